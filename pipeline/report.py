@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cameras import Similarity, camera_up, frame_of, load_sparse, load_views
+from pipeline.cameras import Similarity, camera_up, frame_of, load_poses, load_views
 from pipeline.inputs.photos import load_photos
 from pipeline.options import Options
 from sdfsim.errors import SdfsimError
@@ -229,23 +229,21 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
 
     if "poses" not in done:
         return None
-    views, sparse, place = load_views(folder / "poses"), load_sparse(folder / "poses"), folder / "mesh"
-    moves = [Similarity(1.0, frame_of(camera_up(views).direction), np.zeros(3))]
+    poses, place = load_poses(folder / "poses"), folder / "mesh"
     mesh, skins, trust, proposed = None, {}, {}, []
     if "mesh" in done:
-        moves = [load_field(folder / "distill").to_unit, load_placement(place).to_metres]
+        poses = poses.moved(load_field(folder / "distill").to_unit).moved(load_placement(place).to_metres)
         mesh, skins = load_mesh(place / "mesh.ply"), read_glb(place / TEXTURED)
         trust, proposed = trust_meshes(place), load_views(place / NEXT)
-    points = sparse.xyz
-    for move in moves:
-        views, points = [move.view(view) for view in views], move.points(points)
+    else:
+        poses = poses.moved(Similarity(1.0, frame_of(camera_up(poses.views).direction), np.zeros(3)))
     photos = []
-    for view in [*views, *proposed]:
+    for view in [*poses.views, *proposed]:
         image = folder / "photos" / "images" / view.name
         known = image.is_file()
         photos.append(
             PosedPhoto(view.source, image if known else None, view.focal, (view.cx, view.cy),
                        (view.width, view.height), view.rotation, view.translation, None if known else PROPOSED)
         )  # fmt: skip
-    save_reconstruction(folder / RECORDING, photos, points, sparse.rgb, mesh, skins, trust)
+    save_reconstruction(folder / RECORDING, photos, poses.sparse.xyz, poses.sparse.rgb, mesh, skins, trust)
     return folder / RECORDING

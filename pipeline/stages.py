@@ -75,16 +75,15 @@ def do_poses(run: Run, work: Path) -> dict:
 
 
 def do_distill(run: Run, work: Path) -> dict:
-    from pipeline.cameras import load_sparse, load_views
+    from pipeline.cameras import load_poses
     from pipeline.field.training import PRESETS, train
 
     budget = run.own_budget
     if budget is None and run.options.budget is not None:
         spent = time.monotonic() - run.started
         budget = max(20.0, run.options.budget * (1 - FIT_SHARE) - spent - AFTER_TRAINING)
-    poses = run.place("poses")
     return train(
-        load_views(poses), load_sparse(poses), run.place("photos"), work, settings=PRESETS[run.options.preset],
+        load_poses(run.place("poses")), run.place("photos"), work, settings=PRESETS[run.options.preset],
         budget=budget, seed=run.options.seed, device=run.device(), on_progress=run.tell("distill"),
     ).report  # fmt: skip
 

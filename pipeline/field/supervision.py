@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from pipeline.cameras import Similarity, Sparse, View, nearest_to_axes
+from pipeline.cameras import Poses, Similarity, Sparse, View, nearest_to_axes
 from pipeline.field.interpolation import interpolate
 from pipeline.inputs.photos import Photo
 from sdfsim.errors import SdfsimError
@@ -38,7 +39,7 @@ class DepthPoints:
     view: np.ndarray  # [P] index of the view
 
 
-def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:
+def depth_points(views: Sequence[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:
     """All pixels with depth, times `scale`, in the world of the poses, whose unit is the metre as far as the cameras
     know. Raises SdfsimError where a file of the photos stage is missing."""
     by_name = {photo.name: photo for photo in photos}
@@ -63,15 +64,15 @@ def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale:
     return DepthPoints(np.concatenate(xyz), np.concatenate(pixel), np.concatenate(index))
 
 
-def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[str, float]:
+def depth_scale(poses: Poses, points: DepthPoints) -> dict[str, float]:
     """Compares depth with the triangulated points that lie on the same pixels.
 
     Returns `scale`, the factor of the depth that makes both agree; `spread`, the median share by which a pixel differs
     after that; `points`, how many were compared: with fewer than `FEWEST` the depth is taken as it is. Raises
     SdfsimError where they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
     """
-    ratios = []
-    for number, view in enumerate(views):
+    ratios, sparse = [], poses.sparse
+    for number, view in enumerate(poses.views):
         mine = points.view == number
         seen = sparse.point_of[sparse.view_of == number]
         if not mine.any() or not len(seen):
@@ -102,27 +103,26 @@ class Supervision:
     depth: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def supervision_of(
-    sparse: Sparse, views: list[View], to_unit: Similarity, depth: DepthPoints | None = None, noise: float = 0.0
-) -> Supervision:
+def supervision_of(poses: Poses, depth: DepthPoints | None = None, noise: float = 0.0) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
-    Sparse points and a sensor's depth are in the world of the poses, views in that of the unit sphere. Pixels with
-    depth are lines of sight as well, which end earlier by `noise`, the median share by which the depth is off.
+    Poses are moved to the unit sphere; a sensor's depth is where it was before. Pixels with depth are lines of sight as
+    well, which end earlier by `noise`, the median share by which the depth is off.
     """
-    points = to_unit.points(sparse.xyz)
+    sparse = poses.sparse
+    points = sparse.xyz
     seen = np.bincount(sparse.point_of, minlength=len(points))
     good = (seen >= 3) & (sparse.error < 1.5)
     inside = good & (np.linalg.norm(points, axis=1) < 1.0)
     weights = point_weights(sparse, len(points))[inside]
     use = good[sparse.point_of]
-    centers = np.array([v.center for v in views]).reshape(-1, 3)
+    centers = np.array([view.center for view in poses.views]).reshape(-1, 3)
     end, start = points[sparse.point_of[use]], centers[sparse.view_of[use]]
     measured, gap = np.zeros((0, 3)), np.full(len(end), GAP)
     if depth is not None:
         rng = np.random.default_rng(0)
         some = rng.permutation(len(depth.xyz))
-        measured = to_unit.points(depth.xyz[some])
+        measured = poses.moved_by.points(depth.xyz[some])
         end = np.concatenate([end, measured[:DEPTH_LINES]])
         start = np.concatenate([start, centers[depth.view[some[:DEPTH_LINES]]]])
         away = np.linalg.norm(end[len(gap) :] - start[len(gap) :], axis=1)
@@ -193,12 +193,13 @@ def point_weights(sparse: Sparse, count: int) -> np.ndarray:
     return seen / (1 + np.maximum(sparse.error, 0) ** 2)
 
 
-def unit_sphere_of(views: list[View], sparse: Sparse, *, masked: bool = False) -> Similarity:
+def unit_sphere_of(poses: Poses, *, masked: bool = False) -> Similarity:
     """The similarity that puts what the cameras look at into the unit sphere; `masked`: all points lie on the object.
 
     The centre is where the optical axes meet, drawn weakly to the points' median. The radius is what fits the longer
     side of most photos, less where nearly all points are nearer, and never past the nearest cameras.
     """
+    views, sparse = poses.views, poses.sparse
     centers = np.array([v.center for v in views])
     axes = np.array([v.rotation[2] for v in views])
     weights = point_weights(sparse, len(sparse.xyz))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from PIL import Image
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from pipeline.cameras import Similarity, Sparse, View
+from pipeline.cameras import Poses, Similarity, View
 from pipeline.field.grid_field import Field, FieldSize, GridField, differences, level_step, stencil
 from pipeline.field.mlp_field import MlpField, MlpSize
 from pipeline.field.rendering import (
@@ -139,7 +140,7 @@ def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor
     return center, direction / direction.norm(dim=1, keepdim=True)
 
 
-def load_rays(views: list[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
+def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
     """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. With masks, a view without one
     counts as all object. Raises SdfsimError where a photo is missing."""
     rgb, mask, view_of, pixel, intrinsics, sizes = [], [], [], [], [], []
@@ -438,29 +439,29 @@ class Trained:
 
 
 def train(
-    views: list[View], sparse: Sparse, photos_folder: Path, out: Path, *, settings: Settings,
+    poses: Poses, photos_folder: Path, out: Path, *, settings: Settings,
     budget: float | None = None, seed: int = 0, device: str = "cpu", threads: int | None = None,
     checkpoint_every: float = 20.0, on_progress: Progress = quiet,
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
-    Views and sparse points are in the world of the poses. The budget, s, includes training before a kill: the number of
+    The poses are as structure-from-motion left them. The budget, s, includes training before a kill: the number of
     steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Where the checkpoint of a killed run
     cannot be read, training begins again, and a note of the report says so. Raises SdfsimError where the loss is no
     longer finite.
     """
     photos = load_photos(photos_folder)
     masked = all(photo.mask for photo in photos)
-    to_unit = unit_sphere_of(views, sparse, masked=masked)
-    local = [to_unit.view(view) for view in views]
-    test = held_out(len(views))
-    training = [v for i, v in enumerate(local) if i not in test]
+    to_unit = unit_sphere_of(poses, masked=masked)
+    local = poses.moved(to_unit)
+    test = held_out(len(local.views))
+    training = [view for number, view in enumerate(local.views) if number not in test]
     rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
     depth, agreed = None, {}
     if any(photo.depth for photo in photos):
-        agreed = depth_scale(views, sparse, depth_points(views, photos, photos_folder))
-        depth = depth_points(views, photos, photos_folder, scale=agreed["scale"])
-    supervision = supervision_of(sparse, local, to_unit, depth, agreed.get("spread", 0.0))
+        agreed = depth_scale(poses, depth_points(poses.views, photos, photos_folder))
+        depth = depth_points(poses.views, photos, photos_folder, scale=agreed["scale"])
+    supervision = supervision_of(local, depth, agreed.get("spread", 0.0))
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device)
     checkpoint = out / "checkpoint.safetensors"
@@ -496,7 +497,7 @@ def train(
     trainer.refresh()
     scores = {}
     if test:
-        held, tell = [local[i] for i in test], share_of(on_progress, 0.92, 0.08)
+        held, tell = [local.views[i] for i in test], share_of(on_progress, 0.92, 0.08)
         scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=tell)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),

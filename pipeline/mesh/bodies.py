@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from pipeline.cameras import View, frame_of
+from pipeline.cameras import Poses, frame_of
 from pipeline.inputs.labels import load_names
 from pipeline.mesh.extraction import (
     FLOATER,
@@ -293,12 +293,12 @@ class Parts:
     unrefined: dict[str, str] = field(default_factory=dict)  # by body, why it was not moved to where the photos agree
 
 
-def split(surface: Surface, distance: Distance, finest: float, views: list[View], points: np.ndarray,
-          photos_folder: Path, up: np.ndarray, *, alone: bool) -> Parts:  # fmt: skip
+def split(surface: Surface, distance: Distance, finest: float, poses: Poses, photos_folder: Path,
+          up: np.ndarray, *, alone: bool) -> Parts:  # fmt: skip
     """Finds bodies, takes them out of the scenery and tells those that touch apart.
 
-    All is in normalised space: views, sparse points [P, 3], `up` [3] and the signed distance that the surface is of;
-    `finest` is the width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
+    All is in normalised space: the poses, `up` [3] and the signed distance that the surface is of; `finest` is the
+    width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
     """
     smallest, layer, lift = max(SMALLEST, SMALLEST_CELLS * finest), LAYER * finest, 0.75 * surface.volume.cell
     names = load_names(photos_folder)
@@ -308,7 +308,7 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     votes = None
     if names:
         sight = Visibility(surface.raw, lift, blocking)
-        votes = count_votes(sight, surface.raw.faces, views, photos_folder, names)
+        votes = count_votes(sight, surface.raw.faces, poses.views, photos_folder, names)
     if alone:
         whole = [_whole(surface, mesh, up, layer) for mesh in whole_bodies(surface).values()]
     else:
@@ -334,15 +334,15 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     if not pieces:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
     sampled = {body: body_mesh(body, distance, min(finest / FINER, surface.volume.cell)) for body in pieces}
-    noise = _noise(sampled, points, finest)
+    noise = _noise(sampled, poses.sparse.xyz, finest)
     called = _names([body for body in pieces if body not in noise])
-    meshes, unrefined, pictures = {}, {}, load_pictures(views, photos_folder)
+    meshes, unrefined, pictures = {}, {}, load_pictures(poses.views, photos_folder)
     for body, name in called.items():
         # Lifted clear of the surface in the way, which is sampled more coarsely.
         mesh, why = refine(sampled[body], pictures, blocking, lift, finest, body.level.above, body.layer)
         if why:
             unrefined[name] = why
-        seen = look(Visibility(mesh, lift, blocking), views, photos_folder)
+        seen = look(Visibility(mesh, lift, blocking), poses.views, photos_folder)
         known, color = seen.weight > 0, seen.color
         if known.any() and not known.all():
             color[~known] = spread_colors(mesh.vertices[~known], mesh.vertices[known], color[known])

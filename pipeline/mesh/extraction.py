@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from pipeline.cameras import View
+from pipeline.cameras import Poses
 from pipeline.field.grid_field import Field
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from pipeline.progress import Progress, quiet
@@ -178,15 +178,15 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
 
 
 def surface_of(
-    volume: Volume, field: Field, views: list[View], points: np.ndarray, photos_folder: Path, limit: Distance, *,
+    volume: Volume, field: Field, poses: Poses, photos_folder: Path, limit: Distance, *,
     on_progress: Progress = quiet,
 ) -> Surface:  # fmt: skip
-    """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; views and
-    sparse points [P, 3] are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
+    """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
+    poses are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
     hardly any of it is in the photos."""
     raw, cell = volume.mesh(), volume.cell
-    found = look(Visibility(raw, 0.75 * cell), views, photos_folder, on_progress)
-    far = KDTree(points).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
+    found = look(Visibility(raw, 0.75 * cell), poses.views, photos_folder, on_progress)
+    far = KDTree(poses.sparse.xyz).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
     seen = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell) & ~far
     faces_seen = seen[raw.faces].sum(1) >= 2
     kept, left_out = belonging(raw, faces_seen, FLOATER / 4, SPECK)

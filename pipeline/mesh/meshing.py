@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
-from pipeline.cameras import View, load_sparse, load_views, save_views
+from pipeline.cameras import View, load_poses, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
@@ -43,41 +44,40 @@ def make_meshes(
     or (1) of a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
-    views = [to_unit.view(view) for view in load_views(poses)]
-    points = to_unit.points(load_sparse(poses).xyz)
+    posed = load_poses(poses).moved(to_unit)
     alone = bool(trained.report["masked"])
     inner, limit = field_distance(field), ball
     inside = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
     volume = sample_volume(inside, RESOLUTION[options.preset], on_progress=share_of(on_progress, 0.0, 0.25))
-    surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
+    surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
     scale = None
     if options.distance is not None:
-        scale = measured_scale(options.distance, views, load_photos(photos), Caster(surface.raw))
+        scale = measured_scale(options.distance, posed.views, load_photos(photos), Caster(surface.raw))
     capture, up = load_capture(photos), None
     if capture is not None and capture.up is not None:
         up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
     if capture is not None and scale is None and options.size is None:
         scale = 1 / to_unit.scale, f"metres of {capture.app}"
-    placement = place(surface.visible, views, scale, size=options.size, alone=alone, up=up)
+    placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
     if options.crop is not None:
         limit = box_of(placement, np.reshape(options.crop, (2, 3)))
         volume = volume.limited(limit)
         if not (volume.values < 0).any():
             raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")
-        surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
+        surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
         # Where a person has cut the surroundings away, what is left is what they want to move.
         alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
     on_progress(0.7, "looking for bodies")
-    parts = split(surface, inside, field.finest, views, points, photos, placement.to_metres.rotation[2], alone=alone)
+    parts = split(surface, inside, field.finest, posed, photos, placement.to_metres.rotation[2], alone=alone)
     on_progress(0.8, "drawing objects.png")
-    draw_names(parts, views, photos).save(out / "objects.png")
+    draw_names(parts, posed.views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
-    moved = [placement.to_metres.view(view) for view in views]
     closed, displayed = (
         {name: placement.mesh(mesh) for name, mesh in ({SCENERY: first} | parts.bodies).items() if mesh is not None}
         for first in (parts.solid, parts.shown)
     )
-    shots = shots_of(moved, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
+    views = posed.moved(placement.to_metres).views
+    shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
     ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
     on_progress(0.82, "asking how far each place can be trusted")
     support, told = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
@@ -170,7 +170,7 @@ def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
     return {name: replace(mesh, colors=to_bytes(colors_of(values[name], limits))) for name, mesh in meshes.items()}
 
 
-def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Image:
+def draw_names(parts: Parts, views: Sequence[View], photos_folder: Path) -> Image.Image:
     """A picture of the photos that show bodies best, each body tinted and with its name."""
     meshes = list(parts.bodies.values())
     caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))

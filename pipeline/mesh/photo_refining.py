@@ -7,7 +7,7 @@ nothing: there the surface is the smallest one between what is known on both sid
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -57,7 +57,7 @@ class Picture:
     grey: np.ndarray  # [H, W] float32
 
 
-def load_pictures(views: list[View], photos_folder: Path) -> list[Picture]:
+def load_pictures(views: Sequence[View], photos_folder: Path) -> list[Picture]:
     """The photos of some views, grey and no larger than `LONG_SIDE`."""
     import cv2
 

@@ -60,7 +60,7 @@ def load_placement(mesh_folder: Path) -> Placement:
         raise SdfsimError(f"{path}: damaged", "run the mesh stage again") from error
 
 
-def find_up(shown: Mesh, views: list[View]) -> Up:
+def find_up(shown: Mesh, views: Sequence[View]) -> Up:
     """Up from the largest nearly level plane, else from the cameras; how far they disagree counts as doubt."""
     cameras = camera_up(views)
     normals, areas = face_normals(shown)
@@ -123,7 +123,7 @@ def resting_height(mesh: Mesh) -> float:
     return float(np.quantile(mesh.vertices[:, 2], 0.002))
 
 
-def level(shown: Mesh, views: list[View], up: np.ndarray) -> np.ndarray:
+def level(shown: Mesh, views: Sequence[View], up: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] that turns up [3] to z and the front, which is towards the mean camera, to -y."""
     center = (shown.vertices.min(0) + shown.vertices.max(0)) / 2
     # Cameras all around have no front: take the first photo's side.
@@ -136,7 +136,7 @@ def level(shown: Mesh, views: list[View], up: np.ndarray) -> np.ndarray:
     return frame_of(up)
 
 
-def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None, *, size: float | None = None,
+def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = None, *, size: float | None = None,
           alone: bool = False, up: Up | None = None) -> Placement:  # fmt: skip
     """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
 
@@ -157,7 +157,9 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
     return Placement(Similarity(metres, rotation, translation), up.source, source, up.within)
 
 
-def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], surface: Caster) -> tuple[float, str]:
+def measured_scale(
+    distance: Sequence, views: Sequence[View], photos: list[Photo], surface: Caster
+) -> tuple[float, str]:
     """Metres a normalised unit at which a known distance (see `Options`) is what it should be, and where that comes
     from, in words. Pixels are those of the user's own photos. Raises SdfsimError as `_end` does, for a photo without a
     pose, or a pixel that shows nothing of the surface."""
@@ -175,7 +177,7 @@ def check_distance(distance: Sequence, photos: list[Photo]) -> None:
         _end(text, photos)
 
 
-def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) -> np.ndarray:
+def _locate(text: str, views: Sequence[View], photos: list[Photo], surface: Caster) -> np.ndarray:
     """Position [3] of one end of a known distance."""
     photo, pixel = _end(text, photos)
     view = next((view for view in views if view.name == photo.name), None)

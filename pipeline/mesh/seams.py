@@ -7,6 +7,7 @@ inside belongs to the part whose surface is nearest.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,7 +67,7 @@ class Votes:
         return np.where(self.share.any(1), self.share.argmax(1), -1)
 
 
-def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_folder: Path,
+def count_votes(sight: Visibility, faces: np.ndarray, views: Sequence[View], photos_folder: Path,
                 names: list[str]) -> Votes:  # fmt: skip
     """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out."""
     votes = np.zeros((len(sight.vertices), len(names) + 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,7 +103,7 @@ def framed(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pixels, (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
 
 
-def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress: Progress = quiet) -> Look:
+def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = quiet) -> Look:
     """How many views see each vertex, and its colour in their photos."""
     vertices = sight.vertices
     count = np.zeros(len(vertices), np.int32)

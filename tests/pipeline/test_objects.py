@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cameras import Poses
 from pipeline.mesh.bodies import Parts, find_levels, split
 from pipeline.mesh.extraction import EXTENT, Surface, ball, sample_volume
 from sdfsim.shape.bvh import Winding
 from sdfsim.shape.mass import mass_properties
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
+from tests.pipeline.helpers import NOTHING, sparse_of
 
 FINEST = 0.02
 TABLE = (0.5, 0.35, 0.05)  # half sides of the top and half its thickness
@@ -61,7 +63,7 @@ def parts_of(
     turn = np.eye(3) if turn is None else turn
     up = turn @ np.array([0.0, 0, 1])
     field = lambda p: distance(p @ turn).astype(np.float32)  # noqa: E731
-    return split(surface_of(distance, seen, turn), field, FINEST, [], points, Path(), up, alone=False)
+    return split(surface_of(distance, seen, turn), field, FINEST, Poses((), sparse_of(points)), Path(), up, alone=False)
 
 
 def some_rotation(seed: int) -> np.ndarray:
@@ -187,7 +189,7 @@ def test_what_is_no_body_stays_scenery(scene, seen, why):
 def test_without_scenery_every_component_is_a_body():
     pair = lambda p: np.minimum(box(p, (0.3, 0, 0), (0.1, 0.2, 0.1)), box(p, (-0.4, 0, 0), (0.3, 0.2, 0.2)))  # noqa: E731
     surface = surface_of(pair)
-    parts = split(surface, pair, FINEST, [], NO_POINTS, Path(), np.array([0.0, 0, 1]), alone=True)
+    parts = split(surface, pair, FINEST, NOTHING, Path(), np.array([0.0, 0, 1]), alone=True)
     assert parts.solid is None and parts.shown is None
     volumes = [signed_volume(mesh) for mesh in parts.bodies.values()]
     np.testing.assert_allclose(volumes, [0.6 * 0.4 * 0.4, 0.2 * 0.4 * 0.2], rtol=0.05)

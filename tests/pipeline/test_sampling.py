@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cameras import Sparse
+from pipeline.cameras import Poses, Sparse
 from pipeline.field.grid_field import FieldSize, GridField, laplace_density
 from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, sdf_cache, worst
 from pipeline.field.supervision import (
@@ -20,7 +20,7 @@ from pipeline.field.supervision import (
     FreeSpace,
     supervision_of,
 )
-from tests.pipeline.test_field import UNIT
+from tests.pipeline.helpers import NOTHING
 from tests.pipeline.test_surface import ring
 
 DOUBLE = torch.float64
@@ -148,7 +148,7 @@ def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
     xyz = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
     seen = np.array([0, 0, 0, 0, 1, 1, 1, 2])  # The last point has too few views to be believed.
     sparse = Sparse(xyz, np.zeros((3, 3), np.uint8), np.full(3, 0.5), seen, np.array([0, 1, 2, 3, 0, 1, 2, 0]))
-    found = supervision_of(sparse, views, UNIT)
+    found = supervision_of(Poses(tuple(views), sparse))
     np.testing.assert_allclose(found.points, xyz[:2])
     assert found.sight.shape == (7, 6)
     start, end = found.sight[:, :3], found.sight[:, 3:]
@@ -161,8 +161,7 @@ def test_lines_of_sight_of_a_sensor_end_before_its_noise():
     rng = np.random.default_rng(1)
     xyz = np.concatenate([rng.uniform(-0.3, 0.3, (50, 3)), [[0.0, 0.0, 1.5]]])  # The last one is beyond the sphere.
     depth = DepthPoints(xyz, np.zeros((51, 2)), rng.integers(0, 4, 51))
-    nothing = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
-    found = supervision_of(nothing, views, UNIT, depth, noise=0.01)
+    found = supervision_of(Poses(tuple(views), NOTHING.sparse), depth, noise=0.01)
     assert {tuple(point) for point in found.depth} == {tuple(point) for point in xyz[:50]}
     centers = np.array([view.center for view in views])
     assert (np.linalg.norm(found.sight.reshape(-1, 3), axis=1) < 1 + 1e-9).all()

@@ -285,8 +285,7 @@ def asked(calls, monkeypatch) -> dict[str, dict]:
     note("pipeline.mesh.meshing.make_meshes", "mesh", RESULTS["mesh"])
     note("pipeline.scene_writer.fit_parts", "fit", {})
     monkeypatch.setattr("sdfsim.parallel.choose_threads", lambda work, repeat: 0.0)
-    monkeypatch.setattr("pipeline.cameras.load_views", lambda folder: [])
-    monkeypatch.setattr("pipeline.cameras.load_sparse", lambda folder: None)
+    monkeypatch.setattr("pipeline.cameras.load_poses", lambda folder: None)
     return found
 
 

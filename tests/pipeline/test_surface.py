@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cameras import CAREFUL, UNKNOWN, Similarity, Sparse, View, camera_up, nearest_to_axes
+from pipeline.cameras import CAREFUL, UNKNOWN, Poses, Similarity, Sparse, View, camera_up, nearest_to_axes
 from pipeline.field.supervision import unit_sphere_of
 from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
+from tests.pipeline.helpers import sparse_of
 
 
 def ball(center=(0.0, 0, 0), radius: float = 0.5):
@@ -146,7 +147,7 @@ def test_the_unit_sphere_holds_the_object_and_moves_cameras_along():
     xyz = np.concatenate([rng.normal(size=(300, 3)) * 0.2, rng.normal(size=(40, 3)) * 20])
     observed = np.arange(340).repeat(3)
     sparse = Sparse(xyz, np.zeros((340, 3), np.uint8), np.full(340, 0.5), observed, np.zeros(1020, int))
-    to_unit = unit_sphere_of(views, sparse)
+    to_unit = unit_sphere_of(Poses(tuple(views), sparse))
     assert np.linalg.norm(to_unit.inverse().translation) < 0.1 and 0.5 < 1 / to_unit.scale < 2.5
     p = rng.normal(size=(20, 3)) * 0.3
     for view in views:
@@ -241,3 +242,17 @@ def test_a_similarity_and_its_inverse():
     p = rng.normal(size=(20, 3))
     np.testing.assert_allclose(move.inverse().points(move.points(p)), p, atol=1e-12)
     np.testing.assert_allclose(Similarity.from_dict(move.to_dict()).points(p), move.points(p))
+
+
+def test_cameras_and_points_move_together_and_know_from_where():
+    rng = np.random.default_rng(0)
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    first = Similarity(2.5, q * np.sign(np.linalg.det(q)), rng.normal(size=3))
+    second = Similarity(0.3, np.eye(3)[[1, 2, 0]], rng.normal(size=3))
+    before = Poses(tuple(ring()), sparse_of(0.3 * rng.normal(size=(20, 3))))
+    after = before.moved(first).moved(second)
+    for one, other in zip(before.views, after.views, strict=True):
+        np.testing.assert_allclose(one.project(before.sparse.xyz)[0], other.project(after.sparse.xyz)[0], atol=1e-8)
+    np.testing.assert_allclose(after.moved_by.points(before.sparse.xyz), after.sparse.xyz)
+    back = after.moved_by.inverse().points(after.views[3].center)
+    np.testing.assert_allclose(back, before.views[3].center, atol=1e-12)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cameras import Similarity, View
+from pipeline.cameras import Poses, Similarity, View
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
@@ -21,6 +21,7 @@ from pipeline.report import hollow_line
 from sdfsim.files import write_json
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
 from tests.pipeline import photo_sets
+from tests.pipeline.helpers import NOTHING
 
 FINEST = 0.0157  # as of the quick preset
 
@@ -136,8 +137,8 @@ class Scene:
             Image.fromarray(number[label]).save(folder / FOLDER / f"{view.name}.png")
         if masks:
             write_json(folder / FOLDER / NAMES, {"names": list(masks)})
-        nothing, up = np.zeros((0, 3)), np.array([0, 0, 1.0])
-        found = split(self.surface, self.distance, FINEST, self.views, nothing, folder, up, alone=alone)
+        poses, up = Poses(tuple(self.views), NOTHING.sparse), np.array([0, 0, 1.0])
+        found = split(self.surface, self.distance, FINEST, poses, folder, up, alone=alone)
         back = self.to_unit.inverse()
         return replace(found, bodies={
             name: Mesh(back.points(mesh.vertices), mesh.faces) for name, mesh in found.bodies.items()
