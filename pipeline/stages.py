@@ -140,7 +140,7 @@ class Stage:
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
     "poses": Stage(do_poses, "poses", version=4),
-    "distill": Stage(do_distill, "distill", version=4),
+    "distill": Stage(do_distill, "distill", version=5),
     "mesh": Stage(do_mesh, "mesh", version=9),
     "fit": Stage(do_fit, "assets"),
     "scene": Stage(do_scene, "scene", version=3),

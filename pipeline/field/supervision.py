@@ -16,12 +16,13 @@ from pipeline.field.interpolation import interpolate
 from pipeline.inputs.photos import Photo
 from sdfsim.errors import SdfsimError
 
-# Lines of sight end this far before their points, normalised units.
-GAP = 0.015
-# Clearance that free space asks for: at most, and as a share of the way to the point, which may be on a grazed plane.
-CLEARANCE, SLOPE = 0.02, 0.1
-# Free space counts as filled where the field is below this; between, it may be its coarseness.
-FILLED, JUST_EMPTY = -0.004, 0.002
+# In cells of the field's finest grid, as the field cannot follow a surface more closely:
+GAP = 0.9525  # that lines of sight end before their points; those are uncertain, and so is the surface there
+CLEARANCE = 1.27  # that free space asks for at most, and the shortest line of sight that counts
+# Free space counts as filled where the field is below the first; it is asked to become the second, and no more.
+FILLED, JUST_EMPTY = -0.254, 0.127
+# Clearance as a share of the way to the point, which may be on a grazed plane.
+SLOPE = 0.1
 DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor, that are used
 NOISES = 5.0  # median errors of the depth before which its lines of sight end: a line through the surface erodes it
 APART = 0.2  # A scale that differs by more than this share means other units, or another photo's depth.
@@ -103,11 +104,12 @@ class Supervision:
     depth: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def supervision_of(poses: Poses, depth: DepthPoints | None = None, noise: float = 0.0) -> Supervision:
+def supervision_of(poses: Poses, cell: float, depth: DepthPoints | None = None, noise: float = 0.0) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
-    Poses are moved to the unit sphere; a sensor's depth is where it was before. Pixels with depth are lines of sight as
-    well, which end earlier by `noise`, the median share by which the depth is off.
+    Poses are moved to the unit sphere; a sensor's depth is where it was before. `cell` is the width of a cell of the
+    field's finest grid. Pixels with depth are lines of sight as well, which end earlier by `noise`, the median share by
+    which the depth is off.
     """
     sparse = poses.sparse
     points = sparse.xyz
@@ -118,7 +120,7 @@ def supervision_of(poses: Poses, depth: DepthPoints | None = None, noise: float 
     use = good[sparse.point_of]
     centers = np.array([view.center for view in poses.views]).reshape(-1, 3)
     end, start = points[sparse.point_of[use]], centers[sparse.view_of[use]]
-    measured, gap = np.zeros((0, 3)), np.full(len(end), GAP)
+    measured, gap = np.zeros((0, 3)), np.full(len(end), GAP * cell)
     if depth is not None:
         rng = np.random.default_rng(0)
         some = rng.permutation(len(depth.xyz))
@@ -126,7 +128,7 @@ def supervision_of(poses: Poses, depth: DepthPoints | None = None, noise: float 
         end = np.concatenate([end, measured[:DEPTH_LINES]])
         start = np.concatenate([start, centers[depth.view[some[:DEPTH_LINES]]]])
         away = np.linalg.norm(end[len(gap) :] - start[len(gap) :], axis=1)
-        gap = np.concatenate([gap, GAP + NOISES * noise * away])
+        gap = np.concatenate([gap, GAP * cell + NOISES * noise * away])
         measured = measured[np.linalg.norm(measured, axis=1) < 1.0][:DEPTH_POINTS]
     length = np.linalg.norm(end - start, axis=1)
     direction = (end - start) / np.maximum(length, 1e-9)[:, None]
@@ -134,7 +136,7 @@ def supervision_of(poses: Poses, depth: DepthPoints | None = None, noise: float 
     half = np.sqrt(np.maximum(1 - ((start**2).sum(1) - along**2), 0))
     # Not all the way: a point is uncertain by a little, and so is the surface there.
     low, high = np.maximum(along - half, 0), np.minimum(along + half, length - gap)
-    crosses = (half > 0) & (high > low + 0.02)
+    crosses = (half > 0) & (high > low + CLEARANCE * cell)
     sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
     weights = weights / max(float(weights.mean()), 1e-9) if len(weights) else weights
     return Supervision(points[inside], weights, sight, measured)
@@ -143,9 +145,10 @@ def supervision_of(poses: Poses, depth: DepthPoints | None = None, noise: float 
 class FreeSpace:
     """Points on lines [L, 6] from cameras to what they see, which must be empty whatever colours say. Half of those
     handed out are where the field is solid all the same: a vase's mouth is crossed by one line of sight in hundreds,
-    and would stay filled if lines were drawn evenly."""
+    and would stay filled if lines were drawn evenly. `cell` is the width of a cell of the field's finest grid."""
 
-    def __init__(self, sight: np.ndarray, device: str) -> None:
+    def __init__(self, sight: np.ndarray, cell: float, device: str) -> None:
+        self.cell = cell
         self.start, self.end = (
             torch.tensor(part, dtype=torch.float32, device=device).reshape(-1, 3) for part in np.split(sight, 2, 1)
         )
@@ -161,15 +164,15 @@ class FreeSpace:
         for _ in range(TRIES):
             along = torch.rand(len(self), generator=rng).to(device)
             line = torch.arange(len(self), device=device)
-            wrong = interpolate(cache, self.at(line, along)[0])[:, 0] < FILLED
+            wrong = interpolate(cache, self.at(line, along)[0])[:, 0] < FILLED * self.cell
             found.append(torch.stack([line[wrong].float(), along[wrong]], 1))
         self.filled = torch.cat(found)
 
     def at(self, line: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
         """Points [P, 3] at fractions [P] of lines [P], and the clearance [P] that each asks for."""
         start, end = self.start[line], self.end[line]
-        rest = (1 - along) * (end - start).norm(dim=1) + GAP
-        return start + along[:, None] * (end - start), (SLOPE * rest).clamp_max(CLEARANCE)
+        rest = (1 - along) * (end - start).norm(dim=1) + GAP * self.cell
+        return start + along[:, None] * (end - start), (SLOPE * rest).clamp_max(CLEARANCE * self.cell)
 
     def pick(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         """At most `count` points [P, 3] and the SDF [P] that each must at least have."""
@@ -183,7 +186,7 @@ class FreeSpace:
         along[: count // 2] = self.filled[again, 1]
         points, clearance = self.at(line, along)
         # Emptied, but no more: right beside may be a surface, and this loss comes back to the same places.
-        clearance[: count // 2].clamp_(max=JUST_EMPTY)
+        clearance[: count // 2].clamp_(max=JUST_EMPTY * self.cell)
         return points, clearance
 
 

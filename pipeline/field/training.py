@@ -48,7 +48,6 @@ from sdfsim.parallel import choose_threads
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
-CACHE = 129  # samples a side of the cached SDF; what is thinner than its cells is found by luck only
 HOLLOWS = 0.25  # of the training is done before filled free space is looked for
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
@@ -197,7 +196,8 @@ class Trainer:
             for values in (supervision.points, supervision.weights)
         )
         self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
-        self.free = FreeSpace(supervision.sight if settings.free else supervision.sight[:0], device)
+        sight = supervision.sight if settings.free else supervision.sight[:0]
+        self.free = FreeSpace(sight, settings.size.finest, device)
         self.field, self.optimizer = self.fresh()
         self.iteration, self.iterations, self.seconds = 0, settings.iterations, 0.0
         self.cache: Tensor | None = None
@@ -241,7 +241,7 @@ class Trainer:
         self.field.active = min(levels, 2 + int((levels - 2) * self.fraction / 0.45 + 0.4))
         # Colour does not change with direction at first, or a wrong surface is painted right.
         self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
-        self.cache = sdf_cache(self.field, CACHE)
+        self.cache = sdf_cache(self.field, self.settings.size.sampling)
         self.find_filled()
 
     def find_filled(self) -> None:
@@ -401,7 +401,7 @@ class MlpTrainer(Trainer):
         return 0.1**self.fraction
 
     def refresh(self) -> None:
-        self.cache = sdf_cache(self.field, CACHE)  # only for pictures
+        self.cache = sdf_cache(self.field, self.settings.size.sampling)  # only for pictures
 
     def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
         """Samples [R, S] that bound the error of the opacity, for as many uniforms [R, S]."""
@@ -461,7 +461,7 @@ def train(
     if any(photo.depth for photo in photos):
         agreed = depth_scale(poses, depth_points(poses.views, photos, photos_folder))
         depth = depth_points(poses.views, photos, photos_folder, scale=agreed["scale"])
-    supervision = supervision_of(local, depth, agreed.get("spread", 0.0))
+    supervision = supervision_of(local, settings.size.finest, depth, agreed.get("spread", 0.0))
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device)
     checkpoint = out / "checkpoint.safetensors"

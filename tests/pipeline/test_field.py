@@ -134,7 +134,7 @@ def trainer(seed: int = 0) -> Trainer:
     from dataclasses import replace
 
     settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=20, surface_points=32)
-    return Trainer(settings, toy_rays(), supervision_of(NOTHING), seed)
+    return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), seed)
 
 
 def test_batches_depend_on_seed_and_iteration_only():
@@ -202,7 +202,7 @@ def test_training_lowers_the_colour_error():
     run = trainer()
     losses = [run.step()["color"] for _ in range(20)]
     assert np.mean(losses[-4:]) < np.mean(losses[:4])
-    assert torch.isfinite(sdf_cache(run.field, 9)).all()
+    assert torch.isfinite(sdf_cache(run.field, 2 / 8)).all()
 
 
 def test_masks_make_what_they_exclude_transparent():
@@ -211,7 +211,7 @@ def test_masks_make_what_they_exclude_transparent():
     rays = toy_rays()
     masked = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
     settings = replace(PRESETS["quick"], size=SMALL, rays=128, iterations=40, surface_points=32)
-    run = Trainer(settings, masked, supervision_of(NOTHING), 0)
+    run = Trainer(settings, masked, supervision_of(NOTHING, SMALL.finest), 0)
     losses = [run.step()["mask"] for _ in range(40)]
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
@@ -222,7 +222,7 @@ def test_depth_draws_the_surface_to_where_a_sensor_saw_it():
     grey = replace(rays, rgb=torch.full_like(rays.rgb, 128))
     directions = np.random.default_rng(0).normal(size=(4000, 3))
     ball = 0.45 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    nothing = supervision_of(NOTHING)
+    nothing = supervision_of(NOTHING, SMALL.finest)
     settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=120, surface_points=64)
     off = []
     for supervision in (nothing, replace(nothing, depth=ball)):

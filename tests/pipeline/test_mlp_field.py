@@ -65,7 +65,7 @@ def test_without_gradients_nothing_is_kept():
 def trainer(**changes) -> MlpTrainer:
     small = {"size": TINY, "rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3}
     settings = replace(VOLSDF, **{**small, **changes})
-    supervision = supervision_of(NOTHING)
+    supervision = supervision_of(NOTHING, TINY.finest)
     rays = toy_rays()
     # Without masks the background alone could paint both photos.
     rays = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
@@ -83,7 +83,7 @@ def test_training_lowers_the_loss_and_keeps_a_distance():
     run = trainer()
     assert falls(run, 60, "color", 8) < 0.4
     assert run.converged > 0.5
-    assert torch.isfinite(sdf_cache(run.field, 9)).all()
+    assert torch.isfinite(sdf_cache(run.field, 2 / 8)).all()
 
 
 def test_beta_is_learned():

@@ -82,7 +82,7 @@ class Ball:
             geometry_at=lambda p: (p.norm(dim=1) - 0.5, p, p),
             color_of=lambda geometry, features, directions: torch.tensor(RED).expand(len(geometry), 3) / 255,
         )  # fmt: skip
-        self.cache = sdf_cache(self.field, 129)  # type: ignore[arg-type]
+        self.cache = sdf_cache(self.field, 2 / 128)  # type: ignore[arg-type]
 
 
 def test_a_field_that_is_right_scores_as_such(tmp_path):
@@ -161,7 +161,6 @@ def clock(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock.now))
     monkeypatch.setattr(Trainer, "step", timed)
     monkeypatch.setattr(training, "calibrate", lambda probe, threads: 1.0)
-    monkeypatch.setattr("pipeline.field.training.CACHE", 9)
     return clock
 
 
