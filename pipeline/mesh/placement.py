@@ -22,6 +22,7 @@ GRAVITY = 1.0  # degrees within which a phone knows it
 FLOORS = 0.5  # degrees within which floors and tables are level
 # Largest angle (degrees) between cameras' up and the normal of a plane that tells up, and its least share of the area.
 MAX_ANGLE, MIN_SHARE = 25.0, 0.08
+DRAWN, TRIALS = 2000, 200  # of the search for that plane: points, and planes that are tried
 LEVEL_NORMAL, MIN_FLOOR = 0.95, 0.05  # least z of a level face's normal, and share of the area that a floor has
 # A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
@@ -84,13 +85,15 @@ def plane_up(
     if near.sum() <= 10:
         return None
     p, n, w = points[near], normals[near], weights[near]
-    rng = np.random.default_rng(0)
-    best, inside = 0.0, None
-    for pick in rng.choice(len(p), size=min(200, len(p)), replace=False, p=w / w.sum()):
-        member = (np.abs((p - p[pick]) @ n[pick]) < tolerance) & (n @ n[pick] > 0.9)
-        if w[member].sum() > best:
-            best, inside = float(w[member].sum()), member
-    if inside is None or best < MIN_SHARE * weights.sum():
+    import open3d as o3d
+
+    # It counts points, so that each has to come as often as its share of the area.
+    drawn = p[np.random.default_rng(0).choice(len(p), DRAWN, p=w / w.sum())]
+    o3d.utility.random.seed(0)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(drawn))
+    *normal, offset = cloud.segment_plane(tolerance, 3, TRIALS, 1.0)[0]
+    inside = (np.abs(p @ normal + offset) < tolerance) & (np.abs(n @ normal) > 0.9)
+    if w[inside].sum() < MIN_SHARE * weights.sum():
         return None
     for _ in range(3):
         center = np.average(p[inside], axis=0, weights=w[inside])

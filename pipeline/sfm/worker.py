@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
 from sdfsim.files import write_arrays, write_json
@@ -381,9 +382,8 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
             middle = np.array([size["width"], size["height"]]) / 2
             p, q = (np.hstack([(pixels - middle) / focal, np.ones((len(pixels), 1))]) for pixels in (first, second))
             p, q = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (p, q))
-            u, _, vt = np.linalg.svd(q.T @ p)
-            turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-            explained += np.median(np.linalg.norm(q - p @ turn.T, axis=1)) * focal < least
+            turn = Rotation.align_vectors(q, p)[0]
+            explained += np.median(np.linalg.norm(q - turn.apply(p), axis=1)) * focal < least
         best = max(best, explained / max(1, len(pairs)))
     return best
 

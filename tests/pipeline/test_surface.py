@@ -181,6 +181,19 @@ def test_up_from_the_dominant_plane():
     assert plane_up(clutter, other, np.ones(400), np.array([0.0, 0, 1]), 0.005) is None
 
 
+def test_the_dominant_plane_is_the_largest_not_the_one_with_most_samples():
+    """A table of many small faces beside a floor of few large ones, which slopes by 5 degrees."""
+    rng, slope = np.random.default_rng(0), np.radians(5)
+    floor = rng.uniform(-1, 1, (300, 2)) @ np.array([[np.cos(slope), 0, -np.sin(slope)], [0, 1, 0]])
+    table = np.column_stack([rng.uniform(-0.3, 0.3, (3000, 2)), np.full(3000, 0.5)])
+    sloping = np.array([np.sin(slope), 0, np.cos(slope)])
+    normals = np.concatenate([np.repeat(sloping[None], 300, 0), np.repeat([[0, 0, 1.0]], 3000, 0)])
+    areas = np.concatenate([np.full(300, 4 / 300), np.full(3000, 0.36 / 3000)])
+    found = plane_up(np.concatenate([floor, table]), normals, areas, np.array([0.0, 0, 1]), 0.02)
+    assert found is not None
+    assert np.degrees(np.arccos(np.clip(found[0] @ sloping, -1, 1))) < 0.01 and found[1] < 0.01
+
+
 def scenery() -> Mesh:
     """A floor of 2 m with a block of 0.4 m on it."""
     import trimesh
