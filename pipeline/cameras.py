@@ -120,7 +120,7 @@ STILL = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
-class Poses:
+class PosedPhotos:
     """Posed photos and the points that they see, in one world; and how that world came out of structure-from-motion's.
     Whoever moves it makes another one, so cameras and points are always in the same world."""
 
@@ -128,10 +128,10 @@ class Poses:
     sparse: Sparse
     moved_by: Similarity = STILL  # from the world of structure-from-motion to this one
 
-    def moved(self, move: Similarity) -> Poses:
+    def moved(self, move: Similarity) -> PosedPhotos:
         """The same in another world."""
         views = tuple(move.view(view) for view in self.views)
-        return Poses(views, replace(self.sparse, xyz=move.points(self.sparse.xyz)), move.after(self.moved_by))
+        return PosedPhotos(views, replace(self.sparse, xyz=move.points(self.sparse.xyz)), move.after(self.moved_by))
 
 
 def save_views(views: Sequence[View], path: Path) -> None:
@@ -161,12 +161,12 @@ def view_of(entry: dict) -> View:
     return View(**{**entry, **arrays})
 
 
-def load_poses(folder: Path) -> Poses:
+def load_poses(folder: Path) -> PosedPhotos:
     """Reads the cameras and points of a poses folder. Raises SdfsimError: no readable `cameras.json` or
     `sparse.npz`."""
     views, path = load_views(folder), folder / "sparse.npz"
     try:
-        return Poses(tuple(views), Sparse(**read_arrays(path, "sparse points", "run the poses stage again")))
+        return PosedPhotos(tuple(views), Sparse(**read_arrays(path, "sparse points", "run the poses stage again")))
     except TypeError as error:
         raise SdfsimError(f"{path}: damaged: {error}", "run the poses stage again") from error
 

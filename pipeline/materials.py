@@ -12,7 +12,8 @@ TOOLBOX = "Engineering ToolBox"
 FACTBOOK = "The Physics Factbook"
 EUROCODE = "EN 1991-1-1"
 ROUGH = "rough"
-UNMOVED = ("floor", "scene")  # bodies whose mass never counts
+SCENERY = "scenery"  # the body of all that stays where it is
+UNMOVED = ("floor", SCENERY)  # bodies whose mass never counts
 _WALL = re.compile(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", re.ASCII)
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
@@ -70,7 +71,7 @@ class Choice:
     wall: float | None = None  # m, how thick the wall of a hollow body is; None of a solid one
 
 
-def choose(given: dict[str, str]) -> dict[str, Choice]:
+def materials_of(given: dict[str, str]) -> dict[str, Choice]:
     """Looks up what bodies are made of: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a
     hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError where this makes no sense."""
     found = {}

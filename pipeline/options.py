@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from pipeline.materials import choose
+from pipeline.materials import materials_of
 from sdfsim.errors import EXIT_USAGE, SdfsimError
 
 COMMAND = "reconstruct"
@@ -140,7 +140,7 @@ class Options(BaseModel):
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             got = list(self.crop)
             raise SdfsimError(f"crop: the second corner must lie beyond the first in x, y and z (got {got})")
-        choose(self.material)
+        materials_of(self.material)
         return self
 
     def changed(self, changes: dict[str, Any]) -> Options:

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.cameras import Similarity, camera_up, frame_of, load_poses, load_views
 from pipeline.inputs.photos import load_photos
+from pipeline.materials import SCENERY
 from pipeline.options import Options
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
@@ -137,7 +138,7 @@ def mesh_notes(mesh: dict) -> list[str]:
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
     for name, part in mesh.get("trust", {}).items():
-        if part["guessed"] > GUESSED_SHARE and name != "scene":
+        if part["guessed"] > GUESSED_SHARE and name != SCENERY:
             lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
     if "weak" in mesh:
         more = "" if mesh["next_photos"] else "; no one photo would help much"

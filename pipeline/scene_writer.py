@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.materials import Choice
-from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
+from pipeline.materials import SCENERY, Choice
+from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
 from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
@@ -35,7 +35,7 @@ GAP = 0.3  # of the fall, as a share of the side
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
               device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
-    goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
+    `folder_of` names, and those that are there already are kept. Returns a certificate for each of `shapes`, and
     `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.shape.baked_grid import grid_certificate
     from sdfsim.shape.fit import fit_mesh
@@ -49,7 +49,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         share = weight / sum(weights.values())
         tell = share_of(lambda part, message, name=name: on_progress(part, f"{name}: {message}"), done, share)
         done += share
-        folder, partial = out / name, out / f".{name}.part"
+        folder, partial = out / folder_of(name), out / f".{folder_of(name)}.part"
         if (folder / "shape.json").exists():
             certificates[name] = load_shape(folder).certificate
             continue
@@ -67,6 +67,11 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+
+
+def folder_of(name: str) -> str:
+    """Name of the Shape folder of a part in `assets`."""
+    return "scene" if name == SCENERY else name
 
 
 def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
@@ -176,9 +181,9 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
     else:
         bodies.append(f"  - {{name: floor, {FLOOR}}}")
     if scenery:
-        add(SCENERY, "motion: static", {"asset": "assets/scene"})
+        add(SCENERY, "motion: static", {"asset": f"assets/{folder_of(SCENERY)}"})
     for name, origin in origins.items():
-        add(name, f"position: {_flow(rounded(origin).tolist())}", {"asset": f"assets/{name}"})
+        add(name, f"position: {_flow(rounded(origin).tolist())}", {"asset": f"assets/{folder_of(name)}"})
     if slab is not None:
         box = {"box": {"size": rounded((slab.side, slab.side, slab.thickness)).tolist()}}
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}

@@ -136,7 +136,7 @@ def render(
     return composite(field, chosen, field.geometry_at(chosen.points.view(-1, 3)), beta, behind)
 
 
-def nearest(sdf: Tensor, delta: Tensor) -> Tensor:
+def distance_bound(sdf: Tensor, delta: Tensor) -> Tensor:
     """A lower bound [R, S - 1] of the distance to the surface within each interval of a ray (eq. 13, figure 5), from
     the SDF [R, S] at the samples and the intervals' lengths [R, S - 1].
 
@@ -159,7 +159,7 @@ def opacity_bound(distance: Tensor, sdf: Tensor, beta: Tensor) -> tuple[Tensor, 
     delta = distance[:, 1:] - distance[:, :-1]
     density = laplace_density(sdf[:, :-1], beta)
     before = torch.cumsum(density * delta, 1) - density * delta
-    error = torch.cumsum(delta**2 * torch.exp(-nearest(sdf, delta) / beta), 1) / (4 * beta**2)
+    error = torch.cumsum(delta**2 * torch.exp(-distance_bound(sdf, delta) / beta), 1) / (4 * beta**2)
     return torch.exp(-before) * torch.expm1(error.clamp_max(30.0)), before
 
 

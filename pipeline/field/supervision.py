@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from pipeline.cameras import Poses, Similarity, Sparse, View, nearest_to_axes
+from pipeline.cameras import PosedPhotos, Similarity, Sparse, View, nearest_to_axes
 from pipeline.field.interpolation import interpolate
 from pipeline.inputs.photos import Photo
 from sdfsim.errors import SdfsimError
@@ -65,7 +65,7 @@ def depth_points(views: Sequence[View], photos: list[Photo], folder: Path, *, sc
     return DepthPoints(np.concatenate(xyz), np.concatenate(pixel), np.concatenate(index))
 
 
-def depth_scale(poses: Poses, points: DepthPoints) -> dict[str, float]:
+def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
     """Compares depth with the triangulated points that lie on the same pixels.
 
     Returns `scale`, the factor of the depth that makes both agree; `spread`, the median share by which a pixel differs
@@ -104,7 +104,9 @@ class Supervision:
     depth: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def supervision_of(poses: Poses, cell: float, depth: DepthPoints | None = None, noise: float = 0.0) -> Supervision:
+def supervision_of(
+    poses: PosedPhotos, cell: float, depth: DepthPoints | None = None, noise: float = 0.0
+) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
     Poses are moved to the unit sphere; a sensor's depth is where it was before. `cell` is the width of a cell of the
@@ -196,7 +198,7 @@ def point_weights(sparse: Sparse, count: int) -> np.ndarray:
     return seen / (1 + np.maximum(sparse.error, 0) ** 2)
 
 
-def unit_sphere_of(poses: Poses, *, masked: bool = False) -> Similarity:
+def unit_sphere_of(poses: PosedPhotos, *, masked: bool = False) -> Similarity:
     """The similarity that puts what the cameras look at into the unit sphere; `masked`: all points lie on the object.
 
     The centre is where the optical axes meet, drawn weakly to the points' median. The radius is what fits the longer

@@ -17,7 +17,7 @@ from PIL import Image
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from pipeline.cameras import Poses, Similarity, View
+from pipeline.cameras import PosedPhotos, Similarity, View
 from pipeline.field.grid_field import Field, FieldSize, GridField, differences, level_step, stencil
 from pipeline.field.mlp_field import MlpField, MlpSize
 from pipeline.field.rendering import (
@@ -439,7 +439,7 @@ class Trained:
 
 
 def train(
-    poses: Poses, photos_folder: Path, out: Path, *, settings: Settings,
+    poses: PosedPhotos, photos_folder: Path, out: Path, *, settings: Settings,
     budget: float | None = None, seed: int = 0, device: str = "cpu", threads: int | None = None,
     checkpoint_every: float = 20.0, on_progress: Progress = quiet,
 ) -> Trained:  # fmt: skip

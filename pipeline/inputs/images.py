@@ -27,7 +27,7 @@ DARK = 0.1  # of white, that a hundredth of a photo has to reach
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReadPhoto:
     """A photo as it was read."""
 
     pixels: np.ndarray  # RGB [H, W, 3] uint8
@@ -66,7 +66,7 @@ def exif_focal(image: Image.Image) -> tuple[float | None, str]:
 
 def read_photo(
     path: Path, long_side: int, mask: Path | None = None, shape: float | None = None, white: float | None = None
-) -> Picture:
+) -> ReadPhoto:
     """Reads one photo upright and no larger than `long_side` px; a mask file goes before an alpha channel.
 
     Where a known camera has another `shape`, width over height, than the upright photo, the photo stays as stored.
@@ -90,7 +90,7 @@ def read_photo(
     if inside is not None:
         share = inside[..., None].astype(np.float32) / 255
         pixels = (255 * (pixels[..., :3] / 255.0 * share + BACKDROP * (1 - share)) + 0.5).astype(np.uint8)
-    return Picture(
+    return ReadPhoto(
         np.ascontiguousarray(pixels[..., :3]), original, inside,
         focal * max(pixels.shape[:2]) if focal else None, camera,
     )  # fmt: skip
@@ -190,7 +190,7 @@ def off(image: Image.Image, shape: float) -> float:
     return abs(image.width / image.height / shape - 1)
 
 
-def brightness(picture: Picture) -> float:
+def brightness(picture: ReadPhoto) -> float:
     """How light the lightest hundredth of a photo is, or of its object where it has a mask; from 0 to 1."""
     grey = picture.pixels.astype(np.float32).mean(-1) / 255
     inside = grey if picture.mask is None else grey[picture.mask >= 128]

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import View
-from pipeline.inputs.images import Picture
+from pipeline.inputs.images import ReadPhoto
 from sdfsim.errors import SdfsimError
 
 # COLMAP's camera models, by number: name, and the names of their parameters; none of those that OpenCV does not know.
@@ -274,7 +274,7 @@ def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
     return np.diag([width / known.width, height / known.height, 1.0]) @ known.lens.matrix
 
 
-def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
+def rectified(picture: ReadPhoto, known: KnownCamera, name: str, source: str) -> tuple[ReadPhoto, View, Lens | None]:
     """A photo as a pinhole camera in the same place would have taken it, that camera, and the lens it was freed from.
 
     Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the

@@ -17,8 +17,8 @@ from sdfsim.files import read_json, visible
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes
 UNKNOWN = 255  # a pixel of which nothing is said
-# Names that a scene file may hold already.
-TAKEN = ("scene", "floor", "box", "ball")
+# Names that a scene file holds already, or that of the folder of the scenery's shape.
+TAKEN = ("scenery", "scene", "floor", "box", "ball")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 

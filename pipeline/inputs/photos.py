@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from pipeline.cameras import View, save_views
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
 from pipeline.inputs.deep import common_white
-from pipeline.inputs.images import BLURRED, DARK, Picture, brightness, read_photo, sharpness
+from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, read_photo, sharpness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
@@ -118,7 +118,7 @@ def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
-def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, KnownCamera | None, float]]:
+def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, ReadPhoto, KnownCamera | None, float]]:
     """Name, picture, camera where it is known, and share done."""
     if source.video:
         from pipeline.inputs.video import chosen_frames
@@ -126,7 +126,7 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Kn
         for name, pixels, fraction in chosen_frames(source.video):
             image = Image.fromarray(pixels)
             image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
-            yield name, Picture(np.asarray(image), image.size), None, fraction
+            yield name, ReadPhoto(np.asarray(image), image.size), None, fraction
         return
     masks = source.masks
     # They count where every photo has one, or is cut out by transparency.

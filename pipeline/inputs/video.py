@@ -67,7 +67,7 @@ def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(moved), np.array(sharp)
 
 
-def choose(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
+def choose_frames(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
     """Frames to use, in order: the motion is cut into equal stretches, and the sharpest frame of each is taken; at
     least `FEWEST` where there are as many, at most `MOST`."""
     total = float(moved[-1])
@@ -86,7 +86,7 @@ def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
     if moved[-1] < LEAST_MOTION:
         told = f"{path}: the picture hardly moves (by {moved[-1]:.2f} picture widths in all)"
         raise SdfsimError(told, "walk around the object while filming", exit_code=EXIT_QUALITY)
-    wanted = choose(moved, sharp)
+    wanted = choose_frames(moved, sharp)
     left = set(wanted)
     frames, rate = frames_of(path)
     for index, frame in enumerate(frames):

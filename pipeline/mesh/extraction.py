@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from pipeline.cameras import Poses
+from pipeline.cameras import PosedPhotos
 from pipeline.field.grid_field import Field
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from pipeline.progress import Progress, quiet
@@ -128,7 +128,7 @@ def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: floa
 
 
 @dataclass(frozen=True)
-class Surface:
+class FieldSurface:
     """What was extracted, in normalised space."""
 
     volume: Volume  # the signed distance it comes from
@@ -178,9 +178,9 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
 
 
 def surface_of(
-    volume: Volume, field: Field, poses: Poses, photos_folder: Path, limit: Distance, *,
+    volume: Volume, field: Field, poses: PosedPhotos, photos_folder: Path, limit: Distance, *,
     on_progress: Progress = quiet,
-) -> Surface:  # fmt: skip
+) -> FieldSurface:  # fmt: skip
     """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
     poses are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
     hardly any of it is in the photos."""
@@ -195,7 +195,7 @@ def surface_of(
         told = "mesh: hardly any of the surface is visible in the photos"
         raise SdfsimError(told, "check the poses", exit_code=EXIT_QUALITY)
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
-    return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
+    return FieldSurface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
 
 
 @torch.no_grad()

@@ -15,11 +15,12 @@ from pipeline.cameras import View, load_poses, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
+from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
-from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
+from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
 from pipeline.mesh.visibility import Visibility, hollow, to_bytes
 from pipeline.options import Options
 from pipeline.progress import Progress, quiet, share_of
@@ -28,7 +29,6 @@ from sdfsim.files import read_json, write_bytes, write_json
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, joined, read_attributes, read_mesh, write_glb, write_ply
 
-SCENERY = "scene"
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "volsdf": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
@@ -40,8 +40,8 @@ def make_meshes(
     on_progress: Progress = quiet,
 ) -> dict:  # fmt: skip
     """Writes the files that docs/objects.md lists and returns the stage's report. Vertices in the PLY files have
-    `views` and `uncertainty`, see `Support`. Raises SdfsimError (exit code 3) where there is no surface worth the name,
-    or (1) of a distance or box that makes no sense."""
+    `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) where there is hardly any surface, or
+    (1) for a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
     posed = load_poses(poses).moved(to_unit)
@@ -80,8 +80,8 @@ def make_meshes(
     shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
     ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
     on_progress(0.82, "asking how far each place can be trusted")
-    support, told = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
-    write_parts(parts, surface.visible, placement, support, out)
+    evidence, told = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
+    write_parts(parts, surface.visible, placement, evidence, out)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     write_bytes(out / TEXTURED, write_glb(textures))
     deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
@@ -98,16 +98,16 @@ def make_meshes(
 
 def trust(
     closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
-) -> tuple[Support, dict]:
+) -> tuple[Evidence, dict]:
     """What the photos tell of the vertices of the `closed` meshes, one after the other, and what the report says of it;
     writes `next_photos.json`. Vertices are `counted` [V] bool where they were not cut off; all is in metres."""
     whole = joined(list(closed.values()))
     sight = Visibility(whole, shots.lift, shots.blocking)
-    support = support_of(sight, shots.views)
-    shown = {name: support.nearest(mesh.vertices) for name, mesh in displayed.items()}
-    photos, weak = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
+    evidence = evidence_of(sight, shots.views)
+    shown = {name: evidence.nearest(mesh.vertices) for name, mesh in displayed.items()}
+    photos, weak = next_photos(closed, evidence, sight, shots.blocking, shots.views, counted)
     save_views([photo.view for photo in photos], out / NEXT)
-    return support, {
+    return evidence, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
         "weak": round(weak, 4),
         "next_photos": [photo.told() for photo in photos],
@@ -132,12 +132,12 @@ def rounded(values: ArrayLike) -> np.ndarray:
     return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
 
 
-def write_parts(parts: Parts, visible: Mesh, placement: Placement, support: Support, out: Path) -> None:
+def write_parts(parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path) -> None:
     """Writes meshes in metres with what the photos tell of their vertices, `placement.json` and `parts.json`."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
-        write_bytes(out / name, write_ply(moved, support.nearest(moved.vertices).attributes()))
+        write_bytes(out / name, write_ply(moved, evidence.nearest(moved.vertices).attributes()))
         return moved
 
     write("mesh.ply", visible)

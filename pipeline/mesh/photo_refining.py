@@ -49,7 +49,7 @@ AROUND, TOLD = 20, 0.1 / EVERY
 
 
 @dataclass(frozen=True)
-class Picture:
+class GreyPhoto:
     """A photo to compare patches in."""
 
     view: View  # its camera, for the pixels of the file
@@ -57,7 +57,7 @@ class Picture:
     grey: np.ndarray  # [H, W] float32
 
 
-def load_pictures(views: Sequence[View], photos_folder: Path) -> list[Picture]:
+def load_grey_photos(views: Sequence[View], photos_folder: Path) -> list[GreyPhoto]:
     """The photos of some views, grey and no larger than `LONG_SIDE`."""
     import cv2
 
@@ -67,11 +67,11 @@ def load_pictures(views: Sequence[View], photos_folder: Path) -> list[Picture]:
             grey = np.asarray(image.convert("L"), np.float32)
         scale = min(1.0, LONG_SIDE / max(grey.shape))
         size = round(view.width * scale), round(view.height * scale)
-        found.append(Picture(view, scale, cv2.resize(grey, size, interpolation=cv2.INTER_AREA)))
+        found.append(GreyPhoto(view, scale, cv2.resize(grey, size, interpolation=cv2.INTER_AREA)))
     return found
 
 
-def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, finest: float,
+def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float, finest: float,
            height: Callable[[np.ndarray], np.ndarray], layer: float) -> tuple[Mesh, str]:  # fmt: skip
     """A body whose vertices lie where the photos agree, and why not all rounds of it were done, if so; all is in the
     space of the views.
@@ -102,7 +102,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         sight = Visibility(mesh, lift, blocking)
         if number == 0:
             clear = unblocked(sight, normal, pictures, moves, mean, picked[: count // SELDOM])
-        score = agreement(sight.at(picked), normal[picked], pictures, moves, clear[:, picked])
+        score = patch_correlation(sight.at(picked), normal[picked], pictures, moves, clear[:, picked])
         place, trust = best_places(score, moves)
         trust[low[picked]] = 0
         if not trust.any():
@@ -143,8 +143,8 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
     return mesh, ""
 
 
-def agreement(
-    sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, clear: np.ndarray
+def patch_correlation(
+    sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray
 ) -> np.ndarray:
     """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3]: the mean
     correlation between any two of those that are `clear` [K, P], -1 where too few show a vertex."""
@@ -155,7 +155,7 @@ def agreement(
     return result
 
 
-def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, mean: csr_matrix,
+def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, mean: csr_matrix,
               picked: np.ndarray) -> np.ndarray:  # fmt: skip
     """Whether nothing stands before photos [K, V] where they seem to show vertices with normals [V, 3]: asked at those
     `picked`, and the same around them; yes where they were not asked."""
@@ -180,7 +180,7 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], mo
 
 
 def patches(
-    sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, clear: np.ndarray, most: int
+    sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray, most: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """The patches around vertices [P], moved [M] along normals [P, 3], in the photos that look straightest, at most so
     many and only those that are `clear` [K, P].
@@ -213,7 +213,7 @@ def patches(
         yield part, number, found
 
 
-def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:
+def normalised(picture: GreyPhoto, points: np.ndarray) -> np.ndarray:
     """Grey levels [..., G] of patches of points [..., G, 3] in a photo, with mean 0 and length 1."""
     import cv2
 
@@ -226,8 +226,8 @@ def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:
 
 
 def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from `agreement`, and
-    how far that is to be trusted [P]."""
+    """Where the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from
+    `patch_correlation`, and how far that is to be trusted [P]."""
     best = score.argmax(1)
     middle = best.clip(1, len(moves) - 2)
     before, here, after = (score[np.arange(len(score)), middle + k] for k in (-1, 0, 1))

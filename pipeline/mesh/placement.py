@@ -91,8 +91,8 @@ def plane_up(
     drawn = p[np.random.default_rng(0).choice(len(p), DRAWN, p=w / w.sum())]
     o3d.utility.random.seed(0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(drawn))
-    *normal, offset = cloud.segment_plane(tolerance, 3, TRIALS, 1.0)[0]
-    inside = (np.abs(p @ normal + offset) < tolerance) & (np.abs(n @ normal) > 0.9)
+    plane = cloud.segment_plane(tolerance, 3, TRIALS, 1.0)[0]  # a x + b y + c z + d = 0
+    inside = (np.abs(p @ plane[:3] + plane[3]) < tolerance) & (np.abs(n @ plane[:3]) > 0.9)
     if w[inside].sum() < MIN_SHARE * weights.sum():
         return None
     for _ in range(3):
@@ -126,7 +126,7 @@ def resting_height(mesh: Mesh) -> float:
     return float(np.quantile(mesh.vertices[:, 2], 0.002))
 
 
-def level(shown: Mesh, views: Sequence[View], up: np.ndarray) -> np.ndarray:
+def upright_rotation(shown: Mesh, views: Sequence[View], up: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] that turns up [3] to z and the front, which is towards the mean camera, to -y."""
     center = (shown.vertices.min(0) + shown.vertices.max(0)) / 2
     # Cameras all around have no front: take the first photo's side.
@@ -147,7 +147,7 @@ def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = 
     from; else `size` m is the widest side, 1 m where it is None. `alone`: the floor is where the lowest point is.
     """
     up = up or find_up(shown, views)
-    rotation = level(shown, views, up.direction)
+    rotation = upright_rotation(shown, views, up.direction)
     turned = shown.vertices @ rotation.T
     if scale is None:
         source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"

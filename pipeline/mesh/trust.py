@@ -37,7 +37,7 @@ NEARBY, SLIGHT = 35.0, 0.04  # degrees up to which a way is told in metres; shar
 
 
 @dataclass(frozen=True)
-class Support:
+class Evidence:
     """What photos tell of the places of some points."""
 
     vertices: np.ndarray  # [V, 3] m, the points
@@ -50,11 +50,11 @@ class Support:
         """[V] m, see `sigma_along`; infinite: guessed, as fewer than two photos see the point."""
         return np.where(self.views > 1, sigma_along(self.information, self.normals), np.inf)
 
-    def at(self, index: np.ndarray) -> Support:
+    def at(self, index: np.ndarray) -> Evidence:
         """The same of some of the points."""
-        return Support(self.vertices[index], self.normals[index], self.views[index], self.information[index])
+        return Evidence(self.vertices[index], self.normals[index], self.views[index], self.information[index])
 
-    def nearest(self, points: np.ndarray) -> Support:
+    def nearest(self, points: np.ndarray) -> Evidence:
         """That of the nearest vertex to each of other points [P, 3] m."""
         return self.at(np.asarray(KDTree(self.vertices).query(points)[1]))
 
@@ -86,7 +86,7 @@ def sigma_along(information: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return np.where(known, np.sqrt(np.maximum(variance, 0)), np.inf)
 
 
-def support_of(sight: Visibility, views: Sequence[View]) -> Support:
+def evidence_of(sight: Visibility, views: Sequence[View]) -> Evidence:
     """What views tell of the vertices of a mesh, all in metres."""
     count = len(sight.vertices)
     seen, total = np.zeros(count, np.int64), np.zeros((count, 3, 3))
@@ -94,7 +94,7 @@ def support_of(sight: Visibility, views: Sequence[View]) -> Support:
         index = sight.of_view(view)[0]
         seen[index] += 1
         total[index] += information(view, sight.vertices[index])
-    return Support(sight.vertices, sight.normals, seen, total)
+    return Evidence(sight.vertices, sight.normals, seen, total)
 
 
 def vertex_areas(mesh: Mesh) -> np.ndarray:
@@ -103,15 +103,15 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
     return np.bincount(mesh.faces.ravel(), area, minlength=len(mesh.vertices))
 
 
-def summary(mesh: Mesh, support: Support) -> dict:
+def summary(mesh: Mesh, evidence: Evidence) -> dict:
     """Of a mesh's area: `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
     lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed."""
-    area, uncertainty = vertex_areas(mesh), support.uncertainty
+    area, uncertainty = vertex_areas(mesh), evidence.uncertainty
     known = np.isfinite(uncertainty)
     median = None
     if known.any():
         median = float(np.quantile(uncertainty[known], 0.5, weights=area[known], method="inverted_cdf"))
-    seen_by = np.bincount(np.minimum(support.views, FEW), area, minlength=FEW + 1) / area.sum()
+    seen_by = np.bincount(np.minimum(evidence.views, FEW), area, minlength=FEW + 1) / area.sum()
     return {
         "seen_by": [round(float(share), 4) for share in seen_by],
         "guessed": round(float(area[~known].sum() / area.sum()), 4),
@@ -157,7 +157,7 @@ class NextPhoto:
 
 
 def next_photos(
-    meshes: Mapping[str, Mesh], support: Support, sight: Visibility, solid: Caster, views: Sequence[View],
+    meshes: Mapping[str, Mesh], evidence: Evidence, sight: Visibility, solid: Caster, views: Sequence[View],
     counted: np.ndarray,
 ) -> tuple[list[NextPhoto], float]:  # fmt: skip
     """The photos that help most, the best first, chosen greedily; none where none helps `LEAST` of the surface. Also
@@ -172,7 +172,7 @@ def next_photos(
     area = np.where(counted, vertex_areas(joined(list(meshes.values()))), 0)
     index = np.random.default_rng(0).choice(len(area), SAMPLES, p=area / area.sum())
     part = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes.values()])[index]
-    now, sight = support.at(index), sight.at(index)
+    now, sight = evidence.at(index), sight.at(index)
     sure = now.uncertainty[np.isfinite(now.uncertainty)]
     limit = UNSURE * float(np.median(sure)) if len(sure) else 0.0
     middle, towards = focus(list(views))
@@ -209,7 +209,7 @@ def next_photos(
     return chosen, float(weak.sum() / total)
 
 
-def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
+def worth(now: Evidence, view: View, seen: np.ndarray) -> np.ndarray:
     """How much a photo helps each of the places [S] that it sees, 0 to 1."""
     here = now.at(seen)
     after = sigma_along(here.information + information(view, here.vertices), here.normals)
@@ -218,7 +218,7 @@ def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
 
 
 def _best(
-    now: Support, poor: np.ndarray, tried: Sequence[tuple[np.ndarray, np.ndarray]], middle: np.ndarray, lens: View
+    now: Evidence, poor: np.ndarray, tried: Sequence[tuple[np.ndarray, np.ndarray]], middle: np.ndarray, lens: View
 ) -> tuple[float, View, np.ndarray, np.ndarray] | None:
     """The photo that helps most: how much, its camera, what it looks at [3] m, and the places [S] that it helps.
 

@@ -23,7 +23,7 @@ PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; tha
 
 
 @dataclass(frozen=True)
-class Look:
+class PhotoColors:
     """What the photos show of some points."""
 
     count: np.ndarray  # [V] how many views see each
@@ -103,7 +103,7 @@ def framed(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pixels, (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
 
 
-def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = quiet) -> Look:
+def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = quiet) -> PhotoColors:
     """How many views see each vertex, and its colour in their photos."""
     vertices = sight.vertices
     count = np.zeros(len(vertices), np.int32)
@@ -117,7 +117,7 @@ def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progr
         color[index] += share[:, None] * bilinear(photo, pixels - 0.5)
         weight[index] += share
         on_progress((number + 1) / len(views), f"looking from photo {number + 1} of {len(views)}")
-    return Look(count, color / np.maximum(weight, 1e-12)[:, None], weight)
+    return PhotoColors(count, color / np.maximum(weight, 1e-12)[:, None], weight)
 
 
 def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cameras import Poses, Sparse
+from pipeline.cameras import PosedPhotos, Sparse
 
 
 def sparse_of(points: np.ndarray) -> Sparse:
@@ -13,4 +13,4 @@ def sparse_of(points: np.ndarray) -> Sparse:
     return Sparse(points, np.zeros((len(points), 3), np.uint8), np.zeros(len(points)), none, none)
 
 
-NOTHING = Poses((), sparse_of(np.zeros((0, 3))))
+NOTHING = PosedPhotos((), sparse_of(np.zeros((0, 3))))

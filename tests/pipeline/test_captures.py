@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cameras import Poses, Similarity, Sparse, View, load_views
+from pipeline.cameras import PosedPhotos, Similarity, Sparse, View, load_views
 from pipeline.field.supervision import depth_points, depth_scale
 from pipeline.inputs.captures import UP, DepthFile, load_capture, read_depth, spread
 from pipeline.inputs.known_cameras import lens_of, posed
@@ -148,7 +148,7 @@ def test_the_scale_of_depth_is_found_from_triangulated_points(factor, tmp_path):
     sparse = Sparse(
         xyz, np.zeros((300, 3), np.uint8), np.zeros(300), np.tile(np.arange(300), 2), np.repeat([0, 1], 300)
     )
-    found = depth_scale(Poses(tuple(views), sparse), depth_points(views, photos, tmp_path))
+    found = depth_scale(PosedPhotos(tuple(views), sparse), depth_points(views, photos, tmp_path))
     assert found["scale"] == pytest.approx(factor, rel=1e-6) and found["spread"] < 1e-6
     again = depth_points(views, photos, tmp_path, scale=found["scale"])
     np.testing.assert_allclose(again.xyz[:, 2], 2.0 * factor, rtol=1e-6)
@@ -161,7 +161,7 @@ def test_depth_in_other_units_is_refused(tmp_path):
     xyz = np.column_stack([rng.uniform(-0.5, 0.5, (300, 2)), np.full(300, 2.0)])
     sparse = Sparse(xyz, np.zeros((300, 3), np.uint8), np.zeros(300), np.arange(300), np.zeros(300, int))
     with pytest.raises(SdfsimError, match="1e\\+03 times as far"):
-        depth_scale(Poses(tuple(views), sparse), points)
+        depth_scale(PosedPhotos(tuple(views), sparse), points)
 
 
 def test_depth_of_another_shape_is_refused(tmp_path):

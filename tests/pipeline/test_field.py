@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.cameras import Poses, Similarity, Sparse, View
+from pipeline.cameras import PosedPhotos, Similarity, Sparse, View
 from pipeline.field.grid_field import (
     FieldSize,
     GridField,
@@ -234,7 +234,7 @@ def test_depth_draws_the_surface_to_where_a_sensor_saw_it():
     assert off[1] < 0.03 and off[1] < 0.3 * off[0]
 
 
-def posed_noise(folder: Path) -> Poses:
+def posed_noise(folder: Path) -> PosedPhotos:
     """Four photos of noise, as the photos stage leaves them, and cameras around points that mean nothing."""
     from PIL import Image
 
@@ -252,7 +252,7 @@ def posed_noise(folder: Path) -> Poses:
     points = rng.normal(size=(50, 3)) * 0.3
     point_of, view_of = np.repeat(np.arange(50), 4), np.tile(np.arange(4), 50)
     sparse = Sparse(points, np.zeros((50, 3), np.uint8), np.full(50, 0.5), point_of, view_of)
-    return Poses(tuple(views), sparse)
+    return PosedPhotos(tuple(views), sparse)
 
 
 def test_train_writes_and_reads_back(tmp_path):

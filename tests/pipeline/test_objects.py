@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cameras import Poses
-from pipeline.mesh.bodies import Parts, find_levels, split
-from pipeline.mesh.extraction import EXTENT, Surface, ball, sample_volume
+from pipeline.cameras import PosedPhotos
+from pipeline.mesh.bodies import Parts, find_level_planes, split
+from pipeline.mesh.extraction import EXTENT, FieldSurface, ball, sample_volume
 from sdfsim.shape.bvh import Winding
 from sdfsim.shape.mass import mass_properties
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
@@ -45,7 +45,7 @@ def table(points: np.ndarray) -> np.ndarray:
     return np.minimum.reduce([top, *legs, points[:, 2] + 0.5])
 
 
-def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarray | None = None) -> Surface:
+def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarray | None = None) -> FieldSurface:
     """A surface of which photos show all that lies above the floor, but for what `seen` [V] excludes."""
     turn = np.eye(3) if turn is None else turn
     volume = sample_volume(lambda p: np.maximum(distance(p @ turn), ball(p)).astype(np.float32), 81, extent=EXTENT)
@@ -54,7 +54,7 @@ def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarra
     there = raw.vertices @ turn
     shown = (ball(raw.vertices) < -0.03) & (np.ones(len(there), bool) if seen is None else seen(there))
     faces = shown[raw.faces].all(1)
-    return Surface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, [])
+    return FieldSurface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, [])
 
 
 def parts_of(
@@ -63,7 +63,9 @@ def parts_of(
     turn = np.eye(3) if turn is None else turn
     up = turn @ np.array([0.0, 0, 1])
     field = lambda p: distance(p @ turn).astype(np.float32)  # noqa: E731
-    return split(surface_of(distance, seen, turn), field, FINEST, Poses((), sparse_of(points)), Path(), up, alone=False)
+    return split(
+        surface_of(distance, seen, turn), field, FINEST, PosedPhotos((), sparse_of(points)), Path(), up, alone=False
+    )
 
 
 def some_rotation(seed: int) -> np.ndarray:
@@ -196,6 +198,6 @@ def test_without_scenery_every_component_is_a_body():
 
 
 def test_level_planes_are_found_at_their_heights():
-    levels = find_levels(surface_of(both).visible, np.array([0.0, 0, 1]), FINEST)
+    levels = find_level_planes(surface_of(both).visible, np.array([0.0, 0, 1]), FINEST)
     np.testing.assert_allclose([level.height for level in levels], [-0.5, TOP], atol=0.1 * FINEST)
     assert levels[1].area == pytest.approx(4 * TABLE[0] * TABLE[1] - np.pi * 0.12**2, rel=0.08)

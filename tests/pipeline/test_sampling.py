@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cameras import Poses, Sparse
+from pipeline.cameras import PosedPhotos, Sparse
 from pipeline.field import rendering
 from pipeline.field.grid_field import FieldSize, GridField, laplace_density
-from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, sdf_cache, worst
+from pipeline.field.rendering import EPSILON, bounded_samples, distance_bound, draw, opacity_bound, sdf_cache, worst
 from pipeline.field.supervision import (
     CLEARANCE,
     FILLED,
@@ -57,7 +57,7 @@ def test_nothing_is_nearer_than_the_bound():
     steps = torch.linspace(0, 1, 400, dtype=DOUBLE)
     true = ((start[:, None] + (length * steps)[..., None] * along[:, None]).norm(dim=-1) - 0.3).abs().amin(1)
     ends = torch.stack([start, start + length * along], 1).norm(dim=-1) - 0.3
-    bound = nearest(ends, length)[:, 0]
+    bound = distance_bound(ends, length)[:, 0]
     assert (bound <= true + 1e-9).all()
     assert (bound > 0.5 * true).double().mean() > 0.3
 
@@ -153,7 +153,7 @@ def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
     xyz = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
     seen = np.array([0, 0, 0, 0, 1, 1, 1, 2])  # The last point has too few views to be believed.
     sparse = Sparse(xyz, np.zeros((3, 3), np.uint8), np.full(3, 0.5), seen, np.array([0, 1, 2, 3, 0, 1, 2, 0]))
-    found = supervision_of(Poses(tuple(views), sparse), CELL)
+    found = supervision_of(PosedPhotos(tuple(views), sparse), CELL)
     np.testing.assert_allclose(found.points, xyz[:2])
     assert found.sight.shape == (7, 6)
     start, end = found.sight[:, :3], found.sight[:, 3:]
@@ -166,7 +166,7 @@ def test_lines_of_sight_of_a_sensor_end_before_its_noise():
     rng = np.random.default_rng(1)
     xyz = np.concatenate([rng.uniform(-0.3, 0.3, (50, 3)), [[0.0, 0.0, 1.5]]])  # The last one is beyond the sphere.
     depth = DepthPoints(xyz, np.zeros((51, 2)), rng.integers(0, 4, 51))
-    found = supervision_of(Poses(tuple(views), NOTHING.sparse), CELL, depth, noise=0.01)
+    found = supervision_of(PosedPhotos(tuple(views), NOTHING.sparse), CELL, depth, noise=0.01)
     assert {tuple(point) for point in found.depth} == {tuple(point) for point in xyz[:50]}
     centers = np.array([view.center for view in views])
     assert (np.linalg.norm(found.sight.reshape(-1, 3), axis=1) < 1 + 1e-9).all()

@@ -94,7 +94,7 @@ def test_a_mask_of_another_name_or_content_changes_everything(photos, tmp_path, 
 
 
 def test_a_killed_stage_goes_on_in_its_own_folder(photos, tmp_path, calls, act):
-    def killed(run: stages.Run, work: Path) -> dict:
+    def killed(project: stages.Project, work: Path) -> dict:
         (work / "checkpoint").write_text("half")
         raise KeyboardInterrupt
 
@@ -158,7 +158,7 @@ def test_bad_options_are_one_line_and_write_nothing(photos, tmp_path, keywords, 
 
 
 def test_a_full_disk_and_an_unwritable_folder_are_one_clear_line(photos, tmp_path, calls, act):
-    def full(run: stages.Run, work: Path) -> dict:
+    def full(project: stages.Project, work: Path) -> dict:
         raise OSError(28, "No space left on device", str(work))
 
     act("mesh", full)
@@ -224,7 +224,7 @@ def test_a_skipped_stage_leaves_nothing_of_runs_that_were_killed(photos, tmp_pat
     out, ordinary = tmp_path / "out", STAGES["distill"].run
     reconstruct(photos, out)
 
-    def killed(run: stages.Run, work: Path) -> dict:
+    def killed(project: stages.Project, work: Path) -> dict:
         raise KeyboardInterrupt
 
     act("distill", killed)

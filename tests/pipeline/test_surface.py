@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cameras import CAREFUL, UNKNOWN, Poses, Similarity, Sparse, View, camera_up, nearest_to_axes
+from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, View, camera_up, nearest_to_axes
 from pipeline.field.supervision import unit_sphere_of
 from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
@@ -147,7 +147,7 @@ def test_the_unit_sphere_holds_the_object_and_moves_cameras_along():
     xyz = np.concatenate([rng.normal(size=(300, 3)) * 0.2, rng.normal(size=(40, 3)) * 20])
     observed = np.arange(340).repeat(3)
     sparse = Sparse(xyz, np.zeros((340, 3), np.uint8), np.full(340, 0.5), observed, np.zeros(1020, int))
-    to_unit = unit_sphere_of(Poses(tuple(views), sparse))
+    to_unit = unit_sphere_of(PosedPhotos(tuple(views), sparse))
     assert np.linalg.norm(to_unit.inverse().translation) < 0.1 and 0.5 < 1 / to_unit.scale < 2.5
     p = rng.normal(size=(20, 3)) * 0.3
     for view in views:
@@ -262,7 +262,7 @@ def test_cameras_and_points_move_together_and_know_from_where():
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     first = Similarity(2.5, q * np.sign(np.linalg.det(q)), rng.normal(size=3))
     second = Similarity(0.3, np.eye(3)[[1, 2, 0]], rng.normal(size=3))
-    before = Poses(tuple(ring()), sparse_of(0.3 * rng.normal(size=(20, 3))))
+    before = PosedPhotos(tuple(ring()), sparse_of(0.3 * rng.normal(size=(20, 3))))
     after = before.moved(first).moved(second)
     for one, other in zip(before.views, after.views, strict=True):
         np.testing.assert_allclose(one.project(before.sparse.xyz)[0], other.project(after.sparse.xyz)[0], atol=1e-8)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.cameras import Poses, Sparse, View
+from pipeline.cameras import PosedPhotos, Sparse, View
 from pipeline.field import training
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
@@ -63,7 +63,7 @@ def cloud() -> Sparse:
 def test_training_leaves_renders_and_scores(tmp_path):
     photos(tmp_path, 16)
     settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
-    report = train(Poses(views(16), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
+    report = train(PosedPhotos(views(16), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
     assert report["held_out_photos"] == ["IMG_4.JPG", "IMG_12.JPG"]
     assert len(report["psnr_each"]) == 2 and report["psnr"] == pytest.approx(np.mean(report["psnr_each"]), abs=0.01)
     for name in ("4.jpg", "12.jpg"):
@@ -102,7 +102,7 @@ def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_pat
     settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
     ring = list(views(16))
     ring[4] = away(ring[4])
-    report = train(Poses(tuple(ring), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
+    report = train(PosedPhotos(tuple(ring), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
     assert report["held_out_photos"] == ["IMG_12.JPG"] and len(report["psnr_each"]) == 1
     with Image.open(tmp_path / HELD_OUT / "12.jpg") as render:
         assert report["psnr_px"] == max(render.size)
@@ -113,10 +113,10 @@ def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_pat
 def test_masks_count_only_where_every_photo_has_one_posed_or_not(tmp_path):
     photos(tmp_path, 4, masks=True)
     settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=2, surface_points=16)
-    assert train(Poses(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+    assert train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
     known = [replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=k < 4) for k in range(5)]
     save_photos(known, tmp_path)
-    assert not train(Poses(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+    assert not train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
 
 
 def trainer(iteration: int, iterations: int) -> SimpleNamespace:
@@ -141,7 +141,7 @@ def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
 def test_a_budget_that_is_far_too_small_still_ends_with_a_field(tmp_path):
     photos(tmp_path, 4)
     settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, surface_points=16)
-    report = train(Poses(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1, budget=1e-3).report
+    report = train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1, budget=1e-3).report
     assert report["iterations"] <= FEWEST_STEPS and (tmp_path / "field.safetensors").exists()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.inputs.photos import prepare_photos
-from pipeline.inputs.video import FEWEST, choose, follow, frames_of
+from pipeline.inputs.video import FEWEST, choose_frames, follow, frames_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from tests.pipeline.photo_sets import TABLE_VASE
 
@@ -39,7 +39,7 @@ def test_motion_is_measured_in_picture_widths(tmp_path):
 def test_frames_follow_the_motion_not_the_time():
     """The camera rests for two thirds of the film: hardly a frame of these is wanted."""
     moved = np.concatenate([np.zeros(200), np.linspace(0, 6, 100)])
-    chosen = choose(moved, np.ones(300))
+    chosen = choose_frames(moved, np.ones(300))
     assert sum(index < 200 for index in chosen) <= 2
     assert np.diff(moved[chosen]).max() < 0.15 and len(chosen) == round(6 / 0.07) + 1
 
