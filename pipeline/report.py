@@ -122,7 +122,7 @@ def mesh_notes(mesh: dict) -> list[str]:
         lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
     if mesh.get("up_confidence") == "low":
         lines.append(f"up is uncertain, within {mesh['up_within_degrees']:.0f} degrees: check it before simulating")
-    if str(mesh.get("size", "")).startswith("assumed"):
+    if mesh.get("size_assumed"):
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")

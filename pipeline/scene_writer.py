@@ -158,7 +158,7 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
     """The text of scene.yaml: a floor, the scenery, the bodies that were found at their origins [3] m, and one dropped
     from above where there is a slab."""
-    assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
+    assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
     shapes: list[str] = []
     bodies: list[str] = []

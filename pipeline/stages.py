@@ -139,7 +139,7 @@ class Stage:
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
-    "poses": Stage(do_poses, "poses", version=4),
+    "poses": Stage(do_poses, "poses", version=5),
     "distill": Stage(do_distill, "distill", version=5),
     "mesh": Stage(do_mesh, "mesh", version=10),
     "fit": Stage(do_fit, "assets"),

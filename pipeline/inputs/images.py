@@ -172,9 +172,9 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
         raise SdfsimError(told, "remove it or replace it") from error
     except (OSError, SyntaxError, ValueError, EOFError, RuntimeError) as error:
         why = " ".join(str(error).split())
-        cut = "truncated" in why or "end of file" in why
-        what = "truncated" if cut else f"cannot be decoded ({why})"
-        raise SdfsimError(f"{path}: {what}", "copy it again from the camera, or remove it") from error
+        raise SdfsimError(
+            f"{path}: cannot be decoded ({why})", "copy it again from the camera, or remove it"
+        ) from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 

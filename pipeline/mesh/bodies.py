@@ -295,7 +295,7 @@ class Parts:
     shown: Mesh | None  # what is displayed of it: its visible surface, and the places where bodies stood
     bodies: dict[str, Mesh]  # closed mesh of each body by name, with colours; the largest first
     smallest: float  # what rises less than this above its plane stayed part of the scenery
-    # names of two bodies that touch, and "masks" or "shape", which told them apart
+    # names of two bodies that touch, and "masks" or "shape", which separated them
     touching: list[tuple[str, str, str]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # names of masks whose object has no surface of its own
     noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_are_noise`
@@ -329,10 +329,10 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     pieces: list[FoundBody] = []
     touching: list[tuple[FoundBody, FoundBody, str]] = []
     for body in whole:
-        found, by = _told_apart(surface, body, votes, smallest)
+        found, by, name = _parted(surface, body, votes, smallest)
         parts = [_piece(body, part, names[part.number - 1] if part.number else "") for part in found]
         touching += [(parts[k], parts[n], by) for k, part in enumerate(found) for n in part.neighbours if n > k]
-        pieces += parts or [replace(body, name=by)]
+        pieces += parts or [replace(body, name=name)]
     if votes is not None and not alone:
         for number, name in enumerate(names, start=1):
             if name not in [body.name for body in pieces]:
@@ -362,18 +362,19 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     return Parts(solid, shown, meshes, smallest, pairs, missing, [body.size for body in noise], unrefined)
 
 
-def _told_apart(surface: FieldSurface, body: FoundBody, votes: Votes | None, smallest: float) -> tuple[list[Part], str]:
-    """The parts that a body is made of, and what told them apart; for a single one none, and the name of its masks."""
+def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smallest: float
+            ) -> tuple[list[Part], str, str]:  # fmt: skip
+    """The parts that a body is made of, none for a single one; what separates them, "masks" or "shape"; and the name
+    that masks give to a single one."""
     solid = _solid(surface, body)
     if votes is not None:
         parts, number = parts_by_votes(solid, votes)
         if parts or number:
-            return parts, "masks" if parts else votes.names[number - 1]
+            return parts, "masks", "" if parts else votes.names[number - 1]
     if np.isfinite(body.level.height):
         assert surface.raw.colors is not None
-        parts = parts_by_shape(solid, surface.raw.colors[solid.index], smallest)
-        return parts, "shape" if parts else ""
-    return [], ""
+        return parts_by_shape(solid, surface.raw.colors[solid.index], smallest), "shape", ""
+    return [], "", ""
 
 
 def _solid(surface: FieldSurface, body: FoundBody) -> ConnectedSolid:

@@ -36,6 +36,7 @@ class Placement:
     up_from: str  # "plane", "cameras", or in words what measured it
     size_from: str  # where the scale comes from, in words
     up_within: float = 0.0  # degrees within which up can be trusted
+    size_assumed: bool = False  # whether nothing told the scale
 
     @property
     def up_confidence(self) -> str:
@@ -149,6 +150,7 @@ def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = 
     up = up or find_up(shown, views)
     rotation = upright_rotation(shown, views, up.direction)
     turned = shown.vertices @ rotation.T
+    assumed = scale is None and size is None
     if scale is None:
         source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
         scale = (1.0 if size is None else size) / float(np.ptp(turned, axis=0).max()), source
@@ -157,7 +159,7 @@ def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = 
     low, high = in_metres.vertices.min(0), in_metres.vertices.max(0)
     floor = low[2] if alone else resting_height(in_metres)
     translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, floor])
-    return Placement(Similarity(metres, rotation, translation), up.source, source, up.within)
+    return Placement(Similarity(metres, rotation, translation), up.source, source, up.within, assumed)
 
 
 def measured_scale(

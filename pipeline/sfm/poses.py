@@ -46,11 +46,11 @@ WORSE = 1.15  # times as much of the first attempt's matches left unexplained is
 WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose photos are matched
 
 
-def hopeful(name: str, first: dict) -> bool:
-    """Whether an attempt is worth its time after the first one's failed checks. Photos of one spot, or of a background
-    that stands still, tell no more with more features."""
+def hopeful(settings: dict, first: dict) -> bool:
+    """Whether an attempt is worth its time after the first one's failed checks. Photos taken from one spot, or of a
+    background that stands still, show no more with more features."""
     still = first["still_pairs"] > 0.5
-    return still if name == "without what stands still" else first["turn_only_pairs"] <= 0.9 and not still
+    return still if settings["moving_only"] else first["turn_only_pairs"] <= 0.9 and not still
 
 
 def worth_more(checks: dict) -> bool:
@@ -104,7 +104,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     tries: list[tuple[dict, Path, dict]] = []
     told: list[dict] = []
     for name, settings in ATTEMPTS.items():
-        if tries and (job["known_cameras"] or not hopeful(name, tries[0][0])):
+        if tries and (job["known_cameras"] or not hopeful(settings, tries[0][0])):
             continue
         if any(not checks["failures"] and not worth_more(checks) for checks, _, _ in tries):
             break

@@ -25,7 +25,10 @@ def test_the_page_names_every_photo_and_the_recording_shows_the_cameras(photos, 
         arrays = {"xyz": np.ones((5, 3)), "rgb": np.zeros((5, 3), np.uint8), "error": np.zeros(5)}
         write_arrays(work / "sparse.npz", {**arrays, "point_of": np.zeros(0, int), "view_of": np.zeros(0, int)})
         checks = check(found, [photo(k) for k in range(3)])
-        return {**checks, "left_out": [{"photo": "2.png", "why": "too few matches"}]}
+        return {
+            **checks,
+            "left_out": [{"photo": "2.png", "kind": "overlap", "why": "too few matches", "hopeful": True}],
+        }
 
     act("poses", posed)
     out = tmp_path / "out"

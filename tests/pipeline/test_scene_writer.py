@@ -20,7 +20,7 @@ from sdfsim.shape.mesh import Mesh, write_ply
 from sdfsim.shape.shape import Shape, analytic_shape
 from tests.pipeline.test_surface import cube, scenery
 
-PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m")
+PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m", size_assumed=True)
 
 
 def terrain(height) -> Mesh:
@@ -72,7 +72,9 @@ def test_scene_text_is_valid_yaml_with_gravity_down():
     text = scene_text(PLACEMENT, {}, choose_slab(mesh, mesh))
     data = yaml.safe_load(text)
     assert data["gravity"] == [0, 0, -9.81] and data["shapes"]["scenery"] == {"asset": "assets/scene"}
-    assert "assumed: widest side = 1 m" in text and "confidence: high" in text
+    assert "assumed: widest side = 1 m" in text and "confidence: high" in text and "--distance" in text
+    known = replace(PLACEMENT, size_from="given: widest side = 2 m", size_assumed=False)
+    assert "--distance" not in scene_text(known, {}, None)
     assert [body["name"] for body in data["bodies"]] == ["floor", "scenery", "box"]
 
 

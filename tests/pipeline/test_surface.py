@@ -228,7 +228,7 @@ def test_placement_turns_gravity_down_and_sets_the_size(tmp_path):
     found.save(tmp_path)
     np.testing.assert_allclose(load_placement(tmp_path).mesh(turned).vertices, placed.vertices)
     assert found.up_from == "plane" and found.up_within < 1 and found.up_confidence == "high"
-    assert "assumed" in place(turned, views).size_from
+    assert place(turned, views).size_assumed and not found.size_assumed
     known = place(turned, views, (10.0, "a ruler"), size=3.0)
     assert known.size_from == "a ruler" and np.ptp(known.mesh(turned).vertices, axis=0).max() == pytest.approx(6.0)
 
