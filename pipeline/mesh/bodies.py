@@ -17,6 +17,7 @@ from pipeline.cameras import PosedPhotos, frame_of
 from pipeline.inputs.labels import load_names
 from pipeline.mesh.extraction import (
     FLOATER,
+    LIFT,
     RIM,
     Distance,
     FieldSurface,
@@ -28,6 +29,7 @@ from pipeline.mesh.extraction import (
     sample_box,
 )
 from pipeline.mesh.photo_refining import load_grey_photos, refine
+from pipeline.mesh.placement import LEVEL_NORMAL
 from pipeline.mesh.seams import (
     ConnectedSolid,
     Part,
@@ -42,21 +44,25 @@ from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, face_normals
 
+# Shares, without unit, chosen by hand on the rendered sets (table_vase, `shelf`, touching bodies). Nothing derives
+# them, and other sets may want others.
 LEVEL_SHARE = 0.1  # of the largest level plane: what is smaller carries nothing, as the lid of a box is no table
-LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a face of a level plane
 LARGEST_FOOT = 0.5  # share of its plane that a body covers at most; what covers more is relief
+CARRIED = 0.3  # share of a level plane below which a component's samples lie, and it carries that plane
 SEEN_SHARE = 0.2  # of a body's surface, that photos have to show
 STANDS = 0.3  # least share of a body's lowest layer that has the solid of the plane right below it
-CRUMB = 0.05  # of a body: what is smaller and hangs beside it was torn off it by noise, and goes where it goes
-SCRAP = 0.4  # of the first piece of what masks name as one: a second one that is shorter is left out
+CRUMB = 0.05  # of a body's samples: what is smaller and hangs beside it was torn off it by noise, and goes with it
+FLAKE = 0.02  # of the area of a body's largest piece: smaller pieces are left out
+SCRAP = 0.4  # of the length of the first piece of what masks name: a second one that is shorter is left out
 # Noise has less than the first of the largest body's surface, and less than the second of the most sparse points that a
-# body has on so much surface. Bodies of the rendered shelf had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
+# body has on so much surface. Bodies of `shelf` had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
 SMALL_NOISE, BARE = 0.15, 0.05
+# In cells of the field's finest grid, which decides what can be told from what:
+LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
+SMALLEST = 4.0  # what rises less stays part of what it stands on
+FINER = 1 / 3  # distance of a body's samples
 FILLET = 3.0  # contact layers sideways: what is so near a body's foot is taken away together with it
-LAYER = 1.5  # cells of the finest grid: in a layer so thick a field cannot tell a body from what it stands on
-# What rises less than this (normalised units, or this many cells of the finest grid) stays part of what it stands on.
-SMALLEST, SMALLEST_CELLS = 0.04, 4.0
-FINER = 3.0  # samples of a body to a cell of the field's finest grid
+FEWEST_SAMPLES = 8  # of a component: less is no body
 
 
 @dataclass(frozen=True)
@@ -177,7 +183,7 @@ def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
         hangs = np.asarray(ndimage.minimum(height, label, np.arange(count + 1))) > layer + 1.5 * volume.cell
         for number, box in enumerate(ndimage.find_objects(label, count), start=1):
             mine = label[box] == number
-            if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < 8:
+            if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < FEWEST_SAMPLES:
                 continue
             low = volume.low + volume.cell * np.array([part.start for part in box])
             sides = volume.cell * np.array(mine.shape)
@@ -201,7 +207,7 @@ def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
 def _carries(place: Volume, other: LevelPlane, cell: float) -> bool:
     """Whether the samples right below a level plane are for a good part those of one component."""
     below = -other.above(place.points())
-    return float((place.values * ((below > 0) & (below <= cell))).sum()) * cell**2 > 0.3 * other.area
+    return float((place.values * ((below > 0) & (below <= cell))).sum()) * cell**2 > CARRIED * other.area
 
 
 def _stands(volume: Volume, place: Volume, lowest: np.ndarray, level: LevelPlane, layer: float) -> bool:
@@ -262,7 +268,7 @@ def body_mesh(body: FoundBody, field: Distance, cell: float) -> Mesh:
     mesh = Mesh(sampled.vertices @ frame, sampled.faces)
     label = components(mesh)
     area = np.bincount(label, face_normals(mesh)[1])
-    return keep_faces(mesh, (area > 0.02 * area.max())[label])
+    return keep_faces(mesh, (area > FLAKE * area.max())[label])
 
 
 def without_bodies(volume: Volume, bodies: list[FoundBody], field: Distance) -> Volume:
@@ -309,7 +315,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     All is in normalised space: the poses, `up` [3] and the signed distance that the surface is of; `finest` is the
     width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
     """
-    smallest, layer, lift = max(SMALLEST, SMALLEST_CELLS * finest), LAYER * finest, 0.75 * surface.volume.cell
+    smallest, layer, lift = SMALLEST * finest, LAYER * finest, LIFT * surface.volume.cell
     names = load_names(photos_folder)
     if alone and not names:
         return Parts(None, None, whole_bodies(surface), smallest)
@@ -342,7 +348,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     pieces = [body for body in pieces if not body.name or body.size > SCRAP * largest[body.name]]
     if not pieces:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
-    sampled = {body: body_mesh(body, distance, min(finest / FINER, surface.volume.cell)) for body in pieces}
+    sampled = {body: body_mesh(body, distance, min(FINER * finest, surface.volume.cell)) for body in pieces}
     noise = _noise(sampled, poses.sparse.xyz, finest)
     called = _names([body for body in pieces if body not in noise])
     meshes, unrefined, pictures = {}, {}, load_grey_photos(poses.views, photos_folder)

@@ -22,16 +22,19 @@ from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
-BATCH = 1 << 17  # points a query
-RIM = 0.99  # radius in normalised space at which the solid ends: beyond it the field was never trained
-EXTENT = 1.02  # half the side of the sampled cube
-MIN_SEEN = 2  # photos that have to show a vertex
-# Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
-# set the median error there is ten times that within.
+BATCH = 1 << 17  # points a query; more take more memory and no less time
+RIM = 0.99  # normalised units, radius at which the solid ends: beyond it the field was never trained
+EXTENT = 1.02  # normalised units, half the side of the sampled cube: it holds the ball with two samples around it
+LIFT = 0.75  # cells of the samples by which vertices are lifted off a surface before views look for them
+MIN_SEEN = 2  # photos that have to show a vertex: one alone says nothing of where it is
+# Normalised units. Farther than this from every point of structure-from-motion a surface is a guess. Chosen on a
+# rendered set, where the median error beyond it is ten times that within.
 MAX_FROM_POINTS = 0.1
+# Shares of area and of neighbours, chosen by hand on the photo sets of the project; nothing derives them.
 FLOATER = 0.01  # of the visible surface: a smaller patch says nothing; of the closed solid a quarter of that
-SPECK = 0.02  # normalised units, from which on what is left out is reported
 UNSEEN = 0.05  # a component of whose area photos show less than this share is matter behind the scenery
+CLOSING, CLOSINGS = 0.6, 4  # share of seen neighbours by which an unseen vertex counts as seen, and how many times
+SPECK = 0.02  # normalised units, from which on what is left out is reported: 1 % of the width of the trained space
 
 
 @dataclass(frozen=True)
@@ -171,9 +174,9 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
     trusted = (count >= MIN_SEEN) & ~at_limit
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     degree = np.maximum(np.bincount(edges[:, 0], minlength=len(trusted)), 1)
-    for _ in range(4):
+    for _ in range(CLOSINGS):
         neighbours = np.bincount(edges[:, 0], trusted[edges[:, 1]], minlength=len(trusted))
-        trusted |= (neighbours > 0.6 * degree) & ~at_limit
+        trusted |= (neighbours > CLOSING * degree) & ~at_limit
     return trusted
 
 
@@ -185,7 +188,7 @@ def surface_of(
     poses are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
     hardly any of it is in the photos."""
     raw, cell = volume.mesh(), volume.cell
-    found = look(Visibility(raw, 0.75 * cell), poses.views, photos_folder, on_progress)
+    found = look(Visibility(raw, LIFT * cell), poses.views, photos_folder, on_progress)
     far = KDTree(poses.sparse.xyz).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
     seen = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell) & ~far
     faces_seen = seen[raw.faces].sum(1) >= 2

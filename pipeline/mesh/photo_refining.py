@@ -17,35 +17,36 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
-from pipeline.mesh.visibility import Visibility
+from pipeline.mesh.visibility import FAIR, Visibility
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, vertex_normals
 
+# Chosen by hand on the rendered sets, mostly `shelf`; nothing derives these numbers, and other sets may want others.
 LONG_SIDE = 640  # px; larger photos are made smaller, or the right place would lie too many pixels away
-PHOTOS, FEWEST = 5, 3  # that a patch is compared in, those that look straightest; and how many there must be
-STRAIGHT = 0.35  # least cosine between the normal and a photo's line of sight
-HALF = 3  # a patch has this many pixels to each side of its middle
-PLACES = 25  # along the normal
-NOISE = 4.0  # variance of grey levels that is no texture
+# Photos that a patch is compared in, those that look straightest; and how many there must be: any two agree.
+PHOTOS, FEWEST = 5, 3
+HALF = 3  # px from a patch's middle to its sides
+PLACES = 25  # that are tried along the normal
+NOISE = 4.0  # grey levels squared: variance that is no texture
 # What is not reconstructed may stand before a photo. That one agrees with no others around there: with the best two of
-# ASKED photos by less than CLEAR times as well as any photo does. One vertex of so many is asked.
+# ASKED photos by less than CLEAR times as well as any photo does. One vertex of SELDOM is asked.
 ASKED, CLEAR, SELDOM = 8, 0.5, 16
-# How far vertices are moved, in cells of the field's finest grid; the last round looks in half that range.
+# Cells of the field's finest grid by which vertices are moved at most in a round, and rounds; half as far in the last.
 REACH, ROUNDS = 1.3, 3
 EVERY = 4  # one vertex of so many is looked at, the others follow
-ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises
-# A place is no longer trusted so many times the usual difference from the surface around it. What is usual is told by
-# the places around, since many of them are far off where the field is; but at most so many times the body's median.
+ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises from 0 to 1
+# A place is no longer trusted SPREAD times the usual difference from the surface around it. What is usual depends on
+# the places around, since many of them are far off where the field is; but it is at most FAR times the body's median.
 SPREAD, FAR = 3.0, 2.0
-# A place counts in full where the mean trust within so many edges is this: a lone match at an edge is a mistake.
+# A place counts in full where the mean trust within NEAR edges is EVEN: a lone match at an edge is a mistake.
 NEAR, EVEN = 8, 0.3
-# Weights beside trust: of the surface's area, of its bending, and of where a vertex was.
+# Weights, with trust as unit: of the surface's area, of its bending, of where a vertex was, and of that where no photo
+# tells anything.
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
+AROUND, KNOWN = 20, 0.1 / EVERY  # edges, and mean trust within them, below which vertices stay where they were
 SMOOTHED = 4  # times after each round
-STEPS = 300  # of conjugate gradients
+STEPS = 300  # of conjugate gradients, after which the equations count as not solved
 WALL = 0.25  # of the way to the surface opposite, inside or outside, that a vertex may move in a round
-# Within so many edges vertices need this mean trust around them, or they stay where they were.
-AROUND, TOLD = 20, 0.1 / EVERY
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
         told = np.stack([weight, ~low], 1)
         for _ in range(AROUND):
             told = mean @ told
-        told = (told[:, 0] / (TOLD * told[:, 1]).clip(1e-6)).clip(0, 1)
+        told = (told[:, 0] / (KNOWN * told[:, 1]).clip(1e-6)).clip(0, 1)
         stay = STAY + PINNED * (1 - told)
         moved, converged = settled(mesh, along, mean, wanted, weight, stay)
         # What the surface around it contradicts was a mistake.
@@ -191,7 +192,7 @@ def patches(
     cosine = np.zeros((len(pictures), len(normal)), np.float32)
     for number, picture in enumerate(pictures):
         index, _, straight = sight.of_view(picture.view)
-        cosine[number, index] = np.where(straight > STRAIGHT, straight, 0)
+        cosine[number, index] = np.where(straight > FAIR, straight, 0)
     cosine *= clear
     chosen = np.argsort(-cosine, 0)[:most]
     shown = np.take_along_axis(cosine, chosen, 0) > 0

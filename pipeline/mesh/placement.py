@@ -23,7 +23,8 @@ FLOORS = 0.5  # degrees within which floors and tables are level
 # Largest angle (degrees) between cameras' up and the normal of a plane that tells up, and its least share of the area.
 MAX_ANGLE, MIN_SHARE = 25.0, 0.08
 DRAWN, TRIALS = 2000, 200  # of the search for that plane: points, and planes that are tried
-LEVEL_NORMAL, MIN_FLOOR = 0.95, 0.05  # least z of a level face's normal, and share of the area that a floor has
+LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a level face: 18 degrees
+MIN_FLOOR = 0.05  # share of the area that a floor has
 # A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from pipeline.cameras import View, focus
-from pipeline.mesh.visibility import Visibility, framed
+from pipeline.mesh.visibility import FAIR, Visibility, framed
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, face_normals, joined
 
@@ -27,7 +27,6 @@ SAMPLES = 6000  # of the surface
 PLACES = 600  # directions around the scene in which cameras are tried
 HIGHER = 30.0  # degrees by which these may be above or below the cameras given; and the lowest and highest
 LOWEST, HIGHEST = -60.0, 80.0
-FAIR = 0.35  # least cosine between normal and line of sight at which a photo helps
 UNSURE = 3.0  # times the median uncertainty: from there on a place is weak however many photos see it
 CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anything solid and from the floor
 SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others

@@ -17,8 +17,9 @@ from pipeline.progress import Progress, quiet
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, vertex_normals
 
-# A point seen at a flatter angle than this (cosine) does not count as seen.
-FLATTEST = 0.08
+# Cosines between normal and line of sight. At a flatter angle (85 degrees) a point does not count as seen; at 70
+# degrees a photo begins to help.
+FLATTEST, FAIR = 0.08, 0.35
 PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; that a hollow has
 
 
