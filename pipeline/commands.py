@@ -132,7 +132,7 @@ def fit(
     ] = None,
     units: Annotated[
         Literal["m", "cm", "mm", "in"] | None,
-        typer.Option(help="Of the mesh files (with -o): metres, if not said.", show_default=False),
+        typer.Option(help="Unit of the mesh files (with -o); metres by default.", show_default=False),
     ] = None,
     cluster: Cluster = None,
     device: str = "auto",

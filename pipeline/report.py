@@ -128,7 +128,7 @@ def mesh_notes(mesh: dict) -> list[str]:
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
     how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
-    lines += [f"masks of {name}: they have no surface" for name in mesh.get("masks_without_surface", [])]
+    lines += [f"no surface was found for the masks of {name}" for name in mesh.get("masks_without_surface", [])]
     lines += [f"{name}: its surface was not moved all the way to where the photos agree: {why}"
               for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
     lines += [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
@@ -187,7 +187,7 @@ def page(report: dict, folder: Path) -> str:
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
     if report["psnr"] is not None:
-        side = stages["distill"].get("psnr_px", "a third of the trained")  # not told by runs of before
+        side = stages["distill"].get("psnr_px", "a third of the trained")  # older runs did not record it
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB at {side} px"))
     if mesh:
         rows += [
@@ -219,7 +219,7 @@ def page(report: dict, folder: Path) -> str:
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
-    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras tell; then in metres.
+    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras show; then in metres.
     Returns its path, or None before the poses stage.
     """
     from pipeline.field.training import load_field

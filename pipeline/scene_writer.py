@@ -47,7 +47,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     certificates, done = {}, 0.0
     for name, weight in weights.items():
         share = weight / sum(weights.values())
-        tell = share_of(lambda part, message, name=name: on_progress(part, f"{name}: {message}"), done, share)
+        report = share_of(lambda part, message, name=name: on_progress(part, f"{name}: {message}"), done, share)
         done += share
         folder, partial = out / folder_of(name), out / f".{folder_of(name)}.part"
         if (folder / "shape.json").exists():
@@ -56,7 +56,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         solid, shown = meshes_of(mesh_folder, name)
         shape = fit_mesh(
             solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
-            budget=None if budget is None else budget * share, on_progress=tell, device=device,
+            budget=None if budget is None else budget * share, on_progress=report, device=device,
         )  # fmt: skip
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
         # The folder appears complete or not at all: a run that goes on keeps those that are there.
@@ -123,8 +123,8 @@ def write_scene(
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:
-            told = f"material: no body is called {name!r}{nearest(name, names)}"
-            raise SdfsimError(told, "the bodies are " + ", ".join(names))
+            message = f"material: no body is called {name!r}{nearest(name, names)}"
+            raise SdfsimError(message, "the bodies are " + ", ".join(names))
     made = hashlib.sha256(text.encode()).hexdigest()
     if scene_file.exists() and hashlib.sha256(scene_file.read_bytes()).hexdigest() not in (written, made):
         endings = itertools.chain([""], itertools.count(2))
@@ -145,12 +145,12 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
     found = {}
     for body in scene.bodies:
         choice = materials.get(body.name, Choice())
-        told: dict = {"material": choice.name, "friction": body.friction, "restitution": body.restitution}
+        entry: dict = {"material": choice.name, "friction": body.friction, "restitution": body.restitution}
         if body.motion == "dynamic":
             volume = scene.shapes[body.shape].volume
-            told |= {"density": body.mass / volume, "wall": choice.wall, "volume": volume, "mass": body.mass}
+            entry |= {"density": body.mass / volume, "wall": choice.wall, "volume": volume, "mass": body.mass}
         if body.motion == "dynamic" or body.name in materials:
-            found[body.name] = told
+            found[body.name] = entry
     return found
 
 
@@ -173,7 +173,7 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
             keys = f"shape: {name}, {keys}"
         thick = f", a wall of {1000 * choice.wall:g} mm" if choice.wall else ""
         known = f"{choice.name}{thick}. From: {choice.material.source}"
-        bodies.append(f"  # {known if name in made else 'assumed: no photo tells the material (give --material)'}")
+        bodies.append(f"  # {known if name in made else 'assumed: photos do not show the material (give --material)'}")
         bodies.append(f"  - {{name: {name}, {keys}, {density}{surface}}}")
 
     if "floor" in made:
@@ -245,7 +245,7 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     obstacle = (np.nanmax(top, 1) - top[:, under].max(1)) / side
     central = np.linalg.norm((places - (low + high)[:2] / 2) / np.maximum(high - low, 1e-9)[:2], axis=1)
     good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central - slope / LEVEL - obstacle
-    # What is not level, not flat, or not in the photos is taken only where there is nothing else, the flattest first.
+    # Places that are not level, not flat, or not in the photos are taken only where there are no others.
     bad = np.maximum(slope / LEVEL - 1, 0) + 10 * np.maximum(bump - BUMP, 0) + 10 * np.maximum(unseen - UNSEEN, 0)
     best = int((good - 100 * bad).argmax())
     thickness = THICKNESS * side

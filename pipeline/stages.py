@@ -28,7 +28,7 @@ FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 
 @dataclass
 class Project:
-    """One call: where it works and what it was asked to do."""
+    """A reconstruction: its folder, its options, and where it reports its progress."""
 
     folder: Path  # of all stages
     options: Options  # as in its config.yaml
@@ -206,7 +206,7 @@ def _number(stage: str) -> int:
 
 def run_all(project: Project, stages: dict[str, bool]) -> dict:
     """Runs stages, those whose value is True also when nothing changed, and returns the report. Raises SdfsimError
-    before anything is written where there is no such device, or where something not ours lies in a result's place."""
+    before anything is written where the device is missing, or where files that sdfsim did not write would be lost."""
     if project.options.device == "cuda":
         project.device()
     check_own(project.folder, COMMAND, "report.json", "report.md")
@@ -220,7 +220,7 @@ def run_all(project: Project, stages: dict[str, bool]) -> dict:
             return write_report(project.folder, project.options, current(project.folder))
     except OSError as error:  # a full disk, or what cannot be read or written
         message = f"{error.filename or project.folder}: {error.strerror or error}"
-        raise SdfsimError(message, "run again when this is put right: finished stages are kept") from error
+        raise SdfsimError(message, "solve this and run again: finished stages are kept") from error
 
 
 def check_apart(project: Project) -> None:
@@ -232,12 +232,12 @@ def check_apart(project: Project) -> None:
     for stage in STAGES:
         place = project.place(stage)
         if any(path.is_relative_to(place.resolve()) for path in files):
-            told = f"{given}: lies in {place}, where the result of the {stage} stage belongs"
-            raise SdfsimError(told, "choose another -o; photos are never written to")
+            message = f"{given}: lies in {place}, where the result of the {stage} stage belongs"
+            raise SdfsimError(message, "choose another -o; photos are never written to")
 
 
 def run_reported(project: Project, stage: str, *, again: bool) -> None:
-    """Runs one stage; the report tells what came of it, also where that is an error."""
+    """Runs one stage; the report records its result, also an error."""
     try:
         run_one(project, stage, again=again)
     except SdfsimError as error:
@@ -313,8 +313,8 @@ def read_record(place: Path) -> dict | None:
 def check_replaceable(place: Path) -> None:
     """Raises SdfsimError where anything but an earlier result lies at a stage's place: that is never replaced."""
     if os.path.lexists(place) and read_record(place) is None:
-        told = f"{place}: in the way, and not replaced: sdfsim did not write it (it holds no {RECORD})"
-        raise SdfsimError(told, "choose another folder to write to, or move it away")
+        message = f"{place}: exists and is not replaced, as sdfsim did not write it (no {RECORD} in it)"
+        raise SdfsimError(message, "choose another folder to write to, or move it away")
 
 
 def begin(work: Path, wanted: str, *, fresh: bool) -> Path:

@@ -1,4 +1,4 @@
-"""What structure-from-motion and depth tell the training: where the object is, its surface, and free space."""
+"""What structure-from-motion and depth give to the training: where the object is, its surface, and free space."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SLOPE = 0.1
 DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor, that are used
 NOISES = 5.0  # median errors of the depth before which its lines of sight end: a line through the surface erodes it
 APART = 0.2  # A scale that differs by more than this share means other units, or another photo's depth.
-USUAL = 0.01  # share by which a phone's depth is off, where nothing tells better
+USUAL = 0.01  # share by which a phone's depth is off, where nothing is known better
 FEWEST = 50  # sparse points on pixels with depth that the scale needs
 TRIES = 16  # places along each line at which filled free space is looked for
 
@@ -88,8 +88,8 @@ def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
         return {"scale": 1.0, "spread": USUAL, "points": len(ratio)}
     scale = float(np.median(ratio))
     if not 1 / (1 + APART) < scale < 1 + APART:
-        told = f"depth: the cameras say {scale:.3g} times as far as the depth does"
-        raise SdfsimError(told, "give its unit (depth_unit_scale_factor, metres a count), or leave it out")
+        message = f"depth: the cameras' distances are {scale:.3g} times those of the depth files"
+        raise SdfsimError(message, "give its unit (depth_unit_scale_factor, metres a count), or leave it out")
     return {"scale": scale, "spread": float(np.median(np.abs(ratio / scale - 1))), "points": len(ratio)}
 
 
@@ -145,8 +145,8 @@ def supervision_of(
 
 
 class FreeSpace:
-    """Points on lines [L, 6] from cameras to what they see, which must be empty whatever colours say. Half of those
-    handed out are where the field is solid all the same: a vase's mouth is crossed by one line of sight in hundreds,
+    """Points on lines [L, 6] from cameras to what they see, which must be empty. Half of the
+    points picked are where the field is solid nevertheless: a vase's mouth is crossed by one line of sight in hundreds,
     and would stay filled if lines were drawn evenly. `cell` is the width of a cell of the field's finest grid."""
 
     def __init__(self, sight: np.ndarray, cell: float, device: str) -> None:

@@ -203,7 +203,7 @@ class Trainer:
         self.cache: Tensor | None = None
 
     def fresh(self) -> tuple[Field, torch.optim.Adam]:
-        """A field that nothing was learned by yet, and its optimiser."""
+        """An untrained field and its optimiser."""
         settings = self.settings
         assert isinstance(settings.size, FieldSize)
         field = GridField(settings.size, self.seed, settings.start_radius).to(self.device)
@@ -497,8 +497,8 @@ def train(
     trainer.refresh()
     scores = {}
     if test:
-        held, tell = [local.views[i] for i in test], share_of(on_progress, 0.92, 0.08)
-        scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=tell)
+        held, report = [local.views[i] for i in test], share_of(on_progress, 0.92, 0.08)
+        scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=report)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),

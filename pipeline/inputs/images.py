@@ -167,9 +167,9 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
         with open(path, "rb") as file:
             tiff = file.read(4) in TIFFS
         if tiff:
-            raise SdfsimError(f"{path}: damaged, or a kind of TIFF that is not read", OTHERWISE) from error
-        told = f"{path}: not an image, in spite of its name, or cut short"
-        raise SdfsimError(told, "remove it or replace it") from error
+            raise SdfsimError(f"{path}: damaged, or a kind of TIFF that is not supported", OTHERWISE) from error
+        message = f"{path}: not an image, whatever its name says, or cut short"
+        raise SdfsimError(message, "remove it or replace it") from error
     except (OSError, SyntaxError, ValueError, EOFError, RuntimeError) as error:
         why = " ".join(str(error).split())
         raise SdfsimError(

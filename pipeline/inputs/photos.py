@@ -68,14 +68,14 @@ def prepare_photos(
     try:
         made = _prepare(find_source(unpacked, unpacked=True), out, long_side, on_progress)
     except SdfsimError as error:  # which names files that nobody knows
-        told, hint = (text.replace(str(unpacked), str(source.archive)) for text in (error.message, error.hint))
-        raise SdfsimError(told, hint, exit_code=error.exit_code) from error
+        message, hint = (text.replace(str(unpacked), str(source.archive)) for text in (error.message, error.hint))
+        raise SdfsimError(message, hint, exit_code=error.exit_code) from error
     shutil.rmtree(unpacked, ignore_errors=True)
     return made
 
 
 def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -> tuple[list[Photo], list[str]]:
-    """What `prepare_photos` does with what is no archive."""
+    """What `prepare_photos` does with anything but an archive."""
     if source.capture:
         source = replace(source, photos=tuple(spread(source.photos, source.frames)))
     (out / "images").mkdir(parents=True, exist_ok=True)
@@ -147,8 +147,8 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, ReadPhoto, 
 def _check_shape(path: Path, size: tuple[int, int], camera: KnownCamera | None) -> None:
     """Checks that a photo, or its depth, of this width and height is shaped like the photo of its camera."""
     if camera and camera.height and abs(size[0] / size[1] / (camera.width / camera.height) - 1) > 0.02:
-        told = f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}"
-        raise SdfsimError(told, "give the photos and depth that the cameras were found for, uncropped and as turned")
+        message = f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}"
+        raise SdfsimError(message, "give the photos and depth that the cameras were found for, uncropped and as turned")
 
 
 def notes_on(photos: list[Photo], mask_files: int) -> list[str]:

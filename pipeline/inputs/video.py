@@ -81,11 +81,11 @@ def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
     cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
     moved, sharp = follow(path)
     if len(sharp) < FEWEST:
-        told = f"{path}: only {len(sharp)} frames can be decoded (at least {FEWEST} are needed)"
-        raise SdfsimError(told, "is the video whole? Convert it to MP4 (H.264), or film for longer")
+        message = f"{path}: only {len(sharp)} frames can be decoded (at least {FEWEST} are needed)"
+        raise SdfsimError(message, "check that the video is complete, convert it to MP4 (H.264), or film for longer")
     if moved[-1] < LEAST_MOTION:
-        told = f"{path}: the picture hardly moves (by {moved[-1]:.2f} picture widths in all)"
-        raise SdfsimError(told, "walk around the object while filming", exit_code=EXIT_QUALITY)
+        message = f"{path}: the picture hardly moves (by {moved[-1]:.2f} picture widths in all)"
+        raise SdfsimError(message, "walk around the object while filming", exit_code=EXIT_QUALITY)
     wanted = choose_frames(moved, sharp)
     left = set(wanted)
     frames, rate = frames_of(path)

@@ -57,7 +57,7 @@ SCRAP = 0.4  # of the length of the first piece of what masks name: a second one
 # Noise has less than the first of the largest body's surface, and less than the second of the most sparse points that a
 # body has on so much surface. Bodies of `shelf` had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
 SMALL_NOISE, BARE = 0.15, 0.05
-# In cells of the field's finest grid, which decides what can be told from what:
+# In cells of the field's finest grid, which limits what can be separated:
 LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
 SMALLEST = 4.0  # what rises less stays part of what it stands on
 FINER = 1 / 3  # distance of a body's samples
@@ -89,7 +89,7 @@ class FoundBody:
     own: np.ndarray
     low: np.ndarray  # [3] position of the first of these samples
     cell: float  # between them
-    layer: float  # thickness of the contact layer, in which the field cannot tell body and plane apart
+    layer: float  # thickness of the contact layer, in which the field cannot separate body and plane
     hollow: np.ndarray  # [A, B] bool on the plane: places that the body goes around at the top of the contact layer
     corner: np.ndarray  # [2] of the first of these, in the axes of `frame_of` the plane
     seam: Volume | None = None  # where it ends against what it touches, negative within; None where it ends by itself
@@ -310,7 +310,7 @@ class Parts:
 
 def split(surface: FieldSurface, distance: Distance, finest: float, poses: PosedPhotos, photos_folder: Path,
           up: np.ndarray, *, alone: bool) -> Parts:  # fmt: skip
-    """Finds bodies, takes them out of the scenery and tells those that touch apart.
+    """Finds bodies, takes them out of the scenery and separates those that touch.
 
     All is in normalised space: the poses, `up` [3] and the signed distance that the surface is of; `finest` is the
     width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
@@ -328,7 +328,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
         whole = [_whole(surface, mesh, up, layer) for mesh in whole_bodies(surface).values()]
     else:
         named = None if votes is None else votes.winner > 0
-        # What lies on a body is told apart from it by masks, not by the plane between them.
+        # Masks separate what lies on a body from it; the plane between them does not.
         plain = surface.shown if named is None else surface.shown & ~named[surface.raw.faces].any(1)
         levels = find_level_planes(keep_faces(surface.raw, plain), up, finest)
         whole = find_bodies(surface, levels, layer, smallest, named)
@@ -441,7 +441,7 @@ def _loose(surface: FieldSurface, votes: Votes, number: int, bodies: list[FoundB
 
 
 def _noise(meshes: dict[FoundBody, Mesh], points: np.ndarray, width: float) -> list[FoundBody]:
-    """The bodies that are dark or blurred places which the training filled with something.
+    """The bodies that are only noise: dark or blurred places that the training filled.
 
     They are small, no masks name them, and hardly any of the sparse points [P, 3] lies within `width` of them, where
     others are covered with points.

@@ -195,8 +195,8 @@ def surface_of(
     kept, left_out = belonging(raw, faces_seen, FLOATER / 4, SPECK)
     shown = islands(raw, faces_seen & kept, FLOATER)
     if shown.sum() < 100:
-        told = "mesh: hardly any of the surface is visible in the photos"
-        raise SdfsimError(told, "check the poses", exit_code=EXIT_QUALITY)
+        message = "mesh: hardly any of the surface is visible in the photos"
+        raise SdfsimError(message, "check the poses", exit_code=EXIT_QUALITY)
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
     return FieldSurface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
 

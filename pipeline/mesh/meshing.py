@@ -63,7 +63,10 @@ def make_meshes(
         limit = box_of(placement, np.reshape(options.crop, (2, 3)))
         volume = volume.limited(limit)
         if not (volume.values < 0).any():
-            raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")
+            raise SdfsimError(
+                "crop: the box holds nothing",
+                "corners are in metres, in the axes of the mesh/mesh.ply of a run without --crop",
+            )
         surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
         # Where a person has cut the surroundings away, what is left is what they want to move.
         alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
@@ -80,7 +83,7 @@ def make_meshes(
     shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
     ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
     on_progress(0.82, "asking how far each place can be trusted")
-    evidence, told = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
+    evidence, trusted = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
     write_parts(parts, surface.visible, placement, evidence, out)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     write_bytes(out / TEXTURED, write_glb(textures))
@@ -93,14 +96,14 @@ def make_meshes(
         "size_assumed": placement.size_assumed, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
         "hollows_m": {name: rounded(found).tolist() for name, found in deep.items() if found is not None},
-        "masks_without_surface": parts.missing, "unrefined": parts.unrefined, **told,
+        "masks_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
     }  # fmt: skip
 
 
 def trust(
     closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
 ) -> tuple[Evidence, dict]:
-    """What the photos tell of the vertices of the `closed` meshes, one after the other, and what the report says of it;
+    """What the photos say about the vertices of the `closed` meshes, one after the other, and the same for the report;
     writes `next_photos.json`. Vertices are `counted` [V] bool where they were not cut off; all is in metres."""
     whole = joined(list(closed.values()))
     sight = Visibility(whole, shots.lift, shots.blocking)
@@ -111,7 +114,7 @@ def trust(
     return evidence, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
         "weak": round(weak, 4),
-        "next_photos": [photo.told() for photo in photos],
+        "next_photos": [photo.to_dict() for photo in photos],
     }  # fmt: skip
 
 
@@ -134,7 +137,7 @@ def rounded(values: ArrayLike) -> np.ndarray:
 
 
 def write_parts(parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path) -> None:
-    """Writes meshes in metres with what the photos tell of their vertices, `placement.json` and `parts.json`."""
+    """Writes meshes in metres with what the photos say about their vertices, `placement.json` and `parts.json`."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)

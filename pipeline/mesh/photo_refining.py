@@ -41,7 +41,7 @@ SPREAD, FAR = 3.0, 2.0
 # A place counts in full where the mean trust within NEAR edges is EVEN: a lone match at an edge is a mistake.
 NEAR, EVEN = 8, 0.3
 # Weights, with trust as unit: of the surface's area, of its bending, of where a vertex was, and of that where no photo
-# tells anything.
+# shows anything.
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
 AROUND, KNOWN = 20, 0.1 / EVERY  # edges, and mean trust within them, below which vertices stay where they were
 SMOOTHED = 4  # times after each round
@@ -78,8 +78,8 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
     space of the views.
 
     Vertices are lifted by `lift` off the surface before a view looks for them, and move by cells of width `finest`.
-    Below `layer` of `height`, above the plane that the body stands on, no photo tells the body from its plane; vertices
-    there move along the plane only.
+    Below `layer` of `height`, above the plane that the body stands on, no photo separates the body from its plane, so
+    vertices there move along the plane only.
     """
     count = len(mesh.vertices)
     if len(pictures) < FEWEST:
@@ -115,11 +115,11 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
         for _ in range(NEAR):
             near = mean @ near
         weight = weight * (near / (EVEN / EVERY)).clip(0, 1)
-        told = np.stack([weight, ~low], 1)
+        known = np.stack([weight, ~low], 1)
         for _ in range(AROUND):
-            told = mean @ told
-        told = (told[:, 0] / (KNOWN * told[:, 1]).clip(1e-6)).clip(0, 1)
-        stay = STAY + PINNED * (1 - told)
+            known = mean @ known
+        known = (known[:, 0] / (KNOWN * known[:, 1]).clip(1e-6)).clip(0, 1)
+        stay = STAY + PINNED * (1 - known)
         moved, converged = settled(mesh, along, mean, wanted, weight, stay)
         # What the surface around it contradicts was a mistake.
         off = np.abs(moved - wanted)
@@ -139,7 +139,7 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
         moved = moved.clip(-WALL * inwards, WALL * outwards)
         vertices = mesh.vertices + moved[:, None] * along
         for _ in range(SMOOTHED):
-            vertices = vertices + 0.5 * (told * ~low)[:, None] * (mean @ vertices - vertices)
+            vertices = vertices + 0.5 * (known * ~low)[:, None] * (mean @ vertices - vertices)
         mesh = replace(mesh, vertices=vertices)
     return mesh, ""
 
@@ -176,8 +176,8 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], 
         for _ in range(AROUND if there.any() else 0):
             total, weight = mean @ total, mean @ weight
         photo[:] = np.where(weight > 1e-6, total / weight.clip(1e-6), np.inf)
-    told = np.where(np.isfinite(support), support, -1)
-    return (support >= CLEAR * told.max(0)) | (told.max(0) <= 0)
+    asked_best = np.where(np.isfinite(support), support, -1).max(0)
+    return (support >= CLEAR * asked_best) | (asked_best <= 0)
 
 
 def patches(

@@ -20,7 +20,7 @@ from sdfsim.shape.mesh import Mesh, face_normals
 CONFIDENT = {"high": 2.0, "medium": 6.0}
 GRAVITY = 1.0  # degrees within which a phone knows it
 FLOORS = 0.5  # degrees within which floors and tables are level
-# Largest angle (degrees) between cameras' up and the normal of a plane that tells up, and its least share of the area.
+# Of the plane that gives up: largest angle (degrees) between its normal and cameras' up, and least share of the area.
 MAX_ANGLE, MIN_SHARE = 25.0, 0.08
 DRAWN, TRIALS = 2000, 200  # of the search for that plane: points, and planes that are tried
 LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a level face: 18 degrees
@@ -37,7 +37,7 @@ class Placement:
     up_from: str  # "plane", "cameras", or in words what measured it
     size_from: str  # where the scale comes from, in words
     up_within: float = 0.0  # degrees within which up can be trusted
-    size_assumed: bool = False  # whether nothing told the scale
+    size_assumed: bool = False  # whether the scale is a guess
 
     @property
     def up_confidence(self) -> str:
@@ -211,9 +211,9 @@ def _end(text: str, photos: list[Photo]) -> tuple[Photo, tuple[float, float] | N
     name, pixel = (match[1], (float(match[2]), float(match[3]))) if match else (text, None)
     found = [p for p in photos if p.source == name] or [p for p in photos if Path(p.source).name == name]
     if len(found) != 1:
-        told = f"{len(found)} photos are" if found else "no photo is"
+        which = f"{len(found)} photos are" if found else "no photo is"
         such = ", ".join(photo.source for photo in (found or photos)[:3])
-        raise SdfsimError(f"distance: {told} called {name!r}", f"write PHOTO:X,Y or PHOTO; photos: {such}, ...")
+        raise SdfsimError(f"distance: {which} called {name!r}", f"write PHOTO:X,Y or PHOTO; photos: {such}, ...")
     width, height = found[0].original
     if pixel is not None and not (pixel[0] <= width and pixel[1] <= height):
         raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")

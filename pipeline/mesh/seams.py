@@ -156,7 +156,7 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> ConnectedSolid:
 
 
 def parts_by_votes(solid: ConnectedSolid, votes: Votes) -> tuple[list[Part], int]:
-    """The parts of a solid that masks tell apart, none where there are no two; and the name's number of the whole solid
+    """The parts of a solid that masks separate, none where there are no two; and the name's number of the whole solid
     where it has one, else 0."""
     winner = votes.winner[solid.index]
     count = np.bincount(winner[winner >= 0], minlength=len(votes.names) + 1)
@@ -170,7 +170,8 @@ def parts_by_votes(solid: ConnectedSolid, votes: Votes) -> tuple[list[Part], int
 
 
 def part_of_name(solid: ConnectedSolid, votes: Votes, number: int) -> Part | None:
-    """What masks name of a larger solid, of which a box with an empty border shows a part; None: there is nothing."""
+    """The part with this number in the masks of a larger solid, of which only a box with an empty border is given; None
+    where there is none."""
     mine = votes.share[solid.index, number]
     if not mine.any():
         return None
@@ -182,7 +183,7 @@ def part_of_name(solid: ConnectedSolid, votes: Votes, number: int) -> Part | Non
 
 def parts_by_shape(solid: ConnectedSolid, colors: np.ndarray, least: float) -> list[Part]:
     """The parts of a solid that meet in a groove all along, and whose seam is narrow or whose colours [P, 3] differ;
-    none where it is one. What is shorter than `least` in any direction is no part."""
+    none where it is a single body. Parts are at least `least` long in every direction."""
     groove = _solid_around(solid) - 0.5
     label = np.zeros(len(groove), int)
     waiting = [0]
@@ -360,7 +361,7 @@ def cut(solid: ConnectedSolid, label: np.ndarray, found: list[Seam], numbers: li
 
 def _apart(solid: ConnectedSolid, label: np.ndarray, found: list[Seam], pair: tuple[int, int], colors: np.ndarray,
            groove: np.ndarray, least: float) -> bool:  # fmt: skip
-    """Whether two parts meet as bodies do: in one flat seam, in a groove all along, and narrow or of two colours."""
+    """Whether two parts are two bodies: they meet in one flat seam, in a groove all along, narrow or of two colours."""
     between = [seam for seam in found if seam.pair == pair]
     if len(between) != 1 or not between[0].flat:
         return False

@@ -168,7 +168,7 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
     """Where the texels of a texture lie on a surface with `uv`, perhaps colours, and vertex normals [V, 3]."""
     assert flat.uv is not None
     rows, columns = shape
-    # The charts lie in a plane, and a ray through each texel's centre tells which face covers it, and where.
+    # The charts lie in a plane, and a ray through each texel's centre finds which face covers it, and where.
     sheet = Caster(Mesh(np.c_[flat.uv * [columns, rows], np.zeros(len(flat.uv))], flat.faces))
     parts = []
     for first in range(0, rows * columns, BATCH):

@@ -1,7 +1,7 @@
 """How far each place of a surface can be trusted, and which photos would help most.
 
-A photo tells where a point is across its line of sight, to about a pixel, and nothing along it. Lines of sight from
-several directions together tell the rest. What fewer than two photos see is a guess of the field.
+A photo fixes a point across its line of sight, to about a pixel, and not at all along it. Lines of sight from several
+directions together fix it. What fewer than two photos see is a guess of the field.
 """
 
 from __future__ import annotations
@@ -32,12 +32,15 @@ CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anyt
 SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others
 APART = 15.0  # degrees between the photos proposed
 LEAST = 0.01  # share of the surface that a photo has to help, else it is not worth the way
-NEARBY, SLIGHT = 35.0, 0.04  # degrees up to which a way is told in metres; share of the distance that is not worth it
+NEARBY, SLIGHT = (
+    35.0,
+    0.04,
+)  # degrees up to which a way is described in metres; share of the distance not mentioned
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What photos tell of the places of some points."""
+    """What photos say about the positions of some points."""
 
     vertices: np.ndarray  # [V, 3] m, the points
     normals: np.ndarray  # [V, 3] unit, of the surface there
@@ -63,7 +66,7 @@ class Evidence:
 
 
 def information(view: View, points: np.ndarray) -> np.ndarray:
-    """How exactly one photo tells where points [P, 3] in front of it are: the inverse [P, 3, 3] of the covariance of
+    """How exactly one photo fixes points [P, 3] in front of it: the inverse [P, 3, 3] of the covariance of
     the place, in 1 / (unit of the points)^2, of rank two.
 
     The photo is taken to be off by a standard deviation of 1 px on both axes, its camera to be exact: J^T J of the
@@ -86,7 +89,7 @@ def sigma_along(information: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def evidence_of(sight: Visibility, views: Sequence[View]) -> Evidence:
-    """What views tell of the vertices of a mesh, all in metres."""
+    """What views say about the vertices of a mesh, all in metres."""
     count = len(sight.vertices)
     seen, total = np.zeros(count, np.int64), np.zeros((count, 3, 3))
     for view in views:
@@ -146,7 +149,7 @@ class NextPhoto:
     gain: float  # what it adds, as a share of all that photos from around could add
     words: str  # where to stand and where to look
 
-    def told(self) -> dict:
+    def to_dict(self) -> dict:
         """Plain values for the report."""
         return {
             "position": [round(float(x), 3) for x in self.view.center],
@@ -288,6 +291,6 @@ def way_to(place: np.ndarray, views: Sequence[View], middle: np.ndarray) -> str:
     else:
         ways = [(step @ right, "to the right", "to the left"), (step @ forward, "forward", "back"), *ways]
     slight = SLIGHT * float(np.linalg.norm(place - middle))
-    told = [f"{abs(size):.2g} m {one if size > 0 else other}" for size, one, other in ways if abs(size) > slight]
-    moved = around + (", ".join(told) or ("at the same height" if around else "from the same place"))
+    steps = [f"{abs(size):.2g} m {one if size > 0 else other}" for size, one, other in ways if abs(size) > slight]
+    moved = around + (", ".join(steps) or ("at the same height" if around else "from the same place"))
     return f"stand where {nearest.source} was taken, {moved}"

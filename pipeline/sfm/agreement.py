@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.cameras import View, view_of
 
-ENOUGH = 30  # matches of a pair that tell something
+ENOUGH = 30  # matches of a pair: fewer say nothing
 CONTRADICTION = 4.0  # px from its line, and a match contradicts the poses; what verification allows
 FINEST = 0.2  # px; poses that put matches closer than this or so need not be better
 

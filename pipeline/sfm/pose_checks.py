@@ -31,7 +31,7 @@ COMPONENT_NAMED = 3
 
 @dataclass(frozen=True)
 class Findings:
-    """What the photos of a set have in common, whatever poses were found."""
+    """What the photos of a set have in common; it does not depend on poses."""
 
     components: list[list[str]]  # names of photos linked by verified matches, largest group first
     textureless: float  # share of photos with too few features
@@ -40,8 +40,8 @@ class Findings:
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
-    """Looks at a worker's counts and pairs. Blurred photos match each other, for want of anything finer; a group of
-    nothing else is no group."""
+    """Looks at a worker's counts and pairs. Blurred photos match each other, as nothing finer is left of them; they
+    form no group of their own."""
     sound = {photo.name for photo in photos if not photo.fault}
     counts, names = result["counts"], sorted(result["counts"])
     linked = [pair for pair in result["pairs"] if pair["matches"] >= FEW_MATCHES]
@@ -70,7 +70,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
 
     "All registered" is not "right": repeating textures and several zooms give complete but wrong reconstructions, which
     show in matches that contradict the poses, or lie farther from their lines than they have to. `ordinary` is the
-    result at ordinary thresholds, if `result` is not: its matches tell best how the camera moved. `known` cameras may
+    result at ordinary thresholds, if `result` is not: its matches show best how the camera moved. `known` cameras may
     be off by some pixels.
     """
     views = views_of(result, photos)
@@ -124,8 +124,8 @@ def check_focal(
     if not 1 / FOCAL_OFF < to_exif < FOCAL_OFF:
         # Photos that were cropped carry the focal length of the whole photo.
         wrong = "poses" if doubtful else "EXIF"
-        told = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
-        (failures if doubtful else warnings).append(told)
+        message = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
+        (failures if doubtful else warnings).append(message)
 
 
 def photos_astray(result: dict) -> list[str]:

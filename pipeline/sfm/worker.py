@@ -103,7 +103,7 @@ def matches(pycolmap, job: dict, database: Path) -> None:
 
 def alike(pycolmap, job: dict, database: Path) -> list[tuple[str, str]]:
     """Pairs of photos to match where all are too many: each photo with the `job["partners"]` that have most in common
-    with it, whatever their names. Their features are looked up among words, which are made of the photos' own."""
+    with it. Their features are looked up among words made of these photos' own features."""
     pycolmap.set_random_seed(job["seed"])  # whatever came before
     words = pycolmap.VisualIndex.create(128, 64)  # numbers of a descriptor, and bits of what is kept of it
     rng = np.random.default_rng(job["seed"])
@@ -362,20 +362,20 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
 
 
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
-    """What the matches say whatever the poses: `counts` of each photo, `pairs` (with the share of matches that did not
+    """What the matches show without poses: `counts` of each photo, `pairs` (with the share of matches that did not
     move between the photos), and the share of `turn_only` pairs."""
     result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
     sizes = {name: group for group in job["groups"] for name in group["names"]}
-    told, moving = [], []
+    entries, moving = [], []
     for a, b, first, second in pairs:
         still = float((np.linalg.norm(first - second, axis=1) < STILL).mean())
-        told.append({"a": a, "b": b, "matches": len(first), "still": round(still, 3)})
+        entries.append({"a": a, "b": b, "matches": len(first), "still": round(still, 3)})
         if len(first) >= ENOUGH and still < 0.5 and sizes[a] is sizes[b]:
             moving.append((sizes[a], first, second))
         for name in (a, b):
             result[name]["best_matches"] = max(result[name]["best_matches"], len(first))
     some = moving[:: max(1, len(moving) // TURNS)]
-    return {"counts": result, "pairs": told, "turn_only": round(turn_only(some), 3)}
+    return {"counts": result, "pairs": entries, "turn_only": round(turn_only(some), 3)}
 
 
 def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = STILL) -> float:

@@ -60,7 +60,7 @@ def test_a_material_may_have_the_thickness_of_a_wall(text, wall):
         ("object1", "glass:0mm", "object1: '0mm' is not the thickness of a wall"),
         ("object1", "glass:-4mm", "object1: '-4mm' is not the thickness of a wall"),
         ("object1", "glass:", "object1: '' is not the thickness of a wall"),
-        ("scenery", "glass:4mm", "scenery: takes no thickness: it does not move, so its mass never counts"),
+        ("scenery", "glass:4mm", "scenery: needs no thickness: it does not move, so its mass does not matter"),
     ],
 )
 def test_what_is_no_material_is_refused_before_any_work(body, text, message):

@@ -179,7 +179,7 @@ def test_a_mask_lies_on_its_photo_pixel_by_pixel(tmp_path, orientation):
 def test_a_mask_is_never_turned_where_its_photo_is_not(tmp_path, orientation):
     pixels, _ = stored(tmp_path / "a.png", orientation)
     Image.fromarray(pixels.T).save(tmp_path / "mask.png")
-    with pytest.raises(SdfsimError, match=r"mask\.png: a mask of 90 x 120 does not fit"):
+    with pytest.raises(SdfsimError, match=r"mask\.png: .*90 x 120.*"):
         read_photo(tmp_path / "a.png", 120, tmp_path / "mask.png")
 
 

@@ -79,6 +79,6 @@ def test_nobody_is_told_to_do_what_they_did(options, said, photos, tmp_path, act
         act(stage, lambda run, work: {})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.mesh.meshing.make_meshes", lambda *places, **named: failing())
-        with pytest.raises(SdfsimError, match="no surface") as caught:
+        with pytest.raises(SdfsimError, match="mesh: ") as caught:
             reconstruct(photos, tmp_path / "out", preset=options.preset, budget=options.budget)
     assert said in caught.value.hint and f"--preset {options.preset}" not in caught.value.hint

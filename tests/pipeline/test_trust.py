@@ -176,7 +176,7 @@ def test_photos_of_one_half_ask_for_the_other_half():
         assert depth[0] > 0
     text = " / ".join(improvements({
         "poses": {}, "photos": [], "psnr": None, "failed_checks": [],
-        "stages": {"mesh": {"next_photos": [photo.told() for photo in photos]}},
+        "stages": {"mesh": {"next_photos": [photo.to_dict() for photo in photos]}},
     }, Options()))  # fmt: skip
     assert photos[0].words in text and f"{places[0][0]:.2f}" in text
 

