@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 from pydantic_core import PydanticUndefined
 
-from pipeline.options import Options, flag_of
+from pipeline.options import Options, form_of
 from sdfsim.commands.arguments import Budget, Cluster, Out, command, tell_failed
 from sdfsim.console import Session, duration
 from sdfsim.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
@@ -31,15 +31,13 @@ def options(*names: str, kept: bool = False) -> Callable[[Callable[..., None]], 
     def added(work: Callable[..., None]) -> Callable[..., None]:
         parameters = [*inspect.signature(work, eval_str=True).parameters.values()][:-1]
         for name in names:
-            flag, field = flag_of(name), Options.model_fields[name]
+            field, form = Options.model_fields[name], form_of(name)
             default = None if kept or field.default is PydanticUndefined else field.default
-            kind = flag.kind or (field.annotation if default is not None else Optional[field.annotation])  # noqa: UP045
-            about: Any = typer.Option(
-                *filter(None, [flag.name]), help=flag.help, metavar=flag.metavar, show_default=default is not None
-            )
+            kind = form["kind"] or (field.annotation if default is not None else Optional[field.annotation])  # noqa: UP045
+            flag: Any = typer.Option(help=field.description, metavar=form["metavar"], show_default=default is not None)
             parameters.append(
                 inspect.Parameter(
-                    name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, about]
+                    name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, flag]
                 )
             )
         made: Any = work

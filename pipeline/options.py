@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
@@ -18,24 +17,16 @@ COMMAND = "reconstruct"
 METRES = (1e-4, 1e5)  # smallest and largest length that can be given
 
 
-@dataclass(frozen=True)
-class Flag:
-    """How an option is given on the command line."""
-
-    help: str
-    metavar: str | None = None
-    kind: Any = None  # type of its value there; None: that of the option
-    name: str | None = None  # None: that of the option
-
-
-@dataclass(frozen=True)
-class Changes:
-    """The stages whose results depend on an option; those after them follow."""
-
-    stages: tuple[str, ...]
-
-
 Preset = Literal["quick", "standard", "fine", "volsdf"]
+
+
+def option(default: Any, stages: Sequence[str], about: str = "", kind: Any = None, metavar: str | None = None,
+           **limits: Any) -> Any:  # fmt: skip
+    """A field of `Options`: the stages whose results depend on it (those after them follow), and for the command line
+    what is said about it, the type of its value, if another than here, and how that is written."""
+    extra = {"stages": [*stages], "kind": kind, "metavar": metavar}
+    given = {"default_factory": default} if callable(default) else {"default": default}
+    return Field(**given, description=about, json_schema_extra=extra, **limits)
 
 
 class Options(BaseModel):
@@ -44,53 +35,36 @@ class Options(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     photos: str = ""  # what the user gave, an absolute path
-    preset: Annotated[
-        Preset,
-        Flag("How much time to spend; volsdf is the network of the paper of that name, for a GPU."),
-        Changes(("distill", "mesh")),
-    ] = "standard"
-    # m; None: assumed to be 1 m
-    size: Annotated[float | None, Flag("Widest side of the scene, metres."), Changes(("mesh",))] = None
+    preset: Preset = option(
+        "standard", ["distill", "mesh"],
+        "How much time to spend; volsdf is the network of the paper of that name, for a GPU.",
+    )  # fmt: skip
+    size: float | None = option(None, ["mesh"], "Widest side of the scene, metres.")  # None: assumed to be 1 m
     # s for everything; None: what the preset takes
-    budget: Annotated[float | None, Field(gt=0, allow_inf_nan=False), Changes(("distill", "fit"))] = None
-    seed: Annotated[int, Changes(("poses", "distill", "fit", "scene"))] = 0  # of everything random
+    budget: float | None = option(None, ["distill", "fit"], gt=0, allow_inf_nan=False)
+    seed: int = option(0, ["poses", "distill", "fit", "scene"])  # of everything random
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    recipe: Annotated[
-        Literal["quick", "default", "paper"] | None,
-        Flag("How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says)."),
-        Changes(("fit",)),
-    ] = None
-    # None: `size` counts
-    distance: Annotated[
-        tuple[str, str, float] | None,
-        Flag(
-            "A distance that you know. A place is PHOTO:X,Y, what that pixel shows, or PHOTO, the camera itself.",
-            metavar="PLACE PLACE METRES",
-        ),
-        Changes(("mesh",)),
-    ] = None
+    recipe: Literal["quick", "default", "paper"] | None = option(
+        None, ["fit"],
+        "How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says).",
+    )  # fmt: skip
+    distance: tuple[str, str, float] | None = option(
+        None, ["mesh"],
+        "A distance that you know. A place is PHOTO:X,Y, what that pixel shows, or PHOTO, the camera itself.",
+        metavar="PLACE PLACE METRES",
+    )  # fmt: skip
     # m, x, y, z of the lower and of the upper corner; None: everything is kept
-    crop: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        Flag(
-            "Corners of the box to keep, metres, the lower one first.",
-            metavar="X,Y,Z X,Y,Z",
-            kind=tuple[str, str] | None,
-        ),
-        Changes(("mesh",)),
-    ] = None
-    drop: Annotated[Literal["box", "ball", "none"], Flag("What falls onto the scene."), Changes(("scene",))] = "box"
+    crop: tuple[float, float, float, float, float, float] | None = option(
+        None, ["mesh"], "Corners of the box to keep, metres, the lower one first.",
+        kind=tuple[str, str] | None, metavar="X,Y,Z X,Y,Z",
+    )  # fmt: skip
+    drop: Literal["box", "ball", "none"] = option("box", ["scene"], "What falls onto the scene.")
     # by body, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall
-    material: Annotated[
-        dict[str, str],
-        Flag(
-            "What a body is made of: object1=wood, or object1=ceramic:4mm where it is hollow. Can be repeated.",
-            metavar="BODY=MATERIAL",
-            kind=list[str] | None,
-            name="--material",
-        ),
-        Changes(("scene",)),
-    ] = Field(default_factory=dict)
+    material: dict[str, str] = option(
+        dict, ["scene"],
+        "What a body is made of: object1=wood, or object1=ceramic:4mm where it is hollow. Can be repeated.",
+        kind=list[str] | None, metavar="BODY=MATERIAL",
+    )  # fmt: skip
 
     @field_validator("crop", mode="before")
     @classmethod
@@ -167,17 +141,15 @@ class Options(BaseModel):
         return self.recipe or ("quick" if self.preset == "quick" else "default")
 
 
+def form_of(name: str) -> dict[str, Any]:
+    """What `option` keeps of an option: `stages`, `kind`, `metavar`."""
+    extra: Any = Options.model_fields[name].json_schema_extra
+    return extra or {"stages": []}
+
+
 def names_of(stage: str) -> list[str]:
     """Names of the options that change the result of a stage."""
-    return [
-        name for name, field in Options.model_fields.items()
-        if any(stage in mark.stages for mark in field.metadata if isinstance(mark, Changes))
-    ]  # fmt: skip
-
-
-def flag_of(name: str) -> Flag:
-    """How an option is given on the command line."""
-    return next(mark for mark in Options.model_fields[name].metadata if isinstance(mark, Flag))
+    return [name for name in Options.model_fields if stage in form_of(name)["stages"]]
 
 
 def options_of(**values: Any) -> Options:
