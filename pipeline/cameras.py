@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -79,6 +80,11 @@ class Similarity:
         """Points [P, 3], moved."""
         return self.scale * points @ self.rotation.T + self.translation
 
+    def after(self, first: Similarity) -> Similarity:
+        """What `first` and then this one do together."""
+        rotation = self.rotation @ first.rotation
+        return Similarity(self.scale * first.scale, rotation, self.points(first.translation[None])[0])
+
     def inverse(self) -> Similarity:
         """The way back."""
         return Similarity(1 / self.scale, self.rotation.T, -(np.asarray(self.translation) @ self.rotation) / self.scale)
@@ -110,7 +116,25 @@ class Sparse:
     view_of: np.ndarray  # [O] view index of each observation
 
 
-def save_views(views: list[View], path: Path) -> None:
+STILL = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class PosedPhotos:
+    """Posed photos and the points that they see, in one world; and how that world came out of structure-from-motion's.
+    Whoever moves it makes another one, so cameras and points are always in the same world."""
+
+    views: tuple[View, ...]
+    sparse: Sparse
+    moved_by: Similarity = STILL  # from the world of structure-from-motion to this one
+
+    def moved(self, move: Similarity) -> PosedPhotos:
+        """The same in another world."""
+        views = tuple(move.view(view) for view in self.views)
+        return PosedPhotos(views, replace(self.sparse, xyz=move.points(self.sparse.xyz)), move.after(self.moved_by))
+
+
+def save_views(views: Sequence[View], path: Path) -> None:
     """Writes `cameras.json`."""
     entries = [
         {**asdict(v), "rotation": np.asarray(v.rotation).tolist(), "translation": np.asarray(v.translation).tolist()}
@@ -137,11 +161,12 @@ def view_of(entry: dict) -> View:
     return View(**{**entry, **arrays})
 
 
-def load_sparse(folder: Path) -> Sparse:
-    """Reads the sparse points of a poses folder. Raises SdfsimError: no readable `sparse.npz`."""
-    path = folder / "sparse.npz"
+def load_poses(folder: Path) -> PosedPhotos:
+    """Reads the cameras and points of a poses folder. Raises SdfsimError: no readable `cameras.json` or
+    `sparse.npz`."""
+    views, path = load_views(folder), folder / "sparse.npz"
     try:
-        return Sparse(**read_arrays(path, "sparse points", "run the poses stage again"))
+        return PosedPhotos(tuple(views), Sparse(**read_arrays(path, "sparse points", "run the poses stage again")))
     except TypeError as error:
         raise SdfsimError(f"{path}: damaged: {error}", "run the poses stage again") from error
 
@@ -172,7 +197,7 @@ class Up(NamedTuple):
     within: float
 
 
-def camera_up(views: list[View]) -> Up:
+def camera_up(views: Sequence[View]) -> Up:
     """Up from the cameras alone: people hold cameras level, so it is the direction with the least spread of their right
     axes; where these span no plane, the mean image up."""
     right = np.array([v.rotation[0] for v in views])
@@ -186,7 +211,7 @@ def camera_up(views: list[View]) -> Up:
     return Up(up, "cameras", float(np.hypot(CAREFUL, np.degrees(np.sqrt(max(values[0], 0) / values[1])))))
 
 
-def focus(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
+def focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """Point [3] that the cameras look at, and unit directions [N, 3] from them to it."""
     centers = np.array([v.center for v in views])
     point = nearest_to_axes(centers, np.array([v.rotation[2] for v in views]))

@@ -6,15 +6,16 @@ import re
 from dataclasses import dataclass
 
 from sdfsim.base.errors import SdfsimError, nearest
-from sdfsim.scene.schema import UNITS
 
 CRC = "CRC Handbook of Chemistry and Physics"
 TOOLBOX = "Engineering ToolBox"
 FACTBOOK = "The Physics Factbook"
 EUROCODE = "EN 1991-1-1"
 ROUGH = "rough"
-UNMOVED = ("floor", "scene")  # bodies whose mass never counts
+SCENERY = "scenery"  # the body of all that stays where it is
+UNMOVED = ("floor", SCENERY)  # bodies whose mass never counts
 _WALL = re.compile(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", re.ASCII)
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Material:
         return f"density: {self.density_from}; friction: {self.friction_from}; restitution: {self.restitution_from}"
 
 
-ASSUMED = Material(400.0, 0.8, 0.4)  # of a light wood; no photo tells what a thing is made of
+ASSUMED = Material(400.0, 0.8, 0.4)  # of a light wood; photos do not show what a thing is made of
 MATERIALS = {
     "wood": Material(650, 0.65, 0.75, CRC, TOOLBOX, FACTBOOK),
     "plywood": Material(600, 0.65, 0.7),
@@ -70,21 +71,21 @@ class Choice:
     wall: float | None = None  # m, how thick the wall of a hollow body is; None of a solid one
 
 
-def choose(given: dict[str, str]) -> dict[str, Choice]:
+def materials_of(given: dict[str, str]) -> dict[str, Choice]:
     """Looks up what bodies are made of: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a
     hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError where this makes no sense."""
     found = {}
     for body, text in given.items():
         name, colon, thickness = text.partition(":")
         if name not in MATERIALS:
-            told = f"material: {body}: no such material: {name!r}{nearest(name, MATERIALS)}"
-            raise SdfsimError(told, "there are " + ", ".join(MATERIALS))
+            message = f"material: {body}: no such material: {name!r}{nearest(name, MATERIALS)}"
+            raise SdfsimError(message, "there are " + ", ".join(MATERIALS))
         if colon and body in UNMOVED:
-            raise SdfsimError(f"material: {body}: takes no thickness: it does not move, so its mass never counts")
+            raise SdfsimError(f"material: {body}: needs no thickness: it does not move, so its mass does not matter")
         match = _WALL.fullmatch(thickness)
-        wall = float(match[1]) * UNITS[match[2]] if match else None
+        wall = float(match[1]) * _METRES[match[2]] if match else None
         if colon and not wall:
-            told = f"material: {body}: {thickness!r} is not the thickness of a wall"
-            raise SdfsimError(told, "give one such as 4mm or 0.4cm")
+            message = f"material: {body}: {thickness!r} is not the thickness of a wall"
+            raise SdfsimError(message, "give one such as 4mm or 0.4cm")
         found[body] = Choice(name, MATERIALS[name], wall)
     return found

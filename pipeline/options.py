@@ -1,69 +1,133 @@
-"""The options of a reconstruction, and the config.yaml that keeps them."""
+"""The options of a reconstruction: one model from which commands, stages and config.yaml take them."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
 import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from pipeline.materials import choose
-from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import CONFIG, write_text
+from pipeline.materials import materials_of
+from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
 COMMAND = "reconstruct"
-ALLOWED = {
-    "preset": ("quick", "standard", "fine", "volsdf"),
-    "device": ("auto", "cpu", "cuda"),
-    "drop": ("box", "ball", "none"),
-}
 METRES = (1e-4, 1e5)  # smallest and largest length that can be given
 
 
-@dataclass
-class Options:
-    """Every option of a reconstruction, as written to config.yaml."""
+Preset = Literal["quick", "standard", "fine", "volsdf"]
+
+
+def option(default: Any, stages: Sequence[str], about: str = "", kind: Any = None, metavar: str | None = None,
+           **limits: Any) -> Any:  # fmt: skip
+    """A field of `Options`: the stages whose results depend on it (those after them follow), and for the command line
+    what is said about it, the type of its value, if another than here, and how that is written."""
+    extra = {"stages": [*stages], "kind": kind, "metavar": metavar}
+    given = {"default_factory": default} if callable(default) else {"default": default}
+    return Field(**given, description=about, json_schema_extra=extra, **limits)
+
+
+class Options(BaseModel):
+    """Every option of a reconstruction, as written to config.yaml. `options_of` makes one."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     photos: str = ""  # what the user gave, an absolute path
-    preset: str = "standard"  # quick, standard, fine, or volsdf
-    size: float | None = None  # widest side of the scene, m; None: assumed to be 1 m
-    budget: float | None = None  # s for everything; None: what the preset takes
-    seed: int = 0  # of everything random
-    device: str = "auto"  # auto, cpu or cuda
-    recipe: str | None = None  # of the fit; None: quick for the preset quick, else the default one
-    # two places and the metres between them; None: size counts. A place is `photo.jpg:x,y`, the point of the surface
-    # that this pixel shows, or `photo.jpg`, the camera itself.
-    distance: list | None = None
-    crop: list[float] | None = None  # m, corners x, y, z, x, y, z of the box that is kept; None: everything
-    drop: str = "box"  # what is dropped onto the scene: box, ball or none
-    # by body, what it is made of, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall
-    material: dict[str, str] = field(default_factory=dict)
+    preset: Preset = option(
+        "standard", ["distill", "mesh"],
+        "How much time to spend; volsdf is the network of the paper of that name, for a GPU.",
+    )  # fmt: skip
+    size: float | None = option(None, ["mesh"], "Widest side of the scene, metres.")  # None: assumed to be 1 m
+    # s for everything; None: what the preset takes
+    budget: float | None = option(None, ["distill", "fit"], gt=0, allow_inf_nan=False)
+    seed: int = option(0, ["poses", "distill", "fit", "scene"])  # of everything random
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    recipe: Literal["quick", "default", "paper"] | None = option(
+        None, ["fit"],
+        "How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says).",
+    )  # fmt: skip
+    distance: tuple[str, str, float] | None = option(
+        None, ["mesh"],
+        "A distance that you know. A place is PHOTO:X,Y, what that pixel shows, or PHOTO, the camera itself.",
+        metavar="PLACE PLACE METRES",
+    )  # fmt: skip
+    # m, x, y, z of the lower and of the upper corner; None: everything is kept
+    crop: tuple[float, float, float, float, float, float] | None = option(
+        None, ["mesh"], "Corners of the box to keep, metres, the lower one first.",
+        kind=tuple[str, str] | None, metavar="X,Y,Z X,Y,Z",
+    )  # fmt: skip
+    drop: Literal["box", "ball", "none"] = option("box", ["scene"], "What falls onto the scene.")
+    # by body, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall
+    material: dict[str, str] = option(
+        dict, ["scene"],
+        "What a body is made of: object1=wood, or object1=ceramic:4mm where it is hollow. Can be repeated.",
+        kind=list[str] | None, metavar="BODY=MATERIAL",
+    )  # fmt: skip
 
-    def check(self) -> None:
-        """Raises SdfsimError where a value makes no sense."""
-        for name, allowed in ALLOWED.items():
-            if getattr(self, name) not in allowed:
-                raise SdfsimError(f"{name}: {getattr(self, name)!r} is not one of {', '.join(allowed)}")
-        lengths = {"size": self.size, "distance": self.distance[2] if self.distance else None}
-        for name, metres in lengths.items():
-            if metres is not None and not METRES[0] <= metres <= METRES[1]:
-                raise SdfsimError(f"{name}: must be between {METRES[0]:g} and {METRES[1]:g} m (got {metres:g})")
-        if self.budget is not None and not self.budget > 0:
-            raise SdfsimError(f"budget: must be > 0 s (got {self.budget:g})")
+    @field_validator("crop", mode="before")
+    @classmethod
+    def _read_corners(cls, given: Any) -> Any:
+        """Six numbers from two corners `X,Y,Z`, as they are on the command line."""
+        if not isinstance(given, Sequence) or not all(isinstance(corner, str) for corner in given):
+            return given
+        try:
+            corners = [[float(part) for part in corner.split(",")] for corner in given]
+        except ValueError:
+            corners = []
+        if [len(corner) for corner in corners] != [3, 3]:
+            message = f"--crop takes two corners X,Y,Z in metres (got {' '.join(given)})"
+            raise SdfsimError(message, exit_code=EXIT_USAGE)
+        return corners[0] + corners[1]
+
+    @field_validator("material", mode="before")
+    @classmethod
+    def _read_materials(cls, given: Any) -> Any:
+        """Materials by body from a list of `BODY=MATERIAL`, as they are on the command line."""
+        if not isinstance(given, list):
+            return given
+        found: dict[str, str] = {}
+        for text in given:
+            body, _, material = text.partition("=")
+            if not body or not material or body in found:
+                message = f"--material takes BODY=MATERIAL once for a body, such as object1=wood (got {text})"
+                raise SdfsimError(message, exit_code=EXIT_USAGE)
+            found[body] = material
+        return found
+
+    @field_validator("size", "distance")
+    @classmethod
+    def _check_length(cls, given: Any, info: ValidationInfo) -> Any:
+        metres = given[2] if isinstance(given, tuple) else given
+        if metres is not None and not METRES[0] <= metres <= METRES[1]:
+            limits = f"must be between {METRES[0]:g} and {METRES[1]:g} m (got {metres:g})"
+            raise SdfsimError(f"{info.field_name}: {limits}")
+        return given
+
+    @model_validator(mode="after")
+    def _check(self) -> Options:
         if self.size is not None and self.distance is not None:
             raise SdfsimError("size and distance: both set the scale", "give one of them")
         if self.distance is not None and self.distance[0] == self.distance[1]:
             raise SdfsimError(f"distance: both ends are {self.distance[0]}")
-        if self.crop is not None and not np.less(self.crop[:3], self.crop[3:]).all():
-            raise SdfsimError(f"crop: the second corner must lie beyond the first in x, y and z (got {self.crop})")
-        choose(self.material)
+        if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
+            got = list(self.crop)
+            raise SdfsimError(f"crop: the second corner must lie beyond the first in x, y and z (got {got})")
+        materials_of(self.material)
+        return self
 
     def changed(self, changes: dict[str, Any]) -> Options:
-        """The options with other values; a new size takes the place of a known distance, and the other way round."""
-        instead = {"size": "distance", "distance": "size"}
-        return replace(self, **({instead[key]: None for key in changes if key in instead} | changes))
+        """The options with other values; a new size replaces a known distance, and the other way round. Raises as
+        `options_of` does."""
+        other = {"size": "distance", "distance": "size"}
+        replaced = {other[key]: None for key in changes if key in other}
+        return options_of(**self.model_dump() | replaced | changes)
+
+    def of_stage(self, stage: str) -> dict[str, Any]:
+        """The values, ready for JSON, on which the result of a stage depends."""
+        values = self.model_dump(mode="json") | {"recipe": self.fit_recipe()}
+        return {name: values[name] for name in names_of(stage)}
 
     def longer(self) -> str:
         """What trains for longer than these options."""
@@ -73,20 +137,55 @@ class Options:
         return f"train for longer (--preset {better})" if better else "take more and sharper photos"
 
     def fit_recipe(self) -> str:
-        """The recipe of the fit, see `fit_mesh`."""
+        """The recipe of the fit, see `fit_mesh`: quick for the preset quick, else the default, where none is given."""
         return self.recipe or ("quick" if self.preset == "quick" else "default")
+
+
+def form_of(name: str) -> dict[str, Any]:
+    """What `option` keeps of an option: `stages`, `kind`, `metavar`."""
+    extra: Any = Options.model_fields[name].json_schema_extra
+    return extra or {"stages": []}
+
+
+def names_of(stage: str) -> list[str]:
+    """Names of the options that change the result of a stage."""
+    return [name for name in Options.model_fields if stage in form_of(name)["stages"]]
+
+
+def options_of(**values: Any) -> Options:
+    """Options with these values, the others as by default. Raises SdfsimError, which names the option and what is
+    allowed, for a value that makes no sense or an option that does not exist."""
+    try:
+        return Options(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = first["loc"][0] if first["loc"] else "options"
+        if first["type"] == "extra_forbidden":
+            raise SdfsimError(f"no such option: {name}", f"options: {', '.join(Options.model_fields)}") from error
+        wanted = "too few values" if first["type"] == "missing" else first["msg"].replace("Input should be", "must be")
+        raise SdfsimError(f"{name}: {wanted} (got {first['input']!r})") from error
 
 
 def write_config(options: Options, folder: Path) -> None:
     """Writes config.yaml: every option as resolved."""
-    text = yaml.safe_dump({"command": COMMAND, "version": 1, **asdict(options)}, sort_keys=False, allow_unicode=True)
-    write_text(folder / CONFIG, text)
+    from sdfsim.base.files import CONFIG, write_text
+
+    content = {"command": COMMAND, "version": 1, **options.model_dump(mode="json")}
+    write_text(folder / CONFIG, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
 def read_config(folder: Path) -> Options:
-    """Reads config.yaml. Raises SdfsimError: it is missing or not one of ours."""
+    """Reads config.yaml. Raises SdfsimError: it is missing, not of a reconstruction, or has a value that makes no
+    sense."""
+    from sdfsim.base.files import CONFIG
+
+    path = folder / CONFIG
+    data: Any = None
+    with suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(data, dict) or data.get("command") != COMMAND:
+        raise SdfsimError(f"{folder}: not the folder of a reconstruction", "run `sdfsim reconstruct` first")
     try:
-        data = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-        return Options(**{key: value for key, value in data.items() if key not in ("version", "command")})
-    except (OSError, yaml.YAMLError, TypeError, AttributeError) as error:
-        raise SdfsimError(f"{folder}: not the folder of a reconstruction", "run `sdfsim reconstruct` first") from error
+        return options_of(**{key: value for key, value in data.items() if key not in ("version", "command")})
+    except SdfsimError as error:
+        raise SdfsimError(f"{path}: {error.message}", error.hint, exit_code=error.exit_code) from error

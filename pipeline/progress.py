@@ -1,4 +1,4 @@
-"""How long work tells what it has done."""
+"""How long work reports what it has done."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ Progress = Callable[[float, str], None]  # called with the fraction that is done
 
 
 def quiet(fraction: float, message: str) -> None:
-    """Tells nobody."""
+    """Reports nothing."""
 
 
 def share_of(progress: Progress, start: float, share: float) -> Progress:
-    """What a part of some work, a share of it from a start (both 0 to 1), tells its progress to."""
+    """Where a part of some work, a share of it from a start (both 0 to 1), reports its progress."""
     return lambda fraction, message: progress(start + share * fraction, message)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.cameras import Similarity, camera_up, frame_of, load_sparse, load_views
+from pipeline.cameras import Similarity, camera_up, frame_of, load_poses, load_views
 from pipeline.inputs.photos import load_photos
+from pipeline.materials import SCENERY
 from pipeline.options import Options
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json, write_text
@@ -45,7 +45,8 @@ def write_report(
         with suppress(SdfsimError):
             poses = read_json(folder / ".poses.part" / "checks.json")
     report: dict[str, Any] = {
-        "version": 1, "options": asdict(options), "seconds": seconds, "seconds_total": round(sum(seconds.values()), 1),
+        "version": 1, "options": options.model_dump(mode="json"), "seconds": seconds,
+        "seconds_total": round(sum(seconds.values()), 1),
         "psnr": stages.get("distill", {}).get("psnr"), "stages": stages, "poses": poses, "notes": notes(stages),
         "photos": photo_rows(folder, stages, poses),
         "failed_checks": [f"fit: {fit.get('reason') or 'certificate missed'}"] if fit.get("passed") is False else [],
@@ -121,13 +122,13 @@ def mesh_notes(mesh: dict) -> list[str]:
         lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
     if mesh.get("up_confidence") == "low":
         lines.append(f"up is uncertain, within {mesh['up_within_degrees']:.0f} degrees: check it before simulating")
-    if str(mesh.get("size", "")).startswith("assumed"):
+    if mesh.get("size_assumed"):
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
     how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
-    lines += [f"masks of {name}: they have no surface" for name in mesh.get("masks_without_surface", [])]
+    lines += [f"no surface was found for the masks of {name}" for name in mesh.get("masks_without_surface", [])]
     lines += [f"{name}: its surface was not moved all the way to where the photos agree: {why}"
               for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
     lines += [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
@@ -137,7 +138,7 @@ def mesh_notes(mesh: dict) -> list[str]:
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
     for name, part in mesh.get("trust", {}).items():
-        if part["guessed"] > GUESSED_SHARE and name != "scene":
+        if part["guessed"] > GUESSED_SHARE and name != SCENERY:
             lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
     if "weak" in mesh:
         more = "" if mesh["next_photos"] else "; no one photo would help much"
@@ -186,7 +187,7 @@ def page(report: dict, folder: Path) -> str:
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
     if report["psnr"] is not None:
-        side = stages["distill"].get("psnr_px", "a third of the trained")  # not told by runs of before
+        side = stages["distill"].get("psnr_px", "a third of the trained")  # older runs did not record it
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB at {side} px"))
     if mesh:
         rows += [
@@ -218,7 +219,7 @@ def page(report: dict, folder: Path) -> str:
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
-    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras tell; then in metres.
+    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras show; then in metres.
     Returns its path, or None before the poses stage.
     """
     from pipeline.field.training import load_field
@@ -229,23 +230,21 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
 
     if "poses" not in done:
         return None
-    views, sparse, place = load_views(folder / "poses"), load_sparse(folder / "poses"), folder / "mesh"
-    moves = [Similarity(1.0, frame_of(camera_up(views).direction), np.zeros(3))]
+    poses, place = load_poses(folder / "poses"), folder / "mesh"
     mesh, skins, trust, proposed = None, {}, {}, []
     if "mesh" in done:
-        moves = [load_field(folder / "distill").to_unit, load_placement(place).to_metres]
+        poses = poses.moved(load_field(folder / "distill").to_unit).moved(load_placement(place).to_metres)
         mesh, skins = load_mesh(place / "mesh.ply"), read_glb(place / TEXTURED)
         trust, proposed = trust_meshes(place), load_views(place / NEXT)
-    points = sparse.xyz
-    for move in moves:
-        views, points = [move.view(view) for view in views], move.points(points)
+    else:
+        poses = poses.moved(Similarity(1.0, frame_of(camera_up(poses.views).direction), np.zeros(3)))
     photos = []
-    for view in [*views, *proposed]:
+    for view in [*poses.views, *proposed]:
         image = folder / "photos" / "images" / view.name
         known = image.is_file()
         photos.append(
             PosedPhoto(view.source, image if known else None, view.focal, (view.cx, view.cy),
                        (view.width, view.height), view.rotation, view.translation, None if known else PROPOSED)
         )  # fmt: skip
-    save_reconstruction(folder / RECORDING, photos, points, sparse.rgb, mesh, skins, trust)
+    save_reconstruction(folder / RECORDING, photos, poses.sparse.xyz, poses.sparse.rgb, mesh, skins, trust)
     return folder / RECORDING

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.materials import Choice
-from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
+from pipeline.materials import SCENERY, Choice
+from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
 from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
@@ -36,7 +36,7 @@ GAP = 0.3  # of the fall, as a share of the side
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
               device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
-    goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
+    `folder_of` names, and those that are there already are kept. Returns a certificate for each of `shapes`, and
     `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.sdf.baked_grid import grid_certificate
     from sdfsim.shape.make import fit_mesh
@@ -48,16 +48,16 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     certificates, done = {}, 0.0
     for name, weight in weights.items():
         share = weight / sum(weights.values())
-        tell = share_of(lambda part, message, name=name: on_progress(part, f"{name}: {message}"), done, share)
+        report = share_of(lambda part, message, name=name: on_progress(part, f"{name}: {message}"), done, share)
         done += share
-        folder, partial = out / name, out / f".{name}.part"
+        folder, partial = out / folder_of(name), out / f".{folder_of(name)}.part"
         if (folder / "shape.json").exists():
             certificates[name] = load_shape(folder).certificate
             continue
         solid, shown = meshes_of(mesh_folder, name)
         shape = fit_mesh(
             solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
-            budget=None if budget is None else budget * share, on_progress=tell, device=device,
+            budget=None if budget is None else budget * share, on_progress=report, device=device,
         )  # fmt: skip
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
         # The folder appears complete or not at all: a run that goes on keeps those that are there.
@@ -68,6 +68,11 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+
+
+def folder_of(name: str) -> str:
+    """Name of the Shape folder of a part in `assets`."""
+    return "scene" if name == SCENERY else name
 
 
 def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
@@ -119,8 +124,8 @@ def write_scene(
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:
-            told = f"material: no body is called {name!r}{nearest(name, names)}"
-            raise SdfsimError(told, "the bodies are " + ", ".join(names))
+            message = f"material: no body is called {name!r}{nearest(name, names)}"
+            raise SdfsimError(message, "the bodies are " + ", ".join(names))
     made = hashlib.sha256(text.encode()).hexdigest()
     if scene_file.exists() and hashlib.sha256(scene_file.read_bytes()).hexdigest() not in (written, made):
         endings = itertools.chain([""], itertools.count(2))
@@ -141,12 +146,12 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
     found = {}
     for body in scene.bodies:
         choice = materials.get(body.name, Choice())
-        told: dict = {"material": choice.name, "friction": body.friction, "restitution": body.restitution}
+        entry: dict = {"material": choice.name, "friction": body.friction, "restitution": body.restitution}
         if body.motion == "dynamic":
             volume = scene.shapes[body.shape].volume
-            told |= {"density": body.mass / volume, "wall": choice.wall, "volume": volume, "mass": body.mass}
+            entry |= {"density": body.mass / volume, "wall": choice.wall, "volume": volume, "mass": body.mass}
         if body.motion == "dynamic" or body.name in materials:
-            found[body.name] = told
+            found[body.name] = entry
     return found
 
 
@@ -154,7 +159,7 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
     """The text of scene.yaml: a floor, the scenery, the bodies that were found at their origins [3] m, and one dropped
     from above where there is a slab."""
-    assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
+    assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
     shapes: list[str] = []
     bodies: list[str] = []
@@ -169,7 +174,7 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
             keys = f"shape: {name}, {keys}"
         thick = f", a wall of {1000 * choice.wall:g} mm" if choice.wall else ""
         known = f"{choice.name}{thick}. From: {choice.material.source}"
-        bodies.append(f"  # {known if name in made else 'assumed: no photo tells the material (give --material)'}")
+        bodies.append(f"  # {known if name in made else 'assumed: photos do not show the material (give --material)'}")
         bodies.append(f"  - {{name: {name}, {keys}, {density}{surface}}}")
 
     if "floor" in made:
@@ -177,9 +182,9 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
     else:
         bodies.append(f"  - {{name: floor, {FLOOR}}}")
     if scenery:
-        add(SCENERY, "motion: static", {"asset": "assets/scene"})
+        add(SCENERY, "motion: static", {"asset": f"assets/{folder_of(SCENERY)}"})
     for name, origin in origins.items():
-        add(name, f"position: {_flow(rounded(origin).tolist())}", {"asset": f"assets/{name}"})
+        add(name, f"position: {_flow(rounded(origin).tolist())}", {"asset": f"assets/{folder_of(name)}"})
     if slab is not None:
         box = {"box": {"size": rounded((slab.side, slab.side, slab.thickness)).tolist()}}
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
@@ -241,7 +246,7 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     obstacle = (np.nanmax(top, 1) - top[:, under].max(1)) / side
     central = np.linalg.norm((places - (low + high)[:2] / 2) / np.maximum(high - low, 1e-9)[:2], axis=1)
     good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central - slope / LEVEL - obstacle
-    # What is not level, not flat, or not in the photos is taken only where there is nothing else, the flattest first.
+    # Places that are not level, not flat, or not in the photos are taken only where there are no others.
     bad = np.maximum(slope / LEVEL - 1, 0) + 10 * np.maximum(bump - BUMP, 0) + 10 * np.maximum(unseen - UNSEEN, 0)
     best = int((good - 100 * bad).argmax())
     thickness = THICKNESS * side

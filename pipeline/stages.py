@@ -9,11 +9,11 @@ import shutil
 import time
 import uuid
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.options import COMMAND, Options, read_config, write_config
+from pipeline.options import COMMAND, Options, options_of, read_config, write_config
 from pipeline.progress import Progress
 from pipeline.report import write_report
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
@@ -27,8 +27,8 @@ FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 
 
 @dataclass
-class Run:
-    """One call: where it works and what it was asked to do."""
+class Project:
+    """A reconstruction: its folder, its options, and where it reports its progress."""
 
     folder: Path  # of all stages
     options: Options  # as in its config.yaml
@@ -37,8 +37,8 @@ class Run:
     own_budget: float | None = None
     started: float = field(default_factory=time.monotonic)
 
-    def tell(self, stage: str) -> Progress:
-        """What one stage tells its progress to."""
+    def progress_of(self, stage: str) -> Progress:
+        """Where one stage reports its progress."""
         return lambda fraction, message: self.progress(stage, fraction, message) if self.progress else None
 
     def place(self, stage: str) -> Path:
@@ -55,77 +55,75 @@ class Run:
 # What each stage does: it makes its result in a folder that is there already and returns its report.
 
 
-def do_photos(run: Run, work: Path) -> dict:
+def do_photos(project: Project, work: Path) -> dict:
     from pipeline.inputs.photos import prepare_photos
 
-    photos, notes = prepare_photos(Path(run.options.photos), work, on_progress=run.tell("photos"))
+    photos, notes = prepare_photos(Path(project.options.photos), work, on_progress=project.progress_of("photos"))
     return {"count": len(photos), "notes": notes, "masks": sum(p.mask for p in photos)}
 
 
-def do_poses(run: Run, work: Path) -> dict:
+def do_poses(project: Project, work: Path) -> dict:
     from pipeline.inputs.photos import load_photos
     from pipeline.mesh.placement import check_distance
     from pipeline.sfm.poses import solve
 
-    folder = run.place("photos")
+    folder = project.place("photos")
     photos = load_photos(folder)
-    if run.options.distance is not None:
-        check_distance(run.options.distance, photos)  # rather than after minutes of poses and training
-    return solve(photos, folder, work, seed=run.options.seed, on_progress=run.tell("poses"))
+    if project.options.distance is not None:
+        check_distance(project.options.distance, photos)  # rather than after minutes of poses and training
+    return solve(photos, folder, work, seed=project.options.seed, on_progress=project.progress_of("poses"))
 
 
-def do_distill(run: Run, work: Path) -> dict:
-    from pipeline.cameras import load_sparse, load_views
+def do_distill(project: Project, work: Path) -> dict:
+    from pipeline.cameras import load_poses
     from pipeline.field.training import PRESETS, train
 
-    budget = run.own_budget
-    if budget is None and run.options.budget is not None:
-        spent = time.monotonic() - run.started
-        budget = max(20.0, run.options.budget * (1 - FIT_SHARE) - spent - AFTER_TRAINING)
-    poses = run.place("poses")
+    budget = project.own_budget
+    if budget is None and project.options.budget is not None:
+        spent = time.monotonic() - project.started
+        budget = max(20.0, project.options.budget * (1 - FIT_SHARE) - spent - AFTER_TRAINING)
     return train(
-        load_views(poses), load_sparse(poses), run.place("photos"), work, settings=PRESETS[run.options.preset],
-        budget=budget, seed=run.options.seed, device=run.device(), on_progress=run.tell("distill"),
+        load_poses(project.place("poses")), project.place("photos"), work, settings=PRESETS[project.options.preset],
+        budget=budget, seed=project.options.seed, device=project.device(), on_progress=project.progress_of("distill"),
     ).report  # fmt: skip
 
 
-def do_mesh(run: Run, work: Path) -> dict:
+def do_mesh(project: Project, work: Path) -> dict:
     from pipeline.mesh.meshing import make_meshes
 
     try:
         return make_meshes(
-            run.place("distill"), run.place("poses"), run.place("photos"), work, preset=run.options.preset,
-            size=run.options.size, distance=run.options.distance, crop=run.options.crop, device=run.device(),
-            on_progress=run.tell("mesh"),
+            project.place("distill"), project.place("poses"), project.place("photos"), work, project.options,
+            device=project.device(), on_progress=project.progress_of("mesh"),
         )  # fmt: skip
     except SdfsimError as error:
         if error.exit_code != EXIT_QUALITY:
             raise
-        hint = "; ".join(filter(None, (error.hint, run.options.longer())))
+        hint = "; ".join(filter(None, (error.hint, project.options.longer())))
         raise SdfsimError(error.message, hint, exit_code=EXIT_QUALITY) from error
 
 
-def do_fit(run: Run, work: Path) -> dict:
+def do_fit(project: Project, work: Path) -> dict:
     from pipeline.scene_writer import fit_parts
 
-    budget = run.own_budget
-    if budget is None and run.options.budget is not None:
-        budget = max(10.0, FIT_SHARE * run.options.budget)
+    budget = project.own_budget
+    if budget is None and project.options.budget is not None:
+        budget = max(10.0, FIT_SHARE * project.options.budget)
     return fit_parts(
-        run.place("mesh"), work, budget=budget, recipe=run.options.fit_recipe(), seed=run.options.seed,
-        device=run.device(), on_progress=run.tell("fit"),
+        project.place("mesh"), work, budget=budget, recipe=project.options.fit_recipe(), seed=project.options.seed,
+        device=project.device(), on_progress=project.progress_of("fit"),
     )  # fmt: skip
 
 
-def do_scene(run: Run, work: Path) -> dict:
-    from pipeline.materials import choose
+def do_scene(project: Project, work: Path) -> dict:
+    from pipeline.materials import materials_of
     from pipeline.scene_writer import write_scene
 
-    before = read_record(run.place("scene"))
+    before = read_record(project.place("scene"))
     written = before["report"].get("scene_sha256") if before else None
     return write_scene(
-        run.place("mesh"), run.folder / "scene.yaml", drop=run.options.drop, materials=choose(run.options.material),
-        written=written, seed=run.options.seed,
+        project.place("mesh"), project.folder / "scene.yaml", drop=project.options.drop, written=written,
+        materials=materials_of(project.options.material), seed=project.options.seed,
     )  # fmt: skip
 
 
@@ -133,20 +131,19 @@ def do_scene(run: Run, work: Path) -> dict:
 class Stage:
     """One stage of the way."""
 
-    run: Callable[[Run, Path], dict]
+    run: Callable[[Project, Path], dict]
     folder: str  # where the result lies in that of the run
-    options: tuple[str, ...] = ()  # that the result depends on
     # Raise it with every change after which the stage makes something else of the same; those after it follow.
     version: int = 1
 
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
-    "poses": Stage(do_poses, "poses", ("seed",), 4),
-    "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 4),
-    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 9),
-    "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),
-    "scene": Stage(do_scene, "scene", ("seed", "drop", "material"), 3),
+    "poses": Stage(do_poses, "poses", version=5),
+    "distill": Stage(do_distill, "distill", version=5),
+    "mesh": Stage(do_mesh, "mesh", version=10),
+    "fit": Stage(do_fit, "assets"),
+    "scene": Stage(do_scene, "scene", version=4),
 }
 
 
@@ -161,23 +158,22 @@ def reconstruct(
     run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises SdfsimError for bad
     photos or options (exit code 1), or where poses or surface are not good enough (3).
     """
-    resolved = Options(str(Path(photos).absolute()), **options)
-    resolved.check()
+    resolved = options_of(photos=str(Path(photos).absolute()), **options)
     names = list(STAGES)
     first = _number(from_stage) if from_stage else len(names)
     last = _number(until_stage) if until_stage else len(names) - 1
     if from_stage and first > last:
         raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
-    run = Run(Path(out), resolved, progress)
-    check_apart(run)
-    return run_all(run, {stage: number >= first for number, stage in enumerate(names[: last + 1])})
+    project = Project(Path(out), resolved, progress)
+    check_apart(project)
+    return run_all(project, {stage: number >= first for number, stage in enumerate(names[: last + 1])})
 
 
 def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, float, str], None] | None = None,
                **changes: Any) -> dict:  # fmt: skip
     """Photos -> camera poses: the first two stages, as `reconstruct` does them; options that are not given (None) are
     those of the folder's config.yaml, where there is one."""
-    kept = asdict(read_config(Path(out))) if (Path(out) / CONFIG).exists() else {}
+    kept = read_config(Path(out)).model_dump() if (Path(out) / CONFIG).exists() else {}
     given = {key: value for key, value in changes.items() if value is not None}
     return reconstruct(**{**kept, **given, "photos": photos}, out=out, until_stage="poses", progress=progress)
 
@@ -189,16 +185,17 @@ def run_stage(
     Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone."""
     number, kept = _number(name), read_config(Path(folder))
     known = {key: value for key, value in changes.items() if value is not None}
-    options = kept.changed(known)
-    options.check()
-    run = Run(Path(folder), replace(options, budget=kept.budget), progress, known.get("budget"))
-    done = current(run.folder)
+    options = kept.changed(known)  # also checks the budget, which is not kept
+    project = Project(
+        Path(folder), options.changed({"budget": kept.budget}), progress, options.budget if "budget" in known else None
+    )
+    done = current(project.folder)
     for before in list(STAGES)[:number]:
         if before not in done:
-            why = "is older than what it reads" if read_record(run.place(before)) else "has not run"
+            why = "is older than what it reads" if read_record(project.place(before)) else "has not run"
             command = "poses" if before == "photos" else before  # No command does the photos alone.
             raise SdfsimError(f"{folder}: the {before} stage {why}", f"run `sdfsim {command}` first")
-    return run_all(run, {name: False})
+    return run_all(project, {name: False})
 
 
 def _number(stage: str) -> int:
@@ -207,56 +204,55 @@ def _number(stage: str) -> int:
     return list(STAGES).index(stage)
 
 
-def run_all(run: Run, stages: dict[str, bool]) -> dict:
+def run_all(project: Project, stages: dict[str, bool]) -> dict:
     """Runs stages, those whose value is True also when nothing changed, and returns the report. Raises SdfsimError
-    before anything is written where there is no such device, or where something not ours lies in a result's place."""
-    if run.options.device == "cuda":
-        run.device()
-    check_own(run.folder, COMMAND, "report.json", "report.md")
+    before anything is written where the device is missing, or where files that sdfsim did not write would be lost."""
+    if project.options.device == "cuda":
+        project.device()
+    check_own(project.folder, COMMAND, "report.json", "report.md")
     for stage in stages:
-        check_replaceable(run.place(stage))
+        check_replaceable(project.place(stage))
     try:
-        with locked(run.folder):
-            write_config(run.options, run.folder)
+        with locked(project.folder):
+            write_config(project.options, project.folder)
             for stage, again in stages.items():
-                run_reported(run, stage, again=again)
-            return write_report(run.folder, run.options, current(run.folder))
+                run_reported(project, stage, again=again)
+            return write_report(project.folder, project.options, current(project.folder))
     except OSError as error:  # a full disk, or what cannot be read or written
-        message = f"{error.filename or run.folder}: {error.strerror or error}"
-        raise SdfsimError(message, "run again when this is put right: finished stages are kept") from error
+        message = f"{error.filename or project.folder}: {error.strerror or error}"
+        raise SdfsimError(message, "solve this and run again: finished stages are kept") from error
 
 
-def check_apart(run: Run) -> None:
+def check_apart(project: Project) -> None:
     """Raises SdfsimError where there are no photos, or a file of the user's lies where a result will replace it."""
     from pipeline.inputs.sources import find_source
 
-    given = Path(run.options.photos)
+    given = Path(project.options.photos)
     files = {path.resolve() for path in (given, *find_source(given).files())}
     for stage in STAGES:
-        place = run.place(stage)
+        place = project.place(stage)
         if any(path.is_relative_to(place.resolve()) for path in files):
-            told = f"{given}: lies in {place}, where the result of the {stage} stage belongs"
-            raise SdfsimError(told, "choose another -o; photos are never written to")
+            message = f"{given}: lies in {place}, where the result of the {stage} stage belongs"
+            raise SdfsimError(message, "choose another -o; photos are never written to")
 
 
-def run_reported(run: Run, stage: str, *, again: bool) -> None:
-    """Runs one stage; the report tells what came of it, also where that is an error."""
+def run_reported(project: Project, stage: str, *, again: bool) -> None:
+    """Runs one stage; the report records its result, also an error."""
     try:
-        run_one(run, stage, again=again)
+        run_one(project, stage, again=again)
     except SdfsimError as error:
-        write_report(run.folder, run.options, current(run.folder), (stage, error))
-        more = f"{run.folder / 'report.md'} shows what was found"
+        write_report(project.folder, project.options, current(project.folder), (stage, error))
+        more = f"{project.folder / 'report.md'} shows what was found"
         hint = f"{error.hint}; {more}" if error.hint else more
         raise SdfsimError(error.message, hint, exit_code=error.exit_code) from error
 
 
-def run_one(run: Run, stage: str, *, again: bool) -> None:
+def run_one(project: Project, stage: str, *, again: bool) -> None:
     """Runs one stage, or skips it where its fingerprint is that of its last run."""
-    place, work = run.place(stage), run.folder / f".{stage}.part"
-    before = read_record(run.place(list(STAGES)[_number(stage) - 1])) if stage != "photos" else None
-    inputs = before["made"] if before else hash_of_photos(Path(run.options.photos))
-    values = {**asdict(run.options), "recipe": run.options.fit_recipe()}
-    depends: dict[str, Any] = {key: values[key] for key in STAGES[stage].options} | {"own_budget": run.own_budget}
+    place, work = project.place(stage), project.folder / f".{stage}.part"
+    before = read_record(project.place(list(STAGES)[_number(stage) - 1])) if stage != "photos" else None
+    inputs = before["made"] if before else hash_of_photos(Path(project.options.photos))
+    depends = project.options.of_stage(stage) | {"own_budget": project.own_budget}
     if stage == "fit":
         from sdfsim.sdf.fit.train import FIT_VERSION
 
@@ -264,19 +260,19 @@ def run_one(run: Run, stage: str, *, again: bool) -> None:
     text = json.dumps([stage, STAGES[stage].version, inputs, depends], sort_keys=True)
     wanted = hashlib.sha256(text.encode()).hexdigest()
     known = read_record(place)
-    complete = stage != "scene" or (run.folder / "scene.yaml").exists()
+    complete = stage != "scene" or (project.folder / "scene.yaml").exists()
     if not again and known and known["fingerprint"] == wanted and complete:
         for left in (work, _old(place)):  # by runs that were killed
             shutil.rmtree(left, ignore_errors=True)
-        run.tell(stage)(1.0, "unchanged")
+        project.progress_of(stage)(1.0, "unchanged")
         return
     begin(work, wanted, fresh=again)
     started = time.monotonic()
-    report = STAGES[stage].run(run, work)
+    report = STAGES[stage].run(project, work)
     # Training that a killed run had already done counts as well.
     seconds = time.monotonic() - started + report.get("seconds_before", 0.0)
     finish(work, place, wanted, inputs, report, seconds)
-    run.tell(stage)(1.0, f"done in {seconds:.0f} s")
+    project.progress_of(stage)(1.0, f"done in {seconds:.0f} s")
 
 
 def hash_of_photos(given: Path) -> str:
@@ -317,8 +313,8 @@ def read_record(place: Path) -> dict | None:
 def check_replaceable(place: Path) -> None:
     """Raises SdfsimError where anything but an earlier result lies at a stage's place: that is never replaced."""
     if os.path.lexists(place) and read_record(place) is None:
-        told = f"{place}: in the way, and not replaced: sdfsim did not write it (it holds no {RECORD})"
-        raise SdfsimError(told, "choose another folder to write to, or move it away")
+        message = f"{place}: exists and is not replaced, as sdfsim did not write it (no {RECORD} in it)"
+        raise SdfsimError(message, "choose another folder to write to, or move it away")
 
 
 def begin(work: Path, wanted: str, *, fresh: bool) -> Path:

@@ -18,7 +18,8 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pipeline.mesh.meshing import SCENERY, rounded
+from pipeline.materials import SCENERY
+from pipeline.mesh.meshing import rounded
 from pipeline.mesh.visibility import Above
 from sdfsim.base.errors import run_main
 from sdfsim.base.files import write_text

@@ -172,11 +172,11 @@ def test_hard_cases_are_summed_up_alike():
 def test_presets_and_recipes_in_documents_exist():
     from typing import get_args
 
-    from pipeline.commands import Presets
+    from pipeline.options import Preset
     from sdfsim.sdf.fit.train import Recipe
     from sdfsim.training.presets import PRESETS as TRAINED
 
-    known = {"reconstruct": get_args(Presets), "train": tuple(TRAINED), "fit": get_args(Recipe)}
+    known = {"reconstruct": get_args(Preset), "train": tuple(TRAINED), "fit": get_args(Recipe)}
     named = set()
     for file in (*PAGES, ROOT / "sdfsim" / "models" / "small.md"):
         for line in file.read_text(encoding="utf-8").splitlines():

@@ -27,6 +27,16 @@ class FieldSize:
     width: int = 64  # hidden width of both small networks
     background: int = 64  # grid points a side of the background
 
+    @property
+    def finest(self) -> float:
+        """Width of a cell of the finest level, normalised units."""
+        return level_step(self.levels, len(self.levels))
+
+    @property
+    def sampling(self) -> float:
+        """Distance of samples that show all detail, normalised units: a cell, as all is linear between its corners."""
+        return self.finest
+
 
 BACKGROUND_SAMPLES = 12
 GEOMETRY = 13  # features that the SDF network hands to the colour network
@@ -69,9 +79,9 @@ class Field(nn.Module, ABC):
     view_dependence: float = 1.0  # how much colour changes with direction, 0 to 1
 
     @property
-    @abstractmethod
     def finest(self) -> float:
         """Size of the smallest detail, normalised units."""
+        return self.size.finest
 
     @abstractmethod
     def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -135,10 +145,6 @@ class GridField(Field):
         self.color = nn.Sequential(layer(seen, width), nn.ReLU(), layer(width, 3, gain=0.3))
         n = size.background
         self.background = uniform(n, n, n, 4, bound=1e-2)
-
-    @property
-    def finest(self) -> float:
-        return level_step(self.size.levels, len(self.size.levels))
 
     def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """SDF [P], geometry features [P, 13] and grid features [P, F] at points [P, 3] of normalised space."""

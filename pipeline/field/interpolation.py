@@ -24,10 +24,10 @@ def interpolate(grid: Tensor, points: Tensor) -> Tensor:
     those of its border. Differentiable in the grid, not in the points."""
     if grid.is_cuda:
         return by_rows(grid, points)
-    return _Compiled.apply(grid, points.detach().contiguous())  # type: ignore[no-any-return]
+    return _OnCpu.apply(grid, points.detach().contiguous())  # type: ignore[no-any-return]
 
 
-class _Compiled(torch.autograd.Function):
+class _OnCpu(torch.autograd.Function):
     """Values of a grid on the CPU, with torch's number of threads."""
 
     @staticmethod

@@ -26,6 +26,16 @@ class MlpSize:
     view_frequencies: int = 4  # octaves of the encoding of directions
     background: int = 64  # grid points a side of the background
 
+    @property
+    def finest(self) -> float:
+        """Half a wave of the highest octave, normalised units: what is smaller is not resolved."""
+        return math.pi / (SPAN * 2.0 ** (self.frequencies - 1))
+
+    @property
+    def sampling(self) -> float:
+        """Distance of samples that show all detail, normalised units: two to half a wave."""
+        return self.finest / 2
+
 
 def encoded(values: Tensor, frequencies: int) -> Tensor:
     """Values [P, 3] with their sines and cosines at octaves, [P, 3 + 6 F] (Mildenhall et al., NeRF, eq. 4)."""
@@ -105,11 +115,6 @@ class MlpField(Field):
     def beta(self) -> Tensor:
         """Learned scale of the density, normalised units (section 3.1)."""
         return self.raw_beta.abs() / SPAN + 1e-4
-
-    @property
-    def finest(self) -> float:
-        """Half a wave of the highest octave, normalised units: what is smaller is not resolved."""
-        return math.pi / (SPAN * 2.0 ** (self.size.frequencies - 1))
 
     def _network(self, points: Tensor) -> Tensor:
         """SDF and features [P, 1 + width]."""

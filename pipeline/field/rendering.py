@@ -5,6 +5,7 @@ The grids choose samples from a cached SDF; the MLP bounds the error of the opac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,17 +18,20 @@ from pipeline.field.interpolation import interpolate
 
 EPSILON = 0.1  # of opacity
 START = 128  # samples of every ray at first, and added to those that need more
+COARSE = 4  # cells of the cached SDF between places where the field is always asked
+BINS = 0.75  # reads of the cached SDF along a ray, for each cell of a side
 ROUNDS, BISECTIONS = 5, 10
 
 
 @torch.no_grad()
-def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
+def sdf_cache(field: Field, cell: float) -> Tensor:
     """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen.
 
-    Every `coarse`-th value is the field's, the others only in blocks that the surface may cross; elsewhere they are
-    interpolated. `resolution` n is a multiple of `coarse` plus 1.
+    Its cells are no wider than `cell`. Every `COARSE`-th value is the field's, the others only in blocks that the
+    surface may cross; elsewhere they are interpolated.
     """
-    device = field.background.device
+    device, coarse = field.background.device, COARSE
+    resolution = math.ceil(2 / cell / coarse - 1e-6) * coarse + 1
     line = torch.linspace(-1, 1, resolution, device=device)
 
     def values(points: Tensor) -> Tensor:
@@ -70,10 +74,11 @@ class Samples:
 
 @torch.no_grad()
 def choose_samples(
-    cache: Tensor, origins: Tensor, directions: Tensor, beta: float, uniforms: Tensor, *, bins: int = 96, plain: int = 8
+    cache: Tensor, origins: Tensor, directions: Tensor, beta: float, uniforms: Tensor, *, plain: int = 8
 ) -> Samples:
     """Samples along rays [R, 3], one for each of `uniforms` [R, S] in 0..1: `plain` of them evenly spread, the others
-    where the cached SDF has its surface, read at `bins` even steps."""
+    where the cached SDF has its surface, read at even steps."""
+    bins = round(BINS * (cache.shape[0] - 1))
     enter, leave = sphere_interval(origins, directions)
     length = (leave - enter)[:, None]
     steps = (torch.arange(bins, device=cache.device) + 0.5) / bins
@@ -131,7 +136,7 @@ def render(
     return composite(field, chosen, field.geometry_at(chosen.points.view(-1, 3)), beta, behind)
 
 
-def nearest(sdf: Tensor, delta: Tensor) -> Tensor:
+def distance_bound(sdf: Tensor, delta: Tensor) -> Tensor:
     """A lower bound [R, S - 1] of the distance to the surface within each interval of a ray (eq. 13, figure 5), from
     the SDF [R, S] at the samples and the intervals' lengths [R, S - 1].
 
@@ -154,7 +159,7 @@ def opacity_bound(distance: Tensor, sdf: Tensor, beta: Tensor) -> tuple[Tensor, 
     delta = distance[:, 1:] - distance[:, :-1]
     density = laplace_density(sdf[:, :-1], beta)
     before = torch.cumsum(density * delta, 1) - density * delta
-    error = torch.cumsum(delta**2 * torch.exp(-nearest(sdf, delta) / beta), 1) / (4 * beta**2)
+    error = torch.cumsum(delta**2 * torch.exp(-distance_bound(sdf, delta) / beta), 1) / (4 * beta**2)
     return torch.exp(-before) * torch.expm1(error.clamp_max(30.0)), before
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from PIL import Image
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from pipeline.cameras import Similarity, Sparse, View
+from pipeline.cameras import PosedPhotos, Similarity, View
 from pipeline.field.grid_field import Field, FieldSize, GridField, differences, level_step, stencil
 from pipeline.field.mlp_field import MlpField, MlpSize
 from pipeline.field.rendering import (
@@ -30,10 +31,7 @@ from pipeline.field.rendering import (
     sdf_cache,
     sphere_interval,
 )
-from pipeline.inputs.images import BACKDROP, reduced
-from pipeline.inputs.photos import load_photos
-from pipeline.progress import Progress, quiet, share_of
-from pipeline.sfm.supervision import (
+from pipeline.field.supervision import (
     FreeSpace,
     Supervision,
     depth_points,
@@ -41,13 +39,15 @@ from pipeline.sfm.supervision import (
     supervision_of,
     unit_sphere_of,
 )
+from pipeline.inputs.images import BACKDROP, reduced
+from pipeline.inputs.photos import load_photos
+from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
 from sdfsim.base.parallel import choose_threads
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
-CACHE = 129  # samples a side of the cached SDF; what is thinner than its cells is found by luck only
 HOLLOWS = 0.25  # of the training is done before filled free space is looked for
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
@@ -139,7 +139,7 @@ def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor
     return center, direction / direction.norm(dim=1, keepdim=True)
 
 
-def load_rays(views: list[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
+def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
     """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. With masks, a view without one
     counts as all object. Raises SdfsimError where a photo is missing."""
     rgb, mask, view_of, pixel, intrinsics, sizes = [], [], [], [], [], []
@@ -196,13 +196,14 @@ class Trainer:
             for values in (supervision.points, supervision.weights)
         )
         self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
-        self.free = FreeSpace(supervision.sight if settings.free else supervision.sight[:0], device)
+        sight = supervision.sight if settings.free else supervision.sight[:0]
+        self.free = FreeSpace(sight, settings.size.finest, device)
         self.field, self.optimizer = self.fresh()
         self.iteration, self.iterations, self.seconds = 0, settings.iterations, 0.0
         self.cache: Tensor | None = None
 
     def fresh(self) -> tuple[Field, torch.optim.Adam]:
-        """A field that nothing was learned by yet, and its optimiser."""
+        """An untrained field and its optimiser."""
         settings = self.settings
         assert isinstance(settings.size, FieldSize)
         field = GridField(settings.size, self.seed, settings.start_radius).to(self.device)
@@ -240,7 +241,7 @@ class Trainer:
         self.field.active = min(levels, 2 + int((levels - 2) * self.fraction / 0.45 + 0.4))
         # Colour does not change with direction at first, or a wrong surface is painted right.
         self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
-        self.cache = sdf_cache(self.field, CACHE)
+        self.cache = sdf_cache(self.field, self.settings.size.sampling)
         self.find_filled()
 
     def find_filled(self) -> None:
@@ -400,7 +401,7 @@ class MlpTrainer(Trainer):
         return 0.1**self.fraction
 
     def refresh(self) -> None:
-        self.cache = sdf_cache(self.field, CACHE)  # only for pictures
+        self.cache = sdf_cache(self.field, self.settings.size.sampling)  # only for pictures
 
     def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
         """Samples [R, S] that bound the error of the opacity, for as many uniforms [R, S]."""
@@ -438,29 +439,29 @@ class Trained:
 
 
 def train(
-    views: list[View], sparse: Sparse, photos_folder: Path, out: Path, *, settings: Settings,
+    poses: PosedPhotos, photos_folder: Path, out: Path, *, settings: Settings,
     budget: float | None = None, seed: int = 0, device: str = "cpu", threads: int | None = None,
     checkpoint_every: float = 20.0, on_progress: Progress = quiet,
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
-    Views and sparse points are in the world of the poses. The budget, s, includes training before a kill: the number of
+    The poses are as structure-from-motion left them. The budget, s, includes training before a kill: the number of
     steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Where the checkpoint of a killed run
     cannot be read, training begins again, and a note of the report says so. Raises SdfsimError where the loss is no
     longer finite.
     """
     photos = load_photos(photos_folder)
     masked = all(photo.mask for photo in photos)
-    to_unit = unit_sphere_of(views, sparse, masked=masked)
-    local = [to_unit.view(view) for view in views]
-    test = held_out(len(views))
-    training = [v for i, v in enumerate(local) if i not in test]
+    to_unit = unit_sphere_of(poses, masked=masked)
+    local = poses.moved(to_unit)
+    test = held_out(len(local.views))
+    training = [view for number, view in enumerate(local.views) if number not in test]
     rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
     depth, agreed = None, {}
     if any(photo.depth for photo in photos):
-        agreed = depth_scale(views, sparse, depth_points(views, photos, photos_folder))
-        depth = depth_points(views, photos, photos_folder, scale=agreed["scale"])
-    supervision = supervision_of(sparse, local, to_unit, depth, agreed.get("spread", 0.0))
+        agreed = depth_scale(poses, depth_points(poses.views, photos, photos_folder))
+        depth = depth_points(poses.views, photos, photos_folder, scale=agreed["scale"])
+    supervision = supervision_of(local, settings.size.finest, depth, agreed.get("spread", 0.0))
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device)
     checkpoint = out / "checkpoint.safetensors"
@@ -496,8 +497,8 @@ def train(
     trainer.refresh()
     scores = {}
     if test:
-        held, tell = [local[i] for i in test], share_of(on_progress, 0.92, 0.08)
-        scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=tell)
+        held, report = [local.views[i] for i in test], share_of(on_progress, 0.92, 0.08)
+        scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=report)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),

@@ -168,8 +168,8 @@ def unpack(archive: Path, folder: Path) -> None:
             for entry in entries:
                 place = folder / entry.filename.replace("\\", "/")  # as some programs on Windows write them
                 if not place.resolve().is_relative_to(folder.resolve()):
-                    told = f"{archive}: {entry.filename} would lie outside of the capture"
-                    raise SdfsimError(told, "export it again")
+                    message = f"{archive}: {entry.filename} would lie outside of the capture"
+                    raise SdfsimError(message, "export it again")
                 place.parent.mkdir(parents=True, exist_ok=True)
                 with file.open(entry) as packed, open(place, "wb") as out:
                     shutil.copyfileobj(packed, out)
@@ -253,5 +253,5 @@ def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:
     except (OSError, ValueError, RuntimeError) as error:
         raise SdfsimError(f"{path}: cannot be read as depth: {error}", "export the capture again") from error
     if values is None or np.squeeze(values).ndim != 2:
-        raise SdfsimError(f"{path}: no picture with one channel", "depth is a PNG of 16 bits, an EXR or an NPY")
+        raise SdfsimError(f"{path}: not an image with one channel", "depth is a PNG of 16 bits, an EXR or an NPY")
     return np.squeeze(values)

@@ -75,7 +75,7 @@ def deep_values(path: Path, header: Deep) -> np.ndarray:
     import cv2
 
     if header.planes:
-        raise SdfsimError(f"{path}: more than 8 bits with each channel stored apart (planar): not read", OTHERWISE)
+        raise SdfsimError(f"{path}: more than 8 bits with planar channels: not supported", OTHERWISE)
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -86,12 +86,12 @@ def deep_values(path: Path, header: Deep) -> np.ndarray:
     if values is not None and header.orientation in STORED:
         values = STORED[header.orientation](values)
     if values is None or values.dtype == np.uint8 or values.shape[1::-1] != header.size:
-        raise SdfsimError(f"{path}: more than 8 bits, and damaged or compressed in a way that is not read", OTHERWISE)
+        raise SdfsimError(f"{path}: more than 8 bits, and damaged or in a compression that is not supported", OTHERWISE)
     if values.ndim == 3:
         values = values[..., [2, 1, 0, 3] if values.shape[2] == 4 and header.alpha else [2, 1, 0]]
     if not np.isfinite(values).any() or values.min() < -0.1 * np.abs(values).max():
         low, high = np.nanmin(values), np.nanmax(values)
-        raise SdfsimError(f"{path}: values from {low:.3g} to {high:.3g}, a photo has none below 0", OTHERWISE)
+        raise SdfsimError(f"{path}: values from {low:.3g} to {high:.3g}; photos have none below 0", OTHERWISE)
     return values
 
 

@@ -27,7 +27,7 @@ DARK = 0.1  # of white, that a hundredth of a photo has to reach
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReadPhoto:
     """A photo as it was read."""
 
     pixels: np.ndarray  # RGB [H, W, 3] uint8
@@ -66,7 +66,7 @@ def exif_focal(image: Image.Image) -> tuple[float | None, str]:
 
 def read_photo(
     path: Path, long_side: int, mask: Path | None = None, shape: float | None = None, white: float | None = None
-) -> Picture:
+) -> ReadPhoto:
     """Reads one photo upright and no larger than `long_side` px; a mask file goes before an alpha channel.
 
     Where a known camera has another `shape`, width over height, than the upright photo, the photo stays as stored.
@@ -90,7 +90,7 @@ def read_photo(
     if inside is not None:
         share = inside[..., None].astype(np.float32) / 255
         pixels = (255 * (pixels[..., :3] / 255.0 * share + BACKDROP * (1 - share)) + 0.5).astype(np.uint8)
-    return Picture(
+    return ReadPhoto(
         np.ascontiguousarray(pixels[..., :3]), original, inside,
         focal * max(pixels.shape[:2]) if focal else None, camera,
     )  # fmt: skip
@@ -167,14 +167,14 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
         with open(path, "rb") as file:
             tiff = file.read(4) in TIFFS
         if tiff:
-            raise SdfsimError(f"{path}: damaged, or a kind of TIFF that is not read", OTHERWISE) from error
-        told = f"{path}: not an image, in spite of its name, or cut short"
-        raise SdfsimError(told, "remove it or replace it") from error
+            raise SdfsimError(f"{path}: damaged, or a kind of TIFF that is not supported", OTHERWISE) from error
+        message = f"{path}: not an image, whatever its name says, or cut short"
+        raise SdfsimError(message, "remove it or replace it") from error
     except (OSError, SyntaxError, ValueError, EOFError, RuntimeError) as error:
         why = " ".join(str(error).split())
-        cut = "truncated" in why or "end of file" in why
-        what = "truncated" if cut else f"cannot be decoded ({why})"
-        raise SdfsimError(f"{path}: {what}", "copy it again from the camera, or remove it") from error
+        raise SdfsimError(
+            f"{path}: cannot be decoded ({why})", "copy it again from the camera, or remove it"
+        ) from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 
@@ -190,7 +190,7 @@ def off(image: Image.Image, shape: float) -> float:
     return abs(image.width / image.height / shape - 1)
 
 
-def brightness(picture: Picture) -> float:
+def brightness(picture: ReadPhoto) -> float:
     """How light the lightest hundredth of a photo is, or of its object where it has a mask; from 0 to 1."""
     grey = picture.pixels.astype(np.float32).mean(-1) / 255
     inside = grey if picture.mask is None else grey[picture.mask >= 128]

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import View
-from pipeline.inputs.images import Picture
+from pipeline.inputs.images import ReadPhoto
 from sdfsim.base.errors import SdfsimError
 
 # COLMAP's camera models, by number: name, and the names of their parameters; none of those that OpenCV does not know.
@@ -133,7 +133,7 @@ def read_transforms(path: Path) -> list[KnownCamera]:
         where = f"{path}: {frame['file_path']}"
         model = str(values.get("camera_model", "OPENCV")).upper()
         if model not in PARAMETERS:
-            raise SdfsimError(f"{where}: camera_model: {values['camera_model']!r} is not read", STRAIGHTEN)
+            raise SdfsimError(f"{where}: camera_model: {values['camera_model']!r} is not supported", STRAIGHTEN)
         fisheye = model.endswith("FISHEYE") or bool(values.get("is_fisheye"))
         width, height = int(values.get("w", 0)), int(values.get("h", 0))
         sized = width > 0 and height > 0
@@ -165,8 +165,8 @@ def _pose(matrix: Any, where: str) -> np.ndarray:
         raise SdfsimError(f"{where}: transform_matrix: {shape} numbers", "it takes 4 x 4, or the first 3 rows of that")
     rows = values.reshape(-1, 4)
     if not np.allclose(rows[3:], [0, 0, 0, 1]):
-        told = f"{where}: transform_matrix: its last row is {rows[3].tolist()}, not 0, 0, 0, 1"
-        raise SdfsimError(told, "write it by rows, camera to world, with the place of the camera in the last column")
+        message = f"{where}: transform_matrix: its last row is {rows[3].tolist()}, not 0, 0, 0, 1"
+        raise SdfsimError(message, "write it by rows, camera to world, with the place of the camera in the last column")
     return rows[:3]
 
 
@@ -181,8 +181,8 @@ def read_model(folder: Path) -> list[KnownCamera]:
         model, width, height, values = cameras[camera]
         names = _parameters(folder, model)
         if len(names) != len(values):
-            told = f"{folder}: camera {camera}: {len(values)} parameters, {model} has {len(names)} ({' '.join(names)})"
-            raise SdfsimError(told, "write the model again")
+            wanted = f"{model} has {len(names)} ({' '.join(names)})"
+            raise SdfsimError(f"{folder}: camera {camera}: {len(values)} parameters, {wanted}", "write the model again")
         known = dict(zip(names, values, strict=True))
         fx = known.get("fx", known.get("f", 0.0))
         lens = lens_of(fx, known.get("fy", fx), known["cx"], known["cy"], known, model.endswith("FISHEYE"))
@@ -193,7 +193,7 @@ def read_model(folder: Path) -> list[KnownCamera]:
 
 def _parameters(folder: Path, model: str) -> list[str]:
     if model not in PARAMETERS:
-        raise SdfsimError(f"{folder}: the camera model {model} is not read", STRAIGHTEN)
+        raise SdfsimError(f"{folder}: the camera model {model} is not supported", STRAIGHTEN)
     return PARAMETERS[model]
 
 
@@ -274,7 +274,7 @@ def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
     return np.diag([width / known.width, height / known.height, 1.0]) @ known.lens.matrix
 
 
-def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
+def rectified(picture: ReadPhoto, known: KnownCamera, name: str, source: str) -> tuple[ReadPhoto, View, Lens | None]:
     """A photo as a pinhole camera in the same place would have taken it, that camera, and the lens it was freed from.
 
     Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the

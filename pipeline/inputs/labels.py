@@ -17,8 +17,8 @@ from sdfsim.base.files import read_json, visible
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes
 UNKNOWN = 255  # a pixel of which nothing is said
-# Names that a scene file may hold already.
-TAKEN = ("scene", "floor", "box", "ball")
+# Names that a scene file holds already, or that of the folder of the scenery's shape.
+TAKEN = ("scenery", "scene", "floor", "box", "ball")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
@@ -93,9 +93,9 @@ def find_labels(photos: list[Path]) -> Labels:
             for photo, path in found.items():
                 masks.setdefault(photo, {}).setdefault(folder.name, path)
     if images and masks:
-        raise SdfsimError("there are label images and masks by object", "keep only one of masks/NAME and labels")
+        raise SdfsimError("both label images and masks by object are given", "keep only one of masks/NAME and labels")
     if notes and not masks and not images:
-        raise SdfsimError(f"{'; '.join(notes)}: nothing of it can be used",
+        raise SdfsimError(f"{'; '.join(notes)}: none of these files can be used",
                           "name a mask like its photo: a.png or a.jpg.png for a.jpg")  # fmt: skip
     names = tuple(sorted({name for each in masks.values() for name in each}))
     values: tuple[int, ...] = ()
@@ -106,7 +106,7 @@ def find_labels(photos: list[Path]) -> Labels:
         if not names:
             raise SdfsimError(f"{next(iter(images.values())).parent}: all labels are 0", "0 is no object")
     if len(names) >= UNKNOWN:
-        raise SdfsimError(f"{len(names)} objects in labels and masks, at most {UNKNOWN - 1} can be told apart")
+        raise SdfsimError(f"{len(names)} objects in labels and masks, at most {UNKNOWN - 1} are allowed")
     return Labels(masks, images, names, values, tuple(notes))
 
 
@@ -136,7 +136,7 @@ def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndar
     as stored. Raises SdfsimError where it cannot be read, is in colour, or is not shaped like the photo."""
     stored = decoded(path, 1 << 20)[0]
     if stored.mode not in ("1", "L", "P") and not stored.mode.startswith("I"):
-        raise SdfsimError(f"{path}: a label image has one number a pixel, this one is {stored.mode}",
+        raise SdfsimError(f"{path}: a label image has one number per pixel, this one is {stored.mode}",
                           "write it as a palette PNG, or in grey of 8 or 16 bits")  # fmt: skip
     if size is None:
         return np.asarray(stored).astype(np.int64)

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from pipeline.cameras import View, save_views
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
 from pipeline.inputs.deep import common_white
-from pipeline.inputs.images import BLURRED, DARK, Picture, brightness, read_photo, sharpness
+from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, read_photo, sharpness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
@@ -68,14 +68,14 @@ def prepare_photos(
     try:
         made = _prepare(find_source(unpacked, unpacked=True), out, long_side, on_progress)
     except SdfsimError as error:  # which names files that nobody knows
-        told, hint = (text.replace(str(unpacked), str(source.archive)) for text in (error.message, error.hint))
-        raise SdfsimError(told, hint, exit_code=error.exit_code) from error
+        message, hint = (text.replace(str(unpacked), str(source.archive)) for text in (error.message, error.hint))
+        raise SdfsimError(message, hint, exit_code=error.exit_code) from error
     shutil.rmtree(unpacked, ignore_errors=True)
     return made
 
 
 def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -> tuple[list[Photo], list[str]]:
-    """What `prepare_photos` does with what is no archive."""
+    """What `prepare_photos` does with anything but an archive."""
     if source.capture:
         source = replace(source, photos=tuple(spread(source.photos, source.frames)))
     (out / "images").mkdir(parents=True, exist_ok=True)
@@ -118,7 +118,7 @@ def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
-def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, KnownCamera | None, float]]:
+def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, ReadPhoto, KnownCamera | None, float]]:
     """Name, picture, camera where it is known, and share done."""
     if source.video:
         from pipeline.inputs.video import chosen_frames
@@ -126,7 +126,7 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Kn
         for name, pixels, fraction in chosen_frames(source.video):
             image = Image.fromarray(pixels)
             image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
-            yield name, Picture(np.asarray(image), image.size), None, fraction
+            yield name, ReadPhoto(np.asarray(image), image.size), None, fraction
         return
     masks = source.masks
     # They count where every photo has one, or is cut out by transparency.
@@ -147,8 +147,8 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Kn
 def _check_shape(path: Path, size: tuple[int, int], camera: KnownCamera | None) -> None:
     """Checks that a photo, or its depth, of this width and height is shaped like the photo of its camera."""
     if camera and camera.height and abs(size[0] / size[1] / (camera.width / camera.height) - 1) > 0.02:
-        told = f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}"
-        raise SdfsimError(told, "give the photos and depth that the cameras were found for, uncropped and as turned")
+        message = f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}"
+        raise SdfsimError(message, "give the photos and depth that the cameras were found for, uncropped and as turned")
 
 
 def notes_on(photos: list[Photo], mask_files: int) -> list[str]:

@@ -73,8 +73,8 @@ def find_source(given: Path, *, unpacked: bool = False) -> Source:
     if given.suffix.lower() == ".json" or is_model(given):
         return _with_cameras(given, read_cameras(given))
     if given.is_file():
-        told = f"{given}: not a folder, a video, a transforms.json or a zipped capture"
-        raise SdfsimError(told, "give the folder that holds the photos, not a single file")
+        message = f"{given}: not a folder, a video, a transforms.json or a zipped capture"
+        raise SdfsimError(message, "give the folder that holds the photos, not a single file")
     own = photos_in(given)
     if (place := find_capture(given, deep=unpacked or len(own) < MIN_PHOTOS)) is not None:
         capture, frames = read_capture(place)
@@ -98,15 +98,15 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
     if other:
         notes.append(f"{len(other)} files are not used (first: {other[0]}): {READABLE}")
     if len(found) < MIN_PHOTOS:
-        told = f"{folder}: photos found: {len(found)}, at least {MIN_PHOTOS} are needed (20 to 60 are good)"
+        message = f"{folder}: photos found: {len(found)}, at least {MIN_PHOTOS} are needed (20 to 60 are good)"
         inside = _with_photos(folder)
         if inside:
             some = ", ".join(f"{len(photos_in(sub))} in {sub}" for sub in inside[:NAMED])
             more = f" and {len(inside) - NAMED} more folders" if len(inside) > NAMED else ""
-            raise SdfsimError(f"{told}; below it are {some}{more}", "give the folder that holds the photos")
+            raise SdfsimError(f"{message}; below it are {some}{more}", "give the folder that holds the photos")
         if models := [place for level in levels(folder) for place in level if is_model(place)]:
-            raise SdfsimError(f"{told}; {models[0]} holds cameras", "give that folder")
-        raise SdfsimError(told, notes[0] if notes else "take photos all around, each overlapping the one before")
+            raise SdfsimError(f"{message}; {models[0]} holds cameras", "give that folder")
+        raise SdfsimError(message, notes[0] if notes else "take photos all around, each overlapping the one before")
     return found, notes
 
 
@@ -167,8 +167,8 @@ def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | N
     notes = [f"{len(missing)} of {len(frames)} cameras have no photo (first: {missing[0]})"] if missing else []
     photos = list(known)
     if len(photos) < MIN_PHOTOS:
-        told = f"{cameras}: cameras with a photo: {len(photos)}, at least {MIN_PHOTOS} are needed {' '.join(notes)}"
-        raise SdfsimError(told, "put the photos beside the cameras, or in a folder `images` there or just above")
+        message = f"{cameras}: cameras with a photo: {len(photos)}, at least {MIN_PHOTOS} are needed {' '.join(notes)}"
+        raise SdfsimError(message, "put the photos beside the cameras, or in a folder `images` there or just above")
     if capture is None and any(frame.depth for frame in known.values()):
         capture = Capture("transforms.json with depth", None)
     labels = find_labels(photos)

@@ -67,7 +67,7 @@ def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(moved), np.array(sharp)
 
 
-def choose(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
+def choose_frames(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
     """Frames to use, in order: the motion is cut into equal stretches, and the sharpest frame of each is taken; at
     least `FEWEST` where there are as many, at most `MOST`."""
     total = float(moved[-1])
@@ -81,12 +81,12 @@ def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
     cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
     moved, sharp = follow(path)
     if len(sharp) < FEWEST:
-        told = f"{path}: only {len(sharp)} frames can be decoded (at least {FEWEST} are needed)"
-        raise SdfsimError(told, "is the video whole? Convert it to MP4 (H.264), or film for longer")
+        message = f"{path}: only {len(sharp)} frames can be decoded (at least {FEWEST} are needed)"
+        raise SdfsimError(message, "check that the video is complete, convert it to MP4 (H.264), or film for longer")
     if moved[-1] < LEAST_MOTION:
-        told = f"{path}: the picture hardly moves (by {moved[-1]:.2f} picture widths in all)"
-        raise SdfsimError(told, "walk around the object while filming", exit_code=EXIT_QUALITY)
-    wanted = choose(moved, sharp)
+        message = f"{path}: the picture hardly moves (by {moved[-1]:.2f} picture widths in all)"
+        raise SdfsimError(message, "walk around the object while filming", exit_code=EXIT_QUALITY)
+    wanted = choose_frames(moved, sharp)
     left = set(wanted)
     frames, rate = frames_of(path)
     for index, frame in enumerate(frames):

@@ -13,13 +13,14 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from pipeline.cameras import View, frame_of
+from pipeline.cameras import PosedPhotos, frame_of
 from pipeline.inputs.labels import load_names
 from pipeline.mesh.extraction import (
     FLOATER,
+    LIFT,
     RIM,
     Distance,
-    Surface,
+    FieldSurface,
     Volume,
     components,
     islands,
@@ -27,31 +28,45 @@ from pipeline.mesh.extraction import (
     sample,
     sample_box,
 )
-from pipeline.mesh.photo_refining import load_pictures, refine
-from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
+from pipeline.mesh.photo_refining import load_grey_photos, refine
+from pipeline.mesh.placement import LEVEL_NORMAL
+from pipeline.mesh.seams import (
+    ConnectedSolid,
+    Part,
+    Votes,
+    count_votes,
+    part_of_name,
+    parts_by_shape,
+    parts_by_votes,
+    solid_of,
+)
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals
 
+# Shares, without unit, chosen by hand on the rendered sets (table_vase, `shelf`, touching bodies). Nothing derives
+# them, and other sets may want others.
 LEVEL_SHARE = 0.1  # of the largest level plane: what is smaller carries nothing, as the lid of a box is no table
-LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a face of a level plane
 LARGEST_FOOT = 0.5  # share of its plane that a body covers at most; what covers more is relief
+CARRIED = 0.3  # share of a level plane below which a component's samples lie, and it carries that plane
 SEEN_SHARE = 0.2  # of a body's surface, that photos have to show
 STANDS = 0.3  # least share of a body's lowest layer that has the solid of the plane right below it
-CRUMB = 0.05  # of a body: what is smaller and hangs beside it was torn off it by noise, and goes where it goes
-SCRAP = 0.4  # of the first piece of what masks name as one: a second one that is shorter is left out
+CRUMB = 0.05  # of a body's samples: what is smaller and hangs beside it was torn off it by noise, and goes with it
+FLAKE = 0.02  # of the area of a body's largest piece: smaller pieces are left out
+SCRAP = 0.4  # of the length of the first piece of what masks name: a second one that is shorter is left out
 # Noise has less than the first of the largest body's surface, and less than the second of the most sparse points that a
-# body has on so much surface. Bodies of the rendered shelf had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
+# body has on so much surface. Bodies of `shelf` had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
 SMALL_NOISE, BARE = 0.15, 0.05
+# In cells of the field's finest grid, which limits what can be separated:
+LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
+SMALLEST = 4.0  # what rises less stays part of what it stands on
+FINER = 1 / 3  # distance of a body's samples
 FILLET = 3.0  # contact layers sideways: what is so near a body's foot is taken away together with it
-LAYER = 1.5  # cells of the finest grid: in a layer so thick a field cannot tell a body from what it stands on
-# What rises less than this (normalised units, or this many cells of the finest grid) stays part of what it stands on.
-SMALLEST, SMALLEST_CELLS = 0.04, 4.0
-FINER = 3.0  # samples of a body to a cell of the field's finest grid
+FEWEST_SAMPLES = 8  # of a component: less is no body
 
 
 @dataclass(frozen=True)
-class Level:
+class LevelPlane:
     """A level plane."""
 
     normal: np.ndarray  # [3] unit, upwards
@@ -64,17 +79,17 @@ class Level:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class FoundBody:
     """A body that stands on a level plane, or that masks name."""
 
     name: str  # that of its masks, else object1, object2 ... from the largest down
-    level: Level  # what it stands on, infinitely far below where that is not known
+    level: LevelPlane  # what it stands on, infinitely far below where that is not known
     size: float  # the longest side of its bounding box
     # [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane
     own: np.ndarray
     low: np.ndarray  # [3] position of the first of these samples
     cell: float  # between them
-    layer: float  # thickness of the contact layer, in which the field cannot tell body and plane apart
+    layer: float  # thickness of the contact layer, in which the field cannot separate body and plane
     hollow: np.ndarray  # [A, B] bool on the plane: places that the body goes around at the top of the contact layer
     corner: np.ndarray  # [2] of the first of these, in the axes of `frame_of` the plane
     seam: Volume | None = None  # where it ends against what it touches, negative within; None where it ends by itself
@@ -117,13 +132,13 @@ class Body:
         return value
 
 
-def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
+def find_level_planes(shown: Mesh, up: np.ndarray, width: float) -> list[LevelPlane]:
     """Level planes of a surface, largest first; `up` [3] is unit, and faces within `width` belong to one plane."""
     normals, areas = face_normals(shown)
     centers = shown.vertices[shown.faces].mean(1)
     flat = normals @ up > LEVEL_NORMAL
     normals, areas, centers = normals[flat], areas[flat], centers[flat]
-    levels: list[Level] = []
+    levels: list[LevelPlane] = []
     while len(areas):
         height = centers @ up
         bins = ((height - height.min()) / width).astype(int)
@@ -137,14 +152,14 @@ def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
         offset = centers[member] - middle
         normal = np.linalg.eigh((offset * areas[member, None]).T @ offset)[1][:, 0]
         normal = normal * np.sign(normal @ up) if abs(normal @ up) > LEVEL_NORMAL else up
-        levels.append(Level(normal, float(middle @ normal), float(areas[member].sum())))
+        levels.append(LevelPlane(normal, float(middle @ normal), float(areas[member].sum())))
         rest = (np.abs(levels[-1].above(centers)) > 2 * width) & ~member
         normals, areas, centers = normals[rest], areas[rest], centers[rest]
     return levels
 
 
-def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: float,
-                named: np.ndarray | None = None) -> list[Body]:  # fmt: skip
+def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, smallest: float,
+                named: np.ndarray | None = None) -> list[FoundBody]:  # fmt: skip
     """Bodies without names that stand on level planes, wholly within the trained space; those that touch are one.
 
     What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
@@ -157,7 +172,7 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
     x, y, z = np.ix_(*volume.axes())
     at_rim = np.sqrt(x**2 + y**2 + z**2) > RIM - 2 * volume.cell
     taken = np.zeros(solid.shape, bool)
-    found: list[Body] = []
+    found: list[FoundBody] = []
     # From the top down: what stands on a table has been taken when the table itself is looked at.
     for level in sorted(levels, key=lambda level: -level.height):
         height = volume.along(level.normal).astype(np.float32) - level.height
@@ -168,7 +183,7 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
         hangs = np.asarray(ndimage.minimum(height, label, np.arange(count + 1))) > layer + 1.5 * volume.cell
         for number, box in enumerate(ndimage.find_objects(label, count), start=1):
             mine = label[box] == number
-            if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < 8:
+            if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < FEWEST_SAMPLES:
                 continue
             low = volume.low + volume.cell * np.array([part.start for part in box])
             sides = volume.cell * np.array(mine.shape)
@@ -189,13 +204,13 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
     return found
 
 
-def _carries(place: Volume, other: Level, cell: float) -> bool:
+def _carries(place: Volume, other: LevelPlane, cell: float) -> bool:
     """Whether the samples right below a level plane are for a good part those of one component."""
     below = -other.above(place.points())
-    return float((place.values * ((below > 0) & (below <= cell))).sum()) * cell**2 > 0.3 * other.area
+    return float((place.values * ((below > 0) & (below <= cell))).sum()) * cell**2 > CARRIED * other.area
 
 
-def _stands(volume: Volume, place: Volume, lowest: np.ndarray, level: Level, layer: float) -> bool:
+def _stands(volume: Volume, place: Volume, lowest: np.ndarray, level: LevelPlane, layer: float) -> bool:
     """Whether a component's lowest samples have the plane's solid below them, and cover only a part of the plane."""
     points = place.points()[lowest]
     if not len(points) or len(points) * volume.cell**2 / 1.5 > LARGEST_FOOT * level.area:
@@ -216,8 +231,8 @@ def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
     return here(seen) / max(here(vertices), 1)
 
 
-def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np.ndarray, level: Level, layer: float,
-          size: float) -> Body:  # fmt: skip
+def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np.ndarray, level: LevelPlane,
+          layer: float, size: float) -> FoundBody:  # fmt: skip
     """The body of one component: all samples around it that are nearer to it than to what else is on the plane."""
     margin = int(np.ceil((FILLET + 1) * layer / volume.cell)) + 1
     start = [max(part.start - margin, 0) for part in box]
@@ -229,7 +244,7 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     ndimage.distance_transform_edt(label == 0, return_indices=True, distances=away, indices=nearest)
     own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
     corner = volume.low + volume.cell * np.array(start)
-    body = Body("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))
+    body = FoundBody("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))
     frame = frame_of(level.normal)
     flat = (corner + volume.cell * np.argwhere(own)) @ frame[:2].T
     a, b = (np.arange(low, high, 0.5 * volume.cell) for low, high in zip(flat.min(0), flat.max(0), strict=True))
@@ -241,7 +256,7 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     return replace(body, hollow=np.asarray(ndimage.binary_fill_holes(cut)) & ~cut, corner=flat.min(0))
 
 
-def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
+def body_mesh(body: FoundBody, field: Distance, cell: float) -> Mesh:
     """The closed mesh of a body, sampled `cell` apart along its plane; crumbs are left out."""
     frame = frame_of(body.level.normal)
     turned = (body.low + body.cell * np.argwhere(body.own)) @ frame.T
@@ -253,10 +268,10 @@ def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
     mesh = Mesh(sampled.vertices @ frame, sampled.faces)
     label = components(mesh)
     area = np.bincount(label, face_normals(mesh)[1])
-    return keep_faces(mesh, (area > 0.02 * area.max())[label])
+    return keep_faces(mesh, (area > FLAKE * area.max())[label])
 
 
-def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volume:
+def without_bodies(volume: Volume, bodies: list[FoundBody], field: Distance) -> Volume:
     """The scenery alone: what bodies leave behind is empty, and their plane goes on below them. `volume` holds samples
     of `field`, the signed distance."""
     values = volume.values.copy()
@@ -286,21 +301,21 @@ class Parts:
     shown: Mesh | None  # what is displayed of it: its visible surface, and the places where bodies stood
     bodies: dict[str, Mesh]  # closed mesh of each body by name, with colours; the largest first
     smallest: float  # what rises less than this above its plane stayed part of the scenery
-    # names of two bodies that touch, and "masks" or "shape", which told them apart
+    # names of two bodies that touch, and "masks" or "shape", which separated them
     touching: list[tuple[str, str, str]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # names of masks whose object has no surface of its own
     noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_are_noise`
     unrefined: dict[str, str] = field(default_factory=dict)  # by body, why it was not moved to where the photos agree
 
 
-def split(surface: Surface, distance: Distance, finest: float, views: list[View], points: np.ndarray,
-          photos_folder: Path, up: np.ndarray, *, alone: bool) -> Parts:  # fmt: skip
-    """Finds bodies, takes them out of the scenery and tells those that touch apart.
+def split(surface: FieldSurface, distance: Distance, finest: float, poses: PosedPhotos, photos_folder: Path,
+          up: np.ndarray, *, alone: bool) -> Parts:  # fmt: skip
+    """Finds bodies, takes them out of the scenery and separates those that touch.
 
-    All is in normalised space: views, sparse points [P, 3], `up` [3] and the signed distance that the surface is of;
-    `finest` is the width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
+    All is in normalised space: the poses, `up` [3] and the signed distance that the surface is of; `finest` is the
+    width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
     """
-    smallest, layer, lift = max(SMALLEST, SMALLEST_CELLS * finest), LAYER * finest, 0.75 * surface.volume.cell
+    smallest, layer, lift = SMALLEST * finest, LAYER * finest, LIFT * surface.volume.cell
     names = load_names(photos_folder)
     if alone and not names:
         return Parts(None, None, whole_bodies(surface), smallest)
@@ -308,22 +323,22 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     votes = None
     if names:
         sight = Visibility(surface.raw, lift, blocking)
-        votes = count_votes(sight, surface.raw.faces, views, photos_folder, names)
+        votes = count_votes(sight, surface.raw.faces, poses.views, photos_folder, names)
     if alone:
         whole = [_whole(surface, mesh, up, layer) for mesh in whole_bodies(surface).values()]
     else:
         named = None if votes is None else votes.winner > 0
-        # What lies on a body is told apart from it by masks, not by the plane between them.
+        # Masks separate what lies on a body from it; the plane between them does not.
         plain = surface.shown if named is None else surface.shown & ~named[surface.raw.faces].any(1)
-        levels = find_levels(keep_faces(surface.raw, plain), up, finest)
+        levels = find_level_planes(keep_faces(surface.raw, plain), up, finest)
         whole = find_bodies(surface, levels, layer, smallest, named)
-    pieces: list[Body] = []
-    touching: list[tuple[Body, Body, str]] = []
+    pieces: list[FoundBody] = []
+    touching: list[tuple[FoundBody, FoundBody, str]] = []
     for body in whole:
-        found, by = _told_apart(surface, body, votes, smallest)
+        found, by, name = _parted(surface, body, votes, smallest)
         parts = [_piece(body, part, names[part.number - 1] if part.number else "") for part in found]
         touching += [(parts[k], parts[n], by) for k, part in enumerate(found) for n in part.neighbours if n > k]
-        pieces += parts or [replace(body, name=by)]
+        pieces += parts or [replace(body, name=name)]
     if votes is not None and not alone:
         for number, name in enumerate(names, start=1):
             if name not in [body.name for body in pieces]:
@@ -333,16 +348,16 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     pieces = [body for body in pieces if not body.name or body.size > SCRAP * largest[body.name]]
     if not pieces:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
-    sampled = {body: body_mesh(body, distance, min(finest / FINER, surface.volume.cell)) for body in pieces}
-    noise = _noise(sampled, points, finest)
+    sampled = {body: body_mesh(body, distance, min(FINER * finest, surface.volume.cell)) for body in pieces}
+    noise = _noise(sampled, poses.sparse.xyz, finest)
     called = _names([body for body in pieces if body not in noise])
-    meshes, unrefined, pictures = {}, {}, load_pictures(views, photos_folder)
+    meshes, unrefined, pictures = {}, {}, load_grey_photos(poses.views, photos_folder)
     for body, name in called.items():
         # Lifted clear of the surface in the way, which is sampled more coarsely.
         mesh, why = refine(sampled[body], pictures, blocking, lift, finest, body.level.above, body.layer)
         if why:
             unrefined[name] = why
-        seen = look(Visibility(mesh, lift, blocking), views, photos_folder)
+        seen = look(Visibility(mesh, lift, blocking), poses.views, photos_folder)
         known, color = seen.weight > 0, seen.color
         if known.any() and not known.all():
             color[~known] = spread_colors(mesh.vertices[~known], mesh.vertices[known], color[known])
@@ -353,28 +368,29 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     return Parts(solid, shown, meshes, smallest, pairs, missing, [body.size for body in noise], unrefined)
 
 
-def _told_apart(surface: Surface, body: Body, votes: Votes | None, smallest: float) -> tuple[list[Part], str]:
-    """The parts that a body is made of, and what told them apart; for a single one none, and the name of its masks."""
+def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smallest: float
+            ) -> tuple[list[Part], str, str]:  # fmt: skip
+    """The parts that a body is made of, none for a single one; what separates them, "masks" or "shape"; and the name
+    that masks give to a single one."""
     solid = _solid(surface, body)
     if votes is not None:
         parts, number = parts_by_votes(solid, votes)
         if parts or number:
-            return parts, "masks" if parts else votes.names[number - 1]
+            return parts, "masks", "" if parts else votes.names[number - 1]
     if np.isfinite(body.level.height):
         assert surface.raw.colors is not None
-        parts = parts_by_shape(solid, surface.raw.colors[solid.index], smallest)
-        return parts, "shape" if parts else ""
-    return [], ""
+        return parts_by_shape(solid, surface.raw.colors[solid.index], smallest), "shape", ""
+    return [], "", ""
 
 
-def _solid(surface: Surface, body: Body) -> Solid:
+def _solid(surface: FieldSurface, body: FoundBody) -> ConnectedSolid:
     """What is solid of a body above its contact layer."""
     around = Volume(surface.volume.values[body.part_of(surface.volume)], body.low, body.cell)
     inside = body.own & (around.values < 0) & (body.level.above(around.points()) > body.layer)
     return solid_of(around, inside, surface.raw)
 
 
-def _piece(body: Body, part: Part, name: str) -> Body:
+def _piece(body: FoundBody, part: Part, name: str) -> FoundBody:
     """One part of a body, with no more samples than it needs."""
     mine = body.own & (part.seam.values < 0)
     box = ndimage.find_objects(ndimage.binary_dilation(mine, iterations=3).astype(np.int8))[0]
@@ -383,7 +399,7 @@ def _piece(body: Body, part: Part, name: str) -> Body:
     return replace(body, name=name, seam=part.seam, own=body.own[box], low=low, size=float(size))
 
 
-def _whole(surface: Surface, mesh: Mesh, up: np.ndarray, layer: float) -> Body:
+def _whole(surface: FieldSurface, mesh: Mesh, up: np.ndarray, layer: float) -> FoundBody:
     """A connected component of the solid, given by its mesh, as a body that stands on nothing."""
     volume = surface.volume
     label = ndimage.label(volume.values < 0)[0]  # type: ignore[index]
@@ -393,15 +409,15 @@ def _whole(surface: Surface, mesh: Mesh, up: np.ndarray, layer: float) -> Body:
     return _at_nothing(volume, mine, volume.values < 0, up, layer)
 
 
-def _at_nothing(volume: Volume, mine: np.ndarray, solid: np.ndarray, up: np.ndarray, layer: float) -> Body:
+def _at_nothing(volume: Volume, mine: np.ndarray, solid: np.ndarray, up: np.ndarray, layer: float) -> FoundBody:
     """The body of some samples `mine` [X, Y, Z] of a solid that stands on nothing known."""
     box = ndimage.find_objects(mine.astype(np.int8))[0]
     size = max(part.stop - part.start for part in box) * volume.cell
-    return _body(volume, solid, box, mine[box], Level(up, -np.inf, 0.0), layer, size)
+    return _body(volume, solid, box, mine[box], LevelPlane(up, -np.inf, 0.0), layer, size)
 
 
-def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: np.ndarray, layer: float,
-           smallest: float) -> list[Body]:  # fmt: skip
+def _loose(surface: FieldSurface, votes: Votes, number: int, bodies: list[FoundBody], up: np.ndarray, layer: float,
+           smallest: float) -> list[FoundBody]:  # fmt: skip
     """The body that masks name and that stands on no plane, cut off what it touches; none where there is too little."""
     volume = surface.volume
     vertices = surface.raw.vertices
@@ -424,8 +440,8 @@ def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: 
     return [replace(body, seam=found.seam)]
 
 
-def _noise(meshes: dict[Body, Mesh], points: np.ndarray, width: float) -> list[Body]:
-    """The bodies that are dark or blurred places which the training filled with something.
+def _noise(meshes: dict[FoundBody, Mesh], points: np.ndarray, width: float) -> list[FoundBody]:
+    """The bodies that are only noise: dark or blurred places that the training filled.
 
     They are small, no masks name them, and hardly any of the sparse points [P, 3] lies within `width` of them, where
     others are covered with points.
@@ -438,9 +454,9 @@ def _noise(meshes: dict[Body, Mesh], points: np.ndarray, width: float) -> list[B
     return [body for body, without in zip(meshes, bare, strict=True) if without and not body.name]
 
 
-def _names(bodies: list[Body]) -> dict[Body, str]:
+def _names(bodies: list[FoundBody]) -> dict[FoundBody, str]:
     """A name of its own for each body, the largest first: that of its masks, or else a number."""
-    names: dict[Body, str] = {}
+    names: dict[FoundBody, str] = {}
     taken = {body.name for body in bodies}
     for body in sorted(bodies, key=lambda body: -body.size):
         name = body.name
@@ -451,7 +467,7 @@ def _names(bodies: list[Body]) -> dict[Body, str]:
     return names
 
 
-def whole_bodies(surface: Surface) -> dict[str, Mesh]:
+def whole_bodies(surface: FieldSurface) -> dict[str, Mesh]:
     """Every connected component of the solid as a body, the largest first."""
     solid = surface.solid
     label = components(solid)
@@ -459,7 +475,7 @@ def whole_bodies(surface: Surface) -> dict[str, Mesh]:
     return {f"object{n}": keep_faces(solid, label == k) for n, k in enumerate(order, start=1)}
 
 
-def scenery(surface: Surface, bodies: list[Body], distance: Distance) -> tuple[Mesh, Mesh]:
+def scenery(surface: FieldSurface, bodies: list[FoundBody], distance: Distance) -> tuple[Mesh, Mesh]:
     """The scenery's solid without bodies, and what is displayed of it."""
     raw, mesh = surface.raw, without_bodies(surface.volume, bodies, distance).mesh()
     assert raw.colors is not None

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from pipeline.cameras import View
+from pipeline.cameras import PosedPhotos
 from pipeline.field.grid_field import Field
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from pipeline.progress import Progress, quiet
@@ -22,16 +22,19 @@ from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
-BATCH = 1 << 17  # points a query
-RIM = 0.99  # radius in normalised space at which the solid ends: beyond it the field was never trained
-EXTENT = 1.02  # half the side of the sampled cube
-MIN_SEEN = 2  # photos that have to show a vertex
-# Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
-# set the median error there is ten times that within.
+BATCH = 1 << 17  # points a query; more take more memory and no less time
+RIM = 0.99  # normalised units, radius at which the solid ends: beyond it the field was never trained
+EXTENT = 1.02  # normalised units, half the side of the sampled cube: it holds the ball with two samples around it
+LIFT = 0.75  # cells of the samples by which vertices are lifted off a surface before views look for them
+MIN_SEEN = 2  # photos that have to show a vertex: one alone says nothing of where it is
+# Normalised units. Farther than this from every point of structure-from-motion a surface is a guess. Chosen on a
+# rendered set, where the median error beyond it is ten times that within.
 MAX_FROM_POINTS = 0.1
+# Shares of area and of neighbours, chosen by hand on the photo sets of the project; nothing derives them.
 FLOATER = 0.01  # of the visible surface: a smaller patch says nothing; of the closed solid a quarter of that
-SPECK = 0.02  # normalised units, from which on what is left out is reported
 UNSEEN = 0.05  # a component of whose area photos show less than this share is matter behind the scenery
+CLOSING, CLOSINGS = 0.6, 4  # share of seen neighbours by which an unseen vertex counts as seen, and how many times
+SPECK = 0.02  # normalised units, from which on what is left out is reported: 1 % of the width of the trained space
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: floa
 
 
 @dataclass(frozen=True)
-class Surface:
+class FieldSurface:
     """What was extracted, in normalised space."""
 
     volume: Volume  # the signed distance it comes from
@@ -171,31 +174,31 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
     trusted = (count >= MIN_SEEN) & ~at_limit
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     degree = np.maximum(np.bincount(edges[:, 0], minlength=len(trusted)), 1)
-    for _ in range(4):
+    for _ in range(CLOSINGS):
         neighbours = np.bincount(edges[:, 0], trusted[edges[:, 1]], minlength=len(trusted))
-        trusted |= (neighbours > 0.6 * degree) & ~at_limit
+        trusted |= (neighbours > CLOSING * degree) & ~at_limit
     return trusted
 
 
 def surface_of(
-    volume: Volume, field: Field, views: list[View], points: np.ndarray, photos_folder: Path, limit: Distance, *,
+    volume: Volume, field: Field, poses: PosedPhotos, photos_folder: Path, limit: Distance, *,
     on_progress: Progress = quiet,
-) -> Surface:  # fmt: skip
-    """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; views and
-    sparse points [P, 3] are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
+) -> FieldSurface:  # fmt: skip
+    """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
+    poses are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
     hardly any of it is in the photos."""
     raw, cell = volume.mesh(), volume.cell
-    found = look(Visibility(raw, 0.75 * cell), views, photos_folder, on_progress)
-    far = KDTree(points).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
+    found = look(Visibility(raw, LIFT * cell), poses.views, photos_folder, on_progress)
+    far = KDTree(poses.sparse.xyz).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
     seen = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell) & ~far
     faces_seen = seen[raw.faces].sum(1) >= 2
     kept, left_out = belonging(raw, faces_seen, FLOATER / 4, SPECK)
     shown = islands(raw, faces_seen & kept, FLOATER)
     if shown.sum() < 100:
-        told = "mesh: hardly any of the surface is visible in the photos"
-        raise SdfsimError(told, "check the poses", exit_code=EXIT_QUALITY)
+        message = "mesh: hardly any of the surface is visible in the photos"
+        raise SdfsimError(message, "check the poses", exit_code=EXIT_QUALITY)
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
-    return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
+    return FieldSurface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
 
 
 @torch.no_grad()

@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
-from pipeline.cameras import View, load_sparse, load_views, save_views
+from pipeline.cameras import View, load_poses, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
+from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
-from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
+from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
 from pipeline.mesh.visibility import Visibility, hollow, to_bytes
+from pipeline.options import Options
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_bytes, write_json
@@ -28,7 +30,6 @@ from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
 
-SCENERY = "scene"
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "volsdf": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
@@ -36,52 +37,55 @@ PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 
 
 def make_meshes(
-    distill: Path, poses: Path, photos: Path, out: Path, *, preset: str, size: float | None = None,
-    distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
+    distill: Path, poses: Path, photos: Path, out: Path, options: Options, *, device: str = "cpu",
     on_progress: Progress = quiet,
 ) -> dict:  # fmt: skip
-    """Writes the files that docs/objects.md lists and returns the stage's report; `size`, `distance` and `crop` as in
-    `Options`. Vertices in the PLY files have `views` and `uncertainty`, see `Support`. Raises SdfsimError (exit code 3)
-    where there is no surface worth the name, or (1) of a distance or box that makes no sense."""
+    """Writes the files that docs/objects.md lists and returns the stage's report. Vertices in the PLY files have
+    `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) where there is hardly any surface, or
+    (1) for a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
-    views = [to_unit.view(view) for view in load_views(poses)]
-    points = to_unit.points(load_sparse(poses).xyz)
+    posed = load_poses(poses).moved(to_unit)
     alone = bool(trained.report["masked"])
     inner, limit = field_distance(field), ball
     inside = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
-    volume = sample_volume(inside, RESOLUTION[preset], on_progress=share_of(on_progress, 0.0, 0.25))
-    surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
-    scale = measured_scale(distance, views, load_photos(photos), Caster(surface.raw)) if distance else None
+    volume = sample_volume(inside, RESOLUTION[options.preset], on_progress=share_of(on_progress, 0.0, 0.25))
+    surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
+    scale = None
+    if options.distance is not None:
+        scale = measured_scale(options.distance, posed.views, load_photos(photos), Caster(surface.raw))
     capture, up = load_capture(photos), None
     if capture is not None and capture.up is not None:
         up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
-    if capture is not None and scale is None and size is None:
+    if capture is not None and scale is None and options.size is None:
         scale = 1 / to_unit.scale, f"metres of {capture.app}"
-    placement = place(surface.visible, views, scale, size=size, alone=alone, up=up)
-    if crop is not None:
-        limit = box_of(placement, np.reshape(crop, (2, 3)))
+    placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
+    if options.crop is not None:
+        limit = box_of(placement, np.reshape(options.crop, (2, 3)))
         volume = volume.limited(limit)
         if not (volume.values < 0).any():
-            raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")
-        surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
+            raise SdfsimError(
+                "crop: the box holds nothing",
+                "corners are in metres, in the axes of the mesh/mesh.ply of a run without --crop",
+            )
+        surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
         # Where a person has cut the surroundings away, what is left is what they want to move.
         alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
     on_progress(0.7, "looking for bodies")
-    parts = split(surface, inside, field.finest, views, points, photos, placement.to_metres.rotation[2], alone=alone)
+    parts = split(surface, inside, field.finest, posed, photos, placement.to_metres.rotation[2], alone=alone)
     on_progress(0.8, "drawing objects.png")
-    draw_names(parts, views, photos).save(out / "objects.png")
+    draw_names(parts, posed.views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
-    moved = [placement.to_metres.view(view) for view in views]
     closed, displayed = (
         {name: placement.mesh(mesh) for name, mesh in ({SCENERY: first} | parts.bodies).items() if mesh is not None}
         for first in (parts.solid, parts.shown)
     )
-    shots = shots_of(moved, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
+    views = posed.moved(placement.to_metres).views
+    shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
     ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
     on_progress(0.82, "asking how far each place can be trusted")
-    support, told = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
-    write_parts(parts, surface.visible, placement, support, out)
+    evidence, trusted = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
+    write_parts(parts, surface.visible, placement, evidence, out)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     write_bytes(out / TEXTURED, write_glb(textures))
     deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
@@ -89,28 +93,29 @@ def make_meshes(
         "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
-        "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
+        "up_confidence": placement.up_confidence, "size": placement.size_from,
+        "size_assumed": placement.size_assumed, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
         "hollows_m": {name: rounded(found).tolist() for name, found in deep.items() if found is not None},
-        "masks_without_surface": parts.missing, "unrefined": parts.unrefined, **told,
+        "masks_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
     }  # fmt: skip
 
 
 def trust(
     closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
-) -> tuple[Support, dict]:
-    """What the photos tell of the vertices of the `closed` meshes, one after the other, and what the report says of it;
+) -> tuple[Evidence, dict]:
+    """What the photos say about the vertices of the `closed` meshes, one after the other, and the same for the report;
     writes `next_photos.json`. Vertices are `counted` [V] bool where they were not cut off; all is in metres."""
     whole = joined(list(closed.values()))
     sight = Visibility(whole, shots.lift, shots.blocking)
-    support = support_of(sight, shots.views)
-    shown = {name: support.nearest(mesh.vertices) for name, mesh in displayed.items()}
-    photos, weak = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
+    evidence = evidence_of(sight, shots.views)
+    shown = {name: evidence.nearest(mesh.vertices) for name, mesh in displayed.items()}
+    photos, weak = next_photos(closed, evidence, sight, shots.blocking, shots.views, counted)
     save_views([photo.view for photo in photos], out / NEXT)
-    return support, {
+    return evidence, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
         "weak": round(weak, 4),
-        "next_photos": [photo.told() for photo in photos],
+        "next_photos": [photo.to_dict() for photo in photos],
     }  # fmt: skip
 
 
@@ -132,12 +137,12 @@ def rounded(values: ArrayLike) -> np.ndarray:
     return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
 
 
-def write_parts(parts: Parts, visible: Mesh, placement: Placement, support: Support, out: Path) -> None:
-    """Writes meshes in metres with what the photos tell of their vertices, `placement.json` and `parts.json`."""
+def write_parts(parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path) -> None:
+    """Writes meshes in metres with what the photos say about their vertices, `placement.json` and `parts.json`."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
-        write_bytes(out / name, write_ply(moved, support.nearest(moved.vertices).attributes()))
+        write_bytes(out / name, write_ply(moved, evidence.nearest(moved.vertices).attributes()))
         return moved
 
     write("mesh.ply", visible)
@@ -170,7 +175,7 @@ def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
     return {name: replace(mesh, colors=to_bytes(colors_of(values[name], limits))) for name, mesh in meshes.items()}
 
 
-def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Image:
+def draw_names(parts: Parts, views: Sequence[View], photos_folder: Path) -> Image.Image:
     """A picture of the photos that show bodies best, each body tinted and with its name."""
     meshes = list(parts.bodies.values())
     caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))

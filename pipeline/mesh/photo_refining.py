@@ -7,7 +7,7 @@ nothing: there the surface is the smallest one between what is known on both sid
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,39 +17,40 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
-from pipeline.mesh.visibility import Visibility
+from pipeline.mesh.visibility import FAIR, Visibility
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
+# Chosen by hand on the rendered sets, mostly `shelf`; nothing derives these numbers, and other sets may want others.
 LONG_SIDE = 640  # px; larger photos are made smaller, or the right place would lie too many pixels away
-PHOTOS, FEWEST = 5, 3  # that a patch is compared in, those that look straightest; and how many there must be
-STRAIGHT = 0.35  # least cosine between the normal and a photo's line of sight
-HALF = 3  # a patch has this many pixels to each side of its middle
-PLACES = 25  # along the normal
-NOISE = 4.0  # variance of grey levels that is no texture
+# Photos that a patch is compared in, those that look straightest; and how many there must be: any two agree.
+PHOTOS, FEWEST = 5, 3
+HALF = 3  # px from a patch's middle to its sides
+PLACES = 25  # that are tried along the normal
+NOISE = 4.0  # grey levels squared: variance that is no texture
 # What is not reconstructed may stand before a photo. That one agrees with no others around there: with the best two of
-# ASKED photos by less than CLEAR times as well as any photo does. One vertex of so many is asked.
+# ASKED photos by less than CLEAR times as well as any photo does. One vertex of SELDOM is asked.
 ASKED, CLEAR, SELDOM = 8, 0.5, 16
-# How far vertices are moved, in cells of the field's finest grid; the last round looks in half that range.
+# Cells of the field's finest grid by which vertices are moved at most in a round, and rounds; half as far in the last.
 REACH, ROUNDS = 1.3, 3
 EVERY = 4  # one vertex of so many is looked at, the others follow
-ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises
-# A place is no longer trusted so many times the usual difference from the surface around it. What is usual is told by
-# the places around, since many of them are far off where the field is; but at most so many times the body's median.
+ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises from 0 to 1
+# A place is no longer trusted SPREAD times the usual difference from the surface around it. What is usual depends on
+# the places around, since many of them are far off where the field is; but it is at most FAR times the body's median.
 SPREAD, FAR = 3.0, 2.0
-# A place counts in full where the mean trust within so many edges is this: a lone match at an edge is a mistake.
+# A place counts in full where the mean trust within NEAR edges is EVEN: a lone match at an edge is a mistake.
 NEAR, EVEN = 8, 0.3
-# Weights beside trust: of the surface's area, of its bending, and of where a vertex was.
+# Weights, with trust as unit: of the surface's area, of its bending, of where a vertex was, and of that where no photo
+# shows anything.
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
+AROUND, KNOWN = 20, 0.1 / EVERY  # edges, and mean trust within them, below which vertices stay where they were
 SMOOTHED = 4  # times after each round
-STEPS = 300  # of conjugate gradients
+STEPS = 300  # of conjugate gradients, after which the equations count as not solved
 WALL = 0.25  # of the way to the surface opposite, inside or outside, that a vertex may move in a round
-# Within so many edges vertices need this mean trust around them, or they stay where they were.
-AROUND, TOLD = 20, 0.1 / EVERY
 
 
 @dataclass(frozen=True)
-class Picture:
+class GreyPhoto:
     """A photo to compare patches in."""
 
     view: View  # its camera, for the pixels of the file
@@ -57,7 +58,7 @@ class Picture:
     grey: np.ndarray  # [H, W] float32
 
 
-def load_pictures(views: list[View], photos_folder: Path) -> list[Picture]:
+def load_grey_photos(views: Sequence[View], photos_folder: Path) -> list[GreyPhoto]:
     """The photos of some views, grey and no larger than `LONG_SIDE`."""
     import cv2
 
@@ -67,18 +68,18 @@ def load_pictures(views: list[View], photos_folder: Path) -> list[Picture]:
             grey = np.asarray(image.convert("L"), np.float32)
         scale = min(1.0, LONG_SIDE / max(grey.shape))
         size = round(view.width * scale), round(view.height * scale)
-        found.append(Picture(view, scale, cv2.resize(grey, size, interpolation=cv2.INTER_AREA)))
+        found.append(GreyPhoto(view, scale, cv2.resize(grey, size, interpolation=cv2.INTER_AREA)))
     return found
 
 
-def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, finest: float,
+def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float, finest: float,
            height: Callable[[np.ndarray], np.ndarray], layer: float) -> tuple[Mesh, str]:  # fmt: skip
     """A body whose vertices lie where the photos agree, and why not all rounds of it were done, if so; all is in the
     space of the views.
 
     Vertices are lifted by `lift` off the surface before a view looks for them, and move by cells of width `finest`.
-    Below `layer` of `height`, above the plane that the body stands on, no photo tells the body from its plane; vertices
-    there move along the plane only.
+    Below `layer` of `height`, above the plane that the body stands on, no photo separates the body from its plane, so
+    vertices there move along the plane only.
     """
     count = len(mesh.vertices)
     if len(pictures) < FEWEST:
@@ -102,7 +103,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         sight = Visibility(mesh, lift, blocking)
         if number == 0:
             clear = unblocked(sight, normal, pictures, moves, mean, picked[: count // SELDOM])
-        score = agreement(sight.at(picked), normal[picked], pictures, moves, clear[:, picked])
+        score = patch_correlation(sight.at(picked), normal[picked], pictures, moves, clear[:, picked])
         place, trust = best_places(score, moves)
         trust[low[picked]] = 0
         if not trust.any():
@@ -114,11 +115,11 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         for _ in range(NEAR):
             near = mean @ near
         weight = weight * (near / (EVEN / EVERY)).clip(0, 1)
-        told = np.stack([weight, ~low], 1)
+        known = np.stack([weight, ~low], 1)
         for _ in range(AROUND):
-            told = mean @ told
-        told = (told[:, 0] / (TOLD * told[:, 1]).clip(1e-6)).clip(0, 1)
-        stay = STAY + PINNED * (1 - told)
+            known = mean @ known
+        known = (known[:, 0] / (KNOWN * known[:, 1]).clip(1e-6)).clip(0, 1)
+        stay = STAY + PINNED * (1 - known)
         moved, converged = settled(mesh, along, mean, wanted, weight, stay)
         # What the surface around it contradicts was a mistake.
         off = np.abs(moved - wanted)
@@ -138,13 +139,13 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         moved = moved.clip(-WALL * inwards, WALL * outwards)
         vertices = mesh.vertices + moved[:, None] * along
         for _ in range(SMOOTHED):
-            vertices = vertices + 0.5 * (told * ~low)[:, None] * (mean @ vertices - vertices)
+            vertices = vertices + 0.5 * (known * ~low)[:, None] * (mean @ vertices - vertices)
         mesh = replace(mesh, vertices=vertices)
     return mesh, ""
 
 
-def agreement(
-    sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, clear: np.ndarray
+def patch_correlation(
+    sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray
 ) -> np.ndarray:
     """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3]: the mean
     correlation between any two of those that are `clear` [K, P], -1 where too few show a vertex."""
@@ -155,7 +156,7 @@ def agreement(
     return result
 
 
-def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, mean: csr_matrix,
+def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, mean: csr_matrix,
               picked: np.ndarray) -> np.ndarray:  # fmt: skip
     """Whether nothing stands before photos [K, V] where they seem to show vertices with normals [V, 3]: asked at those
     `picked`, and the same around them; yes where they were not asked."""
@@ -175,12 +176,12 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], mo
         for _ in range(AROUND if there.any() else 0):
             total, weight = mean @ total, mean @ weight
         photo[:] = np.where(weight > 1e-6, total / weight.clip(1e-6), np.inf)
-    told = np.where(np.isfinite(support), support, -1)
-    return (support >= CLEAR * told.max(0)) | (told.max(0) <= 0)
+    asked_best = np.where(np.isfinite(support), support, -1).max(0)
+    return (support >= CLEAR * asked_best) | (asked_best <= 0)
 
 
 def patches(
-    sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, clear: np.ndarray, most: int
+    sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray, most: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """The patches around vertices [P], moved [M] along normals [P, 3], in the photos that look straightest, at most so
     many and only those that are `clear` [K, P].
@@ -191,7 +192,7 @@ def patches(
     cosine = np.zeros((len(pictures), len(normal)), np.float32)
     for number, picture in enumerate(pictures):
         index, _, straight = sight.of_view(picture.view)
-        cosine[number, index] = np.where(straight > STRAIGHT, straight, 0)
+        cosine[number, index] = np.where(straight > FAIR, straight, 0)
     cosine *= clear
     chosen = np.argsort(-cosine, 0)[:most]
     shown = np.take_along_axis(cosine, chosen, 0) > 0
@@ -213,7 +214,7 @@ def patches(
         yield part, number, found
 
 
-def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:
+def normalised(picture: GreyPhoto, points: np.ndarray) -> np.ndarray:
     """Grey levels [..., G] of patches of points [..., G, 3] in a photo, with mean 0 and length 1."""
     import cv2
 
@@ -226,8 +227,8 @@ def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:
 
 
 def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from `agreement`, and
-    how far that is to be trusted [P]."""
+    """Where the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from
+    `patch_correlation`, and how far that is to be trusted [P]."""
     best = score.argmax(1)
     middle = best.clip(1, len(moves) - 2)
     before, here, after = (score[np.arange(len(score)), middle + k] for k in (-1, 0, 1))

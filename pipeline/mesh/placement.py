@@ -20,9 +20,11 @@ from sdfsim.geometry.mesh import Mesh, face_normals
 CONFIDENT = {"high": 2.0, "medium": 6.0}
 GRAVITY = 1.0  # degrees within which a phone knows it
 FLOORS = 0.5  # degrees within which floors and tables are level
-# Largest angle (degrees) between cameras' up and the normal of a plane that tells up, and its least share of the area.
+# Of the plane that gives up: largest angle (degrees) between its normal and cameras' up, and least share of the area.
 MAX_ANGLE, MIN_SHARE = 25.0, 0.08
-LEVEL_NORMAL, MIN_FLOOR = 0.95, 0.05  # least z of a level face's normal, and share of the area that a floor has
+DRAWN, TRIALS = 2000, 200  # of the search for that plane: points, and planes that are tried
+LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a level face: 18 degrees
+MIN_FLOOR = 0.05  # share of the area that a floor has
 # A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
 
@@ -35,6 +37,7 @@ class Placement:
     up_from: str  # "plane", "cameras", or in words what measured it
     size_from: str  # where the scale comes from, in words
     up_within: float = 0.0  # degrees within which up can be trusted
+    size_assumed: bool = False  # whether the scale is a guess
 
     @property
     def up_confidence(self) -> str:
@@ -60,7 +63,7 @@ def load_placement(mesh_folder: Path) -> Placement:
         raise SdfsimError(f"{path}: damaged", "run the mesh stage again") from error
 
 
-def find_up(shown: Mesh, views: list[View]) -> Up:
+def find_up(shown: Mesh, views: Sequence[View]) -> Up:
     """Up from the largest nearly level plane, else from the cameras; how far they disagree counts as doubt."""
     cameras = camera_up(views)
     normals, areas = face_normals(shown)
@@ -84,13 +87,15 @@ def plane_up(
     if near.sum() <= 10:
         return None
     p, n, w = points[near], normals[near], weights[near]
-    rng = np.random.default_rng(0)
-    best, inside = 0.0, None
-    for pick in rng.choice(len(p), size=min(200, len(p)), replace=False, p=w / w.sum()):
-        member = (np.abs((p - p[pick]) @ n[pick]) < tolerance) & (n @ n[pick] > 0.9)
-        if w[member].sum() > best:
-            best, inside = float(w[member].sum()), member
-    if inside is None or best < MIN_SHARE * weights.sum():
+    import open3d as o3d
+
+    # It counts points, so that each has to come as often as its share of the area.
+    drawn = p[np.random.default_rng(0).choice(len(p), DRAWN, p=w / w.sum())]
+    o3d.utility.random.seed(0)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(drawn))
+    plane = cloud.segment_plane(tolerance, 3, TRIALS, 1.0)[0]  # a x + b y + c z + d = 0
+    inside = (np.abs(p @ plane[:3] + plane[3]) < tolerance) & (np.abs(n @ plane[:3]) > 0.9)
+    if w[inside].sum() < MIN_SHARE * weights.sum():
         return None
     for _ in range(3):
         center = np.average(p[inside], axis=0, weights=w[inside])
@@ -123,7 +128,7 @@ def resting_height(mesh: Mesh) -> float:
     return float(np.quantile(mesh.vertices[:, 2], 0.002))
 
 
-def level(shown: Mesh, views: list[View], up: np.ndarray) -> np.ndarray:
+def upright_rotation(shown: Mesh, views: Sequence[View], up: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] that turns up [3] to z and the front, which is towards the mean camera, to -y."""
     center = (shown.vertices.min(0) + shown.vertices.max(0)) / 2
     # Cameras all around have no front: take the first photo's side.
@@ -136,7 +141,7 @@ def level(shown: Mesh, views: list[View], up: np.ndarray) -> np.ndarray:
     return frame_of(up)
 
 
-def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None, *, size: float | None = None,
+def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = None, *, size: float | None = None,
           alone: bool = False, up: Up | None = None) -> Placement:  # fmt: skip
     """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
 
@@ -144,8 +149,9 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
     from; else `size` m is the widest side, 1 m where it is None. `alone`: the floor is where the lowest point is.
     """
     up = up or find_up(shown, views)
-    rotation = level(shown, views, up.direction)
+    rotation = upright_rotation(shown, views, up.direction)
     turned = shown.vertices @ rotation.T
+    assumed = scale is None and size is None
     if scale is None:
         source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
         scale = (1.0 if size is None else size) / float(np.ptp(turned, axis=0).max()), source
@@ -154,10 +160,12 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
     low, high = in_metres.vertices.min(0), in_metres.vertices.max(0)
     floor = low[2] if alone else resting_height(in_metres)
     translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, floor])
-    return Placement(Similarity(metres, rotation, translation), up.source, source, up.within)
+    return Placement(Similarity(metres, rotation, translation), up.source, source, up.within, assumed)
 
 
-def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], surface: Caster) -> tuple[float, str]:
+def measured_scale(
+    distance: Sequence, views: Sequence[View], photos: list[Photo], surface: Caster
+) -> tuple[float, str]:
     """Metres a normalised unit at which a known distance (see `Options`) is what it should be, and where that comes
     from, in words. Pixels are those of the user's own photos. Raises SdfsimError as `_end` does, for a photo without a
     pose, or a pixel that shows nothing of the surface."""
@@ -175,7 +183,7 @@ def check_distance(distance: Sequence, photos: list[Photo]) -> None:
         _end(text, photos)
 
 
-def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) -> np.ndarray:
+def _locate(text: str, views: Sequence[View], photos: list[Photo], surface: Caster) -> np.ndarray:
     """Position [3] of one end of a known distance."""
     photo, pixel = _end(text, photos)
     view = next((view for view in views if view.name == photo.name), None)
@@ -203,9 +211,9 @@ def _end(text: str, photos: list[Photo]) -> tuple[Photo, tuple[float, float] | N
     name, pixel = (match[1], (float(match[2]), float(match[3]))) if match else (text, None)
     found = [p for p in photos if p.source == name] or [p for p in photos if Path(p.source).name == name]
     if len(found) != 1:
-        told = f"{len(found)} photos are" if found else "no photo is"
+        which = f"{len(found)} photos are" if found else "no photo is"
         such = ", ".join(photo.source for photo in (found or photos)[:3])
-        raise SdfsimError(f"distance: {told} called {name!r}", f"write PHOTO:X,Y or PHOTO; photos: {such}, ...")
+        raise SdfsimError(f"distance: {which} called {name!r}", f"write PHOTO:X,Y or PHOTO; photos: {such}, ...")
     width, height = found[0].original
     if pixel is not None and not (pixel[0] <= width and pixel[1] <= height):
         raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")

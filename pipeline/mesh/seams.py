@@ -7,6 +7,7 @@ inside belongs to the part whose surface is nearest.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,7 +67,7 @@ class Votes:
         return np.where(self.share.any(1), self.share.argmax(1), -1)
 
 
-def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_folder: Path,
+def count_votes(sight: Visibility, faces: np.ndarray, views: Sequence[View], photos_folder: Path,
                 names: list[str]) -> Votes:  # fmt: skip
     """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out."""
     votes = np.zeros((len(sight.vertices), len(names) + 1))
@@ -125,7 +126,7 @@ class Seam:
 
 
 @dataclass(frozen=True)
-class Solid:
+class ConnectedSolid:
     """One connected solid."""
 
     volume: Volume  # samples of the signed distance around it
@@ -141,7 +142,7 @@ class Solid:
         return self.inside & np.logical_not(ndimage.binary_erosion(self.inside))
 
 
-def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
+def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> ConnectedSolid:
     """The solid of the samples `inside` [X, Y, Z], with the vertices of the mesh of everything that lie at it."""
     at = np.round((mesh.vertices - volume.low) / volume.cell).astype(int)
     within = np.flatnonzero(((at >= 0) & (at < inside.shape)).all(1))
@@ -151,11 +152,11 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
     faces = place[mesh.faces]
     faces = faces[(faces >= 0).all(1)]
     normals = vertex_normals(Mesh(mesh.vertices[index], faces))
-    return Solid(volume, inside, index, mesh.vertices[index], normals, faces)
+    return ConnectedSolid(volume, inside, index, mesh.vertices[index], normals, faces)
 
 
-def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
-    """The parts of a solid that masks tell apart, none where there are no two; and the name's number of the whole solid
+def parts_by_votes(solid: ConnectedSolid, votes: Votes) -> tuple[list[Part], int]:
+    """The parts of a solid that masks separate, none where there are no two; and the name's number of the whole solid
     where it has one, else 0."""
     winner = votes.winner[solid.index]
     count = np.bincount(winner[winner >= 0], minlength=len(votes.names) + 1)
@@ -168,8 +169,9 @@ def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
     return cut(solid, share.argmax(1), seams(solid, share), there.tolist()), 0
 
 
-def part_of_name(solid: Solid, votes: Votes, number: int) -> Part | None:
-    """What masks name of a larger solid, of which a box with an empty border shows a part; None: there is nothing."""
+def part_of_name(solid: ConnectedSolid, votes: Votes, number: int) -> Part | None:
+    """The part with this number in the masks of a larger solid, of which only a box with an empty border is given; None
+    where there is none."""
     mine = votes.share[solid.index, number]
     if not mine.any():
         return None
@@ -179,9 +181,9 @@ def part_of_name(solid: Solid, votes: Votes, number: int) -> Part | None:
     return parts[1] if parts else None
 
 
-def parts_by_shape(solid: Solid, colors: np.ndarray, least: float) -> list[Part]:
+def parts_by_shape(solid: ConnectedSolid, colors: np.ndarray, least: float) -> list[Part]:
     """The parts of a solid that meet in a groove all along, and whose seam is narrow or whose colours [P, 3] differ;
-    none where it is one. What is shorter than `least` in any direction is no part."""
+    none where it is a single body. Parts are at least `least` long in every direction."""
     groove = _solid_around(solid) - 0.5
     label = np.zeros(len(groove), int)
     waiting = [0]
@@ -199,7 +201,7 @@ def parts_by_shape(solid: Solid, colors: np.ndarray, least: float) -> list[Part]
     return cut(solid, label, seams(solid, share), [0] * (label.max() + 1))
 
 
-def _half(solid: Solid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray) -> np.ndarray:
+def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """One side [N] of the best division of some vertices [P] bool in two, through grooves and where colours change. The
     normalised cut of Shi and Malik (2000), from the second eigenvector of the surface's Laplacian."""
     place = np.cumsum(mine) - 1
@@ -235,7 +237,7 @@ def _half(solid: Solid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray
     return np.flatnonzero(mine)[whole[value > limits[int(np.argmin(costs))]]]
 
 
-def _solid_around(solid: Solid) -> np.ndarray:
+def _solid_around(solid: ConnectedSolid) -> np.ndarray:
     """Share [P] of a ball about each vertex that is solid: a half on a plane, more in a groove."""
     volume = solid.volume
     axis = np.arange(-BALL, BALL + 1)
@@ -255,7 +257,7 @@ def owners(points: np.ndarray, share: np.ndarray, cell: float) -> np.ndarray:
     return (share[voting][near] * weight[..., None]).sum(1) / weight.sum(1, keepdims=True)
 
 
-def seams(solid: Solid, share: np.ndarray) -> list[Seam]:
+def seams(solid: ConnectedSolid, share: np.ndarray) -> list[Seam]:
     """Where the parts of a solid meet, from how much each vertex belongs to each part [P, K]."""
     label = share.argmax(1)
     ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
@@ -291,7 +293,7 @@ def _seam(pair: tuple[int, int], rim: np.ndarray, across: np.ndarray, cell: floa
     return Seam(pair, rim, point, normal, bool(flat), sides)
 
 
-def _walled(solid: Solid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:
+def _walled(solid: ConnectedSolid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:
     """Samples [N] of a solid within the rim of a seam, and their distance [N] from its plane, both within 3 samples."""
     cell = solid.volume.cell
     at = np.argwhere(solid.inside)
@@ -302,7 +304,7 @@ def _walled(solid: Solid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:
     return at[close], beyond[close]
 
 
-def flood(solid: Solid, label: np.ndarray, found: list[Seam]) -> np.ndarray:
+def flood(solid: ConnectedSolid, label: np.ndarray, found: list[Seam]) -> np.ndarray:
     """Part [X, Y, Z] of each sample: that of the nearest vertex through the inside, past no flat seam; -1 outside."""
     from skimage.segmentation import watershed
 
@@ -333,7 +335,7 @@ def _spread(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return values[tuple(nearest)]
 
 
-def cut(solid: Solid, label: np.ndarray, found: list[Seam], numbers: list[int]) -> list[Part]:
+def cut(solid: ConnectedSolid, label: np.ndarray, found: list[Seam], numbers: list[int]) -> list[Part]:
     """The parts of a solid from the part of each vertex [P] and the seams between; `numbers` of their names."""
     cell, part = solid.volume.cell, flood(solid, label, found)
     spread = _spread(part, part >= 0)
@@ -357,9 +359,9 @@ def cut(solid: Solid, label: np.ndarray, found: list[Seam], numbers: list[int]) 
     return parts if len(parts) > 1 else []
 
 
-def _apart(solid: Solid, label: np.ndarray, found: list[Seam], pair: tuple[int, int], colors: np.ndarray,
+def _apart(solid: ConnectedSolid, label: np.ndarray, found: list[Seam], pair: tuple[int, int], colors: np.ndarray,
            groove: np.ndarray, least: float) -> bool:  # fmt: skip
-    """Whether two parts meet as bodies do: in one flat seam, in a groove all along, and narrow or of two colours."""
+    """Whether two parts are two bodies: they meet in one flat seam, in a groove all along, narrow or of two colours."""
     between = [seam for seam in found if seam.pair == pair]
     if len(between) != 1 or not between[0].flat:
         return False

@@ -40,7 +40,7 @@ FAINT = 1e-3  # weight of the vertex colours, which count where no photo does
 class Shots:
     """Photos to take colours from."""
 
-    views: list[View]  # cameras, metres
+    views: Sequence[View]  # cameras, metres
     sharpness: np.ndarray  # [N] of each photo, in any unit
     folder: Path  # of the photos stage
     blocking: Caster  # what can stand in the way of a view
@@ -60,7 +60,7 @@ class Shots:
         return float(np.median(best[best > 0])) if best.any() else 0.0
 
 
-def shots_of(views: list[View], photos: list[Photo], folder: Path, meshes: Sequence[Mesh], cell: float) -> Shots:
+def shots_of(views: Sequence[View], photos: list[Photo], folder: Path, meshes: Sequence[Mesh], cell: float) -> Shots:
     """The photos of some views of a scene of `meshes`, all in metres, exact to about a `cell`."""
     sharpness = {photo.name: photo.sharpness for photo in photos}
     return Shots(views, np.array([sharpness[view.name] for view in views]), folder, Caster(joined(meshes)), cell)
@@ -168,7 +168,7 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
     """Where the texels of a texture lie on a surface with `uv`, perhaps colours, and vertex normals [V, 3]."""
     assert flat.uv is not None
     rows, columns = shape
-    # The charts lie in a plane, and a ray through each texel's centre tells which face covers it, and where.
+    # The charts lie in a plane, and a ray through each texel's centre finds which face covers it, and where.
     sheet = Caster(Mesh(np.c_[flat.uv * [columns, rows], np.zeros(len(flat.uv))], flat.faces))
     parts = []
     for first in range(0, rows * columns, BATCH):

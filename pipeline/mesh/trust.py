@@ -1,7 +1,7 @@
 """How far each place of a surface can be trusted, and which photos would help most.
 
-A photo tells where a point is across its line of sight, to about a pixel, and nothing along it. Lines of sight from
-several directions together tell the rest. What fewer than two photos see is a guess of the field.
+A photo fixes a point across its line of sight, to about a pixel, and not at all along it. Lines of sight from several
+directions together fix it. What fewer than two photos see is a guess of the field.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from pipeline.cameras import View, focus
-from pipeline.mesh.visibility import Visibility, framed
+from pipeline.mesh.visibility import FAIR, Visibility, framed
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals, joined
 
@@ -27,18 +27,20 @@ SAMPLES = 6000  # of the surface
 PLACES = 600  # directions around the scene in which cameras are tried
 HIGHER = 30.0  # degrees by which these may be above or below the cameras given; and the lowest and highest
 LOWEST, HIGHEST = -60.0, 80.0
-FAIR = 0.35  # least cosine between normal and line of sight at which a photo helps
 UNSURE = 3.0  # times the median uncertainty: from there on a place is weak however many photos see it
 CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anything solid and from the floor
 SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others
 APART = 15.0  # degrees between the photos proposed
 LEAST = 0.01  # share of the surface that a photo has to help, else it is not worth the way
-NEARBY, SLIGHT = 35.0, 0.04  # degrees up to which a way is told in metres; share of the distance that is not worth it
+NEARBY, SLIGHT = (
+    35.0,
+    0.04,
+)  # degrees up to which a way is described in metres; share of the distance not mentioned
 
 
 @dataclass(frozen=True)
-class Support:
-    """What photos tell of the places of some points."""
+class Evidence:
+    """What photos say about the positions of some points."""
 
     vertices: np.ndarray  # [V, 3] m, the points
     normals: np.ndarray  # [V, 3] unit, of the surface there
@@ -50,11 +52,11 @@ class Support:
         """[V] m, see `sigma_along`; infinite: guessed, as fewer than two photos see the point."""
         return np.where(self.views > 1, sigma_along(self.information, self.normals), np.inf)
 
-    def at(self, index: np.ndarray) -> Support:
+    def at(self, index: np.ndarray) -> Evidence:
         """The same of some of the points."""
-        return Support(self.vertices[index], self.normals[index], self.views[index], self.information[index])
+        return Evidence(self.vertices[index], self.normals[index], self.views[index], self.information[index])
 
-    def nearest(self, points: np.ndarray) -> Support:
+    def nearest(self, points: np.ndarray) -> Evidence:
         """That of the nearest vertex to each of other points [P, 3] m."""
         return self.at(np.asarray(KDTree(self.vertices).query(points)[1]))
 
@@ -64,7 +66,7 @@ class Support:
 
 
 def information(view: View, points: np.ndarray) -> np.ndarray:
-    """How exactly one photo tells where points [P, 3] in front of it are: the inverse [P, 3, 3] of the covariance of
+    """How exactly one photo fixes points [P, 3] in front of it: the inverse [P, 3, 3] of the covariance of
     the place, in 1 / (unit of the points)^2, of rank two.
 
     The photo is taken to be off by a standard deviation of 1 px on both axes, its camera to be exact: J^T J of the
@@ -86,15 +88,15 @@ def sigma_along(information: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return np.where(known, np.sqrt(np.maximum(variance, 0)), np.inf)
 
 
-def support_of(sight: Visibility, views: Sequence[View]) -> Support:
-    """What views tell of the vertices of a mesh, all in metres."""
+def evidence_of(sight: Visibility, views: Sequence[View]) -> Evidence:
+    """What views say about the vertices of a mesh, all in metres."""
     count = len(sight.vertices)
     seen, total = np.zeros(count, np.int64), np.zeros((count, 3, 3))
     for view in views:
         index = sight.of_view(view)[0]
         seen[index] += 1
         total[index] += information(view, sight.vertices[index])
-    return Support(sight.vertices, sight.normals, seen, total)
+    return Evidence(sight.vertices, sight.normals, seen, total)
 
 
 def vertex_areas(mesh: Mesh) -> np.ndarray:
@@ -103,15 +105,15 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
     return np.bincount(mesh.faces.ravel(), area, minlength=len(mesh.vertices))
 
 
-def summary(mesh: Mesh, support: Support) -> dict:
+def summary(mesh: Mesh, evidence: Evidence) -> dict:
     """Of a mesh's area: `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
     lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed."""
-    area, uncertainty = vertex_areas(mesh), support.uncertainty
+    area, uncertainty = vertex_areas(mesh), evidence.uncertainty
     known = np.isfinite(uncertainty)
     median = None
     if known.any():
         median = float(np.quantile(uncertainty[known], 0.5, weights=area[known], method="inverted_cdf"))
-    seen_by = np.bincount(np.minimum(support.views, FEW), area, minlength=FEW + 1) / area.sum()
+    seen_by = np.bincount(np.minimum(evidence.views, FEW), area, minlength=FEW + 1) / area.sum()
     return {
         "seen_by": [round(float(share), 4) for share in seen_by],
         "guessed": round(float(area[~known].sum() / area.sum()), 4),
@@ -147,7 +149,7 @@ class NextPhoto:
     gain: float  # what it adds, as a share of all that photos from around could add
     words: str  # where to stand and where to look
 
-    def told(self) -> dict:
+    def to_dict(self) -> dict:
         """Plain values for the report."""
         return {
             "position": [round(float(x), 3) for x in self.view.center],
@@ -157,7 +159,7 @@ class NextPhoto:
 
 
 def next_photos(
-    meshes: Mapping[str, Mesh], support: Support, sight: Visibility, solid: Caster, views: Sequence[View],
+    meshes: Mapping[str, Mesh], evidence: Evidence, sight: Visibility, solid: Caster, views: Sequence[View],
     counted: np.ndarray,
 ) -> tuple[list[NextPhoto], float]:  # fmt: skip
     """The photos that help most, the best first, chosen greedily; none where none helps `LEAST` of the surface. Also
@@ -172,7 +174,7 @@ def next_photos(
     area = np.where(counted, vertex_areas(joined(list(meshes.values()))), 0)
     index = np.random.default_rng(0).choice(len(area), SAMPLES, p=area / area.sum())
     part = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes.values()])[index]
-    now, sight = support.at(index), sight.at(index)
+    now, sight = evidence.at(index), sight.at(index)
     sure = now.uncertainty[np.isfinite(now.uncertainty)]
     limit = UNSURE * float(np.median(sure)) if len(sure) else 0.0
     middle, towards = focus(list(views))
@@ -209,7 +211,7 @@ def next_photos(
     return chosen, float(weak.sum() / total)
 
 
-def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
+def worth(now: Evidence, view: View, seen: np.ndarray) -> np.ndarray:
     """How much a photo helps each of the places [S] that it sees, 0 to 1."""
     here = now.at(seen)
     after = sigma_along(here.information + information(view, here.vertices), here.normals)
@@ -218,7 +220,7 @@ def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
 
 
 def _best(
-    now: Support, poor: np.ndarray, tried: Sequence[tuple[np.ndarray, np.ndarray]], middle: np.ndarray, lens: View
+    now: Evidence, poor: np.ndarray, tried: Sequence[tuple[np.ndarray, np.ndarray]], middle: np.ndarray, lens: View
 ) -> tuple[float, View, np.ndarray, np.ndarray] | None:
     """The photo that helps most: how much, its camera, what it looks at [3] m, and the places [S] that it helps.
 
@@ -289,6 +291,6 @@ def way_to(place: np.ndarray, views: Sequence[View], middle: np.ndarray) -> str:
     else:
         ways = [(step @ right, "to the right", "to the left"), (step @ forward, "forward", "back"), *ways]
     slight = SLIGHT * float(np.linalg.norm(place - middle))
-    told = [f"{abs(size):.2g} m {one if size > 0 else other}" for size, one, other in ways if abs(size) > slight]
-    moved = around + (", ".join(told) or ("at the same height" if around else "from the same place"))
+    steps = [f"{abs(size):.2g} m {one if size > 0 else other}" for size, one, other in ways if abs(size) > slight]
+    moved = around + (", ".join(steps) or ("at the same height" if around else "from the same place"))
     return f"stand where {nearest.source} was taken, {moved}"

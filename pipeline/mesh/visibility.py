@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +17,14 @@ from pipeline.progress import Progress, quiet
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
-# A point seen at a flatter angle than this (cosine) does not count as seen.
-FLATTEST = 0.08
+# Cosines between normal and line of sight. At a flatter angle (85 degrees) a point does not count as seen; at 70
+# degrees a photo begins to help.
+FLATTEST, FAIR = 0.08, 0.35
 PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; that a hollow has
 
 
 @dataclass(frozen=True)
-class Look:
+class PhotoColors:
     """What the photos show of some points."""
 
     count: np.ndarray  # [V] how many views see each
@@ -102,7 +104,7 @@ def framed(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pixels, (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
 
 
-def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress: Progress = quiet) -> Look:
+def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = quiet) -> PhotoColors:
     """How many views see each vertex, and its colour in their photos."""
     vertices = sight.vertices
     count = np.zeros(len(vertices), np.int32)
@@ -116,7 +118,7 @@ def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress:
         color[index] += share[:, None] * bilinear(photo, pixels - 0.5)
         weight[index] += share
         on_progress((number + 1) / len(views), f"looking from photo {number + 1} of {len(views)}")
-    return Look(count, color / np.maximum(weight, 1e-12)[:, None], weight)
+    return PhotoColors(count, color / np.maximum(weight, 1e-12)[:, None], weight)
 
 
 def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.cameras import View, view_of
 
-ENOUGH = 30  # matches of a pair that tell something
+ENOUGH = 30  # matches of a pair: fewer say nothing
 CONTRADICTION = 4.0  # px from its line, and a match contradicts the poses; what verification allows
 FINEST = 0.2  # px; poses that put matches closer than this or so need not be better
 
@@ -71,11 +71,20 @@ def excess_of_photos(entries: list[dict]) -> dict[str, float]:
 
 
 def epipolar_errors(a: View, b: View, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Sampson distances [M], px, of matched pixels [M, 2] of two posed photos."""
+    """Sampson distances [M], px, of matched pixels [M, 2] of two posed photos, their lenses' distortion taken away."""
     turn = b.rotation @ a.rotation.T
     x, y, z = b.translation - turn @ a.translation
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
-    return sampson(essential, a.straight(*first.T), b.straight(*second.T), (a.focal, b.focal))[0]
+    form = np.diag([1, 1, b.focal]) @ essential @ np.diag([1, 1, a.focal])  # of pixels from the middle of each photo
+    p, q = (view.focal * view.straight(*at.T.astype(float))[:, :2] for view, at in ((a, first), (b, second)))
+    return sampson(form, p, q)
+
+
+def sampson(form: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Sampson distances [M] of matches [M, 2] under the bilinear form [3, 3]."""
+    from skimage.transform import FundamentalMatrixTransform
+
+    return FundamentalMatrixTransform(form).residuals(first, second)
 
 
 def own_errors(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -93,17 +102,9 @@ def own_errors(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     products = ((q @ backward)[:, :, None] * (p @ forward)[:, None, :]).reshape(len(p), 9)
     weights, best = np.ones(len(p)), np.full(len(p), np.inf)
     for _ in range(4):
-        form = np.linalg.eigh((products * weights[:, None]).T @ products)[1][:, 0].reshape(3, 3)
-        errors, slope = sampson(backward @ form @ forward.T, p, q)
+        form = backward @ np.linalg.eigh((products * weights[:, None]).T @ products)[1][:, 0].reshape(3, 3) @ forward.T
+        errors = sampson(form, p[:, :2], q[:, :2])
         best = min(best, errors, key=np.median)
+        slope = np.maximum(((p @ form.T)[:, :2] ** 2).sum(1) + ((q @ form)[:, :2] ** 2).sum(1), 1e-30)
         weights = slope.mean() / slope / (1 + (errors / (3 * max(float(np.median(errors)), FINEST))) ** 2)
     return best
-
-
-def sampson(form: np.ndarray, p: np.ndarray, q: np.ndarray, focals: tuple = (1.0, 1.0)) -> tuple:
-    """Sampson distances [M], px, of matches p, q [M, 3] (last 1) under q' form p = 0, and their squared slopes [M]; of
-    rays, with the focal lengths (px) of both photos."""
-    forth, back = p @ form.T, q @ form
-    slope = (forth[:, :2] ** 2).sum(1) / focals[1] ** 2 + (back[:, :2] ** 2).sum(1) / focals[0] ** 2
-    slope = np.maximum(slope, 1e-30)
-    return np.abs((q * forth).sum(1)) / np.sqrt(slope), slope

@@ -31,7 +31,7 @@ COMPONENT_NAMED = 3
 
 @dataclass(frozen=True)
 class Findings:
-    """What the photos of a set have in common, whatever poses were found."""
+    """What the photos of a set have in common; it does not depend on poses."""
 
     components: list[list[str]]  # names of photos linked by verified matches, largest group first
     textureless: float  # share of photos with too few features
@@ -40,8 +40,8 @@ class Findings:
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
-    """Looks at a worker's counts and pairs. Blurred photos match each other, for want of anything finer; a group of
-    nothing else is no group."""
+    """Looks at a worker's counts and pairs. Blurred photos match each other, as nothing finer is left of them; they
+    form no group of their own."""
     sound = {photo.name for photo in photos if not photo.fault}
     counts, names = result["counts"], sorted(result["counts"])
     linked = [pair for pair in result["pairs"] if pair["matches"] >= FEW_MATCHES]
@@ -70,7 +70,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
 
     "All registered" is not "right": repeating textures and several zooms give complete but wrong reconstructions, which
     show in matches that contradict the poses, or lie farther from their lines than they have to. `ordinary` is the
-    result at ordinary thresholds, if `result` is not: its matches tell best how the camera moved. `known` cameras may
+    result at ordinary thresholds, if `result` is not: its matches show best how the camera moved. `known` cameras may
     be off by some pixels.
     """
     views = views_of(result, photos)
@@ -82,10 +82,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         found = replace(found, still=still, turn_only=turn_only)
     together = len(found.components[0]) if found.components else len(photos)
     needed = max(3, -(-together // 2), -(-len(photos) // 3))
-    left_out = [
-        {"photo": p.source, "why": why, "hopeful": hope}
-        for p in photos if p.name not in posed for why, hope in [left_out_reason(p, result, found)]
-    ]  # fmt: skip
+    left_out = [{"photo": p.source, **left_out_reason(p, result, found)} for p in photos if p.name not in posed]
     against = result.get("agreement", [])
     angle, around = (spread_angle(views), view_span(views)) if views else (0.0, 0.0)
     failures, warnings = [], []
@@ -127,8 +124,8 @@ def check_focal(
     if not 1 / FOCAL_OFF < to_exif < FOCAL_OFF:
         # Photos that were cropped carry the focal length of the whole photo.
         wrong = "poses" if doubtful else "EXIF"
-        told = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
-        (failures if doubtful else warnings).append(told)
+        message = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
+        (failures if doubtful else warnings).append(message)
 
 
 def photos_astray(result: dict) -> list[str]:
@@ -157,21 +154,26 @@ def check_errors(result: dict, astray: list[str], failures: list[str], warnings:
                         f"{excess(agreement):.1f} times as far off as they must be")  # fmt: skip
 
 
-def left_out_reason(photo: Photo, result: dict, found: Findings) -> tuple[str, bool]:
-    """Why a photo has no pose, and whether a more careful attempt may find one."""
+def left_out_reason(photo: Photo, result: dict, found: Findings) -> dict:
+    """Why a photo has no pose: `kind`, the same in words (`why`), and whether a more careful attempt may find one
+    (`hopeful`)."""
+
+    def reason(kind: str, why: str) -> dict:
+        return {"kind": kind, "why": why, "hopeful": kind in ("overlap", "disagrees")}
+
     entry = result["counts"].get(photo.name, {})
     count, best = entry.get("features", 0), entry.get("best_matches", 0)
     if count < FEW_FEATURES:
-        return f"too few features ({count}): " + (photo.fault or "blurred, dark or without texture"), False
+        return reason("features", f"too few features ({count}): {photo.fault or 'blurred, dark or without texture'}")
     group = next((c for c in found.components if photo.name in c), [])
     if len(group) >= COMPONENT_NAMED and group is not found.components[0]:
         others = f"it matches {len(group) - 1} other photos, none of them in the larger set"
-        return f"shows something else: {others}", False
+        return reason("unrelated", f"shows something else: {others}")
     if photo.fault:
-        return f"{photo.fault} (best pair: {best} matches)", False
+        return reason("fault", f"{photo.fault} (best pair: {best} matches)")
     if best < FEW_MATCHES:
-        return f"too few matches with other photos (best pair: {best}): not enough overlap", True
-    return f"its {best} matches do not agree with the rest of the reconstruction", True
+        return reason("overlap", f"too few matches with other photos (best pair: {best}): not enough overlap")
+    return reason("disagrees", f"its {best} matches do not agree with the rest of the reconstruction")
 
 
 def diagnose(result: dict, found: Findings, failures: list[str]) -> list[str]:
@@ -220,7 +222,7 @@ def failure_hint(checks: dict) -> str:
     """What to try, from the commonest reason."""
     if checks.get("known_cameras"):
         return "check which photo belongs to which camera, and its axes; or give the folder of photos alone"
-    reasons = " ".join(entry["why"] for entry in checks["left_out"])
-    if reasons.count("features") > reasons.count("overlap"):
+    kinds = [entry["kind"] for entry in checks["left_out"]]
+    if kinds.count("features") > kinds.count("overlap"):
         return "take sharper photos in better light, or put something textured under the object"
     return "take 20 to 60 photos in small steps around the object, each overlapping the one before by two thirds"

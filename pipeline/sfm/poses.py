@@ -46,11 +46,11 @@ WORSE = 1.15  # times as much of the first attempt's matches left unexplained is
 WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose photos are matched
 
 
-def hopeful(name: str, first: dict) -> bool:
-    """Whether an attempt is worth its time after the first one's failed checks. Photos of one spot, or of a background
-    that stands still, tell no more with more features."""
+def hopeful(settings: dict, first: dict) -> bool:
+    """Whether an attempt is worth its time after the first one's failed checks. Photos taken from one spot, or of a
+    background that stands still, show no more with more features."""
     still = first["still_pairs"] > 0.5
-    return still if name == "without what stands still" else first["turn_only_pairs"] <= 0.9 and not still
+    return still if settings["moving_only"] else first["turn_only_pairs"] <= 0.9 and not still
 
 
 def worth_more(checks: dict) -> bool:
@@ -102,9 +102,9 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         "exhaustive_up_to": EXHAUSTIVE_UP_TO, "partners": PARTNERS,
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []
-    told: list[dict] = []
+    attempts: list[dict] = []
     for name, settings in ATTEMPTS.items():
-        if tries and (job["known_cameras"] or not hopeful(name, tries[0][0])):
+        if tries and (job["known_cameras"] or not hopeful(settings, tries[0][0])):
             continue
         if any(not checks["failures"] and not worth_more(checks) for checks, _, _ in tries):
             break
@@ -117,16 +117,16 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
             if not tries:
                 raise
             # What the attempts before found out says more than that this one broke.
-            told.append({"name": name, "posed": 0, "failures": [error.message]})
+            attempts.append({"name": name, "posed": 0, "failures": [error.message]})
             continue
         checks = check(result, photos, tries[0][2] if tries else None, known=bool(job["known_cameras"]))
         tries.append((checks, folder, result))
-        told.append({"name": name, "posed": checks["posed"], "failures": checks["failures"]})
+        attempts.append({"name": name, "posed": checks["posed"], "failures": checks["failures"]})
     best = tries[0]
     for one in tries[1:]:
         best = one if better(one, best) else best
     checks, folder, result = best
-    checks["attempts"], checks["known_cameras"] = told, bool(job["known_cameras"])
+    checks["attempts"], checks["known_cameras"] = attempts, bool(job["known_cameras"])
     views = views_of(result, photos) if job["refine"] or not job["known_cameras"] else load_views(known)
     if checks["known_cameras"] and checks["failures"]:
         checks["failures"] = [f"the known cameras do not fit the photos: {'; '.join(checks['failures'])}"]
@@ -177,8 +177,8 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
         try:
             while child.poll() is None:
                 if time.monotonic() - started > timeout:
-                    told = f"camera poses: stopped after {timeout:.0f} s (log: {log})"
-                    raise SdfsimError(told, "use fewer or smaller photos")
+                    message = f"camera poses: stopped after {timeout:.0f} s (log: {log})"
+                    raise SdfsimError(message, "use fewer or smaller photos")
                 on_progress(*estimate(folder, lines, job))
                 with suppress(subprocess.TimeoutExpired):
                     child.wait(0.5)
@@ -186,8 +186,8 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
             child.kill()
             child.wait()
     if child.returncode != 0:
-        told = f"camera poses: COLMAP failed with status {child.returncode} (log: {log})"
-        raise SdfsimError(told, "run again; if it stays, try fewer photos")
+        message = f"camera poses: COLMAP failed with status {child.returncode} (log: {log})"
+        raise SdfsimError(message, "run again; if it fails again, try fewer photos")
     return read_json(folder / "result.json")
 
 

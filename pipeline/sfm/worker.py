@@ -17,20 +17,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
 from sdfsim.base.files import write_arrays, write_json
 
-REFINE_PIXELS = (16.0, 6.0)  # that a point may be off while known cameras are refined, at first and then
+# Chosen by hand on the photo sets of the project; nothing derives these numbers, and other sets may want others.
+# Of known cameras that are refined:
+REFINE_PIXELS = (16.0, 6.0)  # px that a point may be off, at first and then
 REFINE_POINTS = 30  # points that a camera needs to be moved
-SUPPORTED = 70  # that most cameras need for any to be moved: with fewer, a dozen photos came out worse than given
+SUPPORTED = 70  # points that most cameras need for any to be moved: with fewer, a dozen photos came out worse
 TRACKED = 0.02  # m within which a phone tracks its place
-# A photo's excess (see `excess_of_photos`) from which other focal lengths are tried: right poses have 1.0 to 1.8.
-DOUBTFUL = 1.8
+# Of poses that are found:
+DOUBTFUL = 1.8  # excess of a photo from which on other focal lengths are tried; right poses had 1.0 to 1.8
 HOPELESS = 0.5  # of all matches contradicting the poses: no focal length mends that
-ZOOM = 1.12  # times the focal length next to it, and a photo was taken at another zoom; of each alone, 1.05 is noise
-VOCABULARY, WORD_SAMPLES = 2048, 40  # words to look photos up by, and features that each is made of
-ABOUT = 1.03  # times as much unexplained is about the same
+# Ratio of a focal length to the next shorter one from which on they are two zooms; among photos of one zoom, each posed
+# with a focal length of its own, it was up to 1.05.
+ZOOM = 1.12
+ABOUT = 1.03  # ratio of what two models leave unexplained up to which the one with fewer cameras is taken
+# Words to look photos up by, and features that each is made of: a set of hundreds of photos needs far fewer words than
+# the ready-made trees for millions.
+VOCABULARY, WORD_SAMPLES = 2048, 40
+STILL = 2.0  # px between the places of a match in two photos below which it did not move
+TURNS = 200  # pairs of photos at most that are asked for turns on the spot
 
 
 def watch_parent() -> None:
@@ -94,7 +103,7 @@ def matches(pycolmap, job: dict, database: Path) -> None:
 
 def alike(pycolmap, job: dict, database: Path) -> list[tuple[str, str]]:
     """Pairs of photos to match where all are too many: each photo with the `job["partners"]` that have most in common
-    with it, whatever their names. Their features are looked up among words, which are made of the photos' own."""
+    with it. Their features are looked up among words made of these photos' own features."""
     pycolmap.set_random_seed(job["seed"])  # whatever came before
     words = pycolmap.VisualIndex.create(128, 64)  # numbers of a descriptor, and bits of what is kept of it
     rng = np.random.default_rng(job["seed"])
@@ -353,23 +362,23 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
 
 
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
-    """What the matches say whatever the poses: `counts` of each photo, `pairs` (with the share of matches that did not
+    """What the matches show without poses: `counts` of each photo, `pairs` (with the share of matches that did not
     move between the photos), and the share of `turn_only` pairs."""
     result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
     sizes = {name: group for group in job["groups"] for name in group["names"]}
-    told, moving = [], []
+    entries, moving = [], []
     for a, b, first, second in pairs:
-        still = float((np.linalg.norm(first - second, axis=1) < 2.0).mean())
-        told.append({"a": a, "b": b, "matches": len(first), "still": round(still, 3)})
+        still = float((np.linalg.norm(first - second, axis=1) < STILL).mean())
+        entries.append({"a": a, "b": b, "matches": len(first), "still": round(still, 3)})
         if len(first) >= ENOUGH and still < 0.5 and sizes[a] is sizes[b]:
             moving.append((sizes[a], first, second))
         for name in (a, b):
             result[name]["best_matches"] = max(result[name]["best_matches"], len(first))
-    some = moving[:: max(1, len(moving) // 200)]
-    return {"counts": result, "pairs": told, "turn_only": round(turn_only(some), 3)}
+    some = moving[:: max(1, len(moving) // TURNS)]
+    return {"counts": result, "pairs": entries, "turn_only": round(turn_only(some), 3)}
 
 
-def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2.0) -> float:
+def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = STILL) -> float:
     """Share of pairs of photos, of matched pixels [M, 2] each, whose matches a turn of the camera on the spot explains
     to a median of `least` px: with the right focal length, that which explains most pairs, one rotation maps the rays
     of all matches."""
@@ -381,9 +390,8 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
             middle = np.array([size["width"], size["height"]]) / 2
             p, q = (np.hstack([(pixels - middle) / focal, np.ones((len(pixels), 1))]) for pixels in (first, second))
             p, q = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (p, q))
-            u, _, vt = np.linalg.svd(q.T @ p)
-            turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-            explained += np.median(np.linalg.norm(q - p @ turn.T, axis=1)) * focal < least
+            turn = Rotation.align_vectors(q, p)[0]
+            explained += np.median(np.linalg.norm(q - turn.apply(p), axis=1)) * focal < least
         best = max(best, explained / max(1, len(pairs)))
     return best
 

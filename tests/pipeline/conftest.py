@@ -43,11 +43,11 @@ def calls(act) -> list[str]:
     done: list[str] = []
 
     def action(name: str) -> Callable:
-        def note(run: stages.Run, work: Path) -> dict:
+        def note(project: stages.Project, work: Path) -> dict:
             done.append(name)
             (work / "result").write_text(name)
             if name == "scene":
-                (run.folder / "scene.yaml").write_text("version: 1\n")
+                (project.folder / "scene.yaml").write_text("version: 1\n")
             return RESULTS.get(name, {})
 
         return note

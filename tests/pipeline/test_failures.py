@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cameras import load_sparse, load_views
+from pipeline.cameras import load_poses, load_views
 from pipeline.inputs.photos import load_photos, prepare_photos
 from pipeline.sfm.poses import solve
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
@@ -65,7 +65,7 @@ def test_every_second_photo_blurred(tmp_path):
     assert any(note.startswith("24 of 48 photos are blurred, take them again: 001.jpg, 003.jpg") for note in notes)
     verdict = solve(photos, tmp_path, tmp_path)
     assert verdict["posed"] >= 24
-    assert all(entry["why"].startswith(("blurred", "too few features")) for entry in verdict["left_out"])
+    assert all(entry["kind"] in ("fault", "features") for entry in verdict["left_out"])
 
 
 def test_a_repeating_texture(tmp_path):
@@ -97,7 +97,7 @@ def test_the_same_photos_give_the_same_poses(tmp_path):
     for one, two in zip(load_views(tmp_path / "one"), load_views(tmp_path / "two"), strict=True):
         assert one.focal == two.focal and one.name == two.name
         assert np.array_equal(one.rotation, two.rotation) and np.array_equal(one.translation, two.translation)
-    assert np.array_equal(load_sparse(tmp_path / "one").xyz, load_sparse(tmp_path / "two").xyz)
+    assert np.array_equal(load_poses(tmp_path / "one").sparse.xyz, load_poses(tmp_path / "two").sparse.xyz)
 
 
 def test_known_cameras_are_kept_and_checked(tmp_path):
@@ -108,7 +108,7 @@ def test_known_cameras_are_kept_and_checked(tmp_path):
     photos, _ = prepare_photos(tmp_path / "in" / "transforms.json", work)
     verdict = solve(photos, work, work)
     assert verdict["known_cameras"] and verdict["posed"] == 12 and verdict["mean_error"] < 1.0
-    points = load_sparse(work).xyz
+    points = load_poses(work).sparse.xyz
     inside = np.abs(points).max(1) < 2.4
     top = np.abs(points[:, 2] - 0.35) < 0.01
     floor = np.abs(points[:, 2]) < 0.01

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.cameras import Similarity, Sparse, View
+from pipeline.cameras import PosedPhotos, Similarity, Sparse, View
 from pipeline.field.grid_field import (
     FieldSize,
     GridField,
@@ -24,10 +24,11 @@ from pipeline.field.grid_field import (
 )
 from pipeline.field.interpolation import by_rows, interpolate
 from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
+from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, Rays, Trained, Trainer, camera_rays, load_rays, save_field, train
 from pipeline.inputs.photos import save_photos
-from pipeline.sfm.supervision import supervision_of
 from sdfsim.base.errors import SdfsimError
+from tests.pipeline.helpers import NOTHING
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)
 UNIT = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -133,8 +134,7 @@ def trainer(seed: int = 0) -> Trainer:
     from dataclasses import replace
 
     settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=20, surface_points=32)
-    sparse = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
-    return Trainer(settings, toy_rays(), supervision_of(sparse, [], UNIT), seed)
+    return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), seed)
 
 
 def test_batches_depend_on_seed_and_iteration_only():
@@ -202,7 +202,7 @@ def test_training_lowers_the_colour_error():
     run = trainer()
     losses = [run.step()["color"] for _ in range(20)]
     assert np.mean(losses[-4:]) < np.mean(losses[:4])
-    assert torch.isfinite(sdf_cache(run.field, 9)).all()
+    assert torch.isfinite(sdf_cache(run.field, 2 / 8)).all()
 
 
 def test_masks_make_what_they_exclude_transparent():
@@ -210,9 +210,8 @@ def test_masks_make_what_they_exclude_transparent():
 
     rays = toy_rays()
     masked = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
-    sparse = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
     settings = replace(PRESETS["quick"], size=SMALL, rays=128, iterations=40, surface_points=32)
-    run = Trainer(settings, masked, supervision_of(sparse, [], UNIT), 0)
+    run = Trainer(settings, masked, supervision_of(NOTHING, SMALL.finest), 0)
     losses = [run.step()["mask"] for _ in range(40)]
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
@@ -223,9 +222,7 @@ def test_depth_draws_the_surface_to_where_a_sensor_saw_it():
     grey = replace(rays, rgb=torch.full_like(rays.rgb, 128))
     directions = np.random.default_rng(0).normal(size=(4000, 3))
     ball = 0.45 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    nothing = supervision_of(
-        Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int)), [], UNIT
-    )
+    nothing = supervision_of(NOTHING, SMALL.finest)
     settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=120, surface_points=64)
     off = []
     for supervision in (nothing, replace(nothing, depth=ball)):
@@ -237,7 +234,7 @@ def test_depth_draws_the_surface_to_where_a_sensor_saw_it():
     assert off[1] < 0.03 and off[1] < 0.3 * off[0]
 
 
-def posed_noise(folder: Path) -> tuple[list[View], Sparse]:
+def posed_noise(folder: Path) -> PosedPhotos:
     """Four photos of noise, as the photos stage leaves them, and cameras around points that mean nothing."""
     from PIL import Image
 
@@ -254,21 +251,22 @@ def posed_noise(folder: Path) -> tuple[list[View], Sparse]:
     save_photos([replace(photo(k, 40, 40), name=f"{k}.jpg") for k in range(4)], folder)
     points = rng.normal(size=(50, 3)) * 0.3
     point_of, view_of = np.repeat(np.arange(50), 4), np.tile(np.arange(4), 50)
-    return views, Sparse(points, np.zeros((50, 3), np.uint8), np.full(50, 0.5), point_of, view_of)
+    sparse = Sparse(points, np.zeros((50, 3), np.uint8), np.full(50, 0.5), point_of, view_of)
+    return PosedPhotos(tuple(views), sparse)
 
 
 def test_train_writes_and_reads_back(tmp_path):
     from pipeline.field.training import load_field
 
-    views, sparse = posed_noise(tmp_path)
+    poses = posed_noise(tmp_path)
     settings = replace(PRESETS["quick"], size=SMALL, rays=32, iterations=6, surface_points=16)
-    trained = train(views, sparse, tmp_path, tmp_path, settings=settings, threads=1)
+    trained = train(poses, tmp_path, tmp_path, settings=settings, threads=1)
     again = load_field(tmp_path)
     p = torch.randn(10, 3) * 0.4
     with torch.no_grad():
         assert torch.equal(trained.field.sdf(p), again.field.sdf(p))
     assert not (tmp_path / "checkpoint.safetensors").exists()
-    assert len(load_rays([trained.to_unit.view(view) for view in views], tmp_path, 40, masks=False)) > 0
+    assert len(load_rays(poses.moved(trained.to_unit).views, tmp_path, 40, masks=False)) > 0
 
 
 def test_a_full_disk_is_one_clear_line(tmp_path):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.materials import MATERIALS, choose
-from pipeline.options import Options, read_config
+from pipeline.materials import MATERIALS, materials_of
+from pipeline.options import options_of, read_config
 from sdfsim.base.errors import SdfsimError
 from tests.cli.conftest import run as command
 
@@ -48,7 +48,7 @@ def test_the_table_of_the_documents_is_that_of_the_code():
     ("text", "wall"), [("glass", None), ("glass:4mm", 0.004), ("glass:.5cm", 0.005), ("glass:2m", 2)]
 )
 def test_a_material_may_have_the_thickness_of_a_wall(text, wall):
-    choice = choose({"object1": text})["object1"]
+    choice = materials_of({"object1": text})["object1"]
     assert (choice.name, choice.material) == ("glass", MATERIALS["glass"]) and choice.wall == pytest.approx(wall)
 
 
@@ -60,12 +60,12 @@ def test_a_material_may_have_the_thickness_of_a_wall(text, wall):
         ("object1", "glass:0mm", "object1: '0mm' is not the thickness of a wall"),
         ("object1", "glass:-4mm", "object1: '-4mm' is not the thickness of a wall"),
         ("object1", "glass:", "object1: '' is not the thickness of a wall"),
-        ("scene", "glass:4mm", "scene: takes no thickness: it does not move, so its mass never counts"),
+        ("scenery", "glass:4mm", "scenery: needs no thickness: it does not move, so its mass does not matter"),
     ],
 )
 def test_what_is_no_material_is_refused_before_any_work(body, text, message):
     with pytest.raises(SdfsimError) as caught:
-        Options(material={body: text}).check()
+        options_of(material={body: text})
     assert caught.value.message == f"material: {message}" and caught.value.exit_code == 1
 
 
@@ -79,5 +79,5 @@ def test_the_command_takes_a_material_for_every_body(photos, tmp_path, calls, mo
     assert reconstruct("object1=cermic") == 1
     assert reconstruct("object1") == reconstruct("=wood") == reconstruct("a=wood", "a=glass") == 2
     assert calls == [] and not (tmp_path / "out").exists()
-    assert reconstruct("object1=ceramic:4mm", "scene=wood") == 0
-    assert read_config(tmp_path / "out").material == {"object1": "ceramic:4mm", "scene": "wood"}
+    assert reconstruct("object1=ceramic:4mm", "scenery=wood") == 0
+    assert read_config(tmp_path / "out").material == {"object1": "ceramic:4mm", "scenery": "wood"}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cameras import Sparse
 from pipeline.field.mlp_field import MlpField, MlpSize, encoded
 from pipeline.field.rendering import sdf_cache
+from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, MlpTrainer, Trained, Trainer, load_field, save_field
-from pipeline.sfm.supervision import supervision_of
+from tests.pipeline.helpers import NOTHING
 from tests.pipeline.test_field import UNIT, one_thread, toy_rays  # noqa: F401  a fixture
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
@@ -65,9 +65,7 @@ def test_without_gradients_nothing_is_kept():
 def trainer(**changes) -> MlpTrainer:
     small = {"size": TINY, "rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3}
     settings = replace(VOLSDF, **{**small, **changes})
-    nothing = np.zeros((0, 3))
-    sparse = Sparse(nothing, nothing.astype(np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
-    supervision = supervision_of(sparse, [], UNIT)
+    supervision = supervision_of(NOTHING, TINY.finest)
     rays = toy_rays()
     # Without masks the background alone could paint both photos.
     rays = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
@@ -85,7 +83,7 @@ def test_training_lowers_the_loss_and_keeps_a_distance():
     run = trainer()
     assert falls(run, 60, "color", 8) < 0.4
     assert run.converged > 0.5
-    assert torch.isfinite(sdf_cache(run.field, 9)).all()
+    assert torch.isfinite(sdf_cache(run.field, 2 / 8)).all()
 
 
 def test_beta_is_learned():

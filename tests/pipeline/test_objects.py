@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.mesh.bodies import Parts, find_levels, split
-from pipeline.mesh.extraction import EXTENT, Surface, ball, sample_volume
+from pipeline.cameras import PosedPhotos
+from pipeline.mesh.bodies import Parts, find_level_planes, split
+from pipeline.mesh.extraction import EXTENT, FieldSurface, ball, sample_volume
 from sdfsim.geometry.bvh import Winding
 from sdfsim.geometry.mass import mass_properties
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
+from tests.pipeline.helpers import NOTHING, sparse_of
 
 FINEST = 0.02
 TABLE = (0.5, 0.35, 0.05)  # half sides of the top and half its thickness
@@ -43,7 +45,7 @@ def table(points: np.ndarray) -> np.ndarray:
     return np.minimum.reduce([top, *legs, points[:, 2] + 0.5])
 
 
-def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarray | None = None) -> Surface:
+def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarray | None = None) -> FieldSurface:
     """A surface of which photos show all that lies above the floor, but for what `seen` [V] excludes."""
     turn = np.eye(3) if turn is None else turn
     volume = sample_volume(lambda p: np.maximum(distance(p @ turn), ball(p)).astype(np.float32), 81, extent=EXTENT)
@@ -52,7 +54,7 @@ def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarra
     there = raw.vertices @ turn
     shown = (ball(raw.vertices) < -0.03) & (np.ones(len(there), bool) if seen is None else seen(there))
     faces = shown[raw.faces].all(1)
-    return Surface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, [])
+    return FieldSurface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, [])
 
 
 def parts_of(
@@ -61,7 +63,9 @@ def parts_of(
     turn = np.eye(3) if turn is None else turn
     up = turn @ np.array([0.0, 0, 1])
     field = lambda p: distance(p @ turn).astype(np.float32)  # noqa: E731
-    return split(surface_of(distance, seen, turn), field, FINEST, [], points, Path(), up, alone=False)
+    return split(
+        surface_of(distance, seen, turn), field, FINEST, PosedPhotos((), sparse_of(points)), Path(), up, alone=False
+    )
 
 
 def some_rotation(seed: int) -> np.ndarray:
@@ -187,13 +191,13 @@ def test_what_is_no_body_stays_scenery(scene, seen, why):
 def test_without_scenery_every_component_is_a_body():
     pair = lambda p: np.minimum(box(p, (0.3, 0, 0), (0.1, 0.2, 0.1)), box(p, (-0.4, 0, 0), (0.3, 0.2, 0.2)))  # noqa: E731
     surface = surface_of(pair)
-    parts = split(surface, pair, FINEST, [], NO_POINTS, Path(), np.array([0.0, 0, 1]), alone=True)
+    parts = split(surface, pair, FINEST, NOTHING, Path(), np.array([0.0, 0, 1]), alone=True)
     assert parts.solid is None and parts.shown is None
     volumes = [signed_volume(mesh) for mesh in parts.bodies.values()]
     np.testing.assert_allclose(volumes, [0.6 * 0.4 * 0.4, 0.2 * 0.4 * 0.2], rtol=0.05)
 
 
 def test_level_planes_are_found_at_their_heights():
-    levels = find_levels(surface_of(both).visible, np.array([0.0, 0, 1]), FINEST)
+    levels = find_level_planes(surface_of(both).visible, np.array([0.0, 0, 1]), FINEST)
     np.testing.assert_allclose([level.height for level in levels], [-0.5, TOP], atol=0.1 * FINEST)
     assert levels[1].area == pytest.approx(4 * TABLE[0] * TABLE[1] - np.pi * 0.12**2, rel=0.08)

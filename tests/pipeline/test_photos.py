@@ -51,8 +51,8 @@ def absurd() -> bytes:
         (0, "", b"", "photos found: 0, at least 3"),
         (2, "", b"", "photos found: 2, at least 3 are needed"),
         (3, "9.jpg", b"hello", "9.jpg: not an image"),
-        (3, "cut.jpg", encoded("JPEG", 400, 300)[:40_000], "cut.jpg: truncated"),
-        (3, "cut.png", encoded("PNG", 400, 300)[:40_000], "cut.png: truncated"),
+        (3, "cut.jpg", encoded("JPEG", 400, 300)[:40_000], "cut.jpg: cannot be decoded"),
+        (3, "cut.png", encoded("PNG", 400, 300)[:40_000], "cut.png: cannot be decoded"),
         (3, "bomb.png", absurd(), "bomb.png: too large (100000 x 100000"),
         (3, "x.png", encoded("PNG", 20, 20), "x.png: too small"),
     ],
@@ -179,7 +179,7 @@ def test_a_mask_lies_on_its_photo_pixel_by_pixel(tmp_path, orientation):
 def test_a_mask_is_never_turned_where_its_photo_is_not(tmp_path, orientation):
     pixels, _ = stored(tmp_path / "a.png", orientation)
     Image.fromarray(pixels.T).save(tmp_path / "mask.png")
-    with pytest.raises(SdfsimError, match=r"mask\.png: a mask of 90 x 120 does not fit"):
+    with pytest.raises(SdfsimError, match=r"mask\.png: .*90 x 120.*"):
         read_photo(tmp_path / "a.png", 120, tmp_path / "mask.png")
 
 
@@ -431,6 +431,6 @@ def cut(kind: str) -> bytes:
 @pytest.mark.parametrize("kind", ["heic", "avif", "webp", "png"])
 def test_files_of_other_kinds_that_were_cut_are_one_clear_line(tmp_path, kind):
     (tmp_path / f"a.{kind}").write_bytes(cut(kind))
-    with pytest.raises(SdfsimError, match=rf"a\.{kind}: .*(truncated|cut short|cannot be decoded)") as caught:
+    with pytest.raises(SdfsimError, match=rf"a\.{kind}: .*(cut short|cannot be decoded)") as caught:
         read_photo(tmp_path / f"a.{kind}", 120)
     assert "\n" not in caught.value.message

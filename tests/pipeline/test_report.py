@@ -25,7 +25,10 @@ def test_the_page_names_every_photo_and_the_recording_shows_the_cameras(photos, 
         arrays = {"xyz": np.ones((5, 3)), "rgb": np.zeros((5, 3), np.uint8), "error": np.zeros(5)}
         write_arrays(work / "sparse.npz", {**arrays, "point_of": np.zeros(0, int), "view_of": np.zeros(0, int)})
         checks = check(found, [photo(k) for k in range(3)])
-        return {**checks, "left_out": [{"photo": "2.png", "why": "too few matches"}]}
+        return {
+            **checks,
+            "left_out": [{"photo": "2.png", "kind": "overlap", "why": "too few matches", "hopeful": True}],
+        }
 
     act("poses", posed)
     out = tmp_path / "out"
@@ -76,6 +79,6 @@ def test_nobody_is_told_to_do_what_they_did(options, said, photos, tmp_path, act
         act(stage, lambda run, work: {})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.mesh.meshing.make_meshes", lambda *places, **named: failing())
-        with pytest.raises(SdfsimError, match="no surface") as caught:
+        with pytest.raises(SdfsimError, match="mesh: ") as caught:
             reconstruct(photos, tmp_path / "out", preset=options.preset, budget=options.budget)
     assert said in caught.value.hint and f"--preset {options.preset}" not in caught.value.hint

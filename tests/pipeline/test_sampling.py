@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from pipeline.cameras import Sparse
+from pipeline.cameras import PosedPhotos, Sparse
+from pipeline.field import rendering
 from pipeline.field.grid_field import FieldSize, GridField, laplace_density
-from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, sdf_cache, worst
-from pipeline.sfm.supervision import (
+from pipeline.field.rendering import EPSILON, bounded_samples, distance_bound, draw, opacity_bound, sdf_cache, worst
+from pipeline.field.supervision import (
     CLEARANCE,
     FILLED,
     GAP,
@@ -20,10 +23,12 @@ from pipeline.sfm.supervision import (
     FreeSpace,
     supervision_of,
 )
-from tests.pipeline.test_field import UNIT
+from pipeline.field.training import PRESETS
+from tests.pipeline.helpers import NOTHING
 from tests.pipeline.test_surface import ring
 
 DOUBLE = torch.float64
+CELL = 2 / 127  # of the preset quick
 
 
 def rays(count: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
@@ -52,7 +57,7 @@ def test_nothing_is_nearer_than_the_bound():
     steps = torch.linspace(0, 1, 400, dtype=DOUBLE)
     true = ((start[:, None] + (length * steps)[..., None] * along[:, None]).norm(dim=-1) - 0.3).abs().amin(1)
     ends = torch.stack([start, start + length * along], 1).norm(dim=-1) - 0.3
-    bound = nearest(ends, length)[:, 0]
+    bound = distance_bound(ends, length)[:, 0]
     assert (bound <= true + 1e-9).all()
     assert (bound > 0.5 * true).double().mean() > 0.3
 
@@ -148,12 +153,12 @@ def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
     xyz = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
     seen = np.array([0, 0, 0, 0, 1, 1, 1, 2])  # The last point has too few views to be believed.
     sparse = Sparse(xyz, np.zeros((3, 3), np.uint8), np.full(3, 0.5), seen, np.array([0, 1, 2, 3, 0, 1, 2, 0]))
-    found = supervision_of(sparse, views, UNIT)
+    found = supervision_of(PosedPhotos(tuple(views), sparse), CELL)
     np.testing.assert_allclose(found.points, xyz[:2])
     assert found.sight.shape == (7, 6)
     start, end = found.sight[:, :3], found.sight[:, 3:]
     np.testing.assert_allclose(np.linalg.norm(start, axis=1), 1.0, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(end - xyz[seen[:7]], axis=1), GAP, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(end - xyz[seen[:7]], axis=1), GAP * CELL, atol=1e-9)
 
 
 def test_lines_of_sight_of_a_sensor_end_before_its_noise():
@@ -161,15 +166,14 @@ def test_lines_of_sight_of_a_sensor_end_before_its_noise():
     rng = np.random.default_rng(1)
     xyz = np.concatenate([rng.uniform(-0.3, 0.3, (50, 3)), [[0.0, 0.0, 1.5]]])  # The last one is beyond the sphere.
     depth = DepthPoints(xyz, np.zeros((51, 2)), rng.integers(0, 4, 51))
-    nothing = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
-    found = supervision_of(nothing, views, UNIT, depth, noise=0.01)
+    found = supervision_of(PosedPhotos(tuple(views), NOTHING.sparse), CELL, depth, noise=0.01)
     assert {tuple(point) for point in found.depth} == {tuple(point) for point in xyz[:50]}
     centers = np.array([view.center for view in views])
     assert (np.linalg.norm(found.sight.reshape(-1, 3), axis=1) < 1 + 1e-9).all()
     # Every point has a line from its own camera, which ends 5 noises and the usual gap before it.
     sight = xyz[:50] - centers[depth.view[:50]]
     away = np.linalg.norm(sight, axis=1)
-    ends = xyz[:50] - ((GAP + NOISES * 0.01 * away) / away)[:, None] * sight
+    ends = xyz[:50] - ((GAP * CELL + NOISES * 0.01 * away) / away)[:, None] * sight
     assert np.linalg.norm(ends[:, None] - found.sight[:, 3:], axis=2).min(1).max() < 1e-9
 
 
@@ -181,27 +185,27 @@ def crossing(count: int) -> np.ndarray:
 
 def test_half_the_points_are_where_free_space_is_filled():
     sight = crossing(400)
-    free = FreeSpace(sight, "cpu")
+    free = FreeSpace(sight, CELL, "cpu")
     rng = torch.Generator().manual_seed(0)
     evenly, _ = free.pick(200, rng)
     assert (evenly.norm(dim=1) < 0.1).float().mean() < 0.1
     free.look(ball_cache(0.1), rng)
     assert len(free.filled) > 50
     points, clearance = free.pick(200, rng)
-    filled = points.norm(dim=1) < 0.1 + FILLED + 0.01
+    filled = points.norm(dim=1) < 0.1 + FILLED * CELL + 0.01
     assert filled[:100].all() and filled[100:].float().mean() < 0.1
-    rest = 0.4 - points[:, 0] + GAP
-    expected = (SLOPE * rest).clamp_max(CLEARANCE)
+    rest = 0.4 - points[:, 0] + GAP * CELL
+    expected = (SLOPE * rest).clamp_max(CLEARANCE * CELL)
     torch.testing.assert_close(clearance[100:], expected[100:])
-    torch.testing.assert_close(clearance[:100], expected[:100].clamp_max(JUST_EMPTY))
+    torch.testing.assert_close(clearance[:100], expected[:100].clamp_max(JUST_EMPTY * CELL))
 
 
 def test_nothing_is_filled_in_an_empty_field():
-    free = FreeSpace(crossing(50), "cpu")
+    free = FreeSpace(crossing(50), CELL, "cpu")
     rng = torch.Generator().manual_seed(0)
     free.look(ball_cache(0.1) * 0 + 1, rng)
     assert len(free.filled) == 0 and len(free.pick(64, rng)[0]) == 50
-    assert len(FreeSpace(np.zeros((0, 6)), "cpu").pick(64, rng)[0]) == 0
+    assert len(FreeSpace(np.zeros((0, 6)), CELL, "cpu").pick(64, rng)[0]) == 0
 
 
 def test_the_cache_is_the_field_near_its_surface_and_has_its_signs_everywhere():
@@ -214,7 +218,7 @@ def test_the_cache_is_the_field_near_its_surface_and_has_its_signs_everywhere():
     asked = []
     plain = field.sdf
     field.sdf = lambda points: asked.append(len(points)) or plain(points)  # type: ignore[method-assign]
-    cache = sdf_cache(field, 41)
+    cache = sdf_cache(field, 2 / 40)
     near = dense.abs() < 0.05
     torch.testing.assert_close(cache[near], dense[near], rtol=0, atol=1e-6)
     assert ((cache < 0) == (dense < 0)).all()
@@ -227,17 +231,41 @@ def test_a_filled_hollow_is_emptied_by_its_lines_of_sight(radius):
     field = GridField(FieldSize((8, 16, 32), (2, 2, 2), 16, 8), seed=0, start_radius=0.5)
     y, z = (a.ravel() for a in np.meshgrid(np.linspace(-radius, radius, 6), np.linspace(-radius, radius, 6)))
     sight = np.stack([np.full(36, -0.9), y, z, np.full(36, 0.0), y, z], 1)
-    free = FreeSpace(sight, "cpu")
+    free = FreeSpace(sight, CELL, "cpu")
     optimizer = torch.optim.Adam(field.parameters(), lr=0.01)
     rng = torch.Generator().manual_seed(0)
     inside = torch.tensor(sight[:, :3] * [0.2, 1, 1], dtype=torch.float32)  # On the lines, within the ball.
     assert (field.sdf(inside) < 0).all()
     for step in range(150):
         if step % 25 == 0:
-            free.look(sdf_cache(field, 33), rng)
+            free.look(sdf_cache(field, 2 / 32), rng)
         points, clearance = free.pick(128, rng)
         loss = torch.relu(clearance - field.sdf(points)).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     assert (field.sdf(inside) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("preset", "side", "reads"), [("quick", 129, 96), ("standard", 129, 96), ("fine", 225, 168), ("volsdf", 125, 93)]
+)
+def test_a_field_is_sampled_as_finely_as_it_has_detail(preset, side, reads, monkeypatch):
+    """At least once in each cell of its finest grid; three times in four cells along a ray."""
+    size, asked = PRESETS[preset].size, []
+    ball = SimpleNamespace(background=torch.zeros(1), sdf=lambda points: points.norm(dim=1) - 0.5)
+    cache = sdf_cache(ball, size.sampling)  # type: ignore[arg-type]
+    assert cache.shape == (side, side, side, 1) and 2 / (side - 1) <= size.sampling
+    plain = rendering.interpolate
+    monkeypatch.setattr(rendering, "interpolate", lambda grid, points: asked.append(len(points)) or plain(grid, points))
+    rendering.choose_samples(
+        cache, torch.tensor([[0.0, 0, -3]]), torch.tensor([[0.0, 0, 1]]), 0.01, torch.full((1, 32), 0.5)
+    )
+    assert asked == [reads]
+
+
+def test_lengths_of_the_quick_preset_are_those_its_figures_were_measured_with():
+    cell = PRESETS["quick"].size.finest
+    known = {GAP: 0.015, CLEARANCE: 0.02, FILLED: -0.004, JUST_EMPTY: 0.002}
+    assert [cells * cell for cells in known] == pytest.approx(list(known.values()), rel=1e-12)
+    assert GAP * PRESETS["fine"].size.finest < 0.6 * GAP * cell

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from pipeline.cameras import Similarity
-from pipeline.materials import ASSUMED, MATERIALS, choose
+from pipeline.materials import ASSUMED, MATERIALS, materials_of
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
 from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, scene_text, write_scene
@@ -22,7 +22,7 @@ from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 from tests.pipeline.test_surface import cube, scenery
 
-PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m")
+PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m", size_assumed=True)
 
 
 def terrain(height) -> Mesh:
@@ -73,9 +73,11 @@ def test_scene_text_is_valid_yaml_with_gravity_down():
     mesh = scenery()
     text = scene_text(PLACEMENT, {}, choose_slab(mesh, mesh))
     data = yaml.safe_load(text)
-    assert data["gravity"] == [0, 0, -9.81] and data["shapes"]["scene"] == {"asset": "assets/scene"}
-    assert "assumed: widest side = 1 m" in text and "confidence: high" in text
-    assert [body["name"] for body in data["bodies"]] == ["floor", "scene", "box"]
+    assert data["gravity"] == [0, 0, -9.81] and data["shapes"]["scenery"] == {"asset": "assets/scene"}
+    assert "assumed: widest side = 1 m" in text and "confidence: high" in text and "--distance" in text
+    known = replace(PLACEMENT, size_from="given: widest side = 2 m", size_assumed=False)
+    assert "--distance" not in scene_text(known, {}, None)
+    assert [body["name"] for body in data["bodies"]] == ["floor", "scenery", "box"]
 
 
 def test_bodies_found_can_move():
@@ -144,10 +146,10 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
     out = tmp_path / "assets"
     out.mkdir()
     report = fit_parts(meshes, out, budget=30.0)
-    assert [(name, budget) for name, _, budget in fits] == [("scene", 20.0), ("object1", 10.0)]
+    assert [(name, budget) for name, _, budget in fits] == [("scenery", 20.0), ("object1", 10.0)]
     np.testing.assert_allclose(fits[1][1].vertices.min(0), [-0.1, -0.1, 0.0], atol=1e-6)
     assert report["passed"] is False and report["reason"] == "object1: too thin"
-    assert report["caveats"] == ["scene: rough", "object1: rough"]
+    assert report["caveats"] == ["scenery: rough", "object1: rough"]
     assert sorted(path.name for path in out.iterdir()) == ["object1", "scene"]
     assert fit_parts(meshes, out, budget=30.0) == report and len(fits) == 2
 
@@ -182,20 +184,20 @@ def test_bodies_weigh_what_their_materials_do(fitted):
     for given, density, volume in (
         ({}, 400, solid), ({"object1": "glass"}, 2500, solid), ({"object1": "glass:2cm"}, 2500, hollow),
     ):  # fmt: skip
-        report = write_scene(fitted, scene, drop="none", materials=choose(given | {"scene": "rubber"}))
+        report = write_scene(fitted, scene, drop="none", materials=materials_of(given | {"scenery": "rubber"}))
         bodies = {body.name: body for body in load_scene(scene).bodies}
         assert bodies["object1"].mass == pytest.approx(density * volume, rel=0.01)
         told = report["bodies"]["object1"]
         assert told["mass"] == bodies["object1"].mass and told["density"] == pytest.approx(density)
         assert told["volume"] == pytest.approx(volume, rel=0.01)
-        assert bodies["scene"].friction == MATERIALS["rubber"].friction and "mass" not in report["bodies"]["scene"]
+        assert bodies["scenery"].friction == MATERIALS["rubber"].friction and "mass" not in report["bodies"]["scenery"]
 
 
 def test_the_scene_file_names_the_source_of_every_number_and_what_is_assumed(fitted):
-    materials = choose({"object1": "ceramic:4mm", "floor": "wood"})
+    materials = materials_of({"object1": "ceramic:4mm", "floor": "wood"})
     write_scene(fitted, fitted / "scene.yaml", materials=materials)
     lines = [line.strip() for line in (fitted / "scene.yaml").read_text().splitlines()]
     above = {line.split(",")[0]: before for before, line in pairwise(lines) if line.startswith("- {name")}
     assert above["- {name: object1"].startswith("# ceramic, a wall of 4 mm. From: density: CRC Handbook")
     assert above["- {name: floor"].startswith("# wood. From: density: CRC Handbook")
-    assert all(above[f"- {{name: {name}"].startswith("# assumed") for name in ("scene", "box"))
+    assert all(above[f"- {{name: {name}"].startswith("# assumed") for name in ("scenery", "box"))

@@ -94,7 +94,7 @@ def test_a_mask_of_another_name_or_content_changes_everything(photos, tmp_path, 
 
 
 def test_a_killed_stage_goes_on_in_its_own_folder(photos, tmp_path, calls, act):
-    def killed(run: stages.Run, work: Path) -> dict:
+    def killed(project: stages.Project, work: Path) -> dict:
         (work / "checkpoint").write_text("half")
         raise KeyboardInterrupt
 
@@ -122,10 +122,10 @@ def test_leftovers_of_other_options_are_not_used(tmp_path):
 
 def test_run_stage_needs_the_stages_before(photos, tmp_path, calls):
     out = tmp_path / "out"
-    with pytest.raises(SdfsimError, match="not the folder of a reconstruction"):
+    with pytest.raises(SdfsimError, match=str(out)):
         run_stage("distill", out)
     reconstruct(photos, out, preset="quick", until_stage="photos")
-    with pytest.raises(SdfsimError, match="the poses stage has not run"):
+    with pytest.raises(SdfsimError, match="poses stage"):
         run_stage("distill", out)
     run_stage("poses", out)
     calls.clear()
@@ -158,7 +158,7 @@ def test_bad_options_are_one_line_and_write_nothing(photos, tmp_path, keywords, 
 
 
 def test_a_full_disk_and_an_unwritable_folder_are_one_clear_line(photos, tmp_path, calls, act):
-    def full(run: stages.Run, work: Path) -> dict:
+    def full(project: stages.Project, work: Path) -> dict:
         raise OSError(28, "No space left on device", str(work))
 
     act("mesh", full)
@@ -177,7 +177,7 @@ def test_stages_made_from_an_older_result_are_not_reported(photos, tmp_path, cal
     report = run_stage("mesh", out, size=5.0)
     assert list(report["stages"]) == ["photos", "poses", "distill", "mesh"]
     assert report["failed_checks"] == [] and "scene" not in report["paths"]
-    with pytest.raises(SdfsimError, match="the fit stage is older than what it reads") as caught:
+    with pytest.raises(SdfsimError, match="fit stage is older") as caught:
         run_stage("scene", out)
     assert "sdfsim fit" in caught.value.hint
     run_stage("fit", out)
@@ -200,7 +200,7 @@ def test_a_second_run_into_the_same_folder_is_refused(photos, tmp_path, calls):
     reconstruct(photos, out, until_stage="photos")
     with locked(out):
         for again in (lambda: reconstruct(photos, out), lambda: run_stage("poses", out)):
-            with pytest.raises(SdfsimError, match="another run is writing") as caught:
+            with pytest.raises(SdfsimError, match=str(out)) as caught:
                 again()
             assert caught.value.exit_code == 1
     run_stage("poses", out)
@@ -224,7 +224,7 @@ def test_a_skipped_stage_leaves_nothing_of_runs_that_were_killed(photos, tmp_pat
     out, ordinary = tmp_path / "out", STAGES["distill"].run
     reconstruct(photos, out)
 
-    def killed(run: stages.Run, work: Path) -> dict:
+    def killed(project: stages.Project, work: Path) -> dict:
         raise KeyboardInterrupt
 
     act("distill", killed)
@@ -247,7 +247,7 @@ def test_photos_where_a_result_belongs_stay(photos, tmp_path, calls, stage):
     (tmp_path / "link").symlink_to(place / "images")
     before = tree(tmp_path / "scan")
     for given in (place, place / "images", tmp_path / "link"):
-        with pytest.raises(SdfsimError, match=f"where the result of the {stage} stage belongs"):
+        with pytest.raises(SdfsimError, match=rf"{place}.*\b{stage}\b"):
             reconstruct(given, tmp_path / "scan")
     assert calls == [] and tree(tmp_path / "scan") == before
 
@@ -285,8 +285,7 @@ def asked(calls, monkeypatch) -> dict[str, dict]:
     note("pipeline.mesh.meshing.make_meshes", "mesh", RESULTS["mesh"])
     note("pipeline.scene_writer.fit_parts", "fit", {})
     monkeypatch.setattr("sdfsim.base.parallel.choose_threads", lambda work, repeat: 0.0)
-    monkeypatch.setattr("pipeline.cameras.load_views", lambda folder: [])
-    monkeypatch.setattr("pipeline.cameras.load_sparse", lambda folder: None)
+    monkeypatch.setattr("pipeline.cameras.load_poses", lambda folder: None)
     return found
 
 
@@ -311,11 +310,11 @@ def test_the_device_reaches_every_stage_that_computes_there(photos, tmp_path, as
 
 def test_a_device_that_is_not_there_is_refused_before_any_stage(photos, tmp_path, calls, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(SdfsimError, match="no CUDA device here"):
+    with pytest.raises(SdfsimError, match="CUDA"):
         reconstruct(photos, tmp_path / "out", device="cuda")
     assert not (tmp_path / "out").exists()
     reconstruct(photos, tmp_path / "out")
-    with pytest.raises(SdfsimError, match="no CUDA device here"):
+    with pytest.raises(SdfsimError, match="CUDA"):
         run_stage("mesh", tmp_path / "out", device="cuda")
 
 
@@ -323,7 +322,7 @@ def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, call
     monkeypatch.setattr("pipeline.report.write_recording", lambda folder, done: None)
     out = tmp_path / "out"
     assert command("poses", photos, "-o", out).exit_code == 0
-    assert read_config(out) == Options(str(photos))
+    assert read_config(out) == Options(photos=str(photos))
     reconstruct(photos, out, preset="quick", seed=7, size=2.5, drop="ball", budget=900.0)
     before = read_config(out)
     calls.clear()
@@ -337,5 +336,5 @@ def test_a_place_that_is_not_in_the_photos_is_refused_before_the_poses(photos, t
     for stage in ("photos", "poses"):
         monkeypatch.setitem(STAGES, stage, REAL[stage])
     monkeypatch.setattr("pipeline.sfm.poses.solve", lambda *places, **options: pytest.fail("solved"))
-    with pytest.raises(SdfsimError, match=r"distance: no photo is called 'cup\.png'"):
+    with pytest.raises(SdfsimError, match=r"distance: .*'cup\.png'"):
         reconstruct(photos, tmp_path / "out", distance=["0.png:3,4", "cup.png:1,1", 0.1])

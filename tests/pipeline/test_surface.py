@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cameras import CAREFUL, UNKNOWN, Similarity, Sparse, View, camera_up, nearest_to_axes
+from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, View, camera_up, nearest_to_axes
+from pipeline.field.supervision import unit_sphere_of
 from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
-from pipeline.sfm.supervision import unit_sphere_of
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
+from tests.pipeline.helpers import sparse_of
 
 
 def ball(center=(0.0, 0, 0), radius: float = 0.5):
@@ -146,7 +147,7 @@ def test_the_unit_sphere_holds_the_object_and_moves_cameras_along():
     xyz = np.concatenate([rng.normal(size=(300, 3)) * 0.2, rng.normal(size=(40, 3)) * 20])
     observed = np.arange(340).repeat(3)
     sparse = Sparse(xyz, np.zeros((340, 3), np.uint8), np.full(340, 0.5), observed, np.zeros(1020, int))
-    to_unit = unit_sphere_of(views, sparse)
+    to_unit = unit_sphere_of(PosedPhotos(tuple(views), sparse))
     assert np.linalg.norm(to_unit.inverse().translation) < 0.1 and 0.5 < 1 / to_unit.scale < 2.5
     p = rng.normal(size=(20, 3)) * 0.3
     for view in views:
@@ -178,6 +179,19 @@ def test_up_from_the_dominant_plane():
     assert found is not None
     assert np.degrees(np.arccos(found[0] @ normal)) < 0.5 and found[1] < 0.5
     assert plane_up(clutter, other, np.ones(400), np.array([0.0, 0, 1]), 0.005) is None
+
+
+def test_the_dominant_plane_is_the_largest_not_the_one_with_most_samples():
+    """A table of many small faces beside a floor of few large ones, which slopes by 5 degrees."""
+    rng, slope = np.random.default_rng(0), np.radians(5)
+    floor = rng.uniform(-1, 1, (300, 2)) @ np.array([[np.cos(slope), 0, -np.sin(slope)], [0, 1, 0]])
+    table = np.column_stack([rng.uniform(-0.3, 0.3, (3000, 2)), np.full(3000, 0.5)])
+    sloping = np.array([np.sin(slope), 0, np.cos(slope)])
+    normals = np.concatenate([np.repeat(sloping[None], 300, 0), np.repeat([[0, 0, 1.0]], 3000, 0)])
+    areas = np.concatenate([np.full(300, 4 / 300), np.full(3000, 0.36 / 3000)])
+    found = plane_up(np.concatenate([floor, table]), normals, areas, np.array([0.0, 0, 1]), 0.02)
+    assert found is not None
+    assert np.degrees(np.arccos(np.clip(found[0] @ sloping, -1, 1))) < 0.01 and found[1] < 0.01
 
 
 def scenery() -> Mesh:
@@ -214,7 +228,7 @@ def test_placement_turns_gravity_down_and_sets_the_size(tmp_path):
     found.save(tmp_path)
     np.testing.assert_allclose(load_placement(tmp_path).mesh(turned).vertices, placed.vertices)
     assert found.up_from == "plane" and found.up_within < 1 and found.up_confidence == "high"
-    assert "assumed" in place(turned, views).size_from
+    assert place(turned, views).size_assumed and not found.size_assumed
     known = place(turned, views, (10.0, "a ruler"), size=3.0)
     assert known.size_from == "a ruler" and np.ptp(known.mesh(turned).vertices, axis=0).max() == pytest.approx(6.0)
 
@@ -241,3 +255,17 @@ def test_a_similarity_and_its_inverse():
     p = rng.normal(size=(20, 3))
     np.testing.assert_allclose(move.inverse().points(move.points(p)), p, atol=1e-12)
     np.testing.assert_allclose(Similarity.from_dict(move.to_dict()).points(p), move.points(p))
+
+
+def test_cameras_and_points_move_together_and_know_from_where():
+    rng = np.random.default_rng(0)
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    first = Similarity(2.5, q * np.sign(np.linalg.det(q)), rng.normal(size=3))
+    second = Similarity(0.3, np.eye(3)[[1, 2, 0]], rng.normal(size=3))
+    before = PosedPhotos(tuple(ring()), sparse_of(0.3 * rng.normal(size=(20, 3))))
+    after = before.moved(first).moved(second)
+    for one, other in zip(before.views, after.views, strict=True):
+        np.testing.assert_allclose(one.project(before.sparse.xyz)[0], other.project(after.sparse.xyz)[0], atol=1e-8)
+    np.testing.assert_allclose(after.moved_by.points(before.sparse.xyz), after.sparse.xyz)
+    back = after.moved_by.inverse().points(after.views[3].center)
+    np.testing.assert_allclose(back, before.views[3].center, atol=1e-12)

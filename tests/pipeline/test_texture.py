@@ -243,7 +243,7 @@ def test_the_skin_of_a_body_stands_at_the_bodys_origin(tmp_path):
     assert skins_of(tmp_path) == {}
     flat, _, (rows, columns) = unfold(body, 60.0)
     flat = replace(flat, texture=np.zeros((rows, columns, 3), np.uint8))
-    (tmp_path / "textured.glb").write_bytes(write_glb({"scene": flat, "object1": flat}))
+    (tmp_path / "textured.glb").write_bytes(write_glb({"scenery": flat, "object1": flat}))
     skins = skins_of(tmp_path)
-    assert np.allclose(skins["scene"].vertices, flat.vertices, atol=1e-6)
+    assert np.allclose(skins["scenery"].vertices, flat.vertices, atol=1e-6)
     assert np.allclose(skins["object1"].vertices, flat.vertices - [0.3, 0.4, 0.4], atol=1e-6)

@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cameras import Similarity, View
+from pipeline.cameras import PosedPhotos, Similarity, View
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.extraction import EXTENT, Surface, Volume, ball, sample_volume
+from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
 from pipeline.mesh.visibility import hollow
 from pipeline.report import hollow_line
 from sdfsim.base.files import write_json
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from tests.pipeline import photo_sets
+from tests.pipeline.helpers import NOTHING
 
 FINEST = 0.0157  # as of the quick preset
 
@@ -120,7 +121,7 @@ class Scene:
         ]
         raw = Mesh(raw.vertices, raw.faces, (255 * np.array(mean)[nearest] ** (1 / 1.6)).astype(np.uint8))
         shown = ball(raw.vertices) < -0.03
-        self.surface = Surface(volume, raw, shown, np.ones(len(raw.faces), bool), shown[raw.faces].all(1), [])
+        self.surface = FieldSurface(volume, raw, shown, np.ones(len(raw.faces), bool), shown[raw.faces].all(1), [])
         # What the field is between its samples is that of the samples: exact distances take minutes.
         self.distance = lambda points: volume.at(points).astype(np.float32)
 
@@ -136,8 +137,8 @@ class Scene:
             Image.fromarray(number[label]).save(folder / FOLDER / f"{view.name}.png")
         if masks:
             write_json(folder / FOLDER / NAMES, {"names": list(masks)})
-        nothing, up = np.zeros((0, 3)), np.array([0, 0, 1.0])
-        found = split(self.surface, self.distance, FINEST, self.views, nothing, folder, up, alone=alone)
+        poses, up = PosedPhotos(tuple(self.views), NOTHING.sparse), np.array([0, 0, 1.0])
+        found = split(self.surface, self.distance, FINEST, poses, folder, up, alone=alone)
         back = self.to_unit.inverse()
         return replace(found, bodies={
             name: Mesh(back.points(mesh.vertices), mesh.faces) for name, mesh in found.bodies.items()

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.cameras import Sparse, View
+from pipeline.cameras import PosedPhotos, Sparse, View
 from pipeline.field import training
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
@@ -23,7 +23,7 @@ from tests.pipeline.test_poses import photo
 RED, SIDE = (200, 30, 30), 40
 
 
-def views(count: int) -> list[View]:
+def views(count: int) -> tuple[View, ...]:
     """Cameras on a ring of radius 3 that look at the origin."""
     found = []
     for k in range(count):
@@ -32,7 +32,7 @@ def views(count: int) -> list[View]:
         found.append(
             View(f"{k}.jpg", f"IMG_{k}.JPG", SIDE, SIDE, 50.0, SIDE / 2, SIDE / 2, 0.0, turn, np.array([0, 0, 3.0]))
         )
-    return found
+    return tuple(found)
 
 
 def away(view: View) -> View:
@@ -63,7 +63,7 @@ def cloud() -> Sparse:
 def test_training_leaves_renders_and_scores(tmp_path):
     photos(tmp_path, 16)
     settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
-    report = train(views(16), cloud(), tmp_path, tmp_path, settings=settings, threads=1).report
+    report = train(PosedPhotos(views(16), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
     assert report["held_out_photos"] == ["IMG_4.JPG", "IMG_12.JPG"]
     assert len(report["psnr_each"]) == 2 and report["psnr"] == pytest.approx(np.mean(report["psnr_each"]), abs=0.01)
     for name in ("4.jpg", "12.jpg"):
@@ -82,7 +82,7 @@ class Ball:
             geometry_at=lambda p: (p.norm(dim=1) - 0.5, p, p),
             color_of=lambda geometry, features, directions: torch.tensor(RED).expand(len(geometry), 3) / 255,
         )  # fmt: skip
-        self.cache = sdf_cache(self.field, 129)  # type: ignore[arg-type]
+        self.cache = sdf_cache(self.field, 2 / 128)  # type: ignore[arg-type]
 
 
 def test_a_field_that_is_right_scores_as_such(tmp_path):
@@ -100,9 +100,9 @@ def test_a_field_that_is_right_scores_as_such(tmp_path):
 def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_path):
     photos(tmp_path, 16)
     settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
-    ring = views(16)
+    ring = list(views(16))
     ring[4] = away(ring[4])
-    report = train(ring, cloud(), tmp_path, tmp_path, settings=settings, threads=1).report
+    report = train(PosedPhotos(tuple(ring), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
     assert report["held_out_photos"] == ["IMG_12.JPG"] and len(report["psnr_each"]) == 1
     with Image.open(tmp_path / HELD_OUT / "12.jpg") as render:
         assert report["psnr_px"] == max(render.size)
@@ -113,10 +113,10 @@ def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_pat
 def test_masks_count_only_where_every_photo_has_one_posed_or_not(tmp_path):
     photos(tmp_path, 4, masks=True)
     settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=2, surface_points=16)
-    assert train(views(4), cloud(), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+    assert train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
     known = [replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=k < 4) for k in range(5)]
     save_photos(known, tmp_path)
-    assert not train(views(4), cloud(), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+    assert not train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
 
 
 def trainer(iteration: int, iterations: int) -> SimpleNamespace:
@@ -141,7 +141,7 @@ def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
 def test_a_budget_that_is_far_too_small_still_ends_with_a_field(tmp_path):
     photos(tmp_path, 4)
     settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, surface_points=16)
-    report = train(views(4), cloud(), tmp_path, tmp_path, settings=settings, threads=1, budget=1e-3).report
+    report = train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1, budget=1e-3).report
     assert report["iterations"] <= FEWEST_STEPS and (tmp_path / "field.safetensors").exists()
 
 
@@ -161,16 +161,15 @@ def clock(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock.now))
     monkeypatch.setattr(Trainer, "step", timed)
     monkeypatch.setattr(training, "calibrate", lambda probe, threads: 1.0)
-    monkeypatch.setattr("pipeline.field.training.CACHE", 9)
     return clock
 
 
 def test_a_run_that_goes_on_has_what_is_left_of_its_budget(tmp_path, clock):
-    views, sparse = posed_noise(tmp_path)
+    poses = posed_noise(tmp_path)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
     killed.mkdir()
-    report = train(views, sparse, tmp_path, whole, settings=SETTINGS, budget=150.0).report
+    report = train(poses, tmp_path, whole, settings=SETTINGS, budget=150.0).report
     assert report["train_seconds"] == 150.0 and report["iterations"] == 150
     ended = clock.now
 
@@ -179,18 +178,18 @@ def test_a_run_that_goes_on_has_what_is_left_of_its_budget(tmp_path, clock):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(views, sparse, tmp_path, killed, settings=SETTINGS, budget=150.0, checkpoint_every=0.0, on_progress=kill)
-    report = train(views, sparse, tmp_path, killed, settings=SETTINGS, budget=150.0).report
+        train(poses, tmp_path, killed, settings=SETTINGS, budget=150.0, checkpoint_every=0.0, on_progress=kill)
+    report = train(poses, tmp_path, killed, settings=SETTINGS, budget=150.0).report
     assert report["resumed"] and report["seconds_before"] == 100.0
     assert report["train_seconds"] == pytest.approx(150.0, abs=training.PACE)
     assert report["train_seconds"] <= 150.0 and report["iterations"] == report["train_seconds"]
 
 
 def test_what_a_killed_run_had_trained_is_not_lost_in_silence(tmp_path, clock):
-    views, sparse = posed_noise(tmp_path)
+    poses = posed_noise(tmp_path)
     (tmp_path / "checkpoint.safetensors").write_bytes(b"half")
     told: list[str] = []
-    report = train(views, sparse, tmp_path, tmp_path, settings=replace(SETTINGS, iterations=20),
+    report = train(poses, tmp_path, tmp_path, settings=replace(SETTINGS, iterations=20),
                    on_progress=lambda fraction, message: told.append(message)).report  # fmt: skip
     assert not report["resumed"] and report["iterations"] == 20
     assert "what a killed run had trained is lost: checkpoint.safetensors cannot be read" in told[0]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import View
-from pipeline.mesh.trust import NextPhoto, Support, information, next_photos, sigma_along, summary, support_of
+from pipeline.mesh.trust import Evidence, NextPhoto, evidence_of, information, next_photos, sigma_along, summary
 from pipeline.mesh.visibility import Visibility
 from pipeline.options import Options
 from pipeline.report import improvements, notes
@@ -62,7 +62,7 @@ def test_what_is_behind_something_is_guessed():
     floor = plate(20)
     wall = plate(4, z=0.5, half=0.2)
     views = [view for shift in (-0.2, 0.2) for view in pair(0.1 + abs(shift), 3.0)]
-    found = support_of(Visibility(floor, 1e-3, Caster(joined([floor, wall]))), views)
+    found = evidence_of(Visibility(floor, 1e-3, Caster(joined([floor, wall]))), views)
     under = np.abs(floor.vertices[:, :2]).max(1) < 0.15
     beside = np.abs(floor.vertices[:, :2]).min(1) > 0.35
     assert np.isinf(found.uncertainty[under]).all() and (found.views[under] == 0).all()
@@ -75,11 +75,11 @@ def test_what_is_behind_something_is_guessed():
 def test_the_guessed_part_of_a_body_is_told():
     block = cube(0.4, (0, 0, 0.2))
     views = [look_at(np.array([2 * np.cos(a), 2 * np.sin(a), 1.2])) for a in np.arange(8) * np.pi / 4]
-    found = support_of(Visibility(block, 1e-3, Caster(joined([block, plate(4)]))), views)
+    found = evidence_of(Visibility(block, 1e-3, Caster(joined([block, plate(4)]))), views)
     told = summary(block, found)
     # A sixth, and a half of the lowest triangles around it.
     assert told["guessed"] == pytest.approx(1 / 6 + 1 / 24, abs=0.005)
-    report = {"trust": {"scene": told, "object1": told}, "weak": 0.0, "next_photos": []}
+    report = {"trust": {"scenery": told, "object1": told}, "weak": 0.0, "next_photos": []}
     lines = " / ".join(notes({"mesh": report}))
     assert "object1: 21% of its surface is guessed, fewer than two photos see it" in lines
 
@@ -127,18 +127,18 @@ class Photographed:
         self.views = [view_of(make, pose, number) for number, pose in enumerate(poses)]
         self.vertices = whole.vertices
 
-    def support(self, more: list[View] | None = None) -> Support:
-        return support_of(self.sight, [*self.views, *(more or [])])
+    def evidence(self, more: list[View] | None = None) -> Evidence:
+        return evidence_of(self.sight, [*self.views, *(more or [])])
 
     def advice(self) -> tuple[list[NextPhoto], float]:
         counted = self.vertices[:, 2] > -1e-3
-        return next_photos(self.meshes, self.support(), self.sight, self.caster, self.views, counted)
+        return next_photos(self.meshes, self.evidence(), self.sight, self.caster, self.views, counted)
 
     def unseen(self, more: list[View] | None = None) -> float:
         """Share of the box's vertices above the floor that fewer than two photos see."""
         own = slice(len(self.vertices) - len(self.box.vertices), None)
         above = self.vertices[own, 2] > 0.01
-        return float((self.support(more).views[own][above] < 2).mean())
+        return float((self.evidence(more).views[own][above] < 2).mean())
 
 
 def finer(mesh: Mesh) -> Mesh:
@@ -177,7 +177,7 @@ def test_photos_of_one_half_ask_for_the_other_half():
         assert depth[0] > 0
     text = " / ".join(improvements({
         "poses": {}, "photos": [], "psnr": None, "failed_checks": [],
-        "stages": {"mesh": {"next_photos": [photo.told() for photo in photos]}},
+        "stages": {"mesh": {"next_photos": [photo.to_dict() for photo in photos]}},
     }, Options()))  # fmt: skip
     assert photos[0].words in text and f"{places[0][0]:.2f}" in text
 

@@ -29,9 +29,9 @@ def write(folder: Path, size: float, *, scenery: bool) -> None:
     surface = {"friction": 0.8, "restitution": 0.4}
     shapes, bodies = {}, [{"name": "floor", "motion": "static", "plane": {"normal": [0, 0, 1], "offset": -size}}]
     if scenery:
-        analytic_shape("box", size=[4 * size, 4 * size, 0.2 * size], name="scene").save(folder / "assets" / "scene")
-        shapes["scene"] = {"asset": "assets/scene"}
-        bodies.append({"name": "scene", "shape": "scene", "motion": "static", "position": [0, 0, -0.1 * size]})
+        analytic_shape("box", size=[4 * size, 4 * size, 0.2 * size], name="scenery").save(folder / "assets" / "scene")
+        shapes["scenery"] = {"asset": "assets/scene"}
+        bodies.append({"name": "scenery", "shape": "scenery", "motion": "static", "position": [0, 0, -0.1 * size]})
     analytic_shape("box", size=3 * [0.5 * size], name="object1").save(folder / "assets" / "object1")
     shapes["object1"] = {"asset": "assets/object1"}
     bodies.append({"name": "object1", "shape": "object1", "position": [size, 0.0, 0.0], "density": 400.0, **surface})

@@ -219,15 +219,20 @@ def _least_deep(convex, matrix, pair, n, thick, enough, room):
 
 @njit(**BARE)
 def _gjk(convex, matrix, pair, offset, v, room):
-    """The shortest vector from the second solid's core to the first's, which lies by `offset` from it, and where it
-    ends on the first; v is a guess of its direction. Zero where the cores overlap."""
+    """The shortest vector from the second solid's core to the first's, which lies by `offset` from it, as long as is
+    proved, and where it ends on the first; v is a guess of its direction. Zero where the cores overlap."""
     corner, own, weight = room.corner, room.own, room.weight
     count, there, least = 0, (0.0, 0.0, 0.0), math.inf
+    # Along a rim corners come so near each other that rounding turns v in the end: the v that proves most counts.
+    surely, best = -math.inf, v
     for step in range(STEPS):
         a = add(offset, farthest(convex, pair.first, pair.size, matrix, pair.a, scale(v, -1.0)))
         w = sub(a, farthest(convex, pair.second, pair.other, matrix, pair.b, v))
         if step > 0:
-            if least - dot(v, w) <= EXACT * least:
+            proved = dot(v, w)
+            if proved > surely * math.sqrt(least):
+                surely, best = proved / math.sqrt(least), v
+            if least - proved <= EXACT * least:
                 break
             known = False
             for i in range(count):
@@ -246,7 +251,7 @@ def _gjk(convex, matrix, pair, offset, v, room):
         if length >= least:  # rounding has the better of it
             break
         v, there, least = new, on, length
-    return v, there
+    return scale(best, max(surely, 0.0) / norm(best)), there
 
 
 @njit(**BARE)

@@ -1,7 +1,8 @@
-"""What structure-from-motion and depth tell the training: where the object is, its surface, and free space."""
+"""What structure-from-motion and depth give to the training: where the object is, its surface, and free space."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,21 +11,22 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from pipeline.cameras import Similarity, Sparse, View, nearest_to_axes
+from pipeline.cameras import PosedPhotos, Similarity, Sparse, View, nearest_to_axes
 from pipeline.field.interpolation import interpolate
 from pipeline.inputs.photos import Photo
 from sdfsim.base.errors import SdfsimError
 
-# Lines of sight end this far before their points, normalised units.
-GAP = 0.015
-# Clearance that free space asks for: at most, and as a share of the way to the point, which may be on a grazed plane.
-CLEARANCE, SLOPE = 0.02, 0.1
-# Free space counts as filled where the field is below this; between, it may be its coarseness.
-FILLED, JUST_EMPTY = -0.004, 0.002
+# In cells of the field's finest grid, as the field cannot follow a surface more closely:
+GAP = 0.9525  # that lines of sight end before their points; those are uncertain, and so is the surface there
+CLEARANCE = 1.27  # that free space asks for at most, and the shortest line of sight that counts
+# Free space counts as filled where the field is below the first; it is asked to become the second, and no more.
+FILLED, JUST_EMPTY = -0.254, 0.127
+# Clearance as a share of the way to the point, which may be on a grazed plane.
+SLOPE = 0.1
 DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor, that are used
 NOISES = 5.0  # median errors of the depth before which its lines of sight end: a line through the surface erodes it
 APART = 0.2  # A scale that differs by more than this share means other units, or another photo's depth.
-USUAL = 0.01  # share by which a phone's depth is off, where nothing tells better
+USUAL = 0.01  # share by which a phone's depth is off, where nothing is known better
 FEWEST = 50  # sparse points on pixels with depth that the scale needs
 TRIES = 16  # places along each line at which filled free space is looked for
 
@@ -38,7 +40,7 @@ class DepthPoints:
     view: np.ndarray  # [P] index of the view
 
 
-def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:
+def depth_points(views: Sequence[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:
     """All pixels with depth, times `scale`, in the world of the poses, whose unit is the metre as far as the cameras
     know. Raises SdfsimError where a file of the photos stage is missing."""
     by_name = {photo.name: photo for photo in photos}
@@ -63,15 +65,15 @@ def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale:
     return DepthPoints(np.concatenate(xyz), np.concatenate(pixel), np.concatenate(index))
 
 
-def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[str, float]:
+def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
     """Compares depth with the triangulated points that lie on the same pixels.
 
     Returns `scale`, the factor of the depth that makes both agree; `spread`, the median share by which a pixel differs
     after that; `points`, how many were compared: with fewer than `FEWEST` the depth is taken as it is. Raises
     SdfsimError where they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
     """
-    ratios = []
-    for number, view in enumerate(views):
+    ratios, sparse = [], poses.sparse
+    for number, view in enumerate(poses.views):
         mine = points.view == number
         seen = sparse.point_of[sparse.view_of == number]
         if not mine.any() or not len(seen):
@@ -86,8 +88,8 @@ def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[
         return {"scale": 1.0, "spread": USUAL, "points": len(ratio)}
     scale = float(np.median(ratio))
     if not 1 / (1 + APART) < scale < 1 + APART:
-        told = f"depth: the cameras say {scale:.3g} times as far as the depth does"
-        raise SdfsimError(told, "give its unit (depth_unit_scale_factor, metres a count), or leave it out")
+        message = f"depth: the cameras' distances are {scale:.3g} times those of the depth files"
+        raise SdfsimError(message, "give its unit (depth_unit_scale_factor, metres a count), or leave it out")
     return {"scale": scale, "spread": float(np.median(np.abs(ratio / scale - 1))), "points": len(ratio)}
 
 
@@ -103,30 +105,32 @@ class Supervision:
 
 
 def supervision_of(
-    sparse: Sparse, views: list[View], to_unit: Similarity, depth: DepthPoints | None = None, noise: float = 0.0
+    poses: PosedPhotos, cell: float, depth: DepthPoints | None = None, noise: float = 0.0
 ) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
-    Sparse points and a sensor's depth are in the world of the poses, views in that of the unit sphere. Pixels with
-    depth are lines of sight as well, which end earlier by `noise`, the median share by which the depth is off.
+    Poses are moved to the unit sphere; a sensor's depth is where it was before. `cell` is the width of a cell of the
+    field's finest grid. Pixels with depth are lines of sight as well, which end earlier by `noise`, the median share by
+    which the depth is off.
     """
-    points = to_unit.points(sparse.xyz)
+    sparse = poses.sparse
+    points = sparse.xyz
     seen = np.bincount(sparse.point_of, minlength=len(points))
     good = (seen >= 3) & (sparse.error < 1.5)
     inside = good & (np.linalg.norm(points, axis=1) < 1.0)
     weights = point_weights(sparse, len(points))[inside]
     use = good[sparse.point_of]
-    centers = np.array([v.center for v in views]).reshape(-1, 3)
+    centers = np.array([view.center for view in poses.views]).reshape(-1, 3)
     end, start = points[sparse.point_of[use]], centers[sparse.view_of[use]]
-    measured, gap = np.zeros((0, 3)), np.full(len(end), GAP)
+    measured, gap = np.zeros((0, 3)), np.full(len(end), GAP * cell)
     if depth is not None:
         rng = np.random.default_rng(0)
         some = rng.permutation(len(depth.xyz))
-        measured = to_unit.points(depth.xyz[some])
+        measured = poses.moved_by.points(depth.xyz[some])
         end = np.concatenate([end, measured[:DEPTH_LINES]])
         start = np.concatenate([start, centers[depth.view[some[:DEPTH_LINES]]]])
         away = np.linalg.norm(end[len(gap) :] - start[len(gap) :], axis=1)
-        gap = np.concatenate([gap, GAP + NOISES * noise * away])
+        gap = np.concatenate([gap, GAP * cell + NOISES * noise * away])
         measured = measured[np.linalg.norm(measured, axis=1) < 1.0][:DEPTH_POINTS]
     length = np.linalg.norm(end - start, axis=1)
     direction = (end - start) / np.maximum(length, 1e-9)[:, None]
@@ -134,18 +138,19 @@ def supervision_of(
     half = np.sqrt(np.maximum(1 - ((start**2).sum(1) - along**2), 0))
     # Not all the way: a point is uncertain by a little, and so is the surface there.
     low, high = np.maximum(along - half, 0), np.minimum(along + half, length - gap)
-    crosses = (half > 0) & (high > low + 0.02)
+    crosses = (half > 0) & (high > low + CLEARANCE * cell)
     sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
     weights = weights / max(float(weights.mean()), 1e-9) if len(weights) else weights
     return Supervision(points[inside], weights, sight, measured)
 
 
 class FreeSpace:
-    """Points on lines [L, 6] from cameras to what they see, which must be empty whatever colours say. Half of those
-    handed out are where the field is solid all the same: a vase's mouth is crossed by one line of sight in hundreds,
-    and would stay filled if lines were drawn evenly."""
+    """Points on lines [L, 6] from cameras to what they see, which must be empty. Half of the
+    points picked are where the field is solid nevertheless: a vase's mouth is crossed by one line of sight in hundreds,
+    and would stay filled if lines were drawn evenly. `cell` is the width of a cell of the field's finest grid."""
 
-    def __init__(self, sight: np.ndarray, device: str) -> None:
+    def __init__(self, sight: np.ndarray, cell: float, device: str) -> None:
+        self.cell = cell
         self.start, self.end = (
             torch.tensor(part, dtype=torch.float32, device=device).reshape(-1, 3) for part in np.split(sight, 2, 1)
         )
@@ -161,15 +166,15 @@ class FreeSpace:
         for _ in range(TRIES):
             along = torch.rand(len(self), generator=rng).to(device)
             line = torch.arange(len(self), device=device)
-            wrong = interpolate(cache, self.at(line, along)[0])[:, 0] < FILLED
+            wrong = interpolate(cache, self.at(line, along)[0])[:, 0] < FILLED * self.cell
             found.append(torch.stack([line[wrong].float(), along[wrong]], 1))
         self.filled = torch.cat(found)
 
     def at(self, line: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
         """Points [P, 3] at fractions [P] of lines [P], and the clearance [P] that each asks for."""
         start, end = self.start[line], self.end[line]
-        rest = (1 - along) * (end - start).norm(dim=1) + GAP
-        return start + along[:, None] * (end - start), (SLOPE * rest).clamp_max(CLEARANCE)
+        rest = (1 - along) * (end - start).norm(dim=1) + GAP * self.cell
+        return start + along[:, None] * (end - start), (SLOPE * rest).clamp_max(CLEARANCE * self.cell)
 
     def pick(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         """At most `count` points [P, 3] and the SDF [P] that each must at least have."""
@@ -183,7 +188,7 @@ class FreeSpace:
         along[: count // 2] = self.filled[again, 1]
         points, clearance = self.at(line, along)
         # Emptied, but no more: right beside may be a surface, and this loss comes back to the same places.
-        clearance[: count // 2].clamp_(max=JUST_EMPTY)
+        clearance[: count // 2].clamp_(max=JUST_EMPTY * self.cell)
         return points, clearance
 
 
@@ -193,12 +198,13 @@ def point_weights(sparse: Sparse, count: int) -> np.ndarray:
     return seen / (1 + np.maximum(sparse.error, 0) ** 2)
 
 
-def unit_sphere_of(views: list[View], sparse: Sparse, *, masked: bool = False) -> Similarity:
+def unit_sphere_of(poses: PosedPhotos, *, masked: bool = False) -> Similarity:
     """The similarity that puts what the cameras look at into the unit sphere; `masked`: all points lie on the object.
 
     The centre is where the optical axes meet, drawn weakly to the points' median. The radius is what fits the longer
     side of most photos, less where nearly all points are nearer, and never past the nearest cameras.
     """
+    views, sparse = poses.views, poses.sparse
     centers = np.array([v.center for v in views])
     axes = np.array([v.rotation[2] for v in views])
     weights = point_weights(sparse, len(sparse.xyz))

@@ -1,0 +1,91 @@
+"""Options: one model checks them, whoever gives them, and says which stages they change."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from pipeline.options import Options, names_of, options_of, read_config, write_config
+from sdfsim.base.errors import SdfsimError
+from tests.cli.conftest import run as command
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "got"),
+    [
+        ({"preset": "slow"}, "preset", "'slow'"),
+        ({"size": -1.0}, "size", "-1"),
+        ({"size": float("nan")}, "size", "nan"),
+        ({"distance": ["a", "b", 0]}, "distance", "0"),
+        ({"distance": ["a", "b"]}, "distance", "['a', 'b']"),
+        ({"crop": [5, 5, 5, 1, 6, 6]}, "crop", "[5.0, 5.0, 5.0, 1.0, 6.0, 6.0]"),
+        ({"crop": [1, 2, 3]}, "crop", "[1, 2, 3]"),
+        ({"budget": float("inf")}, "budget", "inf"),
+        ({"recipe": "best"}, "recipe", "'best'"),
+        ({"material": {"cup": 3}}, "material", "3"),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_one_line_with_its_option(values, name, got):
+    with pytest.raises(SdfsimError) as caught:
+        options_of(**values)
+    message = caught.value.message
+    assert message.startswith(f"{name}: ") and f"(got {got})" in message and "\n" not in message
+
+
+def test_an_option_that_does_not_exist_is_named_with_those_that_do():
+    with pytest.raises(SdfsimError, match="colour") as caught:
+        options_of(colour="red")
+    assert "crop" in caught.value.hint
+
+
+def test_config_gives_back_every_option(tmp_path):
+    given = options_of(
+        photos="/a", preset="fine", budget=90, seed=3, distance=["a.jpg:1,2", "b.jpg", 2], crop=["0,0,0", "1,2,3.5"],
+        drop="ball", material={"cup": "ceramic:4mm"}, recipe="paper", device="cpu",
+    )  # fmt: skip
+    write_config(given, tmp_path)
+    assert read_config(tmp_path) == given
+    content = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert content["crop"] == [0, 0, 0, 1, 2, 3.5] and content["distance"] == ["a.jpg:1,2", "b.jpg", 2]
+
+
+@pytest.mark.parametrize("content", ["", "[1, 2]", "command: simulate\nversion: 1\nscene: a.yaml\n", "a: [", None])
+def test_a_folder_of_something_else_is_refused(tmp_path, content):
+    if content is not None:
+        (tmp_path / "config.yaml").write_text(content)
+    with pytest.raises(SdfsimError, match=tmp_path.name):
+        read_config(tmp_path)
+
+
+def test_a_config_with_a_bad_value_names_file_and_option(tmp_path):
+    write_config(Options(), tmp_path)
+    text = (tmp_path / "config.yaml").read_text().replace("preset: standard", "preset: slow")
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(SdfsimError, match=r"config\.yaml: preset: .*'slow'"):
+        read_config(tmp_path)
+
+
+def test_what_changes_one_changes_the_other():
+    sized = options_of(size=2.0)
+    known = sized.changed({"distance": ["a", "b", 1.0]})
+    assert known.size is None and known.changed({"size": 3.0}).distance is None
+
+
+def test_commands_take_what_changes_their_stage():
+    for stage in ("mesh", "distill", "fit"):
+        shown = command(stage, "--help").stdout
+        options = [name for name in names_of(stage) if name not in ("seed", "budget")]
+        assert options and all(f"--{name}" in shown for name in options)
+
+
+@pytest.mark.parametrize(
+    ("given", "code"),
+    [(("1,2,3", "4,5,x"), 2), (("1,2", "3,4,5"), 2), (("1,2,3", "4,5,1"), 1), (("0,0,0", "1,2,3"), 0)],
+)
+def test_corners_on_the_command_line(photos, tmp_path, calls, monkeypatch, given, code):
+    monkeypatch.setattr("pipeline.report.write_recording", lambda folder, done: None)
+    assert command("reconstruct", photos, "-o", tmp_path / "out", "--crop", *given).exit_code == code
+    if code:
+        assert not (tmp_path / "out").exists()
+    else:
+        assert read_config(tmp_path / "out").crop == (0, 0, 0, 1, 2, 3)
