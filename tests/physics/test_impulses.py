@@ -10,9 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.options import StepOptions
+from sdfsim.physics.solver.impulses import solve_contacts
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
-from sdfsim.physics.solver.solve import respond
-from sdfsim.physics.solver.world import DRAG, FIRST, GAP, KEY, NORMAL, PUSH, SECOND, TORSION, VOID
+from sdfsim.physics.solver.world import (
+    FIRST,
+    GAP,
+    KEY,
+    NORMAL,
+    NORMAL_IMPULSE,
+    SECOND,
+    TANGENTIAL,
+    TORSION,
+    VOID,
+)
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from tests.physics.test_laws import body
@@ -32,7 +42,7 @@ SEEDS = [seed for seed in range(31) if seed != 11]  # nothing meets in that one
 
 @njit
 def respond_to(world, work, motion, rules, manifolds):
-    respond(world, work, motion, rules, manifolds)
+    solve_contacts(world, work, motion, rules, manifolds)
 
 
 def pile(draw: np.random.Generator) -> Scene:
@@ -80,7 +90,8 @@ def known(world, work, motion, rules, manifolds) -> tuple[list[impulses.Body], l
                         turn @ (share * at + (1.0 - share) * middle)
                         for turn, (at, middle) in zip(turns, places, strict=True)
                     ),
-                    normal=row[NORMAL:GAP].copy(), gap=row[GAP], push=row[PUSH], drag=row[DRAG : DRAG + 3].copy(),
+                    normal=row[NORMAL:GAP].copy(), gap=row[GAP],
+                    push=row[NORMAL_IMPULSE], drag=row[TANGENTIAL : TANGENTIAL + 3].copy(),
                     void=row[VOID] > 0.0, friction=rules.friction * world.friction[pair].prod(),
                 )
             )  # fmt: skip
@@ -111,16 +122,16 @@ def test_the_compiled_solve_is_the_readable_one(seed):
                 motion.velocity[pair[0]] -= draw.choice([0.0, 0.05, 1.0]) * row[NORMAL:GAP]
         work.matrix[:] = Rotation.from_quat(motion.orientation).as_matrix()
         work.inverse[:] = work.matrix @ world.inverse_inertia @ work.matrix.transpose(0, 2, 1)
-        work.free[:] = moves * np.concatenate([rules.inner * rules.gravity, np.zeros(6)])
+        work.free[:] = moves * np.concatenate([rules.substep_dt * rules.gravity, np.zeros(6)])
         work.free[:, 3:] += 0.01 * moves * draw.normal(size=(len(moves), 6))
         work.change[:] = work.shift[:] = 0.0
         bodies, contacts = known(world, work, motion, rules, manifolds)
-        impulses.respond(contacts, rules)
+        impulses.solve_contacts(contacts, rules)
         respond_to(world, work, motion, rules, manifolds)
         found = [row for count, rows in zip(manifolds.count, manifolds.point, strict=True) for row in rows[:count]]
         for contact, row in zip(contacts, found, strict=True):
-            assert row[PUSH] == pytest.approx(contact.push, abs=1e-9)
-            np.testing.assert_allclose(row[DRAG : DRAG + 3], contact.drag, atol=1e-9, rtol=0)
+            assert row[NORMAL_IMPULSE] == pytest.approx(contact.push, abs=1e-9)
+            np.testing.assert_allclose(row[TANGENTIAL : TANGENTIAL + 3], contact.drag, atol=1e-9, rtol=0)
         for b, one in enumerate(bodies):
             np.testing.assert_allclose(work.change[b], one.change, atol=1e-9, rtol=0)
             np.testing.assert_allclose(work.shift[b], one.shift, atol=1e-9, rtol=0)

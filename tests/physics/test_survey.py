@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim.physics.solver.survey import energies, first_fault, touching
-from sdfsim.physics.solver.world import COLUMNS, DRAG, GAP, NORMAL, POINTS, PUSH, Manifolds
+from sdfsim.physics.solver.world import COLUMNS, GAP, NORMAL, NORMAL_IMPULSE, POINTS, TANGENTIAL, Manifolds
 
 BODIES = 7
 
@@ -43,7 +43,7 @@ def test_contacts_are_told_where_the_first_body_has_them(state):
         assert (bodies == pair[m]).all() and gap == point[GAP]
         np.testing.assert_allclose(place, position[first] + Rotation.from_quat(orientation[first]).apply(point[:3]))
         np.testing.assert_allclose(normal, axis)
-        np.testing.assert_allclose(impulse, axis * point[PUSH] + point[DRAG : DRAG + 3])
+        np.testing.assert_allclose(impulse, axis * point[NORMAL_IMPULSE] + point[TANGENTIAL : TANGENTIAL + 3])
 
 
 @pytest.mark.parametrize("value", [1e3, np.nan, np.inf])

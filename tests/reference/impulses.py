@@ -112,7 +112,7 @@ def acts(c: Contact, rules) -> bool:
     approach = relative(bodies, arms, "now") @ n
     falling, then = (relative(bodies, arms, what) for what in ("falling", "then"))
     gap = c.gap - bodies[0].margin - bodies[1].margin
-    way = -(then @ n) * rules.inner
+    way = -(then @ n) * rules.substep_dt
     early = not rules.adds and way > EARLY * min(b.thickness for b in bodies)
     later = -approach > rules.slow and not early  # it first touches, and rebounds in the inner step after
     if c.void or (gap > TOUCH and (gap > way or later)):
@@ -121,18 +121,18 @@ def acts(c: Contact, rules) -> bool:
     # Newton's rule, v' = -e v, at each contact of an impact; what rebounds early as fast as it will come back by here.
     target, rebounds = 0.0, False
     if e > 0.0 and abs(approach) > rules.slow:
-        pull = early * (falling @ n - approach) / rules.inner
+        pull = early * (falling @ n - approach) / rules.substep_dt
         square = (e * approach) ** 2 + 2.0 * pull * max(gap, 0.0) * (1.0 - e * e)
         rebounds = square > 0.0
         target = -np.sign(approach) * np.sqrt(max(square, 0.0))
     c.before = (falling if rebounds else then) @ n
-    rest = -gap / rules.inner if gap > TOUCH else 0.0  # what is open comes up to the surface
+    rest = -gap / rules.substep_dt if gap > TOUCH else 0.0  # what is open comes up to the surface
     if gap > TOUCH:
         target = target if rebounds else rest
     elif gap <= -rules.split:
-        c.deep = -gap * rules.erp / rules.inner
+        c.deep = -gap * rules.erp / rules.substep_dt
     elif gap < -rules.slop:
-        c.out = (-gap - rules.slop) * rules.erp / rules.inner
+        c.out = (-gap - rules.slop) * rules.erp / rules.substep_dt
         target = max(c.out, min(target + c.out, -approach) if rules.adds else target)
     c.calm = rest - c.before
     c.rows = [Row(bodies, arms, n, target - c.before, c.push)]
@@ -221,7 +221,7 @@ def gains(island: list[Contact], rules) -> bool:
     return work > spare
 
 
-def respond(contacts: list[Contact], rules) -> None:
+def solve_contacts(contacts: list[Contact], rules) -> None:
     """Solve for all impulses: to `push` and `drag` of the contacts, and to `change` and `shift` of the bodies."""
     for c in contacts:
         if not acts(c, rules):

@@ -38,4 +38,4 @@ def kept() -> Iterator[None]:
 
 
 with kept():
-    from sdfsim.physics.solver import step as step
+    from sdfsim.physics.solver import advance as advance

@@ -24,10 +24,10 @@ def swept(world, work, motion, rules, span):
             speed = norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) * world.radius[b]
             if world.moves[b]:
                 speed += fall
-            ways[b] = speed * span + 0.5 * rules.reach
+            ways[b] = speed * span + 0.5 * rules.contact_margin
         middle = add(get(motion.position, b), turn(matrix, b, get(world.centre, b)))
         for a in range(3):
-            wide = ways[b] + 0.5 * rules.reach
+            wide = ways[b] + 0.5 * rules.contact_margin
             for c in range(3):
                 wide += abs(matrix[b, a, c]) * world.half[b, c]
             low[b, a] = middle[a] - wide
@@ -44,7 +44,7 @@ def _stirs(world, motion, b):
 
 @njit(**BARE)
 def _may_meet(world, a, b):
-    one, other = world.realm[a], world.realm[b]
+    one, other = world.world[a], world.world[b]
     return (one == other or one < 0 or other < 0) and world.allowed[world.group[a], world.group[b]]
 
 

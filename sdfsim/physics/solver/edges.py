@@ -26,8 +26,8 @@ from sdfsim.physics.solver.vectors import (
 
 @njit(**ENTRY)
 def nodes_within(shapes, world, work, motion, rules, node, start):
-    """Nodes that are within `rules.reach` of another body's surface, or will be by the end of the step as they go: the
-    contact edges of the paper (section 3).
+    """Nodes that are within `rules.contact_margin` of another body's surface, or will be by the end of the step as they
+    go: the contact edges of the paper (section 3).
 
     Args:
         node: [M, 3] surface nodes about the centres of mass, in the bodies' axes.
@@ -37,7 +37,7 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
         [E, 3] int64 the owner, its node and the other body; [E, 7] the distance, the other's outward normal there and
         the node seen from the other's centre of mass (world axes).
     """
-    span = rules.inner * rules.steps
+    span = rules.substep_dt * rules.substeps
     for b in world.going:
         to_matrix(motion.orientation, b, work.matrix)
     swept(world, work, motion, rules, span)
@@ -55,7 +55,7 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
             speed += norm(vector(rules.gravity)) * span * abs(fall) + norm(get(motion.angular, one)) * world.radius[one]
             if norm(get(motion.angular, other)) > 0.0:
                 speed += norm(get(motion.angular, other)) * world.radius[other]
-            most = rules.reach + speed * span
+            most = rules.contact_margin + speed * span
             for u in range(start[one], start[one + 1]):
                 place = mapped(w, c, scale(add(get(node, u), get(world.com, one)), own))
                 seen = sub(scale(place, k), get(world.com, other))
@@ -74,7 +74,7 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
                 back = cross(get(motion.angular, other), along(offset, normal, -d))
                 velocity = sub(velocity, add(get(motion.velocity, other), back))
                 velocity = along(velocity, vector(rules.gravity), fall * span)
-                if d + min(0.0, dot(velocity, normal)) * span > rules.reach:
+                if d + min(0.0, dot(velocity, normal)) * span > rules.contact_margin:
                     continue
                 if count == len(index):
                     more, room = np.empty((2 * count, 3), np.int64), np.empty((2 * count, 7))

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.solver.advance import _torque_free
+from sdfsim.physics.solver.islands import join, root
 from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
-from sdfsim.physics.solver.solve import join, root
-from sdfsim.physics.solver.step import _torque_free
 from sdfsim.physics.solver.vectors import (
     ENTRY,
     add,

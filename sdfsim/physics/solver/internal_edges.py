@@ -13,7 +13,7 @@ from numba import njit
 from sdfsim.physics.solver.convex import farthest, outside, rounding
 from sdfsim.physics.solver.distance import CELL, GRID, KIND, PLANE, distance_alone, solids
 from sdfsim.physics.solver.manifold import renewed
-from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, way_of
+from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, pair_kind
 from sdfsim.physics.solver.surface_distance import KEYS
 from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, sub, turn, turn_back
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
@@ -54,7 +54,7 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
     pieces = max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
-    if way_of(shapes, s, t) != SOLIDS:
+    if pair_kind(shapes, s, t) != SOLIDS:
         for k in range(manifolds.count[p]):
             manifolds.point[p, k, VOID] = 0.0
             for side in range(2):
@@ -145,9 +145,11 @@ def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
     first, last = convex.start[t], convex.start[t + 1]
     if shapes.table[t, KIND] != GRID or first == last:
         rough = ROUGH * shapes.table[t, CELL] if shapes.table[t, KIND] == GRID else 0.0
-        return size * (distance_alone(shapes.table, shapes.brick, shapes.sample, t, place) - rough) <= rules.reach
+        return (
+            size * (distance_alone(shapes.table, shapes.brick, shapes.sample, t, place) - rough) <= rules.contact_margin
+        )
     for piece in range(first, last):
-        if size * outside(convex, piece, place) <= rules.reach:
+        if size * outside(convex, piece, place) <= rules.contact_margin:
             return True
     return False
 

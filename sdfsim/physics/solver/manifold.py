@@ -13,14 +13,14 @@ from sdfsim.physics.solver.distance import KIND, SIZE, SPHERE
 from sdfsim.physics.solver.vectors import BARE, FAST, add, along, dot, get, scale, sub, turn, turn_back
 from sdfsim.physics.solver.world import (
     COLUMNS,
-    DRAG,
     FIRST,
     GAP,
     KEY,
     NORMAL,
+    NORMAL_IMPULSE,
     POINTS,
-    PUSH,
     SECOND,
+    TANGENTIAL,
     TORSION,
     VOID,
 )
@@ -85,7 +85,7 @@ def moved(shapes, world, motion, matrix, rules, manifolds, p, count):
         offset = add(sub(get(motion.position, a), get(motion.position, b)), sub(first, second))
         gap = dot(offset, n)
         slid = along(offset, n, -gap)
-        if gap > rules.reach or dot(slid, slid) > rules.reach * rules.reach:
+        if gap > rules.contact_margin or dot(slid, slid) > rules.contact_margin * rules.contact_margin:
             continue
         for c in range(COLUMNS):
             point[p, kept, c] = point[p, k, c]
@@ -101,8 +101,8 @@ def write(found, count, side, mine, theirs, normal, gap, key):
         found[count, (FIRST if side == 0 else SECOND) + x] = mine[x]
         found[count, (SECOND if side == 0 else FIRST) + x] = theirs[x]
         found[count, NORMAL + x] = normal[x] if side == 0 else -normal[x]
-        found[count, DRAG + x] = 0.0
-    found[count, PUSH] = 0.0
+        found[count, TANGENTIAL + x] = 0.0
+    found[count, NORMAL_IMPULSE] = 0.0
     found[count, GAP] = gap
     found[count, KEY] = key
     found[count, TORSION] = 1.0
@@ -144,7 +144,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
         for x in range(COLUMNS):
             every[e, x] = found[e, x]
     total = count
-    same = rules.reach * rules.reach
+    same = rules.contact_margin * rules.contact_margin
     for k in range(known):
         twin = -1
         for e in range(count):
@@ -160,8 +160,8 @@ def merged(rules, point, p, known, scratch, count, rounded):
             for x in range(COLUMNS):
                 every[total, x] = point[p, k, x]
             total += 1
-        elif every[twin, PUSH] == 0.0:
-            for x in range(PUSH, KEY):
+        elif every[twin, NORMAL_IMPULSE] == 0.0:
+            for x in range(NORMAL_IMPULSE, KEY):
                 every[twin, x] = point[p, k, x]
     # The deepest first, then always the one that is farthest from those chosen.
     chosen, lowest = -1, 1e300
@@ -198,7 +198,7 @@ def renewed(rules, point, p, known, scratch, count):
     for k in range(known):
         for x in range(COLUMNS):
             every[k, x] = point[p, k, x]
-    same = rules.reach * rules.reach
+    same = rules.contact_margin * rules.contact_margin
     if count > POINTS:
         count = thinned(scratch, count)
     for e in range(count):
@@ -217,7 +217,7 @@ def renewed(rules, point, p, known, scratch, count):
         for x in range(COLUMNS):
             point[p, e, x] = found[e, x]
         if twin >= 0:
-            for x in range(PUSH, KEY):
+            for x in range(NORMAL_IMPULSE, KEY):
                 point[p, e, x] = every[twin, x]
             every[twin, KEY] = -1.0  # each goes on once
     return count

@@ -63,7 +63,7 @@ from sdfsim.physics.solver.vectors import (
     turn_back,
     vector,
 )
-from sdfsim.physics.solver.world import COLUMNS, KEY, NORMAL, PUSH, TORSION
+from sdfsim.physics.solver.world import COLUMNS, KEY, NORMAL, NORMAL_IMPULSE, TORSION
 
 MANY = 192  # pairs from which on threads are worth their while, also beside other programs
 SHARES = 16  # of the pairs, each with its own scratch, that threads take in turn
@@ -91,7 +91,7 @@ class Near(NamedTuple):
 
 
 @njit(**FAST)
-def look_around(shapes, world, work, motion, rules, span, old):
+def broad_phase(shapes, world, work, motion, rules, span, old):
     """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
 
     Of `work` it sets how far each body may go until it must be looked around again, and who has somebody near.
@@ -102,7 +102,7 @@ def look_around(shapes, world, work, motion, rules, span, old):
     swept(world, work, motion, rules, span)
     pairs = near_pairs(world, motion, work.low, work.high)
     manifolds = carried(world, motion, pairs, old)
-    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.reach)
+    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin)
     for p in range(len(pairs)):
         if near.count[p, 0] + near.count[p, 1] > 0:
             work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True
@@ -110,7 +110,7 @@ def look_around(shapes, world, work, motion, rules, span, old):
 
 
 @njit(**BARE)
-def way_of(shapes, s, t):
+def pair_kind(shapes, s, t):
     """How two shapes are looked at."""
     table, start = shapes.table, shapes.piece_start
     one, other = is_round(table, s), is_round(table, t)
@@ -133,7 +133,7 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
     total = 0
     for p in range(count):
         s, t = world.shape[pairs[p, 0]], world.shape[pairs[p, 1]]
-        way = way_of(shapes, s, t)
+        way = pair_kind(shapes, s, t)
         for side in range(2):
             start[p, side] = total
             own = s if side == 0 else t
@@ -166,7 +166,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     a, b = pairs[p, 0], pairs[p, 1]
     most = ways[a] + ways[b] + reach
-    way = way_of(shapes, world.shape[a], world.shape[b])
+    way = pair_kind(shapes, world.shape[a], world.shape[b])
     if way == SOLIDS:
         _near_pieces(shapes, world, motion, matrix, a, b, most, near, p)
         return
@@ -241,7 +241,7 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
 
 
 @njit(**FAST)
-def collide(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
+def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
     """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
 
     `gone` [N] is how far any point of a body may have moved since `near` was made.
@@ -267,7 +267,7 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     if near.count[p, 0] + near.count[p, 1] == 0:
         manifolds.count[p] = 0
         return
-    way = way_of(shapes, world.shape[a], world.shape[b])
+    way = pair_kind(shapes, world.shape[a], world.shape[b])
     if way == ROUND:
         _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p)
         return
@@ -287,7 +287,7 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
         return
     known = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
     manifolds.count[p] = known
-    count, look = 0, rules.look + 2.0 * rules.margin + _nearer(world, motion, rules, a, b)
+    count, look = 0, rules.search_margin + 2.0 * rules.margin + _approach_margin(world, motion, rules, a, b)
     for side in range(2):
         if swallowed(shapes, world, motion, matrix, a, b, side, scratch.found):
             manifolds.count[p] = merged(rules, manifolds.point, p, 0, scratch, 1, False)
@@ -339,13 +339,13 @@ def _both_touch(shapes, world, motion, matrix, rules, a, b, place):
         here = turn_back(matrix, body, sub(place, get(motion.position, body)))
         here = scale(add(here, get(world.com, body)), 1.0 / world.scale[body])
         d = distance_alone(shapes.table, shapes.brick, shapes.sample, world.shape[body], here)
-        if abs(d) * world.scale[body] > rules.look:
+        if abs(d) * world.scale[body] > rules.search_margin:
             return False
     return True
 
 
 @njit(**BARE)
-def _nearer(world, motion, rules, a, b):
+def _approach_margin(world, motion, rules, a, b):
     """How much farther than usual a pair looks for points: as far as any of its points may come nearer."""
     if rules.ahead == 0.0:
         return 0.0
@@ -363,7 +363,7 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
     offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
-    look = rules.reach + 2.0 * rules.margin + _nearer(world, motion, rules, a, b)
+    look = rules.contact_margin + 2.0 * rules.margin + _approach_margin(world, motion, rules, a, b)
     plane, pieces = shapes.table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])
     up, count = turn(matrix, b, (0.0, 0.0, 1.0)), 0
     for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
@@ -443,11 +443,11 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
     first, second = shapes.table[world.shape[a], KIND], shapes.table[world.shape[b], KIND]
     one, other = is_round(shapes.table, world.shape[a]), is_round(shapes.table, world.shape[b])
     known, found, point = manifolds.count[p], scratch.found, manifolds.point
-    reach = rules.reach + _nearer(world, motion, rules, a, b)
+    reach = rules.contact_margin + _approach_margin(world, motion, rules, a, b)
     count = round_points(shapes, world, motion, matrix, reach, a, b, 0 if one else 1, found)
     if count == 1 and first == SPHERE and second == SPHERE:
         for x in range(COLUMNS):
-            if known == 0 or x < PUSH or x >= KEY:
+            if known == 0 or x < NORMAL_IMPULSE or x >= KEY:
                 point[p, 0, x] = found[0, x]
         manifolds.count[p] = 1
         return
@@ -467,7 +467,7 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
     (`refresh`)."""
     table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, solids(shapes)
     s, t = shape[pairs[p, 0]], shape[pairs[p, 1]]
-    way = way_of(shapes, s, t)
+    way = pair_kind(shapes, s, t)
     if way == SOLIDS:
         offset = sub(origin(place, frame, coms, 0), origin(place, frame, coms, 1))
         plane, pieces = table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])

@@ -14,9 +14,9 @@ from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Touch
 from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
+from sdfsim.physics.solver.advance import advance as compiled_step
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.physics.solver.record import Edges
-from sdfsim.physics.solver.step import step as compiled_step
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactSurface
@@ -56,7 +56,7 @@ class Compiled:
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=np.ascontiguousarray(pose.to_matrix(state.orientation.cpu()).numpy()), inverse=np.zeros((n, 3, 3)),
-            free=np.zeros((n, 9)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), load=np.zeros((n, 6)),
+            free=np.zeros((n, 9)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), wrench=np.zeros((n, 6)),
             part=np.ones(n), ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
@@ -94,7 +94,7 @@ def _solve(
     bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
 ) -> tuple[State, Edges, tuple[int, ...]]:
     motion, manifolds = taken_up(bodies, state, scene, rules)
-    scene.work.load[:] = 0.0 if state.load is None else state.load.numpy()
+    scene.work.wrench[:] = 0.0 if state.load is None else state.load.numpy()
     manifolds, edges, counts = scene.run(motion, manifolds, rules)
     after = replace(
         state,
@@ -102,7 +102,7 @@ def _solve(
         orientation=torch.from_numpy(motion.orientation),
         velocity=torch.from_numpy(motion.velocity),
         angular_velocity=torch.from_numpy(motion.angular),
-        time=state.time + rules.inner * rules.steps,
+        time=state.time + rules.substep_dt * rules.substeps,
     )
     after = bodies.led(after)
     known = (motion.touching, motion.quiet, motion.anchor, motion.island, *manifolds)
@@ -290,7 +290,7 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         inverse_mass=array["inverse_mass"], inertia=inertia,
         inverse_inertia=np.linalg.inv(inertia) * moves[:, None, None], isotropic=isotropic,
         friction=array["friction"], restitution=array["restitution"], moves=moves, scripted=scripted,
-        group=array["group"], allowed=array["allowed"], realm=array["world"],
+        group=array["group"], allowed=array["allowed"], world=array["world"],
         going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
     )  # fmt: skip

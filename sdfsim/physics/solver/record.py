@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.physics.solver.solve import IMPULSE, met_half_way
+from sdfsim.physics.solver.impulses import IMPULSE, met_half_way
 from sdfsim.physics.solver.vectors import BARE, FAST, get, sub, turn
-from sdfsim.physics.solver.world import DRAG, GAP, NORMAL, PUSH
+from sdfsim.physics.solver.world import GAP, NORMAL, NORMAL_IMPULSE, TANGENTIAL
 
 # Columns of an edge: from the centres of mass of both bodies to the contact, the normal from the second body to the
 # first, the impulse on the first body (all along world axes), the distance when it was first met, the part of the step
@@ -52,7 +52,7 @@ def gathered(world, motion, matrix, manifolds, pairs, when, edges):
     edges, e = _longer(edges, manifolds.count[:pairs].sum())
     for m in range(pairs):
         for k in range(manifolds.count[m]):
-            if manifolds.point[m, k, PUSH] == 0.0:
+            if manifolds.point[m, k, NORMAL_IMPULSE] == 0.0:
                 _put(motion, matrix, manifolds, m, k, when, edges, e)
                 e += 1
     key = edges.pair[:e, 0] * len(world.shape) + edges.pair[:e, 1]
@@ -88,11 +88,11 @@ def _put(motion, matrix, manifolds, m, k, when, edges, e):
     other = turn(matrix, b, (point[m, k, 3], point[m, k, 4], point[m, k, 5]))
     arm, other = met_half_way(sub(get(motion.position, a), get(motion.position, b)), arm, other)
     edges.pair[e, 0], edges.pair[e, 1] = a, b
-    push = point[m, k, PUSH]
+    push = point[m, k, NORMAL_IMPULSE]
     for x in range(3):
         edges.value[e, ARM + x], edges.value[e, OTHER + x] = arm[x], other[x]
         edges.value[e, AXIS + x] = point[m, k, NORMAL + x]
-        edges.value[e, GIVEN + x] = push * point[m, k, NORMAL + x] + point[m, k, DRAG + x]
+        edges.value[e, GIVEN + x] = push * point[m, k, NORMAL + x] + point[m, k, TANGENTIAL + x]
     edges.value[e, APART], edges.value[e, WHEN], edges.value[e, WEIGHT] = point[m, k, GAP], when, push
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.vectors import ENTRY, add, dot, get, put, rotated, scale, sub, turn, vector
-from sdfsim.physics.solver.world import DRAG, GAP, NORMAL, PUSH
+from sdfsim.physics.solver.world import GAP, NORMAL, NORMAL_IMPULSE, TANGENTIAL
 
 
 class Touching(NamedTuple):
@@ -66,10 +66,10 @@ def touching(manifolds, position, orientation, within):
             point = manifolds.point[m, k]
             if point[GAP] <= within:
                 n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
-                drag = (point[DRAG], point[DRAG + 1], point[DRAG + 2])
+                drag = (point[TANGENTIAL], point[TANGENTIAL + 1], point[TANGENTIAL + 2])
                 pair[e], gap[e] = manifolds.pair[m], point[GAP]
                 put(place, e, add(get(position, first), rotated(orientation, first, vector(point), 1.0)))
                 put(normal, e, n)
-                put(impulse, e, add(scale(n, point[PUSH]), drag))
+                put(impulse, e, add(scale(n, point[NORMAL_IMPULSE]), drag))
                 e += 1
     return Touching(pair[:e], place[:e], normal[:e], impulse[:e], gap[:e])

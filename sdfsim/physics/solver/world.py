@@ -11,7 +11,18 @@ POINTS = 24  # of a manifold at most
 # the second body to the first (world), the distance, the impulses of the last inner step: along the normal, and the
 # tangential one (world); the two patches that meet there; by which factor friction acts nearer to the middle of the
 # patch than the point is; and whether it is void, see `internal_edges`.
-FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, KEY, TORSION, VOID, COLUMNS = 0, 3, 6, 9, 10, 11, 14, 15, 16, 17
+FIRST, SECOND, NORMAL, GAP, NORMAL_IMPULSE, TANGENTIAL, KEY, TORSION, VOID, COLUMNS = (
+    0,
+    3,
+    6,
+    9,
+    10,
+    11,
+    14,
+    15,
+    16,
+    17,
+)
 
 
 class World(NamedTuple):
@@ -37,7 +48,7 @@ class World(NamedTuple):
     scripted: np.ndarray  # [N] bool, kinematic
     group: np.ndarray  # [N] int64
     allowed: np.ndarray  # [G, G] bool, whether two groups may touch
-    realm: np.ndarray  # [N] int64, bodies of two realms never meet; -1 is in all
+    world: np.ndarray  # [N] int64, bodies of two worlds never meet; -1 is in all
     going: np.ndarray  # [A] int64, the bodies that move or are scripted
     plane: np.ndarray  # [K] int64, the bodies that are infinite
     still: np.ndarray  # [M] int64, the other static bodies, in the order of their lower ends along `axis`
@@ -59,7 +70,9 @@ class Work(NamedTuple):
     free: np.ndarray
     change: np.ndarray
     shift: np.ndarray
-    load: np.ndarray  # [N, 6] force at the centre of mass and torque, world axes, that pull at a body through the step
+    wrench: (
+        np.ndarray
+    )  # [N, 6] force at the centre of mass and torque, world axes, that pull at a body through the step
     part: np.ndarray  # [N] how much of the inner step a body may move
     ways: np.ndarray  # [N] how far a body may move until it has to be looked around again
     gone: np.ndarray  # [N] how far it has
@@ -103,8 +116,8 @@ class Rules(NamedTuple):
     """What is in play. Lengths and speeds are those of model units, in which the smallest bodies are about 1.4 wide."""
 
     gravity: np.ndarray  # [3]
-    inner: float  # the inner step
-    steps: int  # inner steps in a step
+    substep_dt: float  # the inner step
+    substeps: int  # of them in a step
     slow: float  # an approach up to this speed ends at the surface without a rebound
     # friction, restitution, rotation, sleep: whether they are
     friction: bool = True
@@ -116,8 +129,8 @@ class Rules(NamedTuple):
     cone: bool = True  # whether friction is bounded by a cone; else along two axes, each by itself
     note: bool = False  # whether what contacts did in the step is wanted, see `record`
     ahead: float = 0.0  # new points are looked for so much time farther, as fast as two bodies move against each other
-    reach: float = 0.02  # contacts are kept up to this distance, and while they have slid by no more
-    look: float = 0.004  # new ones are looked for up to this one and twice the margin
+    contact_margin: float = 0.02  # contacts are kept up to this distance, and while they have slid by no more
+    search_margin: float = 0.004  # new ones are looked for up to this one and twice the margin
     still: float = 1e-4  # pairs that have moved by less within a step are not looked at again
     together: float = 1e-4  # points that are deeper than the deepest less this meet in one impact
     erp: float = 0.08  # the share of a penetration that an inner step resolves, through velocity

@@ -8,8 +8,19 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from sdfsim.physics.solver.islands import islands_of
 from sdfsim.physics.solver.vectors import BARE, FAST, add, along, cross, dot, get, norm, scale, sub, turn, vector
-from sdfsim.physics.solver.world import DRAG, FIRST, GAP, KEY, NORMAL, PUSH, SECOND, TORSION, VOID
+from sdfsim.physics.solver.world import (
+    FIRST,
+    GAP,
+    KEY,
+    NORMAL,
+    NORMAL_IMPULSE,
+    SECOND,
+    TANGENTIAL,
+    TORSION,
+    VOID,
+)
 
 # Columns of a row: its direction, how it turns the first and the second body, what a unit of impulse makes of their
 # angular velocities, the inverse of what it makes of the relative velocity, the wanted change, the impulse so far.
@@ -30,7 +41,7 @@ class System(NamedTuple):
 
     where: np.ndarray  # [C, 4] int64: manifold, point, first and second body
     row: np.ndarray  # [C, 3, WIDTH]: along the normal and two tangents
-    grip: np.ndarray  # [C] product of friction
+    friction: np.ndarray  # [C] product of friction
     wanted: np.ndarray  # [C] speed that resolves penetration and is then forgotten
     pushed: np.ndarray  # [C] impulse that has given it so far
     # [C, 3]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
@@ -41,7 +52,7 @@ class System(NamedTuple):
 
 
 @njit(**FAST)
-def respond(world, work, motion, rules, manifolds):
+def solve_contacts(world, work, motion, rules, manifolds):
     """Solve for the impulses of all contacts; they go to the manifolds, and to `change` and `shift` of `work`.
 
     Returns:
@@ -57,10 +68,10 @@ def respond(world, work, motion, rules, manifolds):
             _solve(world, rules, system, change, shift, i)
     for c in range(len(system.where)):
         point = manifolds.point[system.where[c, 0], system.where[c, 1]]
-        point[PUSH] = system.row[c, 0, IMPULSE]
+        point[NORMAL_IMPULSE] = system.row[c, 0, IMPULSE]
         for x in range(3):
             one, other = system.row[c, 1], system.row[c, 2]
-            point[DRAG + x] = one[IMPULSE] * one[AXIS + x] + other[IMPULSE] * other[AXIS + x]
+            point[TANGENTIAL + x] = one[IMPULSE] * one[AXIS + x] + other[IMPULSE] * other[AXIS + x]
     return system
 
 
@@ -70,7 +81,7 @@ def _equations(world, work, motion, rules, manifolds):
     most = manifolds.count.sum()
     where = np.empty((most, 4), np.int64)
     row = np.zeros((most, 3, WIDTH))
-    grip, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
+    mu, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
     count = 0
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
@@ -92,17 +103,17 @@ def _equations(world, work, motion, rules, manifolds):
             then = add(free_fall, _turning(free, a, b, arm, other))
             approach = dot(now, n)
             gap = point[GAP] - margin
-            way = -dot(then, n) * rules.inner
+            way = -dot(then, n) * rules.substep_dt
             early = not rules.adds and way > thin
             if point[VOID] > 0.0 or (gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)):
-                point[PUSH] = point[DRAG] = point[DRAG + 1] = point[DRAG + 2] = 0.0
+                point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
                 continue
             _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
             # Newton's rule for all that meets in one impact: without friction, and with e = 1, energy is kept.
             target, rebounds = 0.0, bounce > 0.0 and abs(approach) > rules.slow
             if rebounds:
                 # What bounces before it has touched has the speed that it will have here on its way back.
-                pull = (dot(free_fall, n) - approach) / rules.inner
+                pull = (dot(free_fall, n) - approach) / rules.substep_dt
                 fall = 2.0 * pull * max(gap, 0.0) * (1.0 - bounce * bounce)
                 square = bounce * bounce * approach * approach + (fall if early else 0.0)
                 target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
@@ -110,19 +121,19 @@ def _equations(world, work, motion, rules, manifolds):
             before = dot(free_fall, n) if rebounds else dot(then, n)
             deep = push = rest = 0.0
             if gap > TOUCH:
-                rest = -gap / rules.inner
+                rest = -gap / rules.substep_dt
                 target = target if rebounds else rest
             elif gap > -rules.split:
                 if gap < -rules.slop:
-                    push = (-gap - rules.slop) * rules.erp / rules.inner
+                    push = (-gap - rules.slop) * rules.erp / rules.substep_dt
                     target = max(push, min(target + push, -approach) if rules.adds else target)
             else:
-                deep = -gap * rules.erp / rules.inner
+                deep = -gap * rules.erp / rules.substep_dt
             row[count, 0, WANTED] = target - before
-            row[count, 0, IMPULSE] = point[PUSH]
+            row[count, 0, IMPULSE] = point[NORMAL_IMPULSE]
             wanted[count] = deep
             calm[count, 0], calm[count, 1], calm[count, 2] = rest - before, before, push
-            grip[count] = friction
+            mu[count] = friction
             if friction > 0.0:
                 if point[TORSION] < 1.0:
                     arm, other = _drawn_in(matrix, manifolds.point, m, manifolds.count[m], k, a, b, between)
@@ -137,8 +148,8 @@ def _equations(world, work, motion, rules, manifolds):
                 _row(world.inverse_mass, inverse, a, b, arm, other, two, row, count, 2)
                 row[count, 1, WANTED] = -dot(then, one)
                 row[count, 2, WANTED] = -dot(then, two)
-                drag = (point[DRAG], point[DRAG + 1], point[DRAG + 2])
-                most_drag = friction * point[PUSH]
+                drag = (point[TANGENTIAL], point[TANGENTIAL + 1], point[TANGENTIAL + 2])
+                most_drag = friction * point[NORMAL_IMPULSE]
                 first, second = dot(drag, one), dot(drag, two)
                 if rules.cone:
                     share = _within(first, second, most_drag)
@@ -148,8 +159,8 @@ def _equations(world, work, motion, rules, manifolds):
                     row[count, 2, IMPULSE] = min(max(second, -most_drag), most_drag)
             where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
             count += 1
-    start, order = _islands(world, work.parent, work.number, where[:count])
-    return System(where[:count], row[:count], grip[:count], wanted[:count], pushed[:count], calm[:count], start, order)
+    start, order = islands_of(world, work.parent, work.number, where[:count])
+    return System(where[:count], row[:count], mu[:count], wanted[:count], pushed[:count], calm[:count], start, order)
 
 
 @njit(**BARE)
@@ -228,52 +239,6 @@ def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
     row[c, e, MASS] = 1.0 / (inverse_mass[a] + inverse_mass[b] + dot(lever, spin) + dot(counter, back))
 
 
-@njit(**BARE)
-def root(parent, b):
-    while parent[b] != b:
-        parent[b] = parent[parent[b]]
-        b = parent[b]
-    return b
-
-
-@njit(**BARE)
-def join(parent, a, b):
-    """Bodies a and b belong together."""
-    one, other = root(parent, a), root(parent, b)
-    parent[max(one, other)] = min(one, other)
-
-
-@njit(**FAST)
-def _islands(world, parent, number, where):
-    """Contacts ordered by island: bodies that move, joined by contacts."""
-    for c in range(len(where)):
-        for e in range(2, 4):
-            parent[where[c, e]], number[where[c, e]] = where[c, e], -1
-    for c in range(len(where)):
-        a, b = where[c, 2], where[c, 3]
-        if world.moves[a] and world.moves[b]:
-            join(parent, a, b)
-    islands = 0
-    label = np.empty(len(where), np.int64)
-    for c in range(len(where)):
-        a = root(parent, where[c, 2])
-        if number[a] < 0:
-            number[a] = islands
-            islands += 1
-        label[c] = number[a]
-    start = np.zeros(islands + 1, np.int64)
-    for c in range(len(where)):
-        start[label[c] + 1] += 1
-    for i in range(islands):
-        start[i + 1] += start[i]
-    fill = start[:-1].copy()
-    order = np.empty(len(where), np.int64)
-    for c in range(len(where)):
-        order[fill[label[c]]] = c
-        fill[label[c]] += 1
-    return start, order
-
-
 @njit(parallel=True, **FAST)
 def _solve_many(world, rules, system, change, shift):
     for i in prange(len(system.start) - 1):
@@ -292,11 +257,11 @@ def _solve(world, rules, system, change, shift, island):
         c = order[o]
         deep = deep or system.wanted[c] > 0.0
         lively = lively or row[c, 0, WANTED] > system.calm[c, 0]
-        for e in range(3 if system.grip[c] > 0.0 else 1):
+        for e in range(3 if system.friction[c] > 0.0 else 1):
             if row[c, e, IMPULSE] != 0.0:
                 _apply(where, row, mass, change, c, e, row[c, e, IMPULSE])
     if deep:
-        _part(mass, rules, system, shift, island)
+        _resolve_penetration(mass, rules, system, shift, island)
     _balance(mass, rules, system, change, island)
     for share in (0.5, 0.0):
         if not lively or not _gains(rules, system, change, island):
@@ -311,7 +276,7 @@ def _solve(world, rules, system, change, shift, island):
             row[c, 0, WANTED] = system.calm[c, 0] + share * (row[c, 0, WANTED] - system.calm[c, 0])
             if system.calm[c, 2] > 0.0:
                 system.wanted[c] = (1.0 - share) * system.calm[c, 2]
-        _part(mass, rules, system, shift, island)
+        _resolve_penetration(mass, rules, system, shift, island)
         _balance(mass, rules, system, change, island)
 
 
@@ -326,13 +291,13 @@ def _gains(rules, system, change, island):
         before, push = system.calm[c, 1], system.calm[c, 2]
         spare += 0.5 * row[c, 0, MASS] * (SPARE * push * push + ROUNDING * before * before + lift)
         work += row[c, 0, IMPULSE] * (before + 0.5 * _speed(where, row, change, c, 0))
-        for e in range(1, 3 if system.grip[c] > 0.0 else 1):
+        for e in range(1, 3 if system.friction[c] > 0.0 else 1):
             work += row[c, e, IMPULSE] * (0.5 * _speed(where, row, change, c, e) - row[c, e, WANTED])
     return work > spare
 
 
 @njit(**BARE)
-def _part(mass, rules, system, shift, island):
+def _resolve_penetration(mass, rules, system, shift, island):
     """Part what is deep in each other, by velocities that move bodies once and are forgotten."""
     where, row, order = system.where, system.row, system.order
     for _ in range(rules.rounds):
@@ -353,7 +318,7 @@ def _part(mass, rules, system, shift, island):
 @njit(**BARE)
 def _balance(mass, rules, system, change, island):
     """All normals, then all friction, until no impulse changes a velocity by more than `exact`."""
-    where, row, order, grip = system.where, system.row, system.order, system.grip
+    where, row, order, friction = system.where, system.row, system.order, system.friction
     first, last = system.start[island], system.start[island + 1]
     for _ in range(rules.rounds):
         worst = 0.0
@@ -362,10 +327,10 @@ def _balance(mass, rules, system, change, island):
             worst = max(worst, _relax(where, row, mass, change, c, 0, 1, 0.0, math.inf))
         for o in range(first, last):
             c = order[o]
-            if grip[c] > 0.0:
-                most = grip[c] * row[c, 0, IMPULSE]
+            if friction[c] > 0.0:
+                most = friction[c] * row[c, 0, IMPULSE]
                 if rules.cone:
-                    worst = max(worst, _rub(where, row, mass, change, c, most))
+                    worst = max(worst, _relax_friction(where, row, mass, change, c, most))
                 else:
                     worst = max(worst, _relax(where, row, mass, change, c, 1, 3, -most, most))
         if worst <= rules.exact:
@@ -397,7 +362,7 @@ def _relax(where, row, mass, change, c, first, last, least, most):
 
 
 @njit(**BARE)
-def _rub(where, row, mass, change, c, most):
+def _relax_friction(where, row, mass, change, c, most):
     """Bring both tangential rows of a contact to rest, as far as the cone of friction allows; returns by how much that
     changed."""
     a, b = where[c, 2], where[c, 3]

@@ -1,0 +1,125 @@
+"""Sleep, compiled: islands that rest in balance are frozen, and woken by what moves beside them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sdfsim.physics.solver.islands import join, root
+from sdfsim.physics.solver.vectors import BARE, FAST, get, norm, put, sub
+
+
+@njit(**BARE)
+def woken(world, motion, manifolds, near):
+    """Wake the islands that something awake may touch in this step; whether there were any."""
+    found = False
+    for p in range(len(near.start)):
+        a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+        if near.count[p, 0] + near.count[p, 1] == 0:
+            continue
+        for sleeper, other in ((a, b), (b, a)):
+            island = motion.island[sleeper]
+            if island < 0:
+                continue
+            awake = motion.island[other] < 0 and (world.moves[other] or world.scripted[other])
+            moving = norm(get(motion.velocity, other)) + norm(get(motion.angular, other)) > 0.0
+            if awake and moving:
+                found = True
+                for c in range(len(motion.island)):
+                    if motion.island[c] == island:
+                        motion.island[c] = -1
+                        motion.quiet[c] = 0
+                        motion.touching[c] = True
+    return found
+
+
+@njit(**FAST)
+def put_to_sleep(world, motion, rules, manifolds):
+    """Freeze the islands all of which have stayed where they were for long enough."""
+    n = len(world.shape)
+    for b in world.going:
+        if not world.moves[b] or motion.island[b] >= 0:
+            continue
+        if motion.touching[b] and _strayed(world, motion, b, 0) < rules.stray:
+            motion.quiet[b] += 1
+        else:
+            motion.quiet[b] = 0
+        if motion.quiet[b] == rules.rest // 2:
+            _drop_anchor(motion, b, 7)
+        if motion.quiet[b] == 0 or (motion.quiet[b] >= rules.rest and not _balanced(world, motion, rules, b)):
+            motion.quiet[b] = 0
+            _drop_anchor(motion, b, 0)
+    if motion.quiet.max() < rules.rest:
+        return
+    parent = np.arange(n)
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        if manifolds.count[m] and world.moves[a] and world.moves[b]:
+            join(parent, a, b)
+    restless = np.zeros(n, np.bool_)
+    for b in range(n):
+        if world.moves[b] and motion.island[b] < 0 and motion.quiet[b] < rules.rest:
+            restless[root(parent, b)] = True
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        if manifolds.count[m] and world.scripted[b]:
+            if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
+                restless[root(parent, a)] = True
+    number = motion.island.max() + 1
+    for b in range(n):
+        if world.moves[b] and motion.island[b] < 0 and not restless[root(parent, b)]:
+            motion.island[b] = number + root(parent, b)
+            put(motion.velocity, b, (0.0, 0.0, 0.0))
+            put(motion.angular, b, (0.0, 0.0, 0.0))
+            motion.touching[b] = True
+
+
+@njit(**BARE)
+def _drop_anchor(motion, b, column):
+    for x in range(3):
+        motion.anchor[b, column + x] = motion.position[b, x]
+    for x in range(4):
+        motion.anchor[b, column + 3 + x] = motion.orientation[b, x]
+
+
+@njit(**BARE)
+def _strayed(world, motion, b, column):
+    """How far at most any point of a body is from where an anchor has it."""
+    anchor, cosine = motion.anchor[b], 0.0
+    for x in range(4):
+        cosine += anchor[column + 3 + x] * motion.orientation[b, x]
+    away = sub(get(motion.position, b), (anchor[column], anchor[column + 1], anchor[column + 2]))
+    return norm(away) + 2.0 * math.sqrt(max(0.0, 1.0 - cosine * cosine)) * world.radius[b]
+
+
+@njit(**BARE)
+def _balanced(world, motion, rules, b):
+    """Whether the forces at a body are in balance: as it went on in the second half of its quiet time, against the
+    first, it would stay near in the time that follows.
+
+    Of the poses q0, q1, q2 at the start, the middle and the end the change of the way is q2 - 2 q1 + q0, which a
+    constant force makes a quarter of what it moves a body in as long a time from rest.
+    """
+    half, whole = rules.rest - rules.rest // 2, rules.rest
+    anchor = motion.anchor[b]
+    most = 0.0
+    for x in range(3):
+        later = (motion.position[b, x] - anchor[7 + x]) / half
+        before = (anchor[7 + x] - anchor[x]) / (whole - half)
+        most += (later - before) ** 2
+    turned, sign, halfway = 0.0, 1.0, 1.0
+    dots = 0.0
+    mids = 0.0
+    for x in range(4):
+        dots += anchor[3 + x] * anchor[10 + x]
+        mids += anchor[10 + x] * motion.orientation[b, x]
+    sign, halfway = (1.0 if dots >= 0.0 else -1.0), (1.0 if mids >= 0.0 else -1.0)
+    for x in range(4):
+        later = (halfway * motion.orientation[b, x] - anchor[10 + x]) / half
+        before = (anchor[10 + x] - sign * anchor[3 + x]) / (whole - half)
+        turned += (later - before) ** 2
+    # Steps a half apart: the acceleration a step, and what it makes of a body at rest in `whole` steps more.
+    gain = (math.sqrt(most) + 2.0 * math.sqrt(turned) * world.radius[b]) / half
+    return 0.5 * gain * whole * whole < rules.drift
