@@ -13,6 +13,10 @@ from sdfsim.evaluation.everyday import ROWS, Check, Setting, changed, checks, mo
 
 HOLDS = Path(__file__).with_name("everyday_holds.txt")
 FAST = ("slender", "edges", "gentle", "bullets", "elastic", "before_touch", "thin_floors", "flat_drops")
+# Three sizes and orientations, and what solids are made of.
+SETTINGS = (
+    Setting(), Setting(kind="mesh"), Setting(size=0.02, yaw=37.0), Setting(size=1.0, yaw=121.0), Setting(kind="grid"),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -20,10 +24,18 @@ def listed() -> list[str]:
     return HOLDS.read_text(encoding="utf-8").splitlines()
 
 
-@pytest.mark.parametrize("row", [row if row in FAST else pytest.param(row, marks=pytest.mark.slow) for row in ROWS])
-def test_what_holds_is_what_is_listed(row, listed):
-    told = changed(list(checks(row, Setting())), listed)
-    assert told == [], f"{len(told)} changed: python -m sdfsim.evaluation.everyday {row} --update {HOLDS}"
+CASES = [
+    pytest.param(row, at, marks=[] if row in FAST and at == Setting() else [pytest.mark.slow], id=f"{row}-{at}")
+    for at in SETTINGS
+    for row in ROWS
+]
+
+
+@pytest.mark.parametrize(("row", "at"), CASES)
+def test_what_holds_is_what_is_listed(row, at, listed):
+    told = changed(list(checks(row, at)), listed)
+    how = f"{row} --size {at.size:g} --yaw {at.yaw:g} --kind {at.kind} --update {HOLDS}"
+    assert told == [], f"{len(told)} changed: python -m sdfsim.evaluation.everyday {how}"
 
 
 # --- the list itself ---
