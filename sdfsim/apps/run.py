@@ -39,8 +39,8 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene, fingerprints
-from sdfsim.simulate.run_memory import COUNTS, PHASES
 from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
+from sdfsim.simulate.steppers import COUNTS, PHASES
 
 Viewer = Literal["none", "file", "native", "web"]
 EVERY = 30.0  # s between two checkpoints
@@ -297,9 +297,7 @@ class Checkpoint:
             if str(kept["identity"]) != self.identity:
                 raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
             self._parts = int(kept["parts"])
-            self._simulator.state = _state(kept, self._simulator.device)
-            self._simulator.steps_done = int(kept["steps_done"])
-            self._simulator.initial_rollout()  # told already; what is taken up here was given by nobody
+            self._simulator.restore(_state(kept, self._simulator.device), int(kept["steps_done"]))
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{file}: not a checkpoint of this version ({error})", _ANEW) from error
         return [Rollout.load(self._part(k)) for k in range(self._parts)]
@@ -354,7 +352,8 @@ def identity(simulator: Simulator) -> str:
     """A hash of all that decides how a run goes: bodies with their paths and distances, start, rules, units, model."""
     s = simulator
     model = (s.model.kind, s.model.reach, s.model.network)
-    return digest(s.dt, s.seed, replace(s.rules, rows=None), s.units, s.bodies, s.state, model)
+    chosen = {name: value for name, value in vars(s.stepper).items() if isinstance(value, bool | float)}
+    return digest(s.dt, s.seed, s.options, type(s.stepper).__name__, chosen, s.units, s.bodies, s.state, model)
 
 
 def _arrays(state: State) -> dict[str, np.ndarray]:

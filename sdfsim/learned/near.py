@@ -16,10 +16,9 @@ from torch import Tensor
 from sdfsim.learned.surfaces import expanded, node_owner
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
-from sdfsim.physics.options import StepOptions
+from sdfsim.physics.options import Options
 from sdfsim.physics.solver.edges import nodes_within
-from sdfsim.physics.solver.prepare import compiled_rules, taken_up
-from sdfsim.simulate.run_memory import Memory
+from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 
 PIERCING = 1e-9  # relative: areas and denominators below count as none
 
@@ -51,12 +50,12 @@ def no_contacts(device: torch.device) -> Contacts:
 
 
 def find_contacts(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
 ) -> Contacts:
-    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units."""
-    scene = (memory or Memory()).compiled(bodies, state)
-    rules = compiled_rules(StepOptions(gravity, dt, 1))._replace(reach=reach)
-    motion, _ = taken_up(bodies, state, scene, rules)
+    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units. A run
+    gives its compiled `scene`, else one is made."""
+    scene = scene or Compiled(bodies, state)
+    rules, (motion, _) = compiled_rules(Options(gravity, dt, 1))._replace(reach=reach), taken_up(state)
     found = nodes_within(
         scene.shapes, scene.world, scene.work, motion, rules, bodies.node.cpu().numpy(), bodies.node_start.cpu().numpy()
     )
@@ -113,7 +112,7 @@ def no_pairs(device: torch.device, corners: int) -> Pairs:
 
 
 def node_pairs(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
 ) -> Pairs:
     """All pairs of nodes of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
     single = torch.arange(len(bodies.node), device=bodies.device)[:, None]
@@ -121,7 +120,7 @@ def node_pairs(
 
 
 def face_pairs(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
 ) -> Pairs:
     """All pairs of faces of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
     return _pairs(bodies, state, gravity, reach, dt, bodies.face)
