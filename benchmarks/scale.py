@@ -83,7 +83,7 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:
-        published = stepper_of(load_model(model, weights=False)).own_step
+        published = stepper_of(load_model(model, weights=False)).on_surfaces
         simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
         frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
         began = time.process_time()

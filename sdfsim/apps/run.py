@@ -282,7 +282,7 @@ class Checkpoint:
         self._folder = folder
         self._simulator = simulator
         self.identity = identity(simulator)
-        self._fresh: list[tuple[Rollout, State, int]] = []  # one entry a step: an interruption splits none
+        self._fresh: list[tuple[Rollout, State]] = []  # one entry a step: an interruption splits none
         self._parts = 0
         self._saved = time.monotonic()
 
@@ -297,14 +297,14 @@ class Checkpoint:
             if str(kept["identity"]) != self.identity:
                 raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
             self._parts = int(kept["parts"])
-            self._simulator.restore(_state(kept, self._simulator.device), int(kept["steps_done"]))
+            self._simulator.restore(_state(kept, self._simulator.device))
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{file}: not a checkpoint of this version ({error})", _ANEW) from error
         return [Rollout.load(self._part(k)) for k in range(self._parts)]
 
     def add(self, frame: Rollout) -> None:
         """Keep a frame and the state it tells of; on disk when the last time is long enough ago."""
-        self._fresh.append((frame, self._simulator.state, self._simulator.steps_done))
+        self._fresh.append((frame, self._simulator.state))
         if time.monotonic() - self._saved > EVERY:
             self.save()
 
@@ -312,10 +312,9 @@ class Checkpoint:
         """Bring what is new to the disk; the state comes last, so that it never tells of a part that is not there."""
         if self._fresh:
             self._folder.mkdir(exist_ok=True)
-            _, state, steps = self._fresh[-1]
-            join([frame for frame, *_ in self._fresh]).save(self._part(self._parts))
-            done = {"identity": self.identity, "parts": self._parts + 1, "steps_done": steps}
-            write_arrays(self._folder / _STATE, done | _arrays(state), compressed=False)
+            join([frame for frame, _ in self._fresh]).save(self._part(self._parts))
+            done = {"identity": self.identity, "parts": self._parts + 1}
+            write_arrays(self._folder / _STATE, done | _arrays(self._fresh[-1][1]), compressed=False)
             self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
             self._parts += 1
         self._saved = time.monotonic()

@@ -164,7 +164,7 @@ def model_units(stepper: Stepper, like: Trajectory) -> Units:
     """Model units in which the recorded step is the model's own; where it has none those of its bodies of a metre."""
     model = stepper.model
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
-    if not stepper.own_step:
+    if not stepper.on_surfaces:
         return Units(length=1.0, time=float(np.sqrt(model.gravity / strength)), mass=1.0)
     length = (like.dt / model.dt) ** 2 * strength / model.gravity
     return Units(length=length, time=like.dt / model.dt, mass=1.0)

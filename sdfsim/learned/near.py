@@ -9,6 +9,7 @@ has one node and one face, which lie wherever they are closest to the other's.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -111,23 +112,13 @@ def no_pairs(device: torch.device, corners: int) -> Pairs:
     return Pairs(nobody, nobody, parts, parts, way[:, 0], way, arms, arms, way, way)
 
 
-def node_pairs(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
-) -> Pairs:
-    """All pairs of nodes of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
-    single = torch.arange(len(bodies.node), device=bodies.device)[:, None]
-    return _pairs(bodies, state, gravity, reach, dt, single)
-
-
-def face_pairs(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
-) -> Pairs:
-    """All pairs of faces of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
-    return _pairs(bodies, state, gravity, reach, dt, bodies.face)
-
-
-def _pairs(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, part: Tensor) -> Pairs:
-    """Pairs of `part` [K, C]: nodes or faces, those of a body in a row."""
+def near_pairs(
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None, *,
+    faces: bool,
+) -> Pairs:  # fmt: skip
+    """All pairs of nodes, or of `faces`, of different bodies within `reach` (model length) during a step, as
+    `find_contacts` has it."""
+    part = bodies.face if faces else torch.arange(len(bodies.node), device=bodies.device)[:, None]
     owner = node_owner(bodies)
     velocity = state.velocity + gravity * dt * bodies.moves[:, None]
     arm = pose.rotate(state.orientation[owner], bodies.node)
@@ -166,6 +157,9 @@ def _pairs(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: floa
     return Pairs(
         owner[a[:, 0]], owner[b[:, 0]], a, b, distance, way, from_first, from_second, normal_first, normal_second
     )
+
+
+node_pairs, face_pairs = partial(near_pairs, faces=False), partial(near_pairs, faces=True)
 
 
 def _centre(place: Tensor, arm: Tensor, part: Tensor) -> Tensor:

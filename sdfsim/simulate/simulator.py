@@ -96,7 +96,7 @@ class Simulator(LiveScene):
         memory, self._asked = scene.limits.memory_gib, {"dt": dt, "free_flight": free_flight}
         rows = None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE))
         stepper = stepper_of(model, contact=effects.contact.on, free_flight=free_flight, rows=rows)
-        if not stepper.on_cuda:
+        if not stepper.on_surfaces:
             self.device = torch.device("cpu")
         self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed
@@ -190,7 +190,7 @@ class Simulator(LiveScene):
         """Go back to the start of the scene."""
         self.restore(self._start)
 
-    def restore(self, state: State, steps_done: int = 0) -> None:
+    def restore(self, state: State) -> None:
         """Go on from a state that steps have led to, here or in another simulator of the same scene, as they would have
         gone on there: to the last bit, and what slept sleeps on. One that somebody has changed is for `state`. Raises
         SdfsimError for a state that cannot be."""
@@ -198,7 +198,8 @@ class Simulator(LiveScene):
             raise SdfsimError(broken)
         self._state = self._good = state
         self._changed[:], self._handed = False, False
-        self._carry, self.steps_done, self._given = None, steps_done, 0.0
+        self._carry, self._given = None, 0.0
+        self.steps_done = round(state.time / self._options.dt)
 
     def __getitem__(self, name: str) -> BodyHandle:
         """A body by its name. Raises SdfsimError where there is none of that name."""

@@ -81,11 +81,15 @@ class Stepper:
     model: Model
     mean: bool = False  # whether model units follow the mean size of the bodies that move, not the smallest
 
-    on_cuda: ClassVar[bool] = False  # whether it runs there too
+    on_surfaces: ClassVar[bool] = False  # whether it works on surface nodes: on CUDA too, in steps of its own length
     forces: ClassVar[bool] = True  # whether it knows forces that pull at bodies, and tells impulses of contacts
     sleeps: ClassVar[bool] = False  # whether it freezes what rests
     network: ClassVar[bool] = False  # whether one has its say in it
-    own_step: ClassVar[bool] = False  # whether its step is one in its own units, and no other
+
+    @property
+    def distances(self) -> bool:
+        """Whether it asks the compiled distances of a scene."""
+        return False
 
     def units(self, scene: Scene, dt: float | None = None) -> Units:
         """Model units of a scene, see `scene_units`."""
@@ -104,17 +108,24 @@ class Stepper:
         """As it steps scenes that are beyond its training."""
         return self
 
-    def init(self, bodies: Bodies, state: State, options: Options) -> Carry:
-        """What it keeps of a run that starts from `state`."""
-        return Carry(bodies, options)
-
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
         """A state that no step has led to, with what the first one needs."""
         return state
 
+    def init(self, bodies: Bodies, state: State, options: Options) -> Carry:
+        """What it keeps of a run that starts from `state`."""
+        if not self.distances:
+            return Carry(bodies, options)
+        from sdfsim.physics.solver.prepare import Compiled
+
+        return Carry(bodies, options, scene=Compiled(bodies, state))
+
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
-        """The state after somebody has changed pose, velocities or load of the bodies `changed` [N] bool, or the
-        direction or strength of gravity."""
+        """The state after somebody has changed pose, velocities or load of the bodies `changed` [N] bool, or gravity.
+        What was made of scenery is made anew where it is one of these."""
+        scene = carry.scene
+        if scene is not None and (changed & ~(scene.world.moves | scene.world.scripted)).any():
+            scene.place(state)
         return state
 
     @torch.no_grad()
@@ -143,26 +154,20 @@ class Stepper:
 class Solver(Stepper):
     """The contact solve."""
 
+    distances = True  # type: ignore[assignment]
     sleeps = True
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
-        """Training it has seen none: it says where its inner step is longer than any that its laws were checked
-        with."""
+        """It has seen no training: it says where its inner step is longer than any that its laws were checked with."""
         inner = self.model.dt * units.time / (self.model.inner or SUBSTEPS)
         if inner <= LONGEST:
             return []
         return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
 
-    def init(self, bodies: Bodies, state: State, options: Options) -> Carry:
-        from sdfsim.physics.solver.prepare import Compiled
-
-        return Carry(bodies, options, scene=Compiled(bodies, state))
-
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
         from sdfsim.physics.solver.prepare import disturbed
 
-        _placed(state, carry, changed)
-        return disturbed(state, changed, gravity=gravity)
+        return disturbed(super().announce(state, carry, changed), changed, gravity=gravity)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         from sdfsim.physics.solver.prepare import contact_points
@@ -186,9 +191,7 @@ class OnSolver(Solver):
     trust: float = 1.0  # in what the network adds to the solve; 0 where a scene is beyond its training
 
     network = True
-
-    def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
-        return outside_training(scenes, self.model, units)
+    unknown = Stepper.unknown
 
     def distrusted(self) -> Stepper:
         return replace(self, trust=0.0)
@@ -197,8 +200,7 @@ class OnSolver(Solver):
         # No network has seen forces in its training.
         asked = self.trust > 0.0 and state.load is None
         carry.options = replace(carry.options, record=asked)
-        solved = super()._step(state, carry)
-        edges = cast("Edges", carry.edges)
+        solved, edges = super()._step(state, carry), cast("Edges", carry.edges)
         if not (asked and len(edges.pair)):
             return solved
         from sdfsim.learned.inference import corrected, packed, terms_of
@@ -222,19 +224,15 @@ class OnSurfaces(Stepper):
     learned: bool = False
     rows: int | None = None  # how many edges the network works on at once; None for all
 
-    on_cuda = True
+    on_surfaces = network = True
     forces = False
-    network = True
-    own_step = True
+
+    @property
+    def distances(self) -> bool:
+        return self.contact and self.family.distances
 
     def surface(self, shape: Shape) -> Shape:
         return self.family.surface(shape, self.model.nodes)
-
-    def init(self, bodies: Bodies, state: State, options: Options) -> Carry:
-        from sdfsim.physics.solver.prepare import Compiled
-
-        asked = self.contact and self.family.distances
-        return Carry(bodies, options, scene=Compiled(bodies, state) if asked else None)
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
         from sdfsim.learned.surfaces import with_history
@@ -245,14 +243,12 @@ class OnSurfaces(Stepper):
         """Bodies that were changed have come from where their velocities lead from."""
         from sdfsim.learned.surfaces import with_history
 
-        _placed(state, carry, changed)
         rows = torch.from_numpy(changed).to(carry.bodies.device)
-        return with_history(state, carry.bodies, carry.options, rows)
+        return with_history(super().announce(state, carry, changed), carry.bodies, carry.options, rows)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         """The edges were found at the start of the step; their points are told where `state` has the bodies."""
-        near = None if carry is None else carry.near
-        if carry is None or near is None or not len(near):
+        if carry is None or carry.near is None or not len(near := carry.near):
             return super().touching(state, carry)
         from sdfsim.learned.near import where
 
@@ -268,8 +264,7 @@ class OnSurfaces(Stepper):
             near = family.none(bodies.device)
             if self.contact:
                 near = family.near(bodies, state, options.gravity, self.model.reach, options.dt, carry.scene)
-        active = torch.cat([near.owner, near.body, *([awake(bodies, state)] if self.learned else [])])
-        active = torch.unique(active)
+        active = torch.unique(torch.cat([near.owner, near.body, *([awake(bodies, state)] if self.learned else [])]))
         chosen = bodies.moves[active]
         carry.near = near
         carry.counts |= {"active": int(chosen.sum()), "contacts": len(near)}
@@ -291,13 +286,6 @@ class OnSurfaces(Stepper):
         now = {name: getattr(free, name) for name in MOTION}
         moved = (predicted.position[chosen], orientation, predicted.velocity[chosen], angular)
         return replace(free, **with_rows(now, rows, moved))
-
-
-def _placed(state: State, carry: Carry, changed: np.ndarray) -> None:
-    """Compiled scenery lies where `state` has it, if some of it was changed."""
-    scene = carry.scene
-    if scene is not None and (changed & ~(scene.world.moves | scene.world.scripted)).any():
-        scene.place(state)
 
 
 def stepper_of(
