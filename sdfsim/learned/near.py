@@ -159,7 +159,8 @@ def near_pairs(
     )
 
 
-node_pairs, face_pairs = partial(near_pairs, faces=False), partial(near_pairs, faces=True)
+node_pairs = partial(near_pairs, faces=False)
+face_pairs = partial(near_pairs, faces=True)
 
 
 def _centre(place: Tensor, arm: Tensor, part: Tensor) -> Tensor:
