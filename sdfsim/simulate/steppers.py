@@ -259,6 +259,8 @@ class OnSurfaces(Stepper):
         from sdfsim.learned.surfaces import compact, predict
 
         bodies, options, family = carry.bodies, carry.options, self.family
+        if state.earlier_position is None:  # of a stepper that needs none
+            state = self.began(state, bodies, options)
         free = super()._step(state, carry)
         with carry.timed("contact_ms"):
             near = family.none(bodies.device)

@@ -63,6 +63,16 @@ def test_a_restored_state_goes_on_as_the_run_did_here_and_elsewhere(dropped, kin
             np.testing.assert_array_equal(getattr(again, name), getattr(once, name), err_msg=name)
 
 
+def test_a_state_of_the_solver_is_taken_up_by_a_network_on_surface_nodes(dropped):
+    one, other, third = (Simulator(dropped, surface_model()) for _ in range(3))
+    bare = replace(one.state, earlier_position=None, earlier_orientation=None)
+    other.restore(bare)
+    third.state = bare
+    one, other, third = (sim.run(steps=5) for sim in (one, other, third))
+    np.testing.assert_array_equal(other.position, one.position)
+    np.testing.assert_array_equal(third.position, one.position)
+
+
 def test_a_state_that_cannot_be_is_not_restored(dropped):
     sim = Simulator(dropped)
     with pytest.raises(SdfsimError, match="body 'floor': velocity is not finite"):
