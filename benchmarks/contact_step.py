@@ -34,7 +34,6 @@ from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.harness import markdown, number
-from sdfsim.learned.model import load_model
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
@@ -51,10 +50,10 @@ GROWN = (256, 512)  # bodies far apart
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
     """Milliseconds a step of the compiled solve."""
     simulator = Simulator(scene, "solver")
-    options = replace(simulator.rules, sleep=False)
+    options = replace(simulator.options, sleep=False)
     rules = compiled_rules(replace(options, dt=dt / simulator.units.time) if dt else options)
     inside = Compiled(simulator.bodies, simulator.state)
-    motion, manifolds = taken_up(simulator.bodies, simulator.state, inside, rules)
+    motion, manifolds = taken_up(simulator.state)
     began = time.perf_counter()
     for _ in range(steps):
         manifolds, *_ = inside.run(motion, manifolds, rules)
@@ -74,7 +73,7 @@ def movi_b(data: Path) -> tuple[float, float]:
 def bowl(count: int, folder: Path) -> tuple[float, float]:
     """Milliseconds a step of PyBullet and of the solve."""
     scene = load_scene(write_scene("bowl", folder / str(count), count))
-    start = start_of_scene(scene, folder / "engine", scene_units(scene, load_model("solver")))
+    start = start_of_scene(scene, folder / "engine", scene_units(scene))
     return bullet(start, FALL)[1].wall_ms, solved(scene, FALL)
 
 

@@ -34,7 +34,7 @@ from sdfsim.evaluation import engines, everyday
 from sdfsim.evaluation.engines import LONGEST, Engine, NotInstalled, TooSlow, motion_rollout, start_of_scene
 from sdfsim.evaluation.everyday import ROWS, Check, Runner, Setting, checks, solved
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
-from sdfsim.learned.model import SOLVER, load_model
+from sdfsim.learned.model import SOLVER
 from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
@@ -82,7 +82,7 @@ def moved(name: str, scene: Scene, seconds: float, folder: Path) -> tuple[Rollou
         return solved(scene, seconds)
     if why := unknown_to(name, scene):
         raise NotRun(why)
-    units = scene_units(scene, load_model(SOLVER))
+    units = scene_units(scene)
     try:
         start = start_of_scene(in_parts(scene, folder / "pieces"), folder / "engine", units)
     except SdfsimError as error:

@@ -165,7 +165,7 @@ def weights(model: str, size: float) -> Iterator[Law]:
         scene = replace(on_floor([box(size)], pillar(size, (1.0, ratio))), effects=Effects(sleep="off"))
         simulator = Simulator(scene, model)
         simulator.run(3.0 * sqrt(size))
-        inner = simulator.dt / simulator.rules.substeps
+        inner = simulator.dt / simulator.options.substeps
         off = 0.0
         for name, mass in {"floor": (1.0 + ratio) * size**3, "1": ratio * size**3}.items():
             pushed = sum(float(c.impulse[2]) for c in simulator.contact_points() if {c.first, c.second} == {"0", name})

@@ -41,12 +41,12 @@ from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, m
 from sdfsim.evaluation.metrics import errors
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.learned.model import SOLVER, Model, load_model, new_network
+from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.scene.load import load_scene
 from sdfsim.sdf.fit.train import RECIPES
 from sdfsim.sdf.grid import sample_grid
 from sdfsim.shape.make import fit_pieces
 from sdfsim.shape.shape import Shape, load_shape
-from sdfsim.simulate.run_memory import Memory
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.presets import PRESETS, Preset
@@ -86,12 +86,12 @@ def recorded(name: str, data: Path) -> dict[str, float]:
     """
     plan = replace(PRESETS[name], nodes=PUBLISHED_NODES)
     task, network = SurfaceTask(data, "test", plan, torch.device("cpu")), untrained(name, PUBLISHED_NODES).network
-    shared, found = Memory(), []
+    found = []
     with one_thread(), torch.no_grad(), peak_memory() as memory:
         for k in range(STEPS_SEEN):
             bodies, state, _ = task.scenes(np.random.default_rng([0, k]), 1)
-            if name == "sdf-sim":
-                shared.compiled(bodies, state)  # not timed: a rollout does this once
+            # Not timed: a rollout does this once.
+            shared = Compiled(bodies, state) if task.family.distances else None
             began = time.process_time()
             near = task.near(bodies, state, shared)
             graph = task.family.graph(bodies, state, near)

@@ -43,7 +43,6 @@ from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, o
 from sdfsim.evaluation.penetration import depths
 from sdfsim.geometry.mesh import Mesh, clean
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
-from sdfsim.learned.model import load_model
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
@@ -209,7 +208,7 @@ def in_pieces(scene: Scene, folder: Path) -> Scene:
 
 def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tuple[Trajectory, float, float]:
     """An engine's motion of a scene in m and s, its ms per simulated second, and the seconds that preparing took."""
-    units = scene_units(scene, load_model("solver"))
+    units = scene_units(scene)
     began = time.perf_counter()
     if run := ENGINES[name]:
         start = start_of_scene(in_pieces(scene, folder / "pieces"), folder / "engine", units)
@@ -217,7 +216,7 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
         motion, timing = run(start, steps, inner)
         return in_metres(motion, units), timing.cpu_ms / (0.02 * units.time), prepared
     simulator = Simulator(scene, "solver")
-    simulator.rules = replace(simulator.rules, substeps=inner)
+    simulator.options = replace(simulator.options, substeps=inner)
     next(simulator.frames(1))
     prepared = time.perf_counter() - began
     simulator.reset()

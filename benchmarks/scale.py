@@ -45,6 +45,7 @@ from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import SimulationError, Simulator, join
+from sdfsim.simulate.steppers import stepper_of
 
 BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
@@ -82,7 +83,7 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:
-        published = load_model(model, weights=False).on_surfaces
+        published = stepper_of(load_model(model, weights=False)).on_surfaces
         simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
         frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
         began = time.process_time()
@@ -105,7 +106,7 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
 def engine(run: Engine, file: Path, steps: int) -> dict:
     """The same of an engine; spheres are spheres there, everything else its convex pieces."""
     scene = load_scene(file)
-    units = scene_units(scene, load_model("solver"))
+    units = scene_units(scene)
     start = start_of_scene(scene, file.parent / "engine", units)
     with peak_memory() as memory:
         motion, timing = run(start, steps)
@@ -232,7 +233,7 @@ def scenery(*, repeats: int = 7) -> None:
     for model in ("solver", "small"):
         simulators = [Simulator(with_far(count), model) for count in FAR]
         for simulator in simulators:
-            simulator.rules = replace(simulator.rules, sleep=False)
+            simulator.options = replace(simulator.options, sleep=False)
             simulator.step(2)  # not timed: it loads what is compiled
         times = np.array([[slid(simulator) for simulator in simulators] for _ in range(repeats)])
         ratio = times[:, 1] / times[:, 0]

@@ -8,10 +8,10 @@ that chaos has no time to grow, and long enough to tell a rebound from a slide.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -19,15 +19,18 @@ import torch
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
-from sdfsim.learned.model import SOLVER, load_model
+from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
-from sdfsim.physics.bodies import State, from_scene
-from sdfsim.physics.options import StepOptions
+from sdfsim.physics.bodies import State
+from sdfsim.physics.options import STEP, SUBSTEPS, Options
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import step
+from sdfsim.simulate.batch import placed, side_by_side, states
+from sdfsim.simulate.steppers import stepper_of
+
+if TYPE_CHECKING:
+    from sdfsim.physics.solver.prepare import Compiled
 
 WINDOW, EVERY = 0.15, 0.06  # model units of time, about seconds for bodies of a metre: length and spacing of windows
 SMOOTH = 4.0  # times gravity: a recording of poses tells no velocity where it accelerates more than that
@@ -173,8 +176,7 @@ class Windows:
 
     def __init__(self, recording: Recording, scene: Scene) -> None:
         self.scene, self.recording = scene, recording
-        model = load_model(SOLVER)
-        self.units = scene_units(scene, model)
+        self.units, self.solver = scene_units(scene), stepper_of(load_model())
         self.moving = [b for b in scene.bodies if b.motion == "dynamic"]
         self.fixed = [b for b in scene.bodies if b.motion != "dynamic"]
         if recording.dt == 0.0:
@@ -187,10 +189,9 @@ class Windows:
             told = f"give at least {self.length + 1} frames"
             raise SdfsimError("the recording is too short, or nowhere smooth", told)
         dt = recording.dt / self.units.time
-        inner = max(1, int(np.ceil(dt / (model.dt / 5.0) - 0.01)))
+        inner = max(1, int(np.ceil(dt / (STEP / SUBSTEPS) - 0.01)))
         gravity = torch.from_numpy(np.asarray(scene.gravity) / self.units.acceleration)
-        self.rules = StepOptions(gravity, dt, inner)
-        self.model = model
+        self.options = Options(gravity, dt, inner)
         self._build(begin)
         touched = self._touched()
         if not touched:
@@ -207,37 +208,20 @@ class Windows:
 
     def _build(self, begin: np.ndarray) -> None:
         """Bodies and start states of the windows that begin at frames `begin`."""
-        bodies = self.moving * len(begin) + self.fixed
-        world = np.repeat(np.arange(len(begin)), len(self.moving))
-        whole = replace(self.scene, bodies=tuple(bodies))
-        tensors, self.start_state = from_scene(whole, self.units, torch.device("cpu"))
-        self.bodies = replace(tensors, world=torch.tensor([*world.tolist(), *[-1] * len(self.fixed)]))
+        whole = replace(self.scene, bodies=tuple(self.moving * len(begin) + self.fixed))
+        world = [*np.repeat(np.arange(len(begin)), len(self.moving)), *[-1] * len(self.fixed)]
         r, u = self.recording, self.units
-
-        def of(values: np.ndarray, unit: float, rest: torch.Tensor) -> torch.Tensor:
-            moving = torch.from_numpy(np.ascontiguousarray(values[begin].reshape(-1, values.shape[-1]) / unit))
-            return torch.cat([moving, rest[len(moving) :]])
-
-        s = self.start_state
-        self.start_state = replace(
-            s,
-            position=of(r.position, u.length, s.position),
-            orientation=of(r.orientation, 1.0, s.orientation),
-            velocity=of(r.velocity, u.velocity, s.velocity),
-            angular_velocity=of(r.angular_velocity, 1.0 / u.time, s.angular_velocity),
-        )
+        given = (r.position / u.length, r.orientation, r.velocity / u.velocity, r.angular_velocity * u.time)
+        self.bodies, start = side_by_side(whole, world, u, torch.device("cpu"))
+        self.start_state = placed(start, *(values[begin].reshape(-1, values.shape[-1]) for values in given))
         frames = begin[None] + 1 + np.arange(self.length)[:, None]
         self.goal = r.position[frames] / u.length, r.orientation[frames]
-        self.memory, self.count = Memory(), len(begin)
-        self.world = self.memory.compiled(self.bodies, self.start_state).world
+        self.carry, self.count = self.solver.init(self.bodies, self.start_state, self.options), len(begin)
+        self.world = cast("Compiled", self.carry.scene).world
         self.given = {name: getattr(self.world, name).copy() for name in ("inverse_mass", "inertia", "inverse_inertia")}
 
-    def _run(self) -> list[State]:
-        state, states = self.start_state, []
-        for _ in range(self.length):
-            state, _ = step(self.model, self.bodies, state, self.rules, self.memory)
-            states.append(state)
-        return states
+    def _run(self) -> Iterator[State]:
+        return states(self.solver, self.start_state, self.carry, self.length)
 
     def _touched(self) -> set[tuple[int, int, int]]:
         """Window and pair of bodies of every contact; static ones count on from those that move."""

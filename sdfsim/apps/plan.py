@@ -59,7 +59,7 @@ def describe(
         "duration_s": scene.duration,
         "dt_s": simulator.dt,
         "steps": steps,
-        "substeps": simulator.rules.substeps,
+        "substeps": simulator.options.substeps,
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),

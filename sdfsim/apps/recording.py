@@ -19,7 +19,7 @@ from sdfsim.geometry.primitives import plane
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
-from sdfsim.simulate.run_memory import PHASES
+from sdfsim.simulate.steppers import PHASES
 
 if TYPE_CHECKING:
     import rerun as rr

@@ -39,8 +39,8 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene, fingerprints
-from sdfsim.simulate.run_memory import COUNTS, PHASES
 from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
+from sdfsim.simulate.steppers import COUNTS, PHASES
 
 Viewer = Literal["none", "file", "native", "web"]
 EVERY = 30.0  # s between two checkpoints
@@ -282,7 +282,7 @@ class Checkpoint:
         self._folder = folder
         self._simulator = simulator
         self.identity = identity(simulator)
-        self._fresh: list[tuple[Rollout, State, int]] = []  # one entry a step: an interruption splits none
+        self._fresh: list[tuple[Rollout, State]] = []  # one entry a step: an interruption splits none
         self._parts = 0
         self._saved = time.monotonic()
 
@@ -297,16 +297,14 @@ class Checkpoint:
             if str(kept["identity"]) != self.identity:
                 raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
             self._parts = int(kept["parts"])
-            self._simulator.state = _state(kept, self._simulator.device)
-            self._simulator.steps_done = int(kept["steps_done"])
-            self._simulator.initial_rollout()  # told already; what is taken up here was given by nobody
+            self._simulator.restore(_state(kept, self._simulator.device))
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{file}: not a checkpoint of this version ({error})", _ANEW) from error
         return [Rollout.load(self._part(k)) for k in range(self._parts)]
 
     def add(self, frame: Rollout) -> None:
         """Keep a frame and the state it tells of; on disk when the last time is long enough ago."""
-        self._fresh.append((frame, self._simulator.state, self._simulator.steps_done))
+        self._fresh.append((frame, self._simulator.state))
         if time.monotonic() - self._saved > EVERY:
             self.save()
 
@@ -314,10 +312,9 @@ class Checkpoint:
         """Bring what is new to the disk; the state comes last, so that it never tells of a part that is not there."""
         if self._fresh:
             self._folder.mkdir(exist_ok=True)
-            _, state, steps = self._fresh[-1]
-            join([frame for frame, *_ in self._fresh]).save(self._part(self._parts))
-            done = {"identity": self.identity, "parts": self._parts + 1, "steps_done": steps}
-            write_arrays(self._folder / _STATE, done | _arrays(state), compressed=False)
+            join([frame for frame, _ in self._fresh]).save(self._part(self._parts))
+            done = {"identity": self.identity, "parts": self._parts + 1}
+            write_arrays(self._folder / _STATE, done | _arrays(self._fresh[-1][1]), compressed=False)
             self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
             self._parts += 1
         self._saved = time.monotonic()
@@ -354,7 +351,8 @@ def identity(simulator: Simulator) -> str:
     """A hash of all that decides how a run goes: bodies with their paths and distances, start, rules, units, model."""
     s = simulator
     model = (s.model.kind, s.model.reach, s.model.network)
-    return digest(s.dt, s.seed, replace(s.rules, rows=None), s.units, s.bodies, s.state, model)
+    chosen = {name: value for name, value in vars(s.stepper).items() if isinstance(value, bool | float)}
+    return digest(s.dt, s.seed, s.options, type(s.stepper).__name__, chosen, s.units, s.bodies, s.state, model)
 
 
 def _arrays(state: State) -> dict[str, np.ndarray]:

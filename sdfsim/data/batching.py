@@ -11,14 +11,13 @@ from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.learned.model import Model
-from sdfsim.learned.surfaces import with_history
-from sdfsim.physics.bodies import Bodies, State, Units, from_scene
-from sdfsim.physics.options import SUBSTEPS, FreeFlight, StepOptions
+from sdfsim.physics.bodies import Bodies, State, Units
+from sdfsim.physics.options import SUBSTEPS, Options
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
-from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import step
+from sdfsim.simulate.batch import placed, side_by_side, states
+from sdfsim.simulate.steppers import FreeFlight, Stepper, stepper_of
 
 BATCH = 50  # trajectories simulated side by side
 PLANE = analytic_shape("plane")
@@ -42,8 +41,7 @@ def merged(
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
     relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]
     scene, world = scene_of(relative, frames, shapes, floor, plane)
-    tensors, state = from_scene(scene, units, device)
-    return replace(tensors, world=torch.tensor(world, device=device)), state
+    return side_by_side(scene, world, units, device)
 
 
 def scene_of(
@@ -84,17 +82,8 @@ def scene_of(
 def state_at(trajectories: list[Trajectory], frames: list[int], like: State) -> State:
     """The state of all trajectories, each at its frame; the floor, which is last, as in `like`."""
 
-    def of(name: str, floor: torch.Tensor) -> torch.Tensor:
-        rows = np.concatenate([getattr(t, name)[k] for t, k in zip(trajectories, frames, strict=True)])
-        return torch.cat([torch.from_numpy(rows).to(floor.device), floor[-1:]])
-
-    return replace(
-        like,
-        position=of("position", like.position),
-        orientation=of("quat_xyzw", like.orientation),
-        velocity=of("velocity", like.velocity),
-        angular_velocity=of("angular_velocity", like.angular_velocity),
-    )
+    each = [[getattr(t, name)[k] for t, k in zip(trajectories, frames, strict=True)] for name in MOTION]
+    return placed(like, *map(np.concatenate, each))
 
 
 def roll_out(
@@ -119,25 +108,24 @@ def roll_out(
     "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit code 3) for a state that is not
     finite.
     """
-    units = model_units(model, group[0])
-    known = {name: model.surface(shape) for name, shape in shapes.items()}
-    bodies, state = merged(group, [0] * len(group), known, units, device, floor, model.surface(PLANE))
+    stepper = stepper_of(model, contact=contact, free_flight=free_flight)
+    units = model_units(stepper, group[0])
+    known = {name: stepper.surface(shape) for name, shape in shapes.items()}
+    bodies, start = merged(group, [0] * len(group), known, units, device, floor, stepper.surface(PLANE))
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
-    rules = StepOptions(
-        gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight,
-        margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher, cone=not as_teacher,
+    options = Options(
+        gravity, group[0].dt / units.time, model.inner or substeps, adds=as_teacher, cone=not as_teacher,
+        margin=MARGIN / units.length if as_teacher else 0.0,
     )  # fmt: skip
-    if model.on_surfaces:
-        state = with_history(state, bodies, rules)
-    states, memory = [state], Memory()
-    for k in range(steps):
-        state, _ = step(model, bodies, state, rules, memory)
+    start = stepper.began(start, bodies, options)
+    motion, carry = [start], stepper.init(bodies, start, options)
+    for k, state in enumerate(states(stepper, start, carry, steps), start=1):
         broken = ~(state.position.isfinite().all(-1) & state.orientation.isfinite().all(-1))
         if broken.any():
-            raise SdfsimError(f"step {k + 1}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY)
-        states.append(state)
+            raise SdfsimError(f"step {k}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY)
+        motion.append(state)
     position, quat, velocity, angular = (
-        np.stack([getattr(s, name).cpu().numpy() for s in states])
+        np.stack([getattr(s, name).cpu().numpy() for s in motion])
         for name in ("position", "orientation", "velocity", "angular_velocity")
     )
     ends = np.cumsum([t.position.shape[1] for t in group])
@@ -172,10 +160,11 @@ def every(trajectory: Trajectory, stride: int) -> Trajectory:
     return replace(trajectory, dt=trajectory.dt * stride, **frames)
 
 
-def model_units(model: Model, like: Trajectory) -> Units:
-    """Model units in which the recorded step is the model's own; for the solver those of its bodies of a metre."""
+def model_units(stepper: Stepper, like: Trajectory) -> Units:
+    """Model units in which the recorded step is the model's own; where it has none those of its bodies of a metre."""
+    model = stepper.model
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
-    if not model.on_surfaces:  # the solve takes the inner steps that it is told
+    if not stepper.on_surfaces:
         return Units(length=1.0, time=float(np.sqrt(model.gravity / strength)), mass=1.0)
     length = (like.dt / model.dt) ** 2 * strength / model.gravity
     return Units(length=length, time=like.dt / model.dt, mass=1.0)

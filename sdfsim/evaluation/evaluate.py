@@ -30,12 +30,12 @@ from sdfsim.evaluation import metrics
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.evaluation.metrics import Motions, energy_gain, errors
 from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
-from sdfsim.learned.model import SOLVER, Model, load_model
-from sdfsim.learned.training_ranges import outside_training
-from sdfsim.physics.options import SUBSTEPS, FreeFlight
+from sdfsim.learned.model import Model, load_model
+from sdfsim.physics.options import STEP, SUBSTEPS
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
+from sdfsim.simulate.steppers import FreeFlight, stepper_of
 from sdfsim.training.contact_cache import inner_steps
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
@@ -92,8 +92,7 @@ def evaluate(
     """
     place = pick_device(device)
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
-    if free_flight == "learned" and not used.on_surfaces:
-        raise SdfsimError("free_flight 'learned' exists for networks on surface nodes only")
+    stepper = stepper_of(used, free_flight=free_flight)
     recorded, shapes = load_recorded(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
     longest -= longest % stride
@@ -115,8 +114,9 @@ def evaluate(
     elif conditions.by_teacher:
         inner = stride * inner_steps(as_recorded[0].dt, substep)
     else:
-        inner = users_inner(recorded[0].dt, scenes) if used.kind == SOLVER else stride * SUBSTEPS
+        inner = stride * SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes)
     used = replace(used, inner=substeps or used.inner)
+    stepper = replace(stepper, model=used)
     for k, group in enumerate(groups):
         on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         common = (used, group, shapes, longest, place)
@@ -144,7 +144,7 @@ def evaluate(
         },
         "as_teacher": conditions.by_teacher,
         "inner_steps": used.inner or inner,
-        "outside_training": outside_training(scenes, used, model_units(used, recorded[0])),
+        "outside_training": stepper.unknown(scenes, model_units(stepper, recorded[0])),
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
         **{who: errors(motions, recorded) for who, motions in contenders.items()},
         "median_survival_s": {who: metrics.survival(motions, recorded) for who, motions in contenders.items()},
@@ -177,8 +177,7 @@ def evaluate(
 
 def users_inner(dt: float, scenes: list[Scene]) -> int:
     """Inner steps in a step of `dt` s that are no longer than those of `Simulator` with the smallest body."""
-    solver = load_model(SOLVER)
-    longest = min(scene_units(scene, solver).time for scene in scenes) * solver.dt / SUBSTEPS
+    longest = min(scene_units(scene).time for scene in scenes) * STEP / SUBSTEPS
     return max(1, math.ceil(dt / longest - 0.01))
 
 

@@ -23,12 +23,13 @@ from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_setti
 from sdfsim.evaluation.engines import bullet, drake, mujoco, rollout_motion, shape_urdf, start_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
-from sdfsim.learned.model import SOLVER, Model, load_model, model_names
+from sdfsim.learned.model import Model, load_model, model_names
 from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import PlaneSdf
 from sdfsim.simulate.simulator import SimulationError, Simulator
+from sdfsim.simulate.steppers import stepper_of
 
 VERSION = 5  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
@@ -110,7 +111,7 @@ def stress(
         content = [VERSION, case.seconds, case.cuda, figures, scenes[case.name]]
         for model in tested:
             # Another device is for networks: the solver has none.
-            if not case.cuda or (model.kind != SOLVER and torch.cuda.is_available()):
+            if not case.cuda or (stepper_of(model).network and torch.cuda.is_available()):
                 arguments = (case, model, device, out)
                 jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments))
         for name in who[len(tested) :] if case.engines else []:

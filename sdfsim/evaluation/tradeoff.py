@@ -32,7 +32,6 @@ from sdfsim.evaluation.metrics import energy_gain, errors
 from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
 from sdfsim.learned.model import SOLVER, Model, load_model, model_names
 from sdfsim.physics.options import SUBSTEPS
-from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -43,6 +42,7 @@ from sdfsim.sdf.reference import MeshDistance, PiecesDistance
 from sdfsim.shape.shape import Shape, own_pieces, with_nodes, with_sdf
 from sdfsim.shape.surface_nodes import hull_nodes
 from sdfsim.simulate.simulator import Simulator
+from sdfsim.simulate.steppers import stepper_of
 
 VERSION = 2  # counts up when what is measured changes, so that kept results are measured again
 REPEATS = 7
@@ -129,7 +129,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     meant for bodies of about a metre, serves scenes of any size. The engines' files go to `folder`. Raises SdfsimError
     for a scene with more than bodies, that all meet each other, on one level plane, or without PyBullet.
     """
-    units = scene_units(scene, load_model(model, weights=False), None)
+    units = stepper_of(load_model(model, weights=False)).units(scene)
     start = start_of_scene(scene, folder, units)
     problems = {
         "bodies that may not touch all others are not measured": any(b.collides_with is not None for b in scene.bodies),
@@ -203,7 +203,7 @@ def settings(models: Sequence[str], *, quick: bool) -> list[Setting]:
         knobs: list[dict[str, Any]] = [{}]
         knobs += [{"nodes": f"thin {k}"} for k in ((64,) if quick else (32, 64, 128, 256))]
         knobs += [{"nodes": f"grid {k}"} for k in ((7,) if quick else (5, 7, 10))]
-        if load_model(name, weights=False).kind == SOLVER:
+        if not stepper_of(load_model(name, weights=False)).network:
             knobs += [{"substeps": k} for k in ((2, 10) if quick else (1, 2, 3, 10, 20))]
             knobs += [{"sdf": kind} for kind in (() if quick else ("mlp", *(f"grid {k}" for k in GRIDS), "mesh"))]
             knobs += [{"stride": 2, "substeps": k} for k in ((1,) if quick else (1, 2, 4))]
@@ -258,7 +258,7 @@ def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], ca
     scene = scene_of([start], [0], shapes, cases.floor)[0]
     effects = replace(scene.effects, sleep="off", contact="auto" if setting.contact else "off")
     simulator = Simulator(replace(scene, effects=effects), model, dt=start.dt)
-    simulator.rules = replace(simulator.rules, substeps=model.inner or setting.substeps)
+    simulator.options = replace(simulator.options, substeps=model.inner or setting.substeps)
     steps = min(TIMED, cases.steps // setting.stride)
     taken = timed(lambda count: deque(simulator.steps(count), maxlen=0), steps)
     return Timing(taken.first_ms, taken.wall_ms / setting.stride, taken.cpu_ms / setting.stride)

@@ -23,9 +23,9 @@ from sdfsim.learned.message_passing import Graph, Layout
 from sdfsim.learned.near import Contacts, Pairs, face_pairs, find_contacts, no_contacts, no_pairs, node_pairs
 from sdfsim.learned.sdf_sim import SDF_SIM, sdf_sim_graph
 from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.sdf.closed_forms import PlaneSdf
 from sdfsim.shape.shape import Shape
-from sdfsim.simulate.run_memory import Memory
 
 
 def points(shape: Shape, count: int | None) -> Shape:
@@ -81,16 +81,17 @@ class Family:
     layout: Layout  # of its graphs
     # a shape, with the nodes (at most so many, None for all) that the network works on
     surface: Callable[[Shape, int | None], Shape]
-    # what of the bodies is near what, for bodies, state, gravity, reach, time step and what the run remembers
-    near: Callable[[Bodies, State, Tensor, float, float, Memory], Contacts | Pairs]
+    # what of the bodies is near what, for bodies, state, gravity, reach, time step and the compiled scene of a run
+    near: Callable[[Bodies, State, Tensor, float, float, Compiled | None], Contacts | Pairs]
     none: Callable[[device], Contacts | Pairs]  # the same of bodies that are near nothing
     graph: Callable[[Bodies, State, Any], Graph]  # the graph of bodies, their state and what is near
+    distances: bool = False  # whether `near` asks the compiled distances of a scene
 
 
 _no_faces, _no_nodes = partial(no_pairs, corners=3), partial(no_pairs, corners=1)
 
 FAMILIES = {
-    "sdf-sim": Family(SDF_SIM, points, find_contacts, no_contacts, sdf_sim_graph),
+    "sdf-sim": Family(SDF_SIM, points, find_contacts, no_contacts, sdf_sim_graph, distances=True),
     "fignet": Family(FIGNET, vertices, face_pairs, _no_faces, fignet_graph),
     "fignet-star": Family(FIGNET_STAR, vertices, face_pairs, _no_faces, fignet_star_graph),
     "mgn": Family(MGN, vertices, node_pairs, _no_nodes, mgn_graph),

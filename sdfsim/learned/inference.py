@@ -22,7 +22,7 @@ from sdfsim.physics.solver.world import World
 
 with kernels.kept():
     from sdfsim.physics.solver import impulse as compiled
-from sdfsim.physics.options import StepOptions
+from sdfsim.physics.options import Options
 
 
 def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:
@@ -65,15 +65,14 @@ def _array(values: list[Tensor]) -> np.ndarray:
 
 
 def corrected(
-    weights: compiled.Weights, world: World, before: State, solved: State, edges: Edges, rules: StepOptions, *,
-    known: float,
+    weights: compiled.Weights, world: World, before: State, solved: State, edges: Edges, terms: compiled.Terms
 ) -> State:  # fmt: skip
-    """What the network, which knows steps of `known`, makes of a step of the solve, whose `edges`, at least one, are
-    its own; those of a pair of bodies stand together."""
+    """What the network makes of a step of the solve, whose `edges`, at least one, are its own; those of a pair of
+    bodies stand together."""
     after = [tensor.clone() for tensor in _poses(solved)]
     start, end = (compiled.Poses(*(t.contiguous().numpy() for t in some)) for some in (_poses(before), after))
     with _blas().limit(limits=1):
-        compiled.correct(weights, world, start, end, edges.pair, edges.value, terms_of(rules, known))
+        compiled.correct(weights, world, start, end, edges.pair, edges.value, terms)
     position, orientation, velocity, angular = after
     return replace(solved, position=position, orientation=orientation, velocity=velocity, angular_velocity=angular)
 
@@ -87,11 +86,11 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController().select(user_api="blas")
 
 
-def terms_of(rules: StepOptions, known: float) -> compiled.Terms:
-    """What is in play, for a network that knows steps of `known`."""
+def terms_of(options: Options, known: float, trust: float = 1.0) -> compiled.Terms:
+    """What is in play, for a network that knows steps of `known`, and that is trusted by 0 to 1 in what it adds."""
     return compiled.Terms(
-        gravity=rules.gravity.cpu().numpy(), dt=rules.dt, known=known, friction=rules.friction,
-        restitution=rules.restitution, rotation=rules.rotation, trust=rules.trust, rest=REST_SPEED, calm=CALM,
+        gravity=options.gravity.cpu().numpy(), dt=options.dt, known=known, friction=options.friction,
+        restitution=options.restitution, rotation=options.rotation, trust=trust, rest=REST_SPEED, calm=CALM,
         lively=LIVELY,
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from torch import nn
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
 from sdfsim.learned.impulse import ImpulseConfig, ImpulseNetwork
-from sdfsim.shape.shape import Shape
+from sdfsim.physics.options import GRAVITY, LENGTH, STEP
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # of any size of a network
@@ -37,25 +37,12 @@ class Model:
     # rescaled to the smallest body that moves.
     length: float
     reach: float  # m, contact radius D
-    nodes: int | None = None  # surface nodes a body it was trained with, see `surface`; None for all
+    nodes: int | None = None  # surface nodes a body it was trained with; None for all
     # inner steps of the solve in a step; 0 for those of the recording engine (5 where none has recorded)
     inner: int = 0
     # name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size)
     ranges: dict[str, list[float]] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)  # training record (data, steps, seconds, errors)
-
-    @property
-    def on_surfaces(self) -> bool:
-        """Whether it predicts motions of surface nodes, as the published networks do."""
-        return self.kind in SURFACE
-
-    def surface(self, shape: Shape) -> Shape:
-        """The shape with the surface nodes, and the faces between them, that the model works on."""
-        if not self.on_surfaces:
-            return shape
-        from sdfsim.learned.families import FAMILIES
-
-        return FAMILIES[self.kind].surface(shape, self.nodes)
 
     def to(self, device: torch.device) -> Model:
         """The same model with its weights on `device`: this one, or a copy where they are elsewhere."""
@@ -106,7 +93,7 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
     from safetensors import SafetensorError, safe_open
 
     if name is None or name == SOLVER:
-        return Model(SOLVER, SOLVER, nn.Module().eval(), dt=0.02, gravity=10.0, length=1.4, reach=0.02)
+        return Model(SOLVER, SOLVER, nn.Module().eval(), dt=STEP, gravity=GRAVITY, length=LENGTH, reach=0.02)
     path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
     if not path.exists():
         raise SdfsimError(

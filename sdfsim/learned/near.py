@@ -9,6 +9,7 @@ has one node and one face, which lie wherever they are closest to the other's.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,10 +17,9 @@ from torch import Tensor
 from sdfsim.learned.surfaces import expanded, node_owner
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
-from sdfsim.physics.options import StepOptions
+from sdfsim.physics.options import Options
 from sdfsim.physics.solver.edges import nodes_within
-from sdfsim.physics.solver.prepare import compiled_rules, taken_up
-from sdfsim.simulate.run_memory import Memory
+from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 
 PIERCING = 1e-9  # relative: areas and denominators below count as none
 
@@ -51,12 +51,12 @@ def no_contacts(device: torch.device) -> Contacts:
 
 
 def find_contacts(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
 ) -> Contacts:
-    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units."""
-    scene = (memory or Memory()).compiled(bodies, state)
-    rules = compiled_rules(StepOptions(gravity, dt, 1))._replace(reach=reach)
-    motion, _ = taken_up(bodies, state, scene, rules)
+    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units. A run
+    gives its compiled `scene`, else one is made."""
+    scene = scene or Compiled(bodies, state)
+    rules, (motion, _) = compiled_rules(Options(gravity, dt, 1))._replace(contact_margin=reach), taken_up(state)
     found = nodes_within(
         scene.shapes, scene.world, scene.work, motion, rules, bodies.node.cpu().numpy(), bodies.node_start.cpu().numpy()
     )
@@ -112,23 +112,13 @@ def no_pairs(device: torch.device, corners: int) -> Pairs:
     return Pairs(nobody, nobody, parts, parts, way[:, 0], way, arms, arms, way, way)
 
 
-def node_pairs(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
-) -> Pairs:
-    """All pairs of nodes of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
-    single = torch.arange(len(bodies.node), device=bodies.device)[:, None]
-    return _pairs(bodies, state, gravity, reach, dt, single)
-
-
-def face_pairs(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
-) -> Pairs:
-    """All pairs of faces of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
-    return _pairs(bodies, state, gravity, reach, dt, bodies.face)
-
-
-def _pairs(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, part: Tensor) -> Pairs:
-    """Pairs of `part` [K, C]: nodes or faces, those of a body in a row."""
+def near_pairs(
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None, *,
+    faces: bool,
+) -> Pairs:  # fmt: skip
+    """All pairs of nodes, or of `faces`, of different bodies within `reach` (model length) during a step, as
+    `find_contacts` has it."""
+    part = bodies.face if faces else torch.arange(len(bodies.node), device=bodies.device)[:, None]
     owner = node_owner(bodies)
     velocity = state.velocity + gravity * dt * bodies.moves[:, None]
     arm = pose.rotate(state.orientation[owner], bodies.node)
@@ -167,6 +157,10 @@ def _pairs(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: floa
     return Pairs(
         owner[a[:, 0]], owner[b[:, 0]], a, b, distance, way, from_first, from_second, normal_first, normal_second
     )
+
+
+node_pairs = partial(near_pairs, faces=False)
+face_pairs = partial(near_pairs, faces=True)
 
 
 def _centre(place: Tensor, arm: Tensor, part: Tensor) -> Tensor:

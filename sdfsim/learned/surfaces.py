@@ -15,8 +15,8 @@ from sdfsim.learned.matching import match_shapes
 from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, GraphNetwork
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
-from sdfsim.physics.options import StepOptions
-from sdfsim.simulate.step import fly
+from sdfsim.physics.free_flight import fly
+from sdfsim.physics.options import Options
 
 NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
 INTRA = Features(8, (0, 4))  # of edges within a body
@@ -171,36 +171,16 @@ def _history(state: State) -> tuple[Tensor, Tensor]:
     return state.earlier_position, state.earlier_orientation
 
 
-def with_history(state: State, bodies: Bodies, rules: StepOptions) -> State:
-    """The same state with the two poses that it would have come from in free flight."""
-    position, orientation = _flown_back(state, bodies, rules)
-    return replace(state, earlier_position=position, earlier_orientation=orientation)
-
-
-def history_told(state: State, before: State, bodies: Bodies, rules: StepOptions) -> State:
-    """A state from outside, with earlier poses that go with it.
-
-    Those that it shares with the state `before` are of that one's motion: bodies that were changed since get the poses
-    that their velocities lead from. A state with earlier poses of its own, such as a restored one, keeps them.
-    """
-    if state.earlier_position is None or state.earlier_orientation is None:
-        return with_history(state, bodies, rules)
-    if state.earlier_position is not before.earlier_position:
-        return state
-    changed = torch.zeros_like(bodies.moves)
-    for name in ("position", "orientation", "velocity", "angular_velocity"):
-        changed |= (getattr(state, name) != getattr(before, name)).any(-1)
-    position, orientation = _flown_back(state, bodies, rules)
-    return replace(
-        state,
-        earlier_position=torch.where(changed[:, None], position, state.earlier_position),
-        earlier_orientation=torch.where(changed[:, None], orientation, state.earlier_orientation),
-    )
-
-
-def _flown_back(state: State, bodies: Bodies, rules: StepOptions) -> tuple[Tensor, Tensor]:
-    """Positions [2, N, 3] and orientations [2, N, 4] two steps and one step before, in free flight."""
-    back = replace(rules, dt=-rules.dt)
-    one = fly(bodies, state, back)
+def with_history(state: State, bodies: Bodies, options: Options, changed: Tensor | None = None) -> State:
+    """The state with the two poses that bodies would have come from in free flight: those that were `changed` [N] bool,
+    all of them where it has no earlier poses, or None is given."""
+    back = replace(options, dt=-options.dt)
+    one = fly(bodies, replace(state, earlier_position=None, earlier_orientation=None), back)
     two = fly(bodies, one, back)
-    return torch.stack([two.position, one.position]), torch.stack([two.orientation, one.orientation])
+    position, orientation = (
+        torch.stack([getattr(s, name) for s in (two, one)]) for name in ("position", "orientation")
+    )
+    if changed is not None and state.earlier_position is not None and state.earlier_orientation is not None:
+        position = torch.where(changed[:, None], position, state.earlier_position)
+        orientation = torch.where(changed[:, None], orientation, state.earlier_orientation)
+    return replace(state, earlier_position=position, earlier_orientation=orientation)

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from sdfsim.learned.contact_graph import number_pairs
-from sdfsim.learned.model import SOLVER, Model
+from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
-from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.scene import Scene
 
 LABELS = {
@@ -21,7 +20,6 @@ LABELS = {
     "friction": "friction of two bodies, multiplied",
     "restitution": "restitution of two bodies, multiplied",
 }
-LONGEST = 0.01  # s, an inner step of the contact solve
 # Part of its largest side by which bodies start inside one another in the training data at most.
 DEEPEST = 0.16
 SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
@@ -31,12 +29,8 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
     """One line for every quantity of `scenes` that lies outside the ranges of `model`; empty when it knows them all.
 
     Sizes and speeds are compared in model units, so that a small or slow scene is not by itself unknown. Scenery is
-    not compared in size: what matters of it is the surface near a contact. The contact solve has seen no training; it
-    is told where its inner step is longer than any that its laws were checked with.
+    not compared in size: what matters of it is the surface near a contact.
     """
-    inner = model.dt * units.time / (model.inner or SUBSTEPS)
-    if model.kind == SOLVER and inner > LONGEST:
-        return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
     if not model.ranges:
         return []
     found = [_values(scene, units) for scene in scenes]

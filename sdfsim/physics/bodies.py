@@ -138,8 +138,6 @@ class Touch:
     # second to the first, the distance, the impulse along the normal and the tangential one [3], the two patches that
     # meet
     point: Tensor
-    held: Tensor  # [N, 13] float64, position, orientation and velocities that the last step ended with
-    gravity: Tensor  # [3], what it was made under
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,21 @@
-"""Free flight in closed form: ballistic motion, and torque-free rotation that keeps its angular momentum."""
+"""Free flight in closed form: ballistic motion, and torque-free rotation that keeps its angular momentum; of states."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from sdfsim.physics.bodies import Bodies, State, awake
+from sdfsim.physics.options import Options
 from sdfsim.physics.pose import apply, from_rotvec, multiply, normalise, to_matrix
 
 MAX_TURN = 0.1  # rad of rotation per inner step of the torque-free rotation
 MOST_TURN = 100.0  # rad of rotation that a step can follow
+MOTION = ("position", "orientation", "velocity", "angular_velocity")
 
 
 def ballistic(position: Tensor, velocity: Tensor, gravity: Tensor, dt: float) -> tuple[Tensor, Tensor]:
@@ -66,3 +70,67 @@ def _rkmk4(q: Tensor, start: Tensor, spin: Callable[[Tensor], Tensor], h: float)
     k3 = slope(0.5 * k2)
     k4 = slope(k3)
     return multiply(from_rotvec((k1 + 2 * k2 + 2 * k3 + k4) / 6.0), q)
+
+
+def driven(bodies: Bodies, state: State, dt: float) -> State:
+    """Scripted bodies take the velocities that lead them along their paths in the coming step."""
+    if bodies.tracks is None:
+        return state
+    velocity, angular = bodies.tracks.velocity(state.time, dt)
+    rows = bodies.tracks.body
+    return replace(
+        state,
+        velocity=state.velocity.index_copy(0, rows, velocity),
+        angular_velocity=state.angular_velocity.index_copy(0, rows, angular),
+    )
+
+
+def fly(bodies: Bodies, state: State, options: Options) -> State:
+    """Free flight of every body that moves: exact, whatever the step. Scripted bodies go on along their paths."""
+    rows = awake(bodies, state)
+    now = {name: getattr(state, name) for name in MOTION}
+    if len(rows):
+        pull = options.gravity
+        if state.load is not None:
+            pull = pull + bodies.inverse_mass[rows, None] * state.load[rows, :3]
+        place, velocity = ballistic(state.position[rows], state.velocity[rows], pull, options.dt)
+        if options.rotation:
+            turned = _turned(bodies, state, rows, options.dt)
+        else:
+            turned = (state.orientation[rows], torch.zeros_like(velocity))
+        now = with_rows(now, rows, (place, turned[0], velocity, turned[1]))
+    if bodies.tracks is not None:
+        place, orientation = bodies.tracks.at(state.time + options.dt)
+        at = bodies.tracks.body
+        now = with_rows(now, at, (place, orientation, state.velocity[at], state.angular_velocity[at]))
+    return replace(
+        state,
+        **now,
+        earlier_position=_shift(state.earlier_position, state.position),
+        earlier_orientation=_shift(state.earlier_orientation, state.orientation),
+        time=state.time + options.dt,
+    )
+
+
+def _turned(bodies: Bodies, state: State, rows: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Orientation and angular velocity after free flight; a torque acts half before and half after it."""
+    orientation, angular, inertia = state.orientation[rows], state.angular_velocity[rows], bodies.inertia[rows]
+    if state.load is None:
+        return torque_free(orientation, angular, inertia, dt)
+    half = 0.5 * dt * state.load[rows, 3:, None]
+
+    def twisted(orientation: Tensor) -> Tensor:
+        axes = to_matrix(orientation)
+        return (axes @ torch.linalg.solve(inertia, axes.mT @ half))[..., 0]
+
+    orientation, angular = torque_free(orientation, angular + twisted(orientation), inertia, dt)
+    return orientation, angular + twisted(orientation)
+
+
+def with_rows(now: dict[str, Tensor], rows: Tensor, values: tuple[Tensor, ...]) -> dict[str, Tensor]:
+    """The tensors of `now` with the given rows replaced."""
+    return {name: now[name].index_copy(0, rows, value) for name, value in zip(MOTION, values, strict=True)}
+
+
+def _shift(earlier: Tensor | None, now: Tensor) -> Tensor | None:
+    return None if earlier is None else torch.stack([earlier[1], now])

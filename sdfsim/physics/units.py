@@ -7,9 +7,8 @@ import math
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import Units, largest_extent
-from sdfsim.physics.options import SUBSTEPS
+from sdfsim.physics.options import GRAVITY, LENGTH, STEP, SUBSTEPS
 from sdfsim.scene.scene import Scene
 
 EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
@@ -22,24 +21,32 @@ MOST_WIDER = 1e4
 SLENDER, SHORTEST = 8.0, 4
 
 
-def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
-    """Model units for a scene: bodies of the model's size, at the model's gravity (Froude scaling); `dt` s fixes the
-    scale by the wanted step instead. Raises SdfsimError for a step that is not positive, or bodies of sizes that no
-    step serves."""
+def scene_units(
+    scene: Scene,
+    dt: float | None = None,
+    *,
+    step: float = STEP,
+    gravity: float = GRAVITY,
+    length: float = LENGTH,
+    mean: bool = False,
+) -> Units:
+    """The units in which bodies of `length` fall under `gravity`, a step being `step` (as the contact solve has these,
+    where nothing is given): of `length` is the smallest body that moves, or their `mean`. `dt` s fixes the scale by the
+    wanted step instead. Raises SdfsimError for a step that is not positive, or bodies of sizes that no step serves."""
     if dt is not None and not 0.0 < dt < np.inf:
         raise SdfsimError(f"dt: must be > 0 s and finite (got {dt:g})")
     strength = float(np.linalg.norm(scene.gravity)) or EARTH
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     sizes = [largest_extent(scene.shapes[b.shape]) * b.scale for b in moving]
     if dt is not None:
-        length = (dt / model.dt) ** 2 * strength / model.gravity
+        metres = (dt / step) ** 2 * strength / gravity
     elif sizes:
         _check_sizes([b.name for b in moving], np.array(sizes))
-        length = float(np.mean(sizes) if model.on_surfaces else np.min(sizes)) / model.length
+        metres = float(np.mean(sizes) if mean else np.min(sizes)) / length
     else:
-        length = 1.0
+        metres = 1.0
     mass = float(np.mean([b.mass for b in moving])) if moving else 1.0
-    return Units(length=length, time=float(np.sqrt(length * model.gravity / strength)), mass=mass)
+    return Units(length=metres, time=float(np.sqrt(metres * gravity / strength)), mass=mass)
 
 
 def inner_steps(scene: Scene) -> int:

@@ -17,20 +17,19 @@ from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import parallel
 from sdfsim.base.version import __version__
 from sdfsim.learned.model import Model, load_model
-from sdfsim.learned.training_ranges import deep_starts, outside_training
+from sdfsim.learned.training_ranges import deep_starts
 from sdfsim.physics.bodies import State, from_scene
-from sdfsim.physics.options import FreeFlight, StepOptions
+from sdfsim.physics.free_flight import MOTION
+from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
-from sdfsim.physics.units import inner_steps, scene_units
+from sdfsim.physics.units import inner_steps
 from sdfsim.physics.validity import check_nodes, check_sizes, fault
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.simulate.body_handle import BodyHandle, ContactPoint
-from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import step
+from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
+from sdfsim.simulate.steppers import COUNTS, PHASES, Carry, FreeFlight, stepper_of
 
 if TYPE_CHECKING:
-    from sdfsim.learned.near import Contacts, Pairs
     from sdfsim.scene.builder import SceneBuilder
 
 BYTES_AN_EDGE = 4096  # of the network, while it is worked on
@@ -53,7 +52,7 @@ class SimulationError(SdfsimError):
         self.rollout = rollout
 
 
-class Simulator:
+class Simulator(LiveScene):
     """Simulates one scene.
 
     Args:
@@ -65,8 +64,9 @@ class Simulator:
         free_flight: "exact", or "learned" for the own formulation of networks on surface nodes.
 
     Attributes:
-        state: bodies and how they move, model units. Give it another one to start from there, or to change a body:
-            `simulator.state = replace(simulator.state, velocity=...)`; its tensors are not to be written into.
+        state: bodies and how they move, model units; see `LiveScene`.
+        options: what is in play, model units; give it others to change that.
+        stepper: what makes the steps.
         dt: s, the step in the scene's units.
         units: metres, seconds and kilograms per model unit.
         outside_training: what of the scene the model has not seen in training, one line each.
@@ -92,48 +92,40 @@ class Simulator:
         effects = plan(scene)
         model = model if model is not None else scene.model
         asked = effects.contact.on or free_flight == "learned"
-        self.model = model if isinstance(model, Model) else load_model(model, weights=asked)
-        if not self.model.on_surfaces:
-            self.device = torch.device("cpu")  # the compiled step and network have no other
-        self.model = self.model.to(self.device)
-        if free_flight == "learned" and not self.model.on_surfaces:
-            raise SdfsimError(
-                "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
-            )
+        model = model if isinstance(model, Model) else load_model(model, weights=asked)
+        memory, self._asked = scene.limits.memory_gib, {"dt": dt, "free_flight": free_flight}
+        rows = None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE))
+        stepper = stepper_of(model, contact=effects.contact.on, free_flight=free_flight, rows=rows)
+        if not stepper.on_surfaces:
+            self.device = torch.device("cpu")
+        self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed
-        self.units, self._dt = scene_units(scene, self.model, dt), dt
+        self.units = stepper.units(scene, dt)
         self.dt = self.model.dt * self.units.time
-        self.outside_training = outside_training([scene], self.model, self.units)
-        gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
-        memory = scene.limits.memory_gib
-        self.rules = StepOptions(
-            gravity=gravity,
-            dt=self.model.dt,
-            contact=effects.contact.on,
-            friction=effects.friction.on,
-            restitution=effects.restitution.on,
-            rotation=effects.rotation.on,
-            free_flight=free_flight,
-            substeps=self.model.inner or inner_steps(scene),
-            rows=None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE)),
-            sleep=effects.sleep.on and not self.model.on_surfaces,
-        )
-        worked_on = replace(scene, shapes=tuple(self.model.surface(shape) for shape in scene.shapes))
+        self.outside_training = stepper.unknown([scene], self.units)
+        worked_on = replace(scene, shapes=tuple(stepper.surface(shape) for shape in scene.shapes))
         check_nodes(worked_on)
-        self.bodies, self.state = from_scene(worked_on, self.units, self.device)
+        self.bodies, state = from_scene(worked_on, self.units, self.device)
         self._names = tuple(b.name for b in scene.bodies)
         check_sizes(self.bodies, self._names, self.units.length)
         if effects.contact.on and self.model.ranges:
-            self.outside_training += deep_starts(self.bodies, self.state, self._names, self.units.length)
-        if self.outside_training:
-            self.rules = replace(self.rules, trust=0.0)
-        if self.model.on_surfaces:
-            from sdfsim.learned.surfaces import with_history
-
-            self.state = with_history(self.state, self.bodies, self.rules)
-        self.memory = Memory()
+            self.outside_training += deep_starts(self.bodies, state, self._names, self.units.length)
+        stepper = stepper.distrusted() if self.outside_training else stepper
+        self.stepper = replace(stepper, model=self.model)
+        gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
+        self._carry: Carry | None = None
+        self._options = Options(
+            gravity=gravity,
+            dt=self.model.dt,
+            friction=effects.friction.on,
+            restitution=effects.restitution.on,
+            rotation=effects.rotation.on,
+            substeps=self.model.inner or inner_steps(scene),
+            sleep=effects.sleep.on and stepper.sleeps,
+        )
+        super().__init__(self.stepper.began(state, self.bodies, self._options))
         dynamic = self.bodies.moves
-        weight = self.bodies.mass[dynamic] * self.rules.gravity.norm()
+        weight = self.bodies.mass[dynamic] * gravity.norm()
         lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
         self._meta = {
             "model": self.model.name,
@@ -147,7 +139,6 @@ class Simulator:
             "torch": torch.__version__,
             "python": platform.python_version(),
         }
-        self.contacts: Contacts | Pairs | None = None
         self.steps_done = 0
         self._given = 0.0  # model energy that came from outside since the last frame
         if broken := self._fault(self.state):
@@ -174,10 +165,41 @@ class Simulator:
             self._step()
         return self.si_state()
 
+    @property
+    def options(self) -> Options:
+        return self._options
+
+    @options.setter
+    def options(self, options: Options) -> None:
+        if not torch.equal(options.gravity, self._options.gravity):
+            self._accept()
+            nobody = np.zeros(len(self.bodies), bool)
+            self._state = self._good = self.stepper.announce(self._state, self.carry, nobody, gravity=True)
+        self._options = options
+        if self._carry is not None:
+            self._carry.options, self._carry.weights = options, None
+
+    @property
+    def carry(self) -> Carry:
+        """What the stepper keeps of this run, made when first asked for."""
+        if self._carry is None:
+            self._carry = self.stepper.init(self.bodies, self._state, self._options)
+        return self._carry
+
     def reset(self) -> None:
         """Go back to the start of the scene."""
-        self.state = self._good = self._start
-        self.memory, self.contacts, self.steps_done, self._given = Memory(), None, 0, 0.0
+        self.restore(self._start)
+
+    def restore(self, state: State) -> None:
+        """Go on from a state that steps have led to, here or in another simulator of the same scene, as they would have
+        gone on there: to the last bit, and what slept sleeps on. One that somebody has changed is for `state`. Raises
+        SdfsimError for a state that cannot be."""
+        if broken := self._fault(state):
+            raise SdfsimError(broken)
+        self._state = self._good = state
+        self._changed[:], self._handed = False, False
+        self._carry, self._given = None, 0.0
+        self.steps_done = round(state.time / self._options.dt)
 
     def __getitem__(self, name: str) -> BodyHandle:
         """A body by its name. Raises SdfsimError where there is none of that name."""
@@ -189,7 +211,7 @@ class Simulator:
     def contact_points(self) -> list[ContactPoint]:
         """Where bodies touch in the present state, as the last step of the contact solve has left it. Raises
         SdfsimError for networks on surface nodes, which know no impulses."""
-        if self.model.on_surfaces:
+        if not self.stepper.forces:
             raise SdfsimError(
                 "networks on surface nodes tell no impulses", "take the solver, or a network on top of it"
             )
@@ -220,7 +242,7 @@ class Simulator:
         """
         scenes = [varied(self.scene, variant) for variant in variants]
         pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
-        same = {"device": str(self.device), "seed": self.seed, "dt": self._dt, "free_flight": self.rules.free_flight}
+        same = {"device": str(self.device), "seed": self.seed, **self._asked}
         jobs = [([scenes[k] for k in piece], self.model, same, seconds, steps) for piece in pieces]
         found = dict(parallel(_run_each, jobs))
         return [rollout for k in range(len(jobs)) for rollout in found[k]]
@@ -265,39 +287,40 @@ class Simulator:
 
     def _step(self) -> None:
         self._accept()
-        after, contacts = step(self.model, self.bodies, self.state, self.rules, self.memory)
+        before = self._state
+        after, _ = self.stepper.advance(before, self.carry)
         awake = self.bodies.moves.cpu().numpy()
         if after.touch is not None:
             awake = awake & (after.touch.island.numpy() < 0)
-        if broken := self._fault(after, awake, self.state):
+        if broken := self._fault(after, awake, before):
             raise self._broke(broken)
-        if (load := self.state.load) is not None:
+        if (load := before.load) is not None:
             force, torque = load.split(3, 1)
-            turning = 0.5 * self.rules.dt * (self.state.angular_velocity + after.angular_velocity)
-            self._given += float((force * (after.position - self.state.position)).sum() + (torque * turning).sum())
-        self.state, self.contacts = after, contacts
-        self._good = after
+            turning = 0.5 * self._options.dt * (before.angular_velocity + after.angular_velocity)
+            self._given += float((force * (after.position - before.position)).sum() + (torque * turning).sum())
+        self._state = self._good = after
         self.steps_done += 1
 
     def _accept(self) -> None:
-        """A state that came from outside is looked at before anything is computed from it."""
-        if self.state is self._good:
+        """What came from outside is looked at before anything is computed from it, and the stepper is told."""
+        if not (self._handed or self._changed.any()):
             return
-        broken = self._fault(self.state)
-        if broken is None and not np.isfinite(self.state.time):
+        state, good, changed = self._state, self._good, self._changed.copy()
+        if self._handed:
+            for name in MOTION:
+                changed |= (getattr(state, name) != getattr(good, name)).any(-1).cpu().numpy()
+        self._changed[:], self._handed = False, False
+        broken = self._fault(state)
+        if broken is None and not np.isfinite(state.time):
             broken = "time is not finite"
         if broken:
-            self.state = self._good
+            self._state = good
             raise self._broke(broken)
-        if self.model.on_surfaces:
-            from sdfsim.learned.surfaces import history_told
-
-            self.state = history_told(self.state, self._good, self.bodies, self.rules)
-        self._given += sum(self._energies(self.state)) - sum(self._energies(self._good))
-        self._good = self.state
+        self._given += sum(self._energies(state)) - sum(self._energies(good))
+        self._state = self._good = self.stepper.announce(state, self.carry, changed)
 
     def _fault(self, state: State, rows: np.ndarray | None = None, before: State | None = None) -> str | None:
-        found = fault(state, self.rules.dt, self.units, rows, before)
+        found = fault(state, self._options.dt, self.units, rows, before)
         return None if found is None else f"body {self._names[found[0]]!r}: {found[1]}"
 
     def _broke(self, what: str) -> SimulationError:
@@ -306,7 +329,8 @@ class Simulator:
 
     def _frame(self, milliseconds: float) -> Rollout:
         state, u = self.si_state(), self.units
-        points, pairs, depth = self._touching()
+        counts = dict.fromkeys((*COUNTS, *PHASES), 0.0) if self._carry is None else self._carry.counts
+        points, pairs, depth = self.stepper.touching(self._state, self._carry)
         kinetic, potential = self._energies(self.state)
         given, self._given = self._given, 0.0
         counters = {
@@ -315,7 +339,7 @@ class Simulator:
             "energy_given": given * u.energy,
             "contacts": float(len(pairs)),
             "worst_penetration": depth * u.length,
-            **self.memory.counts,
+            **counts,
             "step_ms": milliseconds,
         }
         return Rollout(
@@ -332,29 +356,12 @@ class Simulator:
             meta=self._meta,
         )
 
-    def _touching(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Points [C, 3] where bodies touch, pairs of bodies [C, 2], and the deepest penetration; model units."""
-        near = self.contacts
-        if near is not None and len(near):
-            from sdfsim.learned.near import where
-
-            # The edges were found at the start of the step; their points are told where this frame has the bodies.
-            points = where(self.state, self.bodies, near).cpu().numpy()
-            pairs = torch.stack([near.owner, near.body], -1).cpu().numpy()
-            return points, pairs, float((-near.distance).clamp_min(0.0).max())
-        if self.state.touch is None:
-            return np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64), 0.0
-        from sdfsim.physics.solver.prepare import contact_points
-
-        found = contact_points(self.state)
-        return found.point, found.pair, float((-found.gap).max(initial=0.0))
-
     def _energies(self, s: State) -> tuple[float, float]:
         """Kinetic and potential energy of all dynamic bodies in a state, model units."""
         from sdfsim.physics.solver.survey import energies
 
         b = self.bodies
-        known = (b.mass, b.inertia, self.rules.gravity, s.position, s.orientation, s.velocity, s.angular_velocity)
+        known = (b.mass, b.inertia, self._options.gravity, s.position, s.orientation, s.velocity, s.angular_velocity)
         return energies(*(t.cpu().numpy() for t in known))
 
 

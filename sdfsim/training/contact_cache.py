@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from sdfsim.physics.options import SUBSTEPS
 
 if TYPE_CHECKING:
     from sdfsim.physics.bodies import Bodies, State
-    from sdfsim.physics.options import StepOptions
+    from sdfsim.physics.options import Options
     from sdfsim.physics.solver.record import Edges
 
 STEP = 0.02  # s, the step that networks know
@@ -205,10 +205,10 @@ def _fingerprint(files: list[Path], how: Solved) -> str:
 def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     """The frames of each draw and step: of all trajectories of a group at that step."""
     from sdfsim.data.batching import merged, state_at  # needs the SDFs, hence more than torch and numpy
+    from sdfsim.learned.model import load_model
     from sdfsim.physics.bodies import Units
-    from sdfsim.physics.options import StepOptions
-    from sdfsim.physics.solver.prepare import solver_step
-    from sdfsim.simulate.run_memory import Memory
+    from sdfsim.physics.options import Options
+    from sdfsim.simulate.steppers import stepper_of
 
     substep, found = engine_substep(files[0].parent), conditions_of(files[0].parent)
     group = [Trajectory.load(file) for file in files]
@@ -216,21 +216,22 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"), found.floor)
     inner = how.inner or how.stride * inner_steps(group[0].dt, substep)
     gravity = torch.from_numpy(np.asarray(group[0].gravity, dtype=np.float64))
-    rules = StepOptions(gravity, group[0].dt * how.stride, inner)
+    options = Options(gravity, group[0].dt * how.stride, inner, record=True)
     if found.by_teacher:
-        rules = replace(rules, margin=MARGIN, adds=True, cone=False)
+        options = replace(options, margin=MARGIN, adds=True, cone=False)
+    solver, moves = stepper_of(load_model()), bodies.moves.numpy()
     count = min(len(t.position) for t in group)
     parts = []
     for draw in range(how.draws):
         rng = np.random.default_rng([draw, int(hashlib.sha256(files[0].name.encode()).hexdigest()[:8], 16)])
-        memory, touch = Memory(), None
+        carry, touch = solver.init(bodies, start, options), None
         for now in range(0, count - how.stride, how.stride):
             state = replace(state_at(group, [now] * len(group), start), touch=touch)
             state = _disturbed(bodies, state, how, rng) if draw else state
-            after, edges = solver_step(bodies, state, rules, memory, note=True)
+            after, _ = solver.advance(solver.announce(state, carry, moves), carry)
             touch = after.touch
             recorded = state_at(group, [now + how.stride] * len(group), start)
-            parts += _of_step(bodies, state, after, edges, recorded, rules, found.floor)
+            parts += _of_step(bodies, state, after, cast("Edges", carry.edges), recorded, options, found.floor)
     return parts
 
 
@@ -253,7 +254,7 @@ def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generat
 
 
 def _of_step(
-    bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, rules: StepOptions,
+    bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, options: Options,
     of_floor: tuple[float, float],
 ) -> list[ContactFrames]:  # fmt: skip
     """The frames of a step of several trajectories on one floor, of this friction and restitution, in units in which it
@@ -270,7 +271,7 @@ def _of_step(
     rows = np.flatnonzero(np.isin(world, used))
     begins = np.searchsorted(world[:floor], np.arange(world.max() + 1))[of_edge[order]]
     first, second = edges.pair[order].T
-    time = rules.dt / STEP
+    time = options.dt / STEP
     length = time**2
     speed = length / time
 
@@ -289,12 +290,12 @@ def _of_step(
         parts = (
             body(end.velocity, speed),
             body(end.angular_velocity, 1.0 / time),
-            body((end.position - state.position) / rules.dt, speed),
-            body(turned / rules.dt, 1.0 / time),
+            body((end.position - state.position) / options.dt, speed),
+            body(turned / options.dt, 1.0 / time),
         )
         return dict(zip(names, parts, strict=True))
 
-    free = torque_free(state.orientation, state.angular_velocity, bodies.inertia, rules.dt)[1]
+    free = torque_free(state.orientation, state.angular_velocity, bodies.inertia, options.dt)[1]
     return [
         ContactFrames(
             body_start=np.concatenate([[0], np.cumsum(np.bincount(world[rows])[used])]),
@@ -320,7 +321,7 @@ def _of_step(
             gap=edge(APART, length),
             when=edge(WHEN),
             dt=STEP,
-            gravity=rules.gravity.numpy(),
+            gravity=options.gravity.numpy(),
             trajectories=np.zeros(1, dtype=np.int64),
         )
     ]

@@ -18,7 +18,7 @@ from sdfsim.learned.near import Contacts, Pairs
 from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
-from sdfsim.simulate.run_memory import Memory
+from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 
@@ -73,13 +73,13 @@ class SurfaceTask:
         bodies, state, after = self.scenes(rng, count, team)
         # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
         target = target_acceleration(bodies, state, *after)
-        graph = self.family.graph(bodies, state, self.near(bodies, state, Memory()))
+        graph = self.family.graph(bodies, state, self.near(bodies, state))
         return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 
-    def near(self, bodies: Bodies, state: State, memory: Memory) -> Contacts | Pairs:
+    def near(self, bodies: Bodies, state: State, scene: Compiled | None = None) -> Contacts | Pairs:
         """What is near what; see `Family.near`."""
         gravity = torch.tensor(self.trajectories[0].gravity, dtype=torch.float64, device=self.device)
-        return self.family.near(bodies, state, gravity, self.reach, self.dt, memory)
+        return self.family.near(bodies, state, gravity, self.reach, self.dt, scene)
 
     def scenes(
         self, rng: np.random.Generator, count: int, team: Team = ALONE

@@ -16,9 +16,9 @@ from sdfsim.evaluation.engines import bullet, drake, mujoco, newton, shape_urdf,
 from sdfsim.evaluation.stress import TEACHER, by_engine
 from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
-from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape, shape_from_primitive
+from sdfsim.simulate.steppers import stepper_of
 
 SCENE = """
 version: 1
@@ -35,7 +35,7 @@ bodies:
 def started(folder, text: str = SCENE):
     (folder / "scene.yaml").write_text(text)
     scene = load_scene(folder / "scene.yaml")
-    units = scene_units(scene, load_model("small", weights=False))
+    units = stepper_of(load_model("small", weights=False)).units(scene)
     return start_of_scene(scene, folder / "engine", units), units
 
 

@@ -174,7 +174,7 @@ def test_a_step_with_two_threads_is_that_with_one(model):
             before, after = simulator.state, []
             for threads in (2, 1):
                 torch.set_num_threads(threads)
-                simulator.state = before
+                simulator.restore(before)
                 after += list(simulator.steps(1))
             two, one = after
             assert (one.position - two.position).abs().max() <= 1e-6

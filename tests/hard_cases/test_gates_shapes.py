@@ -114,7 +114,7 @@ def test_a_node_where_the_gradient_has_no_direction_of_its_own(kinds, kind, plac
     rest = replace(scene.bodies[0], name="target", shape=1, position=np.zeros(3))
     scene = replace(scene, shapes=(probe, target), bodies=(*scene.bodies, rest))
     sim = Simulator(scene, model)
-    contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
+    contacts = find_contacts(sim.bodies, sim.state, sim.options.gravity, sim.model.reach, sim.options.dt)
     assert len(contacts)
     torch.testing.assert_close(contacts.normal.norm(dim=-1), torch.ones(len(contacts), dtype=torch.float64))
     assert contacts.distance.isfinite().all() and (contacts.distance.abs() < 2.0).all()

@@ -10,11 +10,10 @@ from sdfsim.learned.families import FAMILIES, vertices
 from sdfsim.learned.near import closest_points, face_pairs, node_pairs
 from sdfsim.learned.surfaces import with_history
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
-from sdfsim.physics.options import StepOptions
+from sdfsim.physics.options import Options
 from sdfsim.physics.pose import rotate
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
-from sdfsim.simulate.run_memory import Memory
 from tests.scenes import make_body
 
 CPU = torch.device("cpu")
@@ -39,7 +38,7 @@ def bodies_of(kind: str, seed: int = 0) -> tuple[Bodies, State]:
     worked_on = tuple(FAMILIES[kind].surface(shape, 30) for shape in shapes)
     scene = Scene(worked_on, tuple(bodies), gravity=GRAVITY.numpy(), duration=1.0)
     found, state = from_scene(scene, Units(1.0, 1.0, 1.0), CPU)
-    return found, with_history(state, found, StepOptions(gravity=GRAVITY, dt=DT))
+    return found, with_history(state, found, Options(gravity=GRAVITY, dt=DT))
 
 
 def distances_by_projection(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -139,9 +138,9 @@ def test_the_mirrored_graph_is_the_graph_of_the_mirrored_scene(kind):
         earlier_orientation=state.earlier_orientation * turned,
     )
     family = FAMILIES[kind]
-    made = family.graph(bodies, state, family.near(bodies, state, GRAVITY, REACH, DT, Memory())).mirrored(family.layout)
+    made = family.graph(bodies, state, family.near(bodies, state, GRAVITY, REACH, DT, None)).mirrored(family.layout)
     mirrored = replace(bodies, node=bodies.node * FLIP, face=bodies.face[:, [0, 2, 1]])
-    near = family.near(mirrored, image, GRAVITY, REACH, DT, Memory())
+    near = family.near(mirrored, image, GRAVITY, REACH, DT, None)
     theirs = family.graph(mirrored, image, near)
     for name, features in made.nodes.items():
         torch.testing.assert_close(features, theirs.nodes[name], rtol=0, atol=1e-5)

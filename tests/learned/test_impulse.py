@@ -28,7 +28,7 @@ def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair):
     touched = 0
     for _ in range(20):
         sim.run(steps=1)
-        touched += sim.memory.counts["edges"] > 0
+        touched += sim.carry.counts["edges"] > 0
         torch.testing.assert_close(linear_momentum(sim), before, rtol=0, atol=1e-5)
     assert touched > 1
 
@@ -36,13 +36,14 @@ def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair):
 def first_graph(scene: Scene, steps: int = 30) -> tuple[Simulator, torch.Tensor, ContactGraph]:
     """The first step in which contacts act: the simulator before it, the bodies in contact, and their graph."""
     sim = Simulator(scene, random_model("impulse"))
+    world, options, state = sim.carry.scene.world, replace(sim.options, record=True), sim.state
     for _ in range(steps):
-        solved, edges = solver_step(sim.bodies, sim.state, sim.rules, sim.memory, note=True)
+        solved, edges, _ = solver_step(sim.carry.scene, state, options)
         if edges.value[:, GIVEN : GIVEN + 3].any():
-            world, terms = sim.memory.compiled(sim.bodies, sim.state).world, terms_of(sim.rules, sim.model.dt)
-            active, graph = contact_graph(world, sim.state, solved, edges, terms)
+            active, graph = contact_graph(world, state, solved, edges, terms_of(options, sim.model.dt))
+            sim.restore(state)
             return sim, active, in_single(graph)
-        sim.state = solved
+        state = solved
     raise AssertionError("nothing touched")
 
 
@@ -116,7 +117,7 @@ def test_surfaces_that_do_not_move_against_each_other_are_left_to_the_solve(box_
 def test_beyond_its_training_a_network_adds_nothing(dropped):
     model = replace(random_model("impulse"), length=1.4, ranges={"size": [0.01, 0.02]})
     sim = Simulator(dropped, model)
-    assert sim.outside_training and sim.rules.trust == 0.0
+    assert sim.outside_training and sim.stepper.trust == 0.0
     np.testing.assert_array_equal(sim.run(steps=20).position, Simulator(dropped, "solver").run(steps=20).position)
 
 
@@ -196,7 +197,7 @@ def test_without_friction_nothing_tangential_is_computed(dropped):
     for layer in model.network.rounds:
         layer.tangent_impulse.weight.fill_(torch.nan)
     sim = Simulator(smooth, model)
-    assert not sim.rules.friction
+    assert not sim.options.friction
     rollout = sim.run(steps=8)
     assert rollout.contact_count.sum() > 0
     # The floor's normal is vertical: what is horizontal stays as it was.

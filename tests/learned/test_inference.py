@@ -17,12 +17,11 @@ from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.model import Model, load_model, new_network
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import State
-from sdfsim.physics.options import StepOptions
 from sdfsim.physics.solver import impulse as kernel
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
-from sdfsim.simulate import step as step_module
 from sdfsim.simulate.simulator import Simulator
+from sdfsim.simulate.steppers import OnSolver
 from tests.physics.test_laws import cube
 from tests.scenes import POSE, contact_graph, make_body, random_model
 
@@ -65,17 +64,17 @@ class Compared:
     error: float
 
 
-def in_torch(network, solved: State, rules: StepOptions, active: torch.Tensor, graph: ContactGraph) -> State:
+def in_torch(network, solved: State, terms: kernel.Terms, active: torch.Tensor, graph: ContactGraph) -> State:
     """What the network in torch makes of a solved step."""
-    predicted = network(graph, friction=rules.friction, trust=rules.trust)
-    chosen, time = graph.inverse_mass > 0, rules.dt / graph.dt
+    predicted = network(graph, friction=terms.friction, trust=terms.trust)
+    chosen, time = graph.inverse_mass > 0, terms.dt / graph.dt
     rows = active[chosen]
     place, velocity, turned, angular = (
         getattr(solved, name).clone() for name in ("position", "velocity", "orientation", "angular_velocity")
     )
-    place[rows] += (predicted.mean_velocity - graph.mean_velocity)[chosen] * time * rules.dt
+    place[rows] += (predicted.mean_velocity - graph.mean_velocity)[chosen] * time * terms.dt
     velocity[rows] += (predicted.velocity - graph.solved_velocity)[chosen] * time
-    if rules.rotation:
+    if terms.rotation:
         turn = pose.from_rotvec((predicted.mean_angular - graph.mean_angular)[chosen] * graph.dt)
         turned[rows] = pose.normalise(pose.multiply(turn, turned[rows]))
         angular[rows] += (predicted.angular - graph.solved_angular)[chosen] / time
@@ -86,16 +85,15 @@ def in_torch(network, solved: State, rules: StepOptions, active: torch.Tensor, g
 def steps(monkeypatch) -> list[Compared]:
     """Every step that the compiled network makes, made by torch in double precision as well."""
     found, given = [], []
-    compiled, solved_step = inference.corrected, step_module._solved_step
+    compiled, step = inference.corrected, OnSolver._step
 
-    def stepped(model, *rest):
-        given[:] = [deepcopy(model.network).double()]
-        return solved_step(model, *rest)
+    def stepped(stepper, *rest):
+        given[:] = [deepcopy(stepper.model.network).double()]
+        return step(stepper, *rest)
 
-    def both(weights, world, before, solved, edges, rules, *, known):
-        mine = compiled(weights, world, before, solved, edges, rules, known=known)
-        graph = contact_graph(world, before, solved, edges, inference.terms_of(rules, known))
-        theirs = in_torch(given[0], solved, rules, *graph)
+    def both(weights, world, before, solved, edges, terms):
+        mine = compiled(weights, world, before, solved, edges, terms)
+        theirs = in_torch(given[0], solved, terms, *contact_graph(world, before, solved, edges, terms))
         rows = torch.from_numpy(edges.pair.ravel())
         speed = max(float(getattr(s, n)[rows].abs().max()) for s in (before, solved, theirs) for n in POSE[2:])
 
@@ -105,7 +103,7 @@ def steps(monkeypatch) -> list[Compared]:
         found.append(Compared(len(edges.pair), apart(solved, POSE[2:]), apart(theirs, POSE)))
         return mine
 
-    monkeypatch.setattr(step_module, "_solved_step", stepped)
+    monkeypatch.setattr(OnSolver, "_step", stepped)
     monkeypatch.setattr(inference, "corrected", both)
     return found
 
@@ -151,7 +149,7 @@ def test_they_agree_on_more_edges_than_go_through_a_layer_at_once(steps):
 @pytest.mark.parametrize("longer", [0.5, 2.0])
 def test_they_agree_on_steps_of_another_length_than_the_network_knows(steps, longer):
     sim = Simulator(pile(3), model_of("random"))
-    sim.rules = replace(sim.rules, dt=longer * sim.rules.dt)
+    sim.options = replace(sim.options, dt=longer * sim.options.dt)
     sim.run(steps=15)
     assert agree(steps, 8)
 
@@ -184,7 +182,7 @@ def test_without_trust_it_is_not_asked_and_with_little_it_adds_little(steps):
         """What is added in the first step that has edges."""
         steps.clear()
         sim = Simulator(pile(1), model_of("random"))
-        sim.rules = replace(sim.rules, trust=trust)
+        sim.stepper = replace(sim.stepper, trust=trust)
         sim.run(steps=4)
         return steps[0].change if steps else 0.0
 

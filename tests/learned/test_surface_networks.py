@@ -31,11 +31,11 @@ def test_without_acceleration_every_body_goes_on_as_it_came(dropped):
     """Zero acceleration of every node is uniform motion: translation exactly, rotation to the order of the step."""
     sim = Simulator(dropped, surface_model())
     zero = torch.zeros(len(sim.bodies.node), 3, dtype=torch.float64)
-    after = advance(sim.bodies, sim.state, zero, sim.rules.dt)
+    after = advance(sim.bodies, sim.state, zero, sim.options.dt)
     moves = sim.bodies.moves
     before = sim.state.earlier_position[1]
     torch.testing.assert_close(
-        after.position[moves], (2 * sim.state.position - before)[moves], rtol=0, atol=2e-3 * sim.rules.dt
+        after.position[moves], (2 * sim.state.position - before)[moves], rtol=0, atol=2e-3 * sim.options.dt
     )
     assert torch.equal(after.position[~moves], sim.state.position[~moves])
 
@@ -44,8 +44,8 @@ def test_a_common_acceleration_moves_the_centre_by_it(free_pair):
     sim = Simulator(free_pair, surface_model())
     push = torch.tensor([[0.01, -0.02, 0.03], [0.0, 0.05, 0.0]], dtype=torch.float64)
     owner = node_owner(sim.bodies)
-    with_push = advance(sim.bodies, sim.state, push[owner], sim.rules.dt)
-    without = advance(sim.bodies, sim.state, torch.zeros_like(push[owner]), sim.rules.dt)
+    with_push = advance(sim.bodies, sim.state, push[owner], sim.options.dt)
+    without = advance(sim.bodies, sim.state, torch.zeros_like(push[owner]), sim.options.dt)
     torch.testing.assert_close(with_push.position - without.position, push, rtol=0, atol=1e-9)
     assert float(angle_between(with_push.orientation, without.orientation).max()) < 1e-6
 
@@ -95,7 +95,7 @@ def test_a_body_that_is_changed_goes_on_as_its_new_state_says_and_the_others_as_
     position[3, 0] += 7.0
     changed.state = replace(changed.state, velocity=velocity, position=position)
     ((after,), (kept,)) = (list(sim.steps(1)) for sim in (changed, plain))
-    step = changed.rules.dt
+    step = changed.options.dt
     # Half a step of gravity is in the pose that the velocity leads from.
     way = changed.state.position[3] - position[3] - velocity[3] * step
     assert float(way.norm()) < 10.0 * step**2
@@ -105,7 +105,7 @@ def test_a_body_that_is_changed_goes_on_as_its_new_state_says_and_the_others_as_
 def test_a_state_of_another_run_keeps_its_own_history_and_one_without_gets_one(dropped):
     one, other, bare = (Simulator(dropped, surface_model(), free_flight="learned") for _ in range(3))
     list(one.steps(3))
-    other.state = one.state
+    other.restore(one.state)
     bare.state = replace(one.state, earlier_position=None, earlier_orientation=None)
     (went,), (same,), (near,) = (list(sim.steps(1)) for sim in (one, other, bare))
     assert torch.equal(went.position, same.position)

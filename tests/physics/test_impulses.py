@@ -9,7 +9,7 @@ from numba import njit
 from scipy.spatial.transform import Rotation
 
 from sdfsim.physics.bodies import Units, from_scene
-from sdfsim.physics.options import StepOptions
+from sdfsim.physics.options import Options
 from sdfsim.physics.solver.impulses import solve_contacts
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 from sdfsim.physics.solver.world import (
@@ -105,8 +105,8 @@ def test_the_compiled_solve_is_the_readable_one(seed):
     scene = pile(draw)
     bodies, state = from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))
     inside = Compiled(bodies, state)
-    rules = compiled_rules(StepOptions(torch.from_numpy(scene.gravity), 0.02, **RULES[seed % len(RULES)]))
-    motion, manifolds = taken_up(bodies, state, inside, rules)
+    rules = compiled_rules(Options(torch.from_numpy(scene.gravity), 0.02, **RULES[seed % len(RULES)]))
+    motion, manifolds = taken_up(state)
     world, work, acting = inside.world, inside.work, 0
     for _ in range(5):
         for k in range(100):

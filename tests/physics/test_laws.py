@@ -195,14 +195,14 @@ def test_a_tower_of_planks_stands(size):
 def test_the_heavy_rests_on_the_light(size, ratio):
     bodies = [body(str(k), 0, [0, 0, (k + 0.5) * size], m) for k, m in enumerate((1.0, ratio))]
     sim = simulator([cube(size)], bodies)
-    sim.rules = replace(sim.rules, sleep=False)
+    sim.options = replace(sim.options, sleep=False)
     motion = sim.run(3.0 * sqrt(size))
     assert np.linalg.norm(motion.position[-1] - motion.position[0], axis=1).max() < 0.01 * size
     touch = sim.state.touch
-    inner = sim.rules.dt / sim.rules.substeps
+    inner = sim.options.dt / sim.options.substeps
     weight = torch.zeros(3)
     for pair, count, point in zip(touch.pair, touch.count, touch.point, strict=True):
-        weight[int(pair[1])] += float(point[: int(count), 10].sum()) / inner / float(sim.rules.gravity.norm())
+        weight[int(pair[1])] += float(point[: int(count), 10].sum()) / inner / float(sim.options.gravity.norm())
     masses = sim.bodies.mass
     assert weight[2] == pytest.approx(float(masses.sum()), rel=0.02)
     assert weight[1] == pytest.approx(float(masses[1]), rel=0.02)

@@ -142,11 +142,11 @@ def test_effects_that_are_off_do_not_act():
     scene = heap(1)
     base = Simulator(scene, "solver")
     flat = Simulator(scene, "solver")
-    flat.rules = replace(base.rules, rotation=False, friction=False)
+    flat.options = replace(base.options, rotation=False, friction=False)
     motion = flat.run(1.0)
     assert not motion.angular_velocity[1:, :-1].any()
     sim = Simulator(scene, "solver")
-    sim.rules = replace(base.rules, restitution=False, sleep=False)
+    sim.options = replace(base.options, restitution=False, sleep=False)
     assert sim.run(steps=5).position.shape == base.run(steps=5).position.shape
 
 

@@ -10,11 +10,12 @@ from sdfsim.learned import inference, near
 from sdfsim.learned.near import find_contacts
 from sdfsim.learned.sdf_sim import sdf_sim_graph
 from sdfsim.learned.surfaces import compact, node_owner, predict
+from sdfsim.physics import free_flight
 from sdfsim.physics.solver import impulse
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
-from sdfsim.simulate import step as step_module
+from sdfsim.simulate import steppers
 from sdfsim.simulate.simulator import Simulator
 from tests.learned.test_surface_networks import surface_model
 from tests.scenes import make_body, random_model
@@ -41,7 +42,7 @@ def forbid(monkeypatch):
 
 def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(dropped, forbid):
     alone = replace(dropped, bodies=tuple(replace(b, collides_with=()) for b in dropped.bodies))
-    forbid(step_module, "_solved_step")
+    forbid(steppers.Solver, "_step")
     forbid(solver, "compiled_shapes")
     forbid(inference, "corrected")
     model = random_model("impulse")
@@ -64,11 +65,11 @@ def test_the_network_is_not_asked_before_a_pair_is_near(dropped, forbid):
     forbid(inference, "corrected")
     sim = Simulator(far, random_model("impulse"))
     sim.run(steps=10)
-    assert sim.memory.counts["edges"] == 0 and sim.memory.counts["free"] == 1
+    assert sim.carry.counts["edges"] == 0 and sim.carry.counts["free"] == 1
 
 
 def test_without_a_dynamic_body_nothing_flies(dropped, forbid):
-    forbid(step_module, "ballistic", "torque_free")
+    forbid(free_flight, "ballistic", "torque_free")
     still = tuple(replace(b, motion="static", mass=0.0, velocity=np.zeros(3)) for b in dropped.bodies)
     rollout = Simulator(replace(dropped, bodies=still), random_model("impulse")).run(steps=3)
     assert (rollout.position == rollout.position[0]).all()
@@ -126,7 +127,7 @@ def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped, graphs)
     for _ in range(8):
         before = len(graphs)
         sim.run(steps=1)
-        counts = sim.memory.counts
+        counts = sim.carry.counts
         assert len(graphs) - before == (counts["edges"] > 0)
         if len(graphs) > before:
             graph = graphs[-1]
@@ -140,9 +141,9 @@ def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped, graphs)
 def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(dropped):
     model = surface_model(push=1e-2)
     sim = Simulator(dropped, model)
-    contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
+    contacts = find_contacts(sim.bodies, sim.state, sim.options.gravity, sim.model.reach, sim.options.dt)
     everything = sdf_sim_graph(sim.bodies, sim.state, contacts)
-    whole = predict(model.network, everything, sim.bodies, sim.state, sim.rules.dt)  # type: ignore[arg-type]
+    whole = predict(model.network, everything, sim.bodies, sim.state, sim.options.dt)  # type: ignore[arg-type]
     graphs = seen_by(model)
     rows = torch.cat([contacts.owner, contacts.body]).unique()
     sim.run(steps=1)
@@ -157,7 +158,7 @@ def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(
 
 def test_with_everything_active_nothing_is_copied(dropped):
     sim = Simulator(dropped, surface_model())
-    contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
+    contacts = find_contacts(sim.bodies, sim.state, sim.options.gravity, sim.model.reach, sim.options.dt)
     made = compact(sim.bodies, sim.state, contacts, torch.arange(len(sim.bodies)))
     assert made[0] is sim.bodies and made[1] is sim.state and made[2] is contacts
     some = compact(sim.bodies, sim.state, contacts, torch.cat([contacts.owner, contacts.body]).unique())
@@ -240,4 +241,4 @@ def test_scripted_bodies_do_not_meet_scenery(forbid):
     forbid(inference, "corrected")
     sim = Simulator(Scene(shapes, bodies, np.zeros(3), 1.0), random_model("impulse"))
     sim.run(steps=3)
-    assert sim.memory.counts["pairs"] == 0 and (sim.state.position[1] == 0).all()
+    assert sim.carry.counts["pairs"] == 0 and (sim.state.position[1] == 0).all()

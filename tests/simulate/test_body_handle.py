@@ -126,7 +126,7 @@ def test_contacts_carry_the_weight():
     sim.step(100)
     found = sim.contact_points()
     assert {(c.first, c.second) for c in found} == {("box", "floor")} and len(found) >= 3
-    inner = sim.dt / sim.rules.substeps
+    inner = sim.dt / sim.options.substeps
     np.testing.assert_allclose(sum(c.impulse for c in found) / inner, -0.2 * G, atol=0.02 * 0.2 * 9.81)
     for c in found:
         np.testing.assert_allclose(c.normal, (0, 0, 1), atol=1e-9)

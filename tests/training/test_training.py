@@ -16,9 +16,8 @@ from sdfsim.learned.impulse import Velocities
 from sdfsim.learned.inference import terms_of
 from sdfsim.learned.model import SURFACE, load_model
 from sdfsim.physics.bodies import Units
-from sdfsim.physics.options import StepOptions
-from sdfsim.physics.solver.prepare import solver_step
-from sdfsim.simulate.run_memory import Memory
+from sdfsim.physics.options import Options
+from sdfsim.physics.solver.prepare import Compiled, disturbed, solver_step
 from sdfsim.training import contact_cache
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
@@ -48,18 +47,18 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
     task = ImpulseTask(contact_frames(tmp_path, "train", ONCE), CPU)
     first = Trajectory.load(ball_data / "train" / "0.npz")
     bodies, state = merged([first], [0], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
-    rules = StepOptions(gravity=torch.tensor(first.gravity), dt=first.dt)
+    options = Options(gravity=torch.tensor(first.gravity), dt=first.dt, record=True)
     if teacher:
-        rules = replace(rules, margin=MARGIN, adds=True, cone=False)
-    memory, touch, found = Memory(), None, []
+        options = replace(options, margin=MARGIN, adds=True, cone=False)
+    scene, touch, found = Compiled(bodies, state), None, []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
-        state = replace(state, touch=touch)
-        solved, edges = solver_step(bodies, state, rules, memory, note=True)
+        state = disturbed(replace(state, touch=touch), bodies.moves.numpy())
+        solved, edges, _ = solver_step(scene, state, options)
         touch = solved.touch
         if len(edges.pair):
-            world = memory.compiled(bodies, state).world
-            found.append(in_single(contact_graph(world, state, solved, edges, terms_of(rules, first.dt))[1]))
+            terms = terms_of(options, first.dt)
+            found.append(in_single(contact_graph(scene.world, state, solved, edges, terms)[1]))
     assert len(found) == len(task.frames) > 5
     for k, graph in enumerate(found):
         batch = task.batch(np.array([k])).graph

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ import torch
 from sdfsim.base.compiling import tell_compiling
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Touch
+from sdfsim.physics.options import Options
 from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.advance import advance as compiled_step
@@ -22,10 +22,6 @@ from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
 
-if TYPE_CHECKING:
-    from sdfsim.physics.options import StepOptions
-    from sdfsim.simulate.run_memory import Memory
-
 FORMS = {
     "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
     "cylinder": kinds.CYLINDER,
@@ -35,7 +31,7 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 # inner steps below the usual 4 ms, which scenes of slender bodies have.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
-COARSE = 0.01  # model times: in longer inner steps what is hit in their course is told to a network as well
+COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
 
 
@@ -51,8 +47,6 @@ class Compiled:
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
         self.world = compiled_world(self.bodies, state, self.shapes)
-        self._scenery = np.flatnonzero(~(self.world.moves | self.world.scripted))
-        self._lies = self._scenery_in(state)
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=np.ascontiguousarray(pose.to_matrix(state.orientation.cpu()).numpy()), inverse=np.zeros((n, 3, 3)),
@@ -62,15 +56,6 @@ class Compiled:
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
         )  # fmt: skip
 
-    def follow(self, state: State) -> None:
-        """As `place`, where scenery lies elsewhere than it did: somebody has moved it."""
-        if not np.array_equal(self._scenery_in(state), self._lies):
-            self.place(state)
-
-    def _scenery_in(self, state: State) -> np.ndarray:
-        parts = (part.cpu().numpy()[self._scenery] for part in (state.position, state.orientation))
-        return np.concatenate([*parts], 1)
-
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
     ) -> tuple[compiled.Manifolds, Edges, tuple[int, ...]]:
@@ -78,24 +63,13 @@ class Compiled:
         return compiled_step(self.shapes, self.world, self.work, motion, rules, manifolds)
 
 
-def solver_step(
-    bodies: Bodies, state: State, rules: StepOptions, memory: Memory, *, note: bool = False
-) -> tuple[State, Edges]:
-    """Advance `state` by one step of the contact solve; scripted bodies have the velocities of the coming step. What
-    contacts did is told where it is wanted (`note`)."""
-    scene = memory.compiled(bodies, state)
-    with memory.timed("contact_ms"):
-        after, edges, (pairs, contacts, active) = _solve(bodies, state, scene, compiled_rules(rules, note=note))
-    memory.count(pairs=pairs, contacts=contacts, active=active)
-    return after, edges
-
-
-def _solve(
-    bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
-) -> tuple[State, Edges, tuple[int, ...]]:
-    motion, manifolds = taken_up(bodies, state, scene, rules)
+def solver_step(scene: Compiled, state: State, options: Options) -> tuple[State, Edges, tuple[int, ...]]:
+    """Advance `state` by one step of the contact solve; scripted bodies have the velocities of the coming step. Returns
+    what contacts did where that is recorded, and counts: pairs looked at, contacts, bodies that contacts moved."""
+    rules, (motion, manifolds) = compiled_rules(options), taken_up(state)
     scene.work.wrench[:] = 0.0 if state.load is None else state.load.numpy()
     manifolds, edges, counts = scene.run(motion, manifolds, rules)
+    known = (motion.touching, motion.quiet, motion.anchor, motion.island, *manifolds)
     after = replace(
         state,
         position=torch.from_numpy(motion.position),
@@ -103,53 +77,39 @@ def _solve(
         velocity=torch.from_numpy(motion.velocity),
         angular_velocity=torch.from_numpy(motion.angular),
         time=state.time + rules.substep_dt * rules.substeps,
+        touch=Touch(*map(torch.from_numpy, known)),
     )
-    after = bodies.led(after)
-    known = (motion.touching, motion.quiet, motion.anchor, motion.island, *manifolds)
-    touch = Touch(*map(torch.from_numpy, known), held=held(after), gravity=torch.from_numpy(rules.gravity))
-    return replace(after, touch=touch), edges, counts
+    return scene.bodies.led(after), edges, counts
 
 
-def taken_up(
-    bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
-) -> tuple[compiled.Motion, compiled.Manifolds]:
-    """Copies of a state as the compiled step writes to them; whoever was changed from outside is awake, and so are
-    those that slept with it or on it. Scenery lies where the state has it."""
-    position, orientation, velocity, angular = (
-        np.array(t.cpu().numpy(), dtype=np.float64, order="C")
-        for t in (state.position, state.orientation, state.velocity, state.angular_velocity)
-    )
-    n, touch = len(position), state.touch
-    scene.follow(state)
+def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
+    """Copies of a state as the compiled step writes to them."""
+    poses = (state.position, state.orientation, state.velocity, state.angular_velocity)
+    position, orientation, *velocities = (np.array(t.cpu().numpy(), dtype=np.float64, order="C") for t in poses)
+    touch = state.touch
     if touch is None:
-        anchor = np.concatenate([position, orientation, position, orientation], 1)
-        still, nobody = np.zeros(n, np.int64), np.full(n, -1, np.int64)
-        motion = compiled.Motion(position, orientation, velocity, angular, still > 0, still, anchor, nobody)
-        return motion, _manifolds(None)
-    island, quiet = np.array(touch.island.numpy()), np.array(touch.quiet.numpy())
-    touching = np.array(touch.touching.numpy())
-    if (touch.gravity.numpy() != rules.gravity).any():
-        island[:], quiet[:] = -1, 0
-    changed = (np.concatenate([position, orientation, velocity, angular], -1) != touch.held.numpy()).any(-1)
-    if scene.world.scripted.any():
-        changed &= ~scene.world.scripted
-    if changed.any():
-        beside = touch.pair.numpy()[touch.count.numpy() > 0]
-        restless = changed.copy()
-        restless[beside[changed[beside[:, 1]], 0]] = True
-        restless[beside[changed[beside[:, 0]], 1]] = True
-        up = np.isin(island, island[restless & (island >= 0)])
-        island[up], quiet[up | changed] = -1, 0
-        touching[changed] = False
-    motion = compiled.Motion(
-        position, orientation, velocity, angular, touching, quiet, np.array(touch.anchor.numpy()), island
-    )
-    return motion, _manifolds(touch)
+        still, nobody = np.zeros(len(position), np.int64), np.full(len(position), -1, np.int64)
+        known = still > 0, still, np.concatenate([position, orientation, position, orientation], 1), nobody
+    else:
+        known = (np.array(t.numpy()) for t in (touch.touching, touch.quiet, touch.anchor, touch.island))
+    return compiled.Motion(position, orientation, *velocities, *known), _manifolds(touch)
 
 
-def held(state: State) -> torch.Tensor:
-    """[N, 13] poses and velocities, by which a state that somebody changed is known."""
-    return torch.cat([state.position, state.orientation, state.velocity, state.angular_velocity], -1)
+def disturbed(state: State, changed: np.ndarray, *, gravity: bool = False) -> State:
+    """The state after somebody has changed the bodies `changed` [N] bool, or the `gravity` of all: they are awake, and
+    so are those that slept with them or on them."""
+    touch = state.touch
+    if touch is None:
+        return state
+    island, quiet, touching = (np.array(t.numpy()) for t in (touch.island, touch.quiet, touch.touching))
+    beside = touch.pair.numpy()[touch.count.numpy() > 0]
+    restless = changed.copy()
+    restless[beside[changed[beside[:, 1]], 0]] = True
+    restless[beside[changed[beside[:, 0]], 1]] = True
+    up = np.full(len(island), gravity) | np.isin(island, island[restless & (island >= 0)])
+    island[up], quiet[up | changed], touching[changed] = -1, 0, False
+    parts = {"island": island, "quiet": quiet, "touching": touching}
+    return replace(state, touch=replace(touch, **{name: torch.from_numpy(part) for name, part in parts.items()}))
 
 
 def contact_points(state: State) -> Touching:
@@ -157,13 +117,13 @@ def contact_points(state: State) -> Touching:
     return touching(_manifolds(state.touch), state.position.numpy(), state.orientation.numpy(), TOUCHING)
 
 
-def compiled_rules(rules: StepOptions, *, note: bool = False) -> compiled.Rules:
-    """The rules of a run as the compiled step wants them."""
-    gravity, inner = rules.gravity.cpu().numpy(), rules.dt / rules.substeps
+def compiled_rules(options: Options) -> compiled.Rules:
+    """The options of a run as the compiled step wants them."""
+    gravity, inner = options.gravity.cpu().numpy(), options.dt / options.substeps
     return compiled.Rules(
-        gravity, inner, rules.substeps, SLOW * math.hypot(*gravity) * inner, rules.friction,
-        rules.restitution, rules.rotation, rules.sleep, rules.margin, rules.adds, rules.cone, note,
-        ahead=inner if note and inner > COARSE else 0.0, slop=min(SLOP, SLOP_A_TIME * inner),
+        gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,
+        options.restitution, options.rotation, options.sleep, options.margin, options.adds, options.cone,
+        options.record, ahead=inner if options.record and inner > COARSE else 0.0, slop=min(SLOP, SLOP_A_TIME * inner),
     )  # fmt: skip
 
 

@@ -4,18 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
-
-if TYPE_CHECKING:
-    from sdfsim.simulate.simulator import Simulator
+from sdfsim.physics.bodies import Bodies, State, Units
+from sdfsim.physics.options import Options
+from sdfsim.scene.scene import Scene
+from sdfsim.simulate.steppers import Stepper
 
 Numbers = Sequence[float] | np.ndarray
+
+
+class LiveScene:
+    """A scene in motion, in model units. It notes which bodies somebody changes, for the stepper to be told."""
+
+    scene: Scene
+    units: Units
+    bodies: Bodies
+    stepper: Stepper
+    options: Options
+
+    def __init__(self, state: State) -> None:
+        self._state, self._handed = state, False
+        self._changed = np.zeros(len(state.position), bool)
+
+    @property
+    def state(self) -> State:
+        """Bodies and how they move. Give it another one to start from there, or to change bodies:
+        `simulator.state = replace(simulator.state, velocity=...)`; its tensors are not to be written into."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state, self._handed = state, True
+
+    def change(self, row: int, **fields: torch.Tensor | None) -> None:
+        """Replace fields of the state, of which only those of one body differ."""
+        self._state = replace(self._state, **fields)
+        self._changed[row] = True
 
 
 @dataclass(frozen=True)
@@ -44,7 +73,7 @@ class BodyHandle:
 
     __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
 
-    def __init__(self, simulator: Simulator, row: int) -> None:
+    def __init__(self, simulator: LiveScene, row: int) -> None:
         self._simulator, self._row = simulator, row
         self.name = simulator.scene.bodies[row].name
 
@@ -111,7 +140,7 @@ class BodyHandle:
         self._must_move("be pushed")
         given = _vector("impulse", impulse)
         self.velocity = self.velocity + given / self.mass
-        if at is not None and self._simulator.rules.rotation:
+        if at is not None and self._simulator.options.rotation:
             sim, row = self._simulator, self._row
             turn = np.cross(_vector("at", at) - self.centre, given)
             axes = pose.to_matrix(sim.state.orientation[row]).cpu().numpy()
@@ -124,12 +153,12 @@ class BodyHandle:
 
         The force acts `at` [3] m, world, now, or at the centre of mass. Its moment about the centre of mass stays as it
         is, however the body moves: pull again after a step to follow the point. The torque comes on top of it. Raises
-        SdfsimError where the body does not move by itself, or the model is a network on surface nodes.
+        SdfsimError where the body does not move by itself, or the model knows no forces.
         """
         self._must_move("be pulled")
         sim = self._simulator
-        if sim.model.on_surfaces:
-            raise SdfsimError("the paper network knows no forces", "take the solver, or a network on top of it")
+        if not sim.stepper.forces:
+            raise SdfsimError("networks on surface nodes know no forces", "take the solver, or a network on top of it")
         given, moment = _vector("force", force), _vector("torque", torque)
         if at is not None:
             moment = moment + np.cross(_vector("at", at) - self.centre, given)
@@ -137,12 +166,7 @@ class BodyHandle:
         load = torch.zeros(len(sim.bodies), 6, dtype=torch.float64) if state.load is None else state.load.clone()
         load[self._row, :3] = torch.from_numpy(given / (u.mass * u.acceleration))
         load[self._row, 3:] = torch.from_numpy(moment / u.energy)
-        touch = state.touch
-        if touch is not None:  # what the last step left is another state than this, so that who sleeps wakes up
-            held = touch.held.clone()
-            held[self._row] = torch.nan
-            touch = replace(touch, held=held)
-        sim.state = replace(state, load=load if bool(load.any()) else None, touch=touch)
+        sim.change(self._row, load=load if bool(load.any()) else None)
 
     def _of(self, name: str) -> np.ndarray:
         return getattr(self._simulator.state, name)[self._row].cpu().numpy().copy()
@@ -159,7 +183,7 @@ class BodyHandle:
             self._must_move(f"be given a {name.replace('_', ' ')}")
         tensor = getattr(sim.state, name).clone()
         tensor[self._row] = torch.from_numpy(value).to(tensor)
-        sim.state = replace(sim.state, **{name: tensor})
+        sim.change(self._row, **{name: tensor})
 
     def _must_move(self, what: str) -> None:
         motion = self._simulator.scene.bodies[self._row].motion

@@ -1,0 +1,44 @@
+"""Many scenes in one call: each a world of one set of bodies, which never meets the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from sdfsim.physics.bodies import Bodies, State, Units, from_scene
+from sdfsim.scene.scene import Scene
+from sdfsim.simulate.steppers import Carry, Stepper
+
+
+def side_by_side(scene: Scene, world: Sequence[int], units: Units, device: torch.device) -> tuple[Bodies, State]:
+    """The bodies of a scene, each in its `world` [N] of 0, 1, ...; those in -1, behind all others, are in all of them.
+    In model units."""
+    bodies, state = from_scene(scene, units, device)
+    return replace(bodies, world=torch.tensor(world, dtype=torch.int64, device=device)), state
+
+
+def placed(
+    state: State, position: np.ndarray, orientation: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray
+) -> State:
+    """The first bodies as arrays [K, *] have them, in model units; those behind them, of all worlds, as they are."""
+
+    def of(rows: np.ndarray, known: torch.Tensor) -> torch.Tensor:
+        return torch.cat([torch.from_numpy(np.ascontiguousarray(rows)).to(known.device), known[len(rows) :]])
+
+    return replace(
+        state,
+        position=of(position, state.position),
+        orientation=of(orientation, state.orientation),
+        velocity=of(velocity, state.velocity),
+        angular_velocity=of(angular_velocity, state.angular_velocity),
+    )
+
+
+def states(stepper: Stepper, state: State, carry: Carry, steps: int) -> Iterator[State]:
+    """The state after each of so many steps."""
+    for _ in range(steps):
+        state, carry = stepper.advance(state, carry)
+        yield state
