@@ -59,18 +59,21 @@ class ContactSurface:
 NO_LABELS = {"label": np.zeros((0, 0, 0), np.int16), "label_low": np.zeros(3), "label_cell": np.ones(())}
 
 
+@dataclass(frozen=True, eq=False)
 class ContactGeometry:
-    """Of one shape; each part is made when it is first asked for."""
+    """Of one shape, of which it has the fields; each part is made when it is first asked for."""
 
-    def __init__(self, sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray], mesh: Mesh) -> None:
-        self.sdf, self._nodes, self._pieces, self._mesh = sdf, nodes, pieces, mesh
+    sdf: Sdf
+    nodes: np.ndarray
+    pieces: Sequence[np.ndarray]
+    mesh: Mesh
 
     @cached_property
     def grid(self) -> BakedGrid | None:
         """The distance for where there is no closed form. A wall too thin for it is warned of."""
         if isinstance(self.sdf, ClosedForm):
             return None
-        grid = baked(self.sdf, self._nodes, self._pieces)
+        grid = baked(self.sdf, self.nodes, self.pieces)
         if not self.solids and (wall := unseen_wall(self.sdf, grid)) is not None:
             extent = np.ptp(self.sdf.bounds, axis=0).max()
             _log.warning("a shape of %.2g m has walls of at most %.2g m: things may pass through", extent, wall)
@@ -80,12 +83,12 @@ class ContactGeometry:
     def solids(self) -> tuple[ConvexPiece, ...]:
         """What the shape collides as: its convex pieces, its closed form, or its own hull; nothing for a plane, and for
         what is none of these."""
-        if self._pieces:
-            return tuple(hull(piece) for piece in self._pieces)
+        if self.pieces:
+            return tuple(hull(piece) for piece in self.pieces)
         if isinstance(self.sdf, ClosedForm):
             found = closed_form(self.sdf)
             return () if found is None else (found,)
-        whole = convex_vertices(self._mesh)
+        whole = convex_vertices(self.mesh)
         return (hull(whole),) if len(whole) else ()
 
     @property
@@ -102,18 +105,18 @@ class ContactGeometry:
         """Of a plane without nodes. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
         if isinstance(self.sdf, ClosedForm):
             return ContactSurface(**self._surface())
-        known = digest(self.sdf, self._nodes, [*self._pieces], LEAF, CLUMP, INWARD, SHALLOW)
+        known = digest(self.sdf, self.nodes, [*self.pieces], LEAF, CLUMP, INWARD, SHALLOW)
         path = user_cache("contact") / f"{known}-{VERSION}.npz"
         return ContactSurface(**cached_arrays(path, "the contact surface of a shape", self._surface))
 
     def _surface(self) -> dict[str, np.ndarray]:
         sdf, grid = self.sdf, self.grid
-        if isinstance(sdf, BoxSdf | CylinderSdf) and len(self._nodes):
+        if isinstance(sdf, BoxSdf | CylinderSdf) and len(self.nodes):
             spacing = max(0.5 * min(sdf.sizes), np.sqrt(_area(sdf) / DENSEST))
             nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
             patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
         else:
-            patches = patches_of(sdf, self._nodes, self._pieces)
+            patches = patches_of(sdf, self.nodes, self.pieces)
             cover = np.zeros(len(patches["node"]))
             if grid is not None and len(cover):
                 from scipy.spatial import KDTree

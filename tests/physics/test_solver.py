@@ -10,8 +10,8 @@ import torch
 from sdfsim import Simulator
 from sdfsim.evaluation import hard_cases
 from sdfsim.physics.rollout import Rollout
-from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Scene
+from sdfsim.shape import contact_geometry
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import load_shape, with_sdf
 from tests.apps.test_resuming import Killed, simulate
@@ -180,10 +180,10 @@ def test_a_fitted_shape_rests_on_a_large_box_as_on_a_plane(name, wide):
 
 
 def test_a_copy_of_a_scene_is_not_baked_again(monkeypatch):
-    """Workers get copies of scenes: their shapes are known by what they hold."""
+    """Workers get copies of scenes, which bring what is known of their shapes."""
     shape = with_sdf(analytic_shape("box", size=(1.0, 0.7, 0.3)), "grid", resolution=16)
     scene = hard_cases.on_floor([shape], [hard_cases.body("b", 0, [0, 0, 1.0])])
     first = Simulator(scene, "solver").run(steps=5)
-    monkeypatch.setattr(solver, "baked", None)
+    monkeypatch.setattr(contact_geometry, "baked", None)
     again = Simulator(pickle.loads(pickle.dumps(scene)), "solver").run(steps=5)
     np.testing.assert_array_equal(first.position, again.position)

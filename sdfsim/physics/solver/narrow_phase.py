@@ -63,7 +63,7 @@ from sdfsim.physics.solver.vectors import (
     turn_back,
     vector,
 )
-from sdfsim.physics.solver.world import COLUMNS, KEY, NORMAL, NORMAL_IMPULSE, TORSION
+from sdfsim.physics.solver.world import COLUMNS, FIRST, KEY, NORMAL, NORMAL_IMPULSE, SECOND, TORSION
 
 MANY = 192  # pairs from which on threads are worth their while, also beside other programs
 SHARES = 16  # of the pairs, each with its own scratch, that threads take in turn
@@ -313,16 +313,15 @@ def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p):
         for x in range(3):
             alike += point[k, NORMAL + x] * point[0, NORMAL + x]
         flat = flat and alike > FLAT and point[k, KEY] == point[0, KEY]
-        middle = add(middle, (point[k, 0], point[k, 1], point[k, 2]))
+        middle = along(middle, _half_way(motion, matrix, point, a, b, k), 1.0 / count)
     if not flat:
         return
-    middle = scale(middle, 1.0 / count)
     full = _both_touch(shapes, world, motion, matrix, rules, a, b, middle)
     for k in range(count):
         if full:
             point[k, TORSION] = FACE
             continue
-        way = sub((point[k, 0], point[k, 1], point[k, 2]), middle)
+        way = sub(_half_way(motion, matrix, point, a, b, k), middle)
         total = weights = 0.0
         for e in range(PROBES):
             t = (e + 0.5) / PROBES
@@ -332,9 +331,16 @@ def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p):
 
 
 @njit(**BARE)
+def _half_way(motion, matrix, point, a, b, k):
+    """The place half way between the two surfaces at a contact: the same whichever body is first."""
+    mine = add(get(motion.position, a), turn(matrix, a, (point[k, FIRST], point[k, FIRST + 1], point[k, FIRST + 2])))
+    other = (point[k, SECOND], point[k, SECOND + 1], point[k, SECOND + 2])
+    return scale(add(add(mine, get(motion.position, b)), turn(matrix, b, other)), 0.5)
+
+
+@njit(**BARE)
 def _both_touch(shapes, world, motion, matrix, rules, a, b, place):
-    """Whether a place, from the first body's centre of mass in its axes, is on the surface of either."""
-    place = add(get(motion.position, a), turn(matrix, a, place))
+    """Whether a place is on the surface of either body."""
     for body in (a, b):
         here = turn_back(matrix, body, sub(place, get(motion.position, body)))
         here = scale(add(here, get(world.com, body)), 1.0 / world.scale[body])
