@@ -178,7 +178,7 @@ class Conditions:
 
 def conditions_of(data: Path) -> Conditions:
     """How a dataset, a folder or one of its splits, was recorded. Raises SdfsimError where its `dataset.json` is not
-    readable, or has a floor that is none."""
+    readable, or has an invalid floor."""
     home = home_of(data)
     info = read_info(home) if home else {}
     floor = floor_of(info, home or data)

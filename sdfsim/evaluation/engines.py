@@ -197,7 +197,7 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
     """PyBullet's motion of `steps` recorded steps, in the teacher's own inner steps unless told.
 
     Raises:
-        SdfsimError: PyBullet is not installed, a step that is none of the teacher's, or another inertia than recorded.
+        SdfsimError: PyBullet is not installed, a step that the teacher does not make, or another inertia than recorded.
     """
     t, parts = start.motion, []
     with Teacher(t.gravity, start.floor, step=t.dt, substeps=substeps or substeps_of(t.dt)) as teacher:

@@ -50,7 +50,7 @@ def fault(
     if not np.isfinite(value).all():
         return body, f"{name} is not finite"
     if not what:
-        return body, "orientation is no rotation"
+        return body, "orientation is not a unit quaternion"
     return body, f"{float(np.linalg.norm(value)) * unit:.3g} {what} (at most {most[wrong] * unit:.3g})"
 
 

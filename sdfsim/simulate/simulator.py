@@ -72,7 +72,7 @@ class Simulator(LiveScene):
         outside_training: what of the scene the model has not seen in training, one line each.
 
     Raises:
-        SdfsimError: no such model or device, a step that is none, a body that moves without mass or without nodes
+        SdfsimError: no such model or device, an invalid time step, a body that moves without mass or without nodes
             that tell how it turns, one that is too large, too far away or too fast.
     """
 

@@ -113,7 +113,7 @@ def test_a_run_on_disk_is_readable_up_to_the_last_good_step(tmp_path, monkeypatc
     [
         ({"position": np.array([0.0, np.nan, 1.0])}, "body 'b0': position is not finite"),
         ({"position": np.array([1e15, 0.0, 1.0])}, "too far to be placed exactly"),
-        ({"quat_xyzw": np.array([0.0, 0.0, 0.0, 2.0])}, "orientation is no rotation"),
+        ({"quat_xyzw": np.array([0.0, 0.0, 0.0, 2.0])}, "orientation is not a unit quaternion"),
     ],
 )
 def test_a_start_that_cannot_be_is_told_before_any_step(fields, told):
