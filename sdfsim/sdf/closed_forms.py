@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -12,7 +13,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.sdf.sdf import accepts_numpy
 
 
-class ClosedForm:
+class ClosedForm(ABC):
     """A solid about the origin with an exact distance; its fields are its sizes, m, positive (else SdfsimError)."""
 
     KIND: ClassVar[str]
@@ -37,9 +38,9 @@ class ClosedForm:
         """(x, y, z) m, its half extents. A plane has none and gives its `bounds` itself, so this is not abstract."""
         raise NotImplementedError
 
+    @abstractmethod
     def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        raise NotImplementedError
 
     def to(self, device: torch.device | str) -> Self:
         """Itself: it holds no tensors."""

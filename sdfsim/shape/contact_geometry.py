@@ -16,13 +16,13 @@ import numpy as np
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import cached_arrays, digest, user_cache
 from sdfsim.geometry.mesh import Mesh, convex_hull, lattice
-from sdfsim.sdf.baked_grid import BakedGrid, baked, inwards, surface_samples, unseen_wall
+from sdfsim.sdf.baked_grid import BAKE_VERSION, BakedGrid, baked, inwards, surface_samples, unseen_wall
 from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
 from sdfsim.sdf.reference import PiecesDistance, unique_planes
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 
-VERSION = 1  # of what is kept on disk
+VERSION = 1  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve tells no more of them apart
@@ -106,7 +106,7 @@ class ContactGeometry:
         if isinstance(self.sdf, ClosedForm):
             return ContactSurface(**self._surface())
         known = digest(self.sdf, self.nodes, [*self.pieces], LEAF, CLUMP, INWARD, SHALLOW)
-        path = user_cache("contact") / f"{known}-{VERSION}.npz"
+        path = user_cache("contact") / f"{known}-{BAKE_VERSION}-{VERSION}.npz"
         return ContactSurface(**cached_arrays(path, "the contact surface of a shape", self._surface))
 
     def _surface(self) -> dict[str, np.ndarray]:
