@@ -41,6 +41,7 @@ from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, m
 from sdfsim.evaluation.metrics import errors
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.learned.model import SOLVER, Model, load_model, new_network
+from sdfsim.learned.tensors import body_tensors, state_tensors
 from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.scene.load import load_scene
 from sdfsim.sdf.fit.train import RECIPES
@@ -65,6 +66,7 @@ MEMORY = 12  # GiB that a process may take
 TRAINED, BATCH = {"width": 32, "steps": 4}, 4
 NODES = 64  # a body, in training
 FRAME = "50"
+CPU = torch.device("cpu")
 
 
 def untrained(name: str, nodes: int | None) -> Model:
@@ -85,13 +87,14 @@ def recorded(name: str, data: Path) -> dict[str, float]:
         milliseconds to find what is near and to pass the graph; peak memory.
     """
     plan = replace(PRESETS[name], nodes=PUBLISHED_NODES)
-    task, network = SurfaceTask(data, "test", plan, torch.device("cpu")), untrained(name, PUBLISHED_NODES).network
+    task, network = SurfaceTask(data, "test", plan, CPU), untrained(name, PUBLISHED_NODES).network
     found = []
     with one_thread(), torch.no_grad(), peak_memory() as memory:
         for k in range(STEPS_SEEN):
             bodies, state, _ = task.scenes(np.random.default_rng([0, k]), 1)
             # Not timed: a rollout does this once.
             shared = Compiled(bodies, state) if task.family.distances else None
+            bodies, state = body_tensors(bodies, CPU), state_tensors(state, CPU)
             began = time.process_time()
             near = task.near(bodies, state, shared)
             graph = task.family.graph(bodies, state, near)
@@ -247,7 +250,7 @@ def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
     solver, motions, conditions = load_model(SOLVER), [], conditions_of(data)
     for group in batches(recorded):
         motions += roll_out(
-            solver, group, shapes, int(FRAME), torch.device("cpu"), substeps=inner, floor=conditions.floor,
+            solver, group, shapes, int(FRAME), substeps=inner, floor=conditions.floor,
             as_teacher=conditions.by_teacher,
         )  # fmt: skip
     return errors(motions, recorded)[FRAME]

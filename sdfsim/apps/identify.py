@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import torch
 
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
@@ -111,15 +110,15 @@ def _from_poses(path: Path, scene: Scene) -> Recording:
     """Velocities by central differences, which are exact in free flight, where no impact is near."""
     bodies = [b for b in scene.bodies if b.motion == "dynamic"]
     dt, poses = _read_csv(path, [b.name for b in bodies])
-    turn = pose.normalise(torch.from_numpy(poses[..., 3:]))
-    com = torch.from_numpy(np.array([scene.shapes[b.shape].com * b.scale for b in bodies]))
-    position = poses[..., :3] + pose.rotate(turn, com.expand(len(poses), -1, -1)).numpy()
+    turn = pose.normalise(poses[..., 3:])
+    com = np.array([scene.shapes[b.shape].com * b.scale for b in bodies])
+    position = poses[..., :3] + pose.rotate(turn, com)
     velocity, angular = np.zeros_like(position), np.zeros_like(position)
     velocity[1:-1] = (position[2:] - position[:-2]) / (2.0 * dt)
-    angular[1:-1] = pose.to_rotvec(pose.multiply(turn[2:], pose.conjugate(turn[:-2]))).numpy() / (2.0 * dt)
+    angular[1:-1] = pose.to_rotvec(pose.multiply(turn[2:], pose.conjugate(turn[:-2]))) / (2.0 * dt)
     bend = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
     smooth = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
-    return Recording(dt, position, turn.numpy(), velocity, angular, np.pad(smooth, 1))
+    return Recording(dt, position, turn, velocity, angular, np.pad(smooth, 1))
 
 
 def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> dict[str, Any]:
@@ -190,7 +189,7 @@ class Windows:
             raise SdfsimError("the recording is too short, or nowhere smooth", told)
         dt = recording.dt / self.units.time
         inner = max(1, int(np.ceil(dt / (STEP / SUBSTEPS) - 0.01)))
-        gravity = torch.from_numpy(np.asarray(scene.gravity) / self.units.acceleration)
+        gravity = np.asarray(scene.gravity) / self.units.acceleration
         self.options = Options(gravity, dt, inner)
         self._build(begin)
         touched = self._touched()
@@ -212,7 +211,7 @@ class Windows:
         world = [*np.repeat(np.arange(len(begin)), len(self.moving)), *[-1] * len(self.fixed)]
         r, u = self.recording, self.units
         given = (r.position / u.length, r.orientation, r.velocity / u.velocity, r.angular_velocity * u.time)
-        self.bodies, start = side_by_side(whole, world, u, torch.device("cpu"))
+        self.bodies, start = side_by_side(whole, world, u)
         self.start_state = placed(start, *(values[begin].reshape(-1, values.shape[-1]) for values in given))
         frames = begin[None] + 1 + np.arange(self.length)[:, None]
         self.goal = r.position[frames] / u.length, r.orientation[frames]
@@ -255,13 +254,12 @@ class Windows:
         for k, ratio in zip(self.weighed, np.exp(parameters[2 * count :]), strict=True):
             for name, power in (("inverse_mass", -1), ("inertia", 1), ("inverse_inertia", -1)):
                 getattr(self.world, name)[k:total:many] = self.given[name][k:total:many] * ratio**power
-        size = self.bodies.size[:total].numpy()[:, None]
+        size = self.bodies.size[:total, None]
         errors = []
         for t, state in enumerate(self._run()):
             place, turn = (values[t].reshape(total, -1) for values in self.goal)
-            back = pose.conjugate(torch.from_numpy(np.ascontiguousarray(turn)))
-            away = pose.multiply(state.orientation[:total], back)
-            errors += [state.position[:total].numpy() - place, 0.5 * size * pose.to_rotvec(away).numpy()]
+            away = pose.multiply(state.orientation[:total], pose.conjugate(turn))
+            errors += [state.position[:total] - place, 0.5 * size * pose.to_rotvec(away)]
         return np.nan_to_num(np.concatenate(errors).ravel(), nan=1e3) / OUTLIER
 
     def jacobian(self, parameters: np.ndarray, errors: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -55,7 +55,7 @@ def describe(
         "step_ms": step_ms,
         "run_s": 1e-3 * step_ms * steps,
         "model": simulator.model.name,
-        "device": str(simulator.device),
+        "device": simulator.device,
         "duration_s": scene.duration,
         "dt_s": simulator.dt,
         "steps": steps,

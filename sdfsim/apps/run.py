@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 import yaml
 
 from sdfsim.apps.recording import Playback, framed, save_rollout
@@ -106,7 +105,7 @@ def simulate(
         "viewer": viewer,
         "allow_outside": allow_outside,
         "until_settled": until_settled,
-        "device": str(simulator.device),
+        "device": simulator.device,
     }
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
@@ -116,45 +115,49 @@ def simulate(
             kept.clear()  # where it was killed between its last file and its end
             say(f"{out}: finished already")
             return done
-        frames = kept.restore() if resume else []
-        if not frames and any((out / name).exists() for name in _RESULTS):
+        parts = kept.restore() if resume else []
+        if not parts and any((out / name).exists() for name in _RESULTS):
             say(f"replaced the earlier run in {out}")
         for name in _RESULTS:
             (out / name).unlink(missing_ok=True)
-        if not frames:
+        if not parts:
             kept.clear()
-            frames = [simulator.initial_rollout()]
-            kept.add(frames[0])
+            parts = [simulator.initial_rollout()]
+            kept.add(parts[0])
         write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
         live = Playback(scene) if viewer in ("native", "web") else None
         if live:
             if address := stream_to_viewer(live, viewer):
                 say(f"watch it at {address}")
             live.log_static()
-            live.log_steps(join(frames))
+            live.log_steps(join(parts))
 
         started, broken = time.monotonic(), None
-        still = [row.all() for row in resting(scene, join(frames))]  # by frame, whether everything rests
+        still = [row.all() for row in resting(scene, join(parts))]  # by frame, whether everything rests
 
         def settled() -> bool:
             return until_settled and len(still) > SETTLED and all(still[-SETTLED - 1 :])
 
+        at_once = 1 if until_settled else None  # so that the run ends with the step in which everything rests
         try:
-            for frame in simulator.frames(0 if settled() else steps - simulator.steps_done):
-                frames.append(frame)
-                kept.add(frame)
+            for part in simulator.frames(0 if settled() else steps - simulator.steps_done, at_once):
+                parts.append(part)
+                kept.add(part)
                 if live:
-                    live.log_steps(frame)
-                now = float(frame.time[-1])
+                    live.log_steps(part)
+                now = float(part.time[-1])
                 on_progress("simulate", now / length, f"{now:.2f} of {length:g} s simulated")
                 if until_settled:
-                    still += [row.all() for row in resting(scene, frame)]
+                    still += [row.all() for row in resting(scene, part)]
                 if settled():
                     break
         except (SimulationError, KeyboardInterrupt) as error:
             broken = error
+            if isinstance(error, SimulationError):
+                parts.append(error.rollout)
+                kept.add(error.rollout)
             kept.save()
-        rollout = join(frames)
+        rollout = join(parts)
         rollout = replace(rollout, meta=rollout.meta | {"scene": fingerprints(scene)})
         on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
@@ -282,7 +285,7 @@ class Checkpoint:
         self._folder = folder
         self._simulator = simulator
         self.identity = identity(simulator)
-        self._fresh: list[tuple[Rollout, State]] = []  # one entry a step: an interruption splits none
+        self._fresh: list[tuple[Rollout, State]] = []  # an interruption splits none
         self._parts = 0
         self._saved = time.monotonic()
 
@@ -297,14 +300,14 @@ class Checkpoint:
             if str(kept["identity"]) != self.identity:
                 raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
             self._parts = int(kept["parts"])
-            self._simulator.restore(_state(kept, self._simulator.device))
+            self._simulator.restore(_state(kept))
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{file}: not a checkpoint of this version ({error})", _ANEW) from error
         return [Rollout.load(self._part(k)) for k in range(self._parts)]
 
-    def add(self, frame: Rollout) -> None:
-        """Keep a frame and the state it tells of; on disk when the last time is long enough ago."""
-        self._fresh.append((frame, self._simulator.state))
+    def add(self, part: Rollout) -> None:
+        """Keep frames and the state that they lead to; on disk when the last time is long enough ago."""
+        self._fresh.append((part, self._simulator.state))
         if time.monotonic() - self._saved > EVERY:
             self.save()
 
@@ -359,16 +362,16 @@ def _arrays(state: State) -> dict[str, np.ndarray]:
     """Every array of a state and of what touches in it, by name."""
     found = {"time": np.array(state.time)}
     for prefix, part in (("", state), ("touch.", state.touch)):
-        for name, value in vars(part).items() if part is not None else ():
-            if isinstance(value, torch.Tensor):
-                found[prefix + name] = value.cpu().numpy()
+        for f in fields(part) if part is not None else ():
+            if isinstance(value := getattr(part, f.name), np.ndarray):
+                found[prefix + f.name] = value
     return found
 
 
-def _state(arrays: dict[str, np.ndarray], device: torch.device) -> State:
-    def tensors(kind: type, prefix: str) -> dict[str, torch.Tensor]:
+def _state(arrays: dict[str, np.ndarray]) -> State:
+    def known(kind: type, prefix: str) -> dict[str, np.ndarray]:
         names = {f.name: prefix + f.name for f in fields(kind) if f.name != "time"}
-        return {k: torch.as_tensor(arrays[name], device=device) for k, name in names.items() if name in arrays}
+        return {k: arrays[name] for k, name in names.items() if name in arrays}
 
-    touch = tensors(Touch, "touch.")
-    return State(**tensors(State, ""), touch=Touch(**touch) if touch else None, time=float(arrays["time"]))
+    touch = known(Touch, "touch.")
+    return State(**known(State, ""), touch=Touch(**touch) if touch else None, time=float(arrays["time"]))

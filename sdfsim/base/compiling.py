@@ -9,7 +9,7 @@ _log = logging.getLogger(__name__)
 _said: set[str] = set()
 
 
-def tell_compiling(function: Any, what: str, takes: str) -> None:
+def warn_compiling(function: Any, what: str, takes: str) -> None:
     """Warn, once in a process, that `what` is about to be compiled: where the compiled `function` is neither in memory
     nor in numba's cache for this source."""
     if what in _said or is_compiled(function):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.data.dataset import FLOOR, Trajectory
@@ -29,7 +28,6 @@ def merged(
     frames: list[int],
     shapes: dict[str, Shape],
     units: Units,
-    device: torch.device,
     floor: tuple[float, float] = FLOOR,
     plane: Shape = PLANE,
 ) -> tuple[Bodies, State]:
@@ -41,7 +39,7 @@ def merged(
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
     relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]
     scene, world = scene_of(relative, frames, shapes, floor, plane)
-    return side_by_side(scene, world, units, device)
+    return side_by_side(scene, world, units)
 
 
 def scene_of(
@@ -91,7 +89,6 @@ def roll_out(
     group: list[Trajectory],
     shapes: dict[str, Shape],
     steps: int,
-    device: torch.device,
     free_flight: FreeFlight = "exact",
     *,
     contact: bool = True,
@@ -111,8 +108,8 @@ def roll_out(
     stepper = stepper_of(model, contact=contact, free_flight=free_flight)
     units = model_units(stepper, group[0])
     known = {name: stepper.surface(shape) for name, shape in shapes.items()}
-    bodies, start = merged(group, [0] * len(group), known, units, device, floor, stepper.surface(PLANE))
-    gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
+    bodies, start = merged(group, [0] * len(group), known, units, floor, stepper.surface(PLANE))
+    gravity = np.asarray(group[0].gravity, dtype=np.float64) / units.acceleration
     options = Options(
         gravity, group[0].dt / units.time, model.inner or substeps, adds=as_teacher, cone=not as_teacher,
         margin=MARGIN / units.length if as_teacher else 0.0,
@@ -120,12 +117,12 @@ def roll_out(
     start = stepper.began(start, bodies, options)
     motion, carry = [start], stepper.init(bodies, start, options)
     for k, state in enumerate(states(stepper, start, carry, steps), start=1):
-        broken = ~(state.position.isfinite().all(-1) & state.orientation.isfinite().all(-1))
+        broken = ~(np.isfinite(state.position).all(-1) & np.isfinite(state.orientation).all(-1))
         if broken.any():
-            raise SdfsimError(f"step {k}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY)
+            raise SdfsimError(f"step {k}: {broken.sum()} bodies are not finite", exit_code=EXIT_QUALITY)
         motion.append(state)
     position, quat, velocity, angular = (
-        np.stack([getattr(s, name).cpu().numpy() for s in motion])
+        np.stack([getattr(s, name) for s in motion])
         for name in ("position", "orientation", "velocity", "angular_velocity")
     )
     ends = np.cumsum([t.position.shape[1] for t in group])

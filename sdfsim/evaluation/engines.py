@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
@@ -123,11 +122,11 @@ def centred_mesh(shape: Shape) -> Mesh:
 
 def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
     """The start of a scene's bodies but for planes as a recording of one frame, shapes called by their index."""
-    bodies, state = from_scene(scene, units, torch.device("cpu"))
+    bodies, state = from_scene(scene, units)
     solid = _solid(scene)
 
-    def of(values: torch.Tensor) -> np.ndarray:
-        return values.numpy()[solid].copy()
+    def of(values: np.ndarray) -> np.ndarray:
+        return values[solid].copy()
 
     return Trajectory(
         position=of(state.position)[None],

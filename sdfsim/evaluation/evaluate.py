@@ -90,8 +90,7 @@ def evaluate(
         SdfsimError: no or unreadable trajectories or shapes, or no `chaos_floor` where it is asked for; exit code 3
             when a rollout is not finite.
     """
-    place = pick_device(device)
-    used = (model if isinstance(model, Model) else load_model(model)).to(place)
+    used = (model if isinstance(model, Model) else load_model(model)).to(str(pick_device(device)))
     stepper = stepper_of(used, free_flight=free_flight)
     recorded, shapes = load_recorded(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
@@ -119,7 +118,7 @@ def evaluate(
     stepper = replace(stepper, model=used)
     for k, group in enumerate(groups):
         on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
-        common = (used, group, shapes, longest, place)
+        common = (used, group, shapes, longest)
         started = time.perf_counter()
         contenders["model"] += roll_out(
             *common, free_flight, substeps=inner, as_teacher=conditions.by_teacher, floor=conditions.floor

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import locked, write_json, write_text
@@ -64,7 +63,6 @@ TRUTH = f"PyBullet {1e3 * SUBSTEP:.3g} ms"  # made the recordings: no error of i
 FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
 GRIDS = (32, 64, 128, 256)
 PHYSICAL = ("contact", "friction", "restitution", "rotation")  # effects that the engines always have
-CPU = torch.device("cpu")
 Rows = list[tuple[str, ...]]
 
 
@@ -243,7 +241,7 @@ def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
         prepared = time.perf_counter() - began
         starts, steps = [every(t, setting.stride) for t in cases.starts], cases.steps // setting.stride
         motions = roll_out(
-            model, starts, shapes, steps, CPU, contact=setting.contact, floor=cases.floor, substeps=setting.substeps,
+            model, starts, shapes, steps, contact=setting.contact, floor=cases.floor, substeps=setting.substeps,
             as_teacher=setting.contact and cases.by_teacher,
         )  # fmt: skip
     result = _judged(motions, cases, setting.stride) | {"prepare_s": prepared, "peak_mib": memory["mib"]}

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from torch import Tensor, device
+from torch import device
 
 from sdfsim.geometry.mesh import Mesh, convex_hull, joined
 from sdfsim.learned.baselines.dpi import DPI, dpi_graph
@@ -22,7 +22,7 @@ from sdfsim.learned.baselines.mgn import MGN, mgn_graph
 from sdfsim.learned.message_passing import Graph, Layout
 from sdfsim.learned.near import Contacts, Pairs, face_pairs, find_contacts, no_contacts, no_pairs, node_pairs
 from sdfsim.learned.sdf_sim import SDF_SIM, sdf_sim_graph
-from sdfsim.physics.bodies import Bodies, State
+from sdfsim.learned.tensors import BodyTensors, StateTensors
 from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.sdf.closed_forms import PlaneSdf
 from sdfsim.shape.shape import Shape
@@ -82,9 +82,9 @@ class Family:
     # a shape, with the nodes (at most so many, None for all) that the network works on
     surface: Callable[[Shape, int | None], Shape]
     # what of the bodies is near what, for bodies, state, gravity, reach, time step and the compiled scene of a run
-    near: Callable[[Bodies, State, Tensor, float, float, Compiled | None], Contacts | Pairs]
+    near: Callable[[BodyTensors, StateTensors, np.ndarray, float, float, Compiled | None], Contacts | Pairs]
     none: Callable[[device], Contacts | Pairs]  # the same of bodies that are near nothing
-    graph: Callable[[Bodies, State, Any], Graph]  # the graph of bodies, their state and what is near
+    graph: Callable[[BodyTensors, StateTensors, Any], Graph]  # the graph of bodies, their state and what is near
     distances: bool = False  # whether `near` asks the compiled distances of a scene
 
 

@@ -12,11 +12,12 @@ import torch
 from threadpoolctl import ThreadpoolController
 from torch import Tensor, nn
 
-from sdfsim.base.compiling import tell_compiling
+from sdfsim.base.compiling import warn_compiling
 from sdfsim.learned.contact_graph import REST_SPEED
 from sdfsim.learned.impulse import CALM, LIVELY, ImpulseNetwork, Round
 from sdfsim.physics import solver as kernels
 from sdfsim.physics.bodies import State
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.solver.world import World
 
@@ -27,7 +28,7 @@ from sdfsim.physics.options import Options
 
 def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:
     """Copies of the weights of a network."""
-    tell_compiling(compiled.correct, "the network", "half a minute")
+    warn_compiling(compiled.correct, "the network", "half a minute")
     rounds = list(cast("Iterable[Round]", network.rounds))
 
     def layer(*modules: Iterable[nn.Linear | nn.LayerNorm]) -> compiled.Layer:
@@ -69,12 +70,10 @@ def corrected(
 ) -> State:  # fmt: skip
     """What the network makes of a step of the solve, whose `edges`, at least one, are its own; those of a pair of
     bodies stand together."""
-    after = [tensor.clone() for tensor in _poses(solved)]
-    start, end = (compiled.Poses(*(t.contiguous().numpy() for t in some)) for some in (_poses(before), after))
+    start, end = compiled.Poses(*_poses(before)), compiled.Poses(*(array.copy() for array in _poses(solved)))
     with _blas().limit(limits=1):
         compiled.correct(weights, world, start, end, edges.pair, edges.value, terms)
-    position, orientation, velocity, angular = after
-    return replace(solved, position=position, orientation=orientation, velocity=velocity, angular_velocity=angular)
+    return replace(solved, **dict(zip(MOTION, end, strict=True)))
 
 
 @cache
@@ -89,11 +88,11 @@ def _blas() -> ThreadpoolController:
 def terms_of(options: Options, known: float, trust: float = 1.0) -> compiled.Terms:
     """What is in play, for a network that knows steps of `known`, and that is trusted by 0 to 1 in what it adds."""
     return compiled.Terms(
-        gravity=options.gravity.cpu().numpy(), dt=options.dt, known=known, friction=options.friction,
+        gravity=options.gravity, dt=options.dt, known=known, friction=options.friction,
         restitution=options.restitution, rotation=options.rotation, trust=trust, rest=REST_SPEED, calm=CALM,
         lively=LIVELY,
     )  # fmt: skip
 
 
-def _poses(state: State) -> tuple[Tensor, ...]:
-    return state.position, state.orientation, state.velocity, state.angular_velocity
+def _poses(state: State) -> list[np.ndarray]:
+    return [np.ascontiguousarray(getattr(state, name)) for name in MOTION]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sdfsim.physics.pose import to_matrix
+from sdfsim.learned.pose import to_matrix
 
 # Weight of staying at `start`, over the nodes' spread. Far below what any extent beyond rounding weighs, it decides
 # only about turns that the nodes leave open.

@@ -7,15 +7,14 @@ import math
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import nn
+from typing import TYPE_CHECKING, Any
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
-from sdfsim.learned.impulse import ImpulseConfig, ImpulseNetwork
 from sdfsim.physics.options import GRAVITY, LENGTH, STEP
+
+if TYPE_CHECKING:  # it takes its time to load
+    from torch import nn
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # of any size of a network
@@ -30,7 +29,7 @@ class Model:
 
     name: str  # bundled name or file stem
     kind: str  # "solver", "impulse" or one of `SURFACE`
-    network: nn.Module  # in evaluation mode; the solver has none
+    network: Any  # an `nn.Module` in evaluation mode; None for the solver, and where the weights are left aside
     dt: float  # s, the step of the training data, or of the solver for bodies of `length` at `gravity`
     gravity: float  # m/s^2, its magnitude in the training data
     # m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it. The solver is
@@ -44,10 +43,13 @@ class Model:
     ranges: dict[str, list[float]] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)  # training record (data, steps, seconds, errors)
 
-    def to(self, device: torch.device) -> Model:
-        """The same model with its weights on `device`: this one, or a copy where they are elsewhere."""
-        there = {weight.device for weight in self.network.state_dict().values()}
-        if all(at.type == device.type and device.index in (None, at.index) for at in there):
+    def to(self, device: str) -> Model:
+        """The same model with its weights on `device`: this one, or a copy where they are elsewhere. The solver has
+        none."""
+        if self.network is None:
+            return self
+        there, (kind, _, index) = {w.device for w in self.network.state_dict().values()}, device.partition(":")
+        if all(at.type == kind and index in ("", str(at.index)) for at in there):
             return self
         return replace(self, network=deepcopy(self.network).to(device))
 
@@ -58,7 +60,7 @@ class Model:
         info = {
             "version": MODEL_VERSION,
             "kind": self.kind,
-            "config": asdict(self.network.config),  # type: ignore[call-overload]
+            "config": asdict(self.network.config),
             **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "inner", "ranges", "card")},
         }
         weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
@@ -70,6 +72,8 @@ class Model:
 def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
     """An untrained network of `kind` ("impulse" or one of `SURFACE`). Raises KeyError for another."""
     if kind == "impulse":
+        from sdfsim.learned.impulse import ImpulseConfig, ImpulseNetwork
+
         return ImpulseNetwork(ImpulseConfig(**config))
     from sdfsim.learned.families import FAMILIES
     from sdfsim.learned.message_passing import GraphConfig, GraphNetwork
@@ -93,29 +97,29 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
     from safetensors import SafetensorError, safe_open
 
     if name is None or name == SOLVER:
-        return Model(SOLVER, SOLVER, nn.Module().eval(), dt=STEP, gravity=GRAVITY, length=LENGTH, reach=0.02)
+        return Model(SOLVER, SOLVER, None, dt=STEP, gravity=GRAVITY, length=LENGTH, reach=0.02)
     path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
     if not path.exists():
         raise SdfsimError(
             f"model {str(name)!r} not found", f"there are {', '.join(model_names())}; or the path of a .safetensors"
         )
     try:
-        with safe_open(path, framework="pt") as file:
+        with safe_open(path, framework="pt" if weights else "np") as file:
             info = json.loads((file.metadata() or {})["sdfsim_model"])
             if info.pop("version", 1) != MODEL_VERSION:
                 raise ValueError("it is of an earlier version; train it again")
             config = info.pop("config")
+            network = None
             if weights:
                 _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})
-            network = nn.Module() if not weights else new_network(info["kind"], config)
-            network.load_state_dict({k: file.get_tensor(k) for k in file.keys()} if weights else {})
+                network = new_network(info["kind"], config).eval().requires_grad_(False)
+                network.load_state_dict({k: file.get_tensor(k) for k in file.keys()})
         model = Model(name=path.stem, network=network, **info)
         for key in ("dt", "gravity", "length", "reach"):
             if not 0 < float(getattr(model, key)) < math.inf:
                 raise ValueError(f"{key} must be > 0")
     except (OSError, SafetensorError, LookupError, ValueError, TypeError, RuntimeError, AttributeError) as error:
         raise SdfsimError(f"{path}: not a model of this version of sdfsim: {error}") from error
-    network.eval().requires_grad_(False)
     return model
 
 
@@ -123,6 +127,8 @@ def _check_size(kind: str, config: dict[str, Any], found: dict[str, list[int]]) 
     """Raise ValueError where the weights of a file are not those of its network: before memory is taken for it."""
     if any(isinstance(value, int) and not 0 <= value <= MOST for value in config.values()):
         raise ValueError(f"sizes of its network must be 0 to {MOST} (got {config})")
+    import torch
+
     with torch.device("meta"):
         wanted = {name: list(weight.shape) for name, weight in new_network(kind, config).state_dict().items()}
     if wanted != found:

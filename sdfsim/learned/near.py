@@ -11,15 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from sdfsim.learned import pose
 from sdfsim.learned.surfaces import expanded, node_owner
-from sdfsim.physics import pose
-from sdfsim.physics.bodies import Bodies, State
-from sdfsim.physics.options import Options
-from sdfsim.physics.solver.edges import nodes_within
-from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
+from sdfsim.learned.tensors import BodyTensors, StateTensors, state_arrays
+from sdfsim.physics.solver.prepare import Compiled, nodes_near
 
 PIERCING = 1e-9  # relative: areas and denominators below count as none
 
@@ -51,21 +50,18 @@ def no_contacts(device: torch.device) -> Contacts:
 
 
 def find_contacts(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
+    bodies: BodyTensors, state: StateTensors, gravity: np.ndarray, reach: float, dt: float, scene: Compiled | None
 ) -> Contacts:
-    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units. A run
-    gives its compiled `scene`, else one is made."""
-    scene = scene or Compiled(bodies, state)
-    rules, (motion, _) = compiled_rules(Options(gravity, dt, 1))._replace(contact_margin=reach), taken_up(state)
-    found = nodes_within(
-        scene.shapes, scene.world, scene.work, motion, rules, bodies.node.cpu().numpy(), bodies.node_start.cpu().numpy()
-    )
+    """All contact edges of a state within `reach`, the contact radius D, under gravity [3], by the compiled `scene`;
+    all in model units."""
+    assert scene is not None
+    found = nodes_near(scene, state_arrays(state), gravity, reach, dt)
     index, value = (torch.from_numpy(array).to(bodies.device) for array in found)
     owner, node, body = index.unbind(1)
     return Contacts(owner, node, body, seen=value[:, 4:], distance=value[:, 0], normal=value[:, 1:4])
 
 
-def where(state: State, bodies: Bodies, contacts: Contacts | Pairs) -> Tensor:
+def where(state: StateTensors, bodies: BodyTensors, contacts: Contacts | Pairs) -> Tensor:
     """[E, 3] where the nodes of contact edges are in a state, world."""
     turned = pose.rotate(state.orientation[contacts.owner], bodies.node[contacts.node])
     return state.position[contacts.owner] + turned
@@ -113,14 +109,15 @@ def no_pairs(device: torch.device, corners: int) -> Pairs:
 
 
 def near_pairs(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None, *,
+    bodies: BodyTensors, state: StateTensors, gravity: np.ndarray, reach: float, dt: float, scene: Compiled | None = None, *,
     faces: bool,
 ) -> Pairs:  # fmt: skip
     """All pairs of nodes, or of `faces`, of different bodies within `reach` (model length) during a step, as
     `find_contacts` has it."""
     part = bodies.face if faces else torch.arange(len(bodies.node), device=bodies.device)[:, None]
     owner = node_owner(bodies)
-    velocity = state.velocity + gravity * dt * bodies.moves[:, None]
+    fall = torch.from_numpy(gravity * dt).to(bodies.device)
+    velocity = state.velocity + fall * bodies.moves[:, None]
     arm = pose.rotate(state.orientation[owner], bodies.node)
     # Differences of places alone matter; about the mean they keep their precision far from the origin.
     place = (state.position - state.position[bodies.moves].mean(0))[owner] + arm if bodies.moves.any() else arm
@@ -168,7 +165,7 @@ def _centre(place: Tensor, arm: Tensor, part: Tensor) -> Tensor:
     return place[part[:, 0]] - arm[part[:, 0]]
 
 
-def _speed_at(bodies: Bodies, state: State, velocity: Tensor, body: Tensor, arm: Tensor) -> Tensor:
+def _speed_at(bodies: BodyTensors, state: StateTensors, velocity: Tensor, body: Tensor, arm: Tensor) -> Tensor:
     """[E, 3] velocity of bodies [E] at `arm` [E, 3]; the speed of a plane is that of all of it."""
     turning = torch.linalg.cross(state.angular_velocity[body], arm)
     return velocity[body] + torch.where(bodies.size[body].isfinite()[:, None], turning, 0.0)
@@ -186,7 +183,7 @@ def _normals(triangle: Tensor) -> Tensor:
     return normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-12)
 
 
-def _near(bodies: Bodies, part: Tensor, owner: Tensor, place: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:
+def _near(bodies: BodyTensors, part: Tensor, owner: Tensor, place: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:
     """Pairs (first, second) of parts [K, C] of bodies that may touch whose boxes, wider by `margin` [M], overlap."""
     of_part = owner[part[:, 0]]
     wide = margin[part].amax(1)[:, None]

@@ -12,7 +12,7 @@ from torch import Tensor
 from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, Layout
 from sdfsim.learned.near import Contacts
 from sdfsim.learned.surfaces import NODES, STAR, motion_features, star
-from sdfsim.physics.bodies import Bodies, State
+from sdfsim.learned.tensors import BodyTensors, StateTensors
 
 CONTACT = Features(15, (0, 3, 6, 9))
 SDF_SIM = Layout(
@@ -21,7 +21,7 @@ SDF_SIM = Layout(
 )
 
 
-def sdf_sim_graph(bodies: Bodies, state: State, contacts: Contacts) -> Graph:
+def sdf_sim_graph(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> Graph:
     """The published graph."""
     features = _contact_features(bodies, state, contacts).float()
     node, body = contacts.node[:, None], contacts.body[:, None]
@@ -29,7 +29,7 @@ def sdf_sim_graph(bodies: Bodies, state: State, contacts: Contacts) -> Graph:
     return Graph(motion_features(bodies, state), star(bodies, state) | edges)
 
 
-def _contact_features(bodies: Bodies, state: State, contacts: Contacts) -> Tensor:
+def _contact_features(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> Tensor:
     """[E, 15]: node to closest point, normal, both seen from the other body's centre, distances. An infinite floor has
     no centre: its body node stands in for the closest point."""
     c = contacts

@@ -11,12 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sdfsim.learned import pose
 from sdfsim.learned.matching import match_shapes
 from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, GraphNetwork
-from sdfsim.physics import pose
-from sdfsim.physics.bodies import Bodies, State
-from sdfsim.physics.free_flight import fly
-from sdfsim.physics.options import Options
+from sdfsim.learned.tensors import BodyTensors, StateTensors
 
 NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
 INTRA = Features(8, (0, 4))  # of edges within a body
@@ -24,16 +22,18 @@ NODES = {"body": NODE, "node": NODE}
 STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
 MESH = EdgeKind("node", "node", INTRA)
 TARGET = Features(3, (0,))  # of accelerations
-_NOT_PER_BODY = ("contact", "node", "node_start", "face", "allowed", "sdfs", "tracks")
+_NOT_PER_BODY = ("node", "node_start", "face", "allowed")
 
 
-def node_owner(bodies: Bodies) -> Tensor:
+def node_owner(bodies: BodyTensors) -> Tensor:
     """[M] int64, the body of every surface node."""
     count = bodies.node_start[1:] - bodies.node_start[:-1]
     return torch.repeat_interleave(torch.arange(len(bodies), device=bodies.device), count)
 
 
-def compact(bodies: Bodies, state: State, contacts: Any, rows: Tensor) -> tuple[Bodies, State, Any]:
+def compact(
+    bodies: BodyTensors, state: StateTensors, contacts: Any, rows: Tensor
+) -> tuple[BodyTensors, StateTensors, Any]:
     """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts
     (`Contacts` or `Pairs`), which are among them."""
     if len(rows) == len(bodies):
@@ -47,10 +47,10 @@ def compact(bodies: Bodies, state: State, contacts: Any, rows: Tensor) -> tuple[
     face = place[bodies.face]
     some = replace(
         bodies, **{k: getattr(bodies, k)[rows] for k in per_body}, node=bodies.node[node], node_start=start,
-        face=face[(face >= 0).all(-1)], tracks=None,
+        face=face[(face >= 0).all(-1)],
     )  # fmt: skip
     earlier_position, earlier_orientation = _history(state)
-    moved = State(
+    moved = StateTensors(
         *(v[rows] for v in (state.position, state.orientation, state.velocity, state.angular_velocity)),
         earlier_position=earlier_position[:, rows],
         earlier_orientation=earlier_orientation[:, rows],
@@ -73,7 +73,7 @@ def expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
     return which, start[which] + torch.arange(len(which), device=count.device) - first
 
 
-def motion_features(bodies: Bodies, state: State) -> dict[str, Tensor]:
+def motion_features(bodies: BodyTensors, state: StateTensors) -> dict[str, Tensor]:
     """Features of body nodes [N, 13] and surface nodes [M, 13], the same for every network.
 
     Displacement over each of the last two steps, displacement of the body's centre over the last, inverse mass,
@@ -97,7 +97,7 @@ def motion_features(bodies: Bodies, state: State) -> dict[str, Tensor]:
     return {"body": body.float(), "node": node.float()}
 
 
-def star(bodies: Bodies, state: State) -> dict[str, Edges]:
+def star(bodies: BodyTensors, state: StateTensors) -> dict[str, Edges]:
     """Edges between the surface nodes and their body's node, up and down: the node from the centre, now and at rest."""
     owner = node_owner(bodies)
     features = _now_and_at_rest(_arms(bodies, state), bodies.node)
@@ -105,7 +105,7 @@ def star(bodies: Bodies, state: State) -> dict[str, Edges]:
     return {"intra_up": Edges(features, node, body), "intra_down": Edges(features, body, node)}
 
 
-def mesh_edges(bodies: Bodies, state: State) -> Edges:
+def mesh_edges(bodies: BodyTensors, state: StateTensors) -> Edges:
     """Edges along the sides of the mesh's faces, each once a direction: sender from receiver, now and at rest."""
     sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
     sides = sides[sides[:, 0] != sides[:, 1]]  # those of the plane's one node
@@ -123,12 +123,12 @@ def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
     return torch.cat([now, now.norm(dim=-1, keepdim=True), rest, rest.norm(dim=-1, keepdim=True)], -1).float()
 
 
-def _arms(bodies: Bodies, state: State) -> Tensor:
+def _arms(bodies: BodyTensors, state: StateTensors) -> Tensor:
     """[M, 3] nodes from their body's centre of mass, world axes."""
     return pose.apply(pose.to_matrix(state.orientation)[node_owner(bodies)], bodies.node)
 
 
-def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> State:
+def advance(bodies: BodyTensors, state: StateTensors, acceleration: Tensor, dt: float) -> StateTensors:
     """The next state when every node of a body accelerates by `acceleration` [M, 3] (displacement a step, twice)."""
     earlier_position, earlier_orientation = _history(state)
     owner = node_owner(bodies)
@@ -141,7 +141,7 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
     offset = torch.where(still, torch.zeros_like(offset), offset)
     orientation = torch.where(still, state.orientation, orientation)
     turn = pose.to_rotvec(pose.multiply(orientation, pose.conjugate(state.orientation)))
-    return State(
+    return StateTensors(
         position=state.position + offset,
         orientation=orientation,
         velocity=offset / dt,
@@ -150,13 +150,13 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
 
 
 def predict(
-    network: GraphNetwork, graph: Graph, bodies: Bodies, state: State, dt: float, rows: int | None = None
-) -> State:
+    network: GraphNetwork, graph: Graph, bodies: BodyTensors, state: StateTensors, dt: float, rows: int | None = None
+) -> StateTensors:
     """One step of the published simulators, the network working on at most `rows` edges at once."""
     return advance(bodies, state, network.target.undo(network(graph, rows=rows)).double(), dt)
 
 
-def target_acceleration(bodies: Bodies, state: State, position: Tensor, orientation: Tensor) -> Tensor:
+def target_acceleration(bodies: BodyTensors, state: StateTensors, position: Tensor, orientation: Tensor) -> Tensor:
     """[M, 3] accelerations that would take `state` to the poses `position` [N, 3], `orientation` [N, 4]."""
     earlier_position, earlier_orientation = _history(state)
     owner = node_owner(bodies)
@@ -165,22 +165,7 @@ def target_acceleration(bodies: Bodies, state: State, position: Tensor, orientat
     return (position - 2 * state.position + earlier_position[1])[owner] + curl
 
 
-def _history(state: State) -> tuple[Tensor, Tensor]:
+def _history(state: StateTensors) -> tuple[Tensor, Tensor]:
     if state.earlier_position is None or state.earlier_orientation is None:
         raise ValueError("a network on surface nodes needs the two earlier poses")
     return state.earlier_position, state.earlier_orientation
-
-
-def with_history(state: State, bodies: Bodies, options: Options, changed: Tensor | None = None) -> State:
-    """The state with the two poses that bodies would have come from in free flight: those that were `changed` [N] bool,
-    all of them where it has no earlier poses, or None is given."""
-    back = replace(options, dt=-options.dt)
-    one = fly(bodies, replace(state, earlier_position=None, earlier_orientation=None), back)
-    two = fly(bodies, one, back)
-    position, orientation = (
-        torch.stack([getattr(s, name) for s in (two, one)]) for name in ("position", "orientation")
-    )
-    if changed is not None and state.earlier_position is not None and state.earlier_orientation is not None:
-        position = torch.where(changed[:, None], position, state.earlier_position)
-        orientation = torch.where(changed[:, None], orientation, state.earlier_orientation)
-    return replace(state, earlier_position=position, earlier_orientation=orientation)

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-import torch
 
-from sdfsim.learned.contact_graph import number_pairs
 from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.scene.scene import Scene
@@ -85,23 +83,23 @@ def _products(scene: Scene, name: str) -> list[float]:
 def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
     """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
     Bodies have `names` [N]; a model unit is so many `metres`."""
-    from sdfsim.learned.near import find_contacts  # numba takes its time to load
+    from sdfsim.physics.solver.prepare import Compiled, nodes_near  # numba takes its time to load
 
-    nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)
-    inside = find_contacts(bodies, state, nothing, reach=0.0, dt=0.0)
-    if not len(inside):
+    index, value = nodes_near(Compiled(bodies, state), state, np.zeros(3), reach=0.0, dt=0.0)
+    if not len(index):
         return []
+    owners, _, others = index.T
     # Of the two the smaller one that moves is what the way out is long or short for.
-    size = torch.where(bodies.moves, bodies.size, torch.inf)
-    part = -inside.distance / torch.minimum(size[inside.owner], size[inside.body])
+    size = np.where(bodies.moves, bodies.size, np.inf)
+    part = -value[:, 0] / np.minimum(size[owners], size[others])
     deep = part > DEEPEST
-    if not bool(deep.any()):
+    if not deep.any():
         return []
-    pairs = number_pairs(inside.owner[deep], inside.body[deep], len(bodies))[1]
+    pairs = len(np.unique(np.sort(index[deep][:, [0, 2]], axis=1), axis=0))
     worst = int(part.argmax())
-    owner, body = (names[int(i[worst])] for i in (inside.owner, inside.body))
+    owner, body = names[owners[worst]], names[others[worst]]
     return [
         f"pairs that start inside one another: {pairs} here, {owner!r} in {body!r} by "
-        f"{-float(inside.distance[worst]) * metres:.3g} m, {float(part[worst]):.0%} of a body's size; "
+        f"{-float(value[worst, 0]) * metres:.3g} m, {float(part[worst]):.0%} of a body's size; "
         f"trained on up to {DEEPEST:.0%}"
     ]

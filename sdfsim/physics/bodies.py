@@ -1,16 +1,16 @@
-"""A scene as tensors in the model's units: what stays constant while it is simulated."""
+"""A scene as arrays in the model's units: what stays constant while it is simulated, and the state that changes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
+from sdfsim.physics.motion import Motion, Rows
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.sdf.sdf import Sdf
@@ -50,25 +50,25 @@ class Units:
 class Tracks:
     """The paths of K kinematic bodies with up to P poses each, model units."""
 
-    body: Tensor  # [K] int64 the bodies they move
-    time: Tensor  # [K, P] float64, increasing; infinite beyond the last pose of a path
-    origin: Tensor  # [K, P, 3] float64, of the shapes' own origins
-    orientation: Tensor  # [K, P, 4] float64 xyzw
-    com: Tensor  # [K, 3] float64, centre of mass from the shape's origin (shape axes)
+    body: np.ndarray  # [K] int64 the bodies they move
+    time: np.ndarray  # [K, P] float64, increasing; infinite beyond the last pose of a path
+    origin: np.ndarray  # [K, P, 3] float64, of the shapes' own origins
+    orientation: np.ndarray  # [K, P, 4] float64 xyzw
+    com: np.ndarray  # [K, 3] float64, centre of mass from the shape's origin (shape axes)
 
-    def at(self, time: float) -> tuple[Tensor, Tensor]:
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Centres of mass [K, 3] and orientations [K, 4] at `time`."""
-        row = torch.arange(len(self.body), device=self.time.device)
-        before = ((self.time <= time).sum(1) - 1).clamp(0, self.time.shape[1] - 2)
+        row = np.arange(len(self.body))
+        before = np.clip((self.time <= time).sum(1) - 1, 0, self.time.shape[1] - 2)
         start, stop = self.time[row, before], self.time[row, before + 1]
-        share = ((time - start) / (stop - start)).clamp(0.0, 1.0)[:, None]
-        origin = torch.lerp(self.origin[row, before], self.origin[row, before + 1], share)
+        share = np.clip((time - start) / (stop - start), 0.0, 1.0)[:, None]
+        origin = self.origin[row, before] + share * (self.origin[row, before + 1] - self.origin[row, before])
         first, last = self.orientation[row, before], self.orientation[row, before + 1]
         turn = pose.to_rotvec(pose.multiply(last, pose.conjugate(first)))
         orientation = pose.normalise(pose.multiply(pose.from_rotvec(share * turn), first))
         return origin + pose.rotate(orientation, self.com), orientation
 
-    def velocity(self, time: float, dt: float) -> tuple[Tensor, Tensor]:
+    def velocity(self, time: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean velocity [K, 3] and angular velocity [K, 3] from `time` to `time + dt`: what leads from pose to pose."""
         (place, turn), (later, turned) = self.at(time), self.at(time + dt)
         return (later - place) / dt, pose.to_rotvec(pose.multiply(turned, pose.conjugate(turn))) / dt
@@ -78,26 +78,26 @@ class Tracks:
 class Bodies:
     """N bodies with M surface nodes; lengths, times and masses in model units."""
 
-    shape: Tensor  # [N] int64 index into `sdfs`, -1 for a body that nothing may touch
-    scale: Tensor  # [N] float64, shape metres -> model lengths
-    com: Tensor  # [N, 3] float64, centre of mass from the shape's origin (shape axes, scaled)
-    mass: Tensor  # [N] float64 (0 unless dynamic)
-    inverse_mass: Tensor  # [N] float64, 0 unless dynamic
-    inertia: Tensor  # [N, 3, 3] float64 about the centre of mass, shape axes (identity unless dynamic)
+    shape: np.ndarray  # [N] int64 index into `sdfs`, -1 for a body that nothing may touch
+    scale: np.ndarray  # [N] float64, shape metres -> model lengths
+    com: np.ndarray  # [N, 3] float64, centre of mass from the shape's origin (shape axes, scaled)
+    mass: np.ndarray  # [N] float64 (0 unless dynamic)
+    inverse_mass: np.ndarray  # [N] float64, 0 unless dynamic
+    inertia: np.ndarray  # [N, 3, 3] float64 about the centre of mass, shape axes (identity unless dynamic)
     # friction, restitution: [N] float64
-    friction: Tensor
-    restitution: Tensor
-    moves: Tensor  # [N] bool, True for dynamic bodies: they fly, and contacts push them
-    bounds: Tensor  # [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled
-    size: Tensor  # [N] float64, largest side of `bounds` (infinite for a plane)
-    radius: Tensor  # [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane)
-    node: Tensor  # [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled
-    node_start: Tensor  # [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1]
+    friction: np.ndarray
+    restitution: np.ndarray
+    moves: np.ndarray  # [N] bool, True for dynamic bodies: they fly, and contacts push them
+    bounds: np.ndarray  # [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled
+    size: np.ndarray  # [N] float64, largest side of `bounds` (infinite for a plane)
+    radius: np.ndarray  # [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane)
+    node: np.ndarray  # [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled
+    node_start: np.ndarray  # [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1]
     # [F, 3] int64, corners of the surfaces' triangles, indices into `node`; none where nodes are points alone
-    face: Tensor
-    group: Tensor  # [N] int64, what `collides_with` makes of a body
-    allowed: Tensor  # [G, G] bool, whether bodies of two groups may touch
-    world: Tensor  # [N] int64: bodies of two worlds never meet; -1 is in all of them
+    face: np.ndarray
+    group: np.ndarray  # [N] int64, what `collides_with` makes of a body
+    allowed: np.ndarray  # [G, G] bool, whether bodies of two groups may touch
+    world: np.ndarray  # [N] int64: bodies of two worlds never meet; -1 is in all of them
     sdfs: tuple[Sdf, ...]  # signed distances of the shapes that may be touched
     contact: tuple[ContactGeometry, ...] = ()  # of each of these
     tracks: Tracks | None = None  # the paths of kinematic bodies, None where there are none
@@ -105,67 +105,45 @@ class Bodies:
     def __len__(self) -> int:
         return len(self.shape)
 
-    @property
-    def device(self) -> torch.device:
-        return self.shape.device
-
-    def may_meet(self, a: Tensor, b: Tensor) -> Tensor:
-        """[P] bool: whether bodies `a` [P] and `b` [P] may touch; at least one of a pair is dynamic."""
-        one, other = self.world[a], self.world[b]
-        together = (one == other) | (one < 0) | (other < 0)
-        return together & (self.moves[a] | self.moves[b]) & self.allowed[self.group[a], self.group[b]]
-
-    def led(self, state: State) -> State:
-        """The state with scripted bodies where their paths have them at its time."""
-        if self.tracks is None:
-            return state
-        (place, turn), at = self.tracks.at(state.time), self.tracks.body
-        position, orientation = state.position.index_copy(0, at, place), state.orientation.index_copy(0, at, turn)
-        return replace(state, position=position, orientation=orientation)
-
 
 @dataclass(frozen=True)
-class Touch:
+class Touch(Rows):
     """What the contact solve knows of N bodies from one step to the next."""
 
-    touching: Tensor  # [N] bool, whether contacts acted in the last inner step
-    quiet: Tensor  # [N] int64, for how many steps a body in contact has stayed near its anchor
-    anchor: Tensor  # [N, 7] float64, position and orientation that it has stayed near
-    island: Tensor  # [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake
-    pair: Tensor  # [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has
-    count: Tensor
+    touching: np.ndarray  # [N] bool, whether contacts acted in the last inner step
+    quiet: np.ndarray  # [N] int64, for how many steps a body in contact has stayed near its anchor
+    anchor: np.ndarray  # [N, 7] float64, position and orientation that it has stayed near
+    island: np.ndarray  # [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake
+    pair: np.ndarray  # [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has
+    count: np.ndarray
     # [P, 24, 16] float64: where a point is on either body (about its centre of mass, in its axes), the normal from the
     # second to the first, the distance, the impulse along the normal and the tangential one [3], the two patches that
     # meet
-    point: Tensor
+    point: np.ndarray
 
 
 @dataclass(frozen=True)
-class State:
-    """Where N bodies are and how they move."""
+class State(Motion):
+    """Where N bodies are and how they move, at one instant."""
 
-    position: Tensor  # [N, 3] float64, centres of mass
-    orientation: Tensor  # [N, 4] float64 xyzw, shape axes -> world
-    velocity: Tensor  # [N, 3] float64, of the centres of mass
-    angular_velocity: Tensor  # [N, 3] float64, world frame
     # [2, N, 3] and [2, N, 4], the two poses before (oldest first), for networks on surface nodes; None for others
-    earlier_position: Tensor | None = None
-    earlier_orientation: Tensor | None = None
+    earlier_position: np.ndarray | None = None
+    earlier_orientation: np.ndarray | None = None
     touch: Touch | None = None  # contacts and sleep of the solve; None before its first step
     # [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does
-    load: Tensor | None = None
+    load: np.ndarray | None = None
     time: float = 0.0  # since the start
 
 
-def awake(bodies: Bodies, state: State) -> Tensor:
+def awake(bodies: Bodies, state: State) -> np.ndarray:
     """[A] int64, the dynamic bodies that are not asleep."""
     moves = bodies.moves if state.touch is None else bodies.moves & (state.touch.island < 0)
-    return moves.nonzero()[:, 0]
+    return np.flatnonzero(moves)
 
 
-def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies, State]:
-    """Bodies and initial state of a scene, in model units on `device`. Raises SdfsimError where a body that moves has
-    no mass or no surface nodes."""
+def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
+    """Bodies and initial state of a scene, in model units. Raises SdfsimError where a body that moves has no mass or no
+    surface nodes."""
     shapes = [scene.shapes[b.shape] for b in scene.bodies]
     for body, shape in zip(scene.bodies, shapes, strict=True):
         if body.motion == "dynamic" and (not body.mass > 0 or len(shape.nodes) == 0 or not shape.volume > 0):
@@ -181,50 +159,48 @@ def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies
     node_start = np.concatenate([[0], np.cumsum([len(n) for n in nodes])])
     faces = [s.faces + first for s, first in zip(shapes, node_start[:-1], strict=True)]
 
-    def tensor(array, dtype=torch.float64) -> Tensor:
-        return torch.as_tensor(np.asarray(array), dtype=dtype, device=device)
+    def array(values: Any, dtype: type = np.float64) -> np.ndarray:
+        return np.ascontiguousarray(values, dtype=dtype)
 
     group, allowed = contact_groups(scene.bodies)
     touched = sorted({b.shape for b, g in zip(scene.bodies, group, strict=True) if allowed[g].any()})
     slot = {shape: k for k, shape in enumerate(touched)}
     paths = [(k, b.path) for k, b in enumerate(scene.bodies) if b.path is not None]
     bodies = Bodies(
-        shape=tensor([slot.get(b.shape, -1) for b in scene.bodies], torch.int64),
-        scale=tensor(scale),
-        com=tensor(com),
-        mass=tensor(mass),
-        inverse_mass=tensor(np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)),
-        inertia=tensor(inertia),
-        friction=tensor([b.friction for b in scene.bodies]),
-        restitution=tensor([b.restitution for b in scene.bodies]),
-        moves=tensor(moves, torch.bool),
-        bounds=tensor(bounds),
-        size=tensor((bounds[:, 1] - bounds[:, 0]).max(-1)),
-        radius=tensor(np.linalg.norm(np.abs(bounds).max(1), axis=-1)),
-        node=tensor(np.concatenate(nodes).reshape(-1, 3)),
-        node_start=tensor(node_start, torch.int64),
-        face=tensor(np.concatenate(faces), torch.int64),
-        group=tensor(group, torch.int64),
-        allowed=tensor(allowed, torch.bool),
-        world=torch.zeros(len(scene.bodies), dtype=torch.int64, device=device),
+        shape=array([slot.get(b.shape, -1) for b in scene.bodies], np.int64),
+        scale=array(scale),
+        com=array(com),
+        mass=array(mass),
+        inverse_mass=array(np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)),
+        inertia=array(inertia),
+        friction=array([b.friction for b in scene.bodies]),
+        restitution=array([b.restitution for b in scene.bodies]),
+        moves=array(moves, bool),
+        bounds=array(bounds),
+        size=array((bounds[:, 1] - bounds[:, 0]).max(-1)),
+        radius=array(np.linalg.norm(np.abs(bounds).max(1), axis=-1)),
+        node=array(np.concatenate(nodes).reshape(-1, 3)),
+        node_start=array(node_start, np.int64),
+        face=array(np.concatenate(faces), np.int64),
+        group=array(group, np.int64),
+        allowed=array(allowed, bool),
+        world=np.zeros(len(scene.bodies), dtype=np.int64),
         sdfs=tuple(scene.shapes[k].sdf for k in touched),
         contact=tuple(scene.shapes[k].contact for k in touched),
-        tracks=_tracks(paths, com, length=units.length, time=units.time, device=device),
+        tracks=_tracks(paths, com, length=units.length, time=units.time),
     )
-    orientation = tensor([b.quat_xyzw for b in scene.bodies])
-    origin = tensor([b.position for b in scene.bodies]) / units.length
+    orientation = array([b.quat_xyzw for b in scene.bodies])
+    origin = array([b.position for b in scene.bodies]) / units.length
     state = State(
         position=origin + pose.rotate(orientation, bodies.com),
         orientation=orientation,
-        velocity=tensor([b.velocity for b in scene.bodies]) / units.velocity,
-        angular_velocity=tensor([b.angular_velocity for b in scene.bodies]) * units.time,
+        velocity=array([b.velocity for b in scene.bodies]) / units.velocity,
+        angular_velocity=array([b.angular_velocity for b in scene.bodies]) * units.time,
     )
     return bodies, state
 
 
-def _tracks(
-    paths: Sequence[tuple[int, Waypoints]], com: np.ndarray, *, length: float, time: float, device: torch.device
-) -> Tracks | None:
+def _tracks(paths: Sequence[tuple[int, Waypoints]], com: np.ndarray, *, length: float, time: float) -> Tracks | None:
     """The paths of a scene, in SI units by the number of the body, as tracks; None where there are none. Centres of
     mass [N, 3] from the shapes' origins are in model units, of which one is `length` m and `time` s."""
     if not paths:
@@ -234,15 +210,12 @@ def _tracks(
     def padded(values: np.ndarray, fill) -> np.ndarray:
         return np.concatenate([values, np.broadcast_to(fill, (most - len(values), *values.shape[1:]))])
 
-    def tensor(rows) -> Tensor:
-        return torch.as_tensor(np.stack(rows), dtype=torch.float64, device=device)
-
     return Tracks(
-        body=torch.tensor([k for k, _ in paths], device=device),
-        time=tensor([padded(p.time / time, np.inf) for _, p in paths]),
-        origin=tensor([padded(p.position / length, p.position[-1] / length) for _, p in paths]),
-        orientation=tensor([padded(p.quat_xyzw, p.quat_xyzw[-1]) for _, p in paths]),
-        com=tensor([com[k] for k, _ in paths]),
+        body=np.array([k for k, _ in paths]),
+        time=np.stack([padded(p.time / time, np.inf) for _, p in paths]),
+        origin=np.stack([padded(p.position / length, p.position[-1] / length) for _, p in paths]),
+        orientation=np.stack([padded(p.quat_xyzw, p.quat_xyzw[-1]) for _, p in paths]),
+        com=np.stack([com[k] for k, _ in paths]),
     )
 
 

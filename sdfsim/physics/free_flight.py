@@ -6,24 +6,27 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from sdfsim.physics.bodies import Bodies, State, awake
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
-from sdfsim.physics.pose import apply, from_rotvec, multiply, normalise, to_matrix
+from sdfsim.physics.pose import from_rotvec, multiply, normalise, to_matrix
 
 MAX_TURN = 0.1  # rad of rotation per inner step of the torque-free rotation
 MOST_TURN = 100.0  # rad of rotation that a step can follow
-MOTION = ("position", "orientation", "velocity", "angular_velocity")
 
 
-def ballistic(position: Tensor, velocity: Tensor, gravity: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+def ballistic(
+    position: np.ndarray, velocity: np.ndarray, gravity: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Position [N, 3] m and velocity [N, 3] m/s after `dt` s under constant `gravity` [3] m/s^2 (exact)."""
     return position + velocity * dt + 0.5 * gravity * dt**2, velocity + gravity * dt
 
 
-def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+def torque_free(
+    orientation: np.ndarray, angular_velocity: np.ndarray, inertia: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Rotation of bodies on which no torque acts: orientation [N, 4] and angular velocity [N, 3] rad/s, world, after
     `dt` s, by inertias [N, 3, 3] kg m^2 in body axes.
 
@@ -31,24 +34,25 @@ def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, 
     Runge-Kutta-Munthe-Kaas method of order 4, each inner step turning at most `MAX_TURN`. Beyond `MOST_TURN` in all it
     is no longer exact.
     """
-    turning = (angular_velocity != 0).any(-1).nonzero()[:, 0]
+    turning = np.flatnonzero((angular_velocity != 0).any(-1))
     if len(turning) < len(orientation):  # what does not turn stays as it is
-        some = orientation[turning], angular_velocity[turning]
+        after = orientation.copy(), angular_velocity.copy()
         if len(turning):
-            some = torque_free(*some, inertia[turning], dt)
-        return orientation.index_copy(0, turning, some[0]), angular_velocity.index_copy(0, turning, some[1])
+            some = torque_free(orientation[turning], angular_velocity[turning], inertia[turning], dt)
+            after[0][turning], after[1][turning] = some
+        return after
     if len(orientation) == 0:
         return orientation, angular_velocity
-    inverse = torch.linalg.inv(inertia)
+    inverse = np.linalg.inv(inertia)
     rotation = to_matrix(orientation)
-    momentum = apply(rotation, apply(inertia, apply(rotation.mT, angular_velocity)))
-    fastest = float(angular_velocity.norm(dim=-1).max())
+    momentum = _times(rotation, _times(inertia, _times(rotation.mT, angular_velocity)))
+    fastest = float(np.linalg.norm(angular_velocity, axis=-1).max())
     steps = max(1, math.ceil(min(MOST_TURN, fastest * abs(dt)) / MAX_TURN))
     h = dt / steps
 
-    def spin(q: Tensor) -> Tensor:
+    def spin(q: np.ndarray) -> np.ndarray:
         r = to_matrix(q)
-        return apply(r, apply(inverse, apply(r.mT, momentum)))
+        return _times(r, _times(inverse, _times(r.mT, momentum)))
 
     for _ in range(steps):
         orientation = normalise(_rkmk4(orientation, angular_velocity, spin, h))
@@ -56,14 +60,19 @@ def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, 
     return orientation, angular_velocity
 
 
-def _rkmk4(q: Tensor, start: Tensor, spin: Callable[[Tensor], Tensor], h: float) -> Tensor:
+def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """[N, 3] products of matrices [N, 3, 3] and vectors [N, 3]."""
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _rkmk4(q: np.ndarray, start: np.ndarray, spin: Callable[[np.ndarray], np.ndarray], h: float) -> np.ndarray:
     """One Runge-Kutta-Munthe-Kaas step of order 4 for q' = spin(q) (world axes), where spin(q) = `start`; it never
     leaves the unit sphere."""
 
-    def slope(u: Tensor) -> Tensor:
+    def slope(u: np.ndarray) -> np.ndarray:
         w = spin(multiply(from_rotvec(u), q))
-        uw = torch.linalg.cross(u, w)
-        return h * (w - 0.5 * uw + torch.linalg.cross(u, uw) / 12.0)  # dexp^-1, to the order needed
+        uw = np.cross(u, w)
+        return h * (w - 0.5 * uw + np.cross(u, uw) / 12.0)  # dexp^-1, to the order needed
 
     k1 = h * start
     k2 = slope(0.5 * k1)
@@ -77,18 +86,12 @@ def driven(bodies: Bodies, state: State, dt: float) -> State:
     if bodies.tracks is None:
         return state
     velocity, angular = bodies.tracks.velocity(state.time, dt)
-    rows = bodies.tracks.body
-    return replace(
-        state,
-        velocity=state.velocity.index_copy(0, rows, velocity),
-        angular_velocity=state.angular_velocity.index_copy(0, rows, angular),
-    )
+    return _put(state, bodies.tracks.body, velocity=velocity, angular_velocity=angular)
 
 
 def fly(bodies: Bodies, state: State, options: Options) -> State:
     """Free flight of every body that moves: exact, whatever the step. Scripted bodies go on along their paths."""
-    rows = awake(bodies, state)
-    now = {name: getattr(state, name) for name in MOTION}
+    rows, after = awake(bodies, state), state
     if len(rows):
         pull = options.gravity
         if state.load is not None:
@@ -97,40 +100,54 @@ def fly(bodies: Bodies, state: State, options: Options) -> State:
         if options.rotation:
             turned = _turned(bodies, state, rows, options.dt)
         else:
-            turned = (state.orientation[rows], torch.zeros_like(velocity))
-        now = with_rows(now, rows, (place, turned[0], velocity, turned[1]))
+            turned = (state.orientation[rows], np.zeros_like(velocity))
+        after = _put(after, rows, **dict(zip(MOTION, (place, turned[0], velocity, turned[1]), strict=True)))
     if bodies.tracks is not None:
         place, orientation = bodies.tracks.at(state.time + options.dt)
-        at = bodies.tracks.body
-        now = with_rows(now, at, (place, orientation, state.velocity[at], state.angular_velocity[at]))
+        after = _put(after, bodies.tracks.body, position=place, orientation=orientation)
     return replace(
-        state,
-        **now,
+        after,
         earlier_position=_shift(state.earlier_position, state.position),
         earlier_orientation=_shift(state.earlier_orientation, state.orientation),
         time=state.time + options.dt,
     )
 
 
-def _turned(bodies: Bodies, state: State, rows: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+def with_history(state: State, bodies: Bodies, options: Options, changed: np.ndarray | None = None) -> State:
+    """The state with the two poses that bodies would have come from in free flight: those that were `changed` [N] bool,
+    all of them where it has no earlier poses, or None is given."""
+    back = replace(options, dt=-options.dt)
+    one = fly(bodies, replace(state, earlier_position=None, earlier_orientation=None), back)
+    two = fly(bodies, one, back)
+    position, orientation = (np.stack([getattr(s, name) for s in (two, one)]) for name in MOTION[:2])
+    if changed is not None and state.earlier_position is not None and state.earlier_orientation is not None:
+        position = np.where(changed[:, None], position, state.earlier_position)
+        orientation = np.where(changed[:, None], orientation, state.earlier_orientation)
+    return replace(state, earlier_position=position, earlier_orientation=orientation)
+
+
+def _turned(bodies: Bodies, state: State, rows: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Orientation and angular velocity after free flight; a torque acts half before and half after it."""
     orientation, angular, inertia = state.orientation[rows], state.angular_velocity[rows], bodies.inertia[rows]
     if state.load is None:
         return torque_free(orientation, angular, inertia, dt)
     half = 0.5 * dt * state.load[rows, 3:, None]
 
-    def twisted(orientation: Tensor) -> Tensor:
+    def twisted(orientation: np.ndarray) -> np.ndarray:
         axes = to_matrix(orientation)
-        return (axes @ torch.linalg.solve(inertia, axes.mT @ half))[..., 0]
+        return (axes @ np.linalg.solve(inertia, axes.mT @ half))[..., 0]
 
     orientation, angular = torque_free(orientation, angular + twisted(orientation), inertia, dt)
     return orientation, angular + twisted(orientation)
 
 
-def with_rows(now: dict[str, Tensor], rows: Tensor, values: tuple[Tensor, ...]) -> dict[str, Tensor]:
-    """The tensors of `now` with the given rows replaced."""
-    return {name: now[name].index_copy(0, rows, value) for name, value in zip(MOTION, values, strict=True)}
+def _put(state: State, rows: np.ndarray, **values: np.ndarray) -> State:
+    """The state with the given rows of some arrays replaced."""
+    changed = {name: getattr(state, name).copy() for name in values}
+    for name, value in values.items():
+        changed[name][rows] = value
+    return replace(state, **changed)
 
 
-def _shift(earlier: Tensor | None, now: Tensor) -> Tensor | None:
-    return None if earlier is None else torch.stack([earlier[1], now])
+def _shift(earlier: np.ndarray | None, now: np.ndarray) -> np.ndarray | None:
+    return None if earlier is None else np.stack([earlier[1], now])

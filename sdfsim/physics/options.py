@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
+import numpy as np
 
 STEP, GRAVITY, LENGTH = 0.02, 10.0, 1.4  # the contact solve's step in s, for bodies of so many m under so many m/s^2
 SUBSTEPS = 5  # inner steps in one step of the engine that the training data come from; some recordings have fewer
@@ -14,7 +14,7 @@ SUBSTEPS = 5  # inner steps in one step of the engine that the training data com
 class Options:
     """What is in play during a run, in model units."""
 
-    gravity: Tensor  # [3] float64
+    gravity: np.ndarray  # [3] float64
     dt: float  # the step
     substeps: int = SUBSTEPS  # inner steps of the solve in it
     friction: bool = True  # False computes no tangential impulse

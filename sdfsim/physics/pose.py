@@ -1,58 +1,48 @@
-"""Rotations as unit quaternions (xyzw), batched over leading dimensions, in the dtype they are given."""
+"""Rotations as unit quaternions (xyzw), batched over leading dimensions."""
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import numpy as np
 
 
-def multiply(a: Tensor, b: Tensor) -> Tensor:
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product `a b` of [..., 4] quaternions: first turn by `b`, then by `a`."""
-    av, aw = a[..., :3], a[..., 3:]
-    bv, bw = b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + torch.linalg.cross(av, bv)
-    return torch.cat([vector, aw * bw - (av * bv).sum(-1, keepdim=True)], -1)
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + np.cross(av, bv)
+    return np.concatenate([vector, aw * bw - (av * bv).sum(-1, keepdims=True)], -1)
 
 
-def conjugate(q: Tensor) -> Tensor:
+def conjugate(q: np.ndarray) -> np.ndarray:
     """The inverse rotation of a unit quaternion [..., 4]."""
-    return torch.cat([-q[..., :3], q[..., 3:]], -1)
+    return q * (-1.0, -1.0, -1.0, 1.0)
 
 
-def normalise(q: Tensor) -> Tensor:
+def normalise(q: np.ndarray) -> np.ndarray:
     """The unit quaternion nearest to `q` [..., 4]."""
-    return q / q.norm(dim=-1, keepdim=True)
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
-def rotate(q: Tensor, v: Tensor) -> Tensor:
+def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors `v` [..., 3] turned by `q` [..., 4]."""
-    t = 2.0 * torch.linalg.cross(q[..., :3], v)
-    return v + q[..., 3:] * t + torch.linalg.cross(q[..., :3], t)
+    t = 2.0 * np.cross(q[..., :3], v)
+    return v + q[..., 3:] * t + np.cross(q[..., :3], t)
 
 
-def apply(m: Tensor, v: Tensor) -> Tensor:
-    """Products [..., 3] of matrices [..., 3, 3] and vectors [..., 3]."""
-    return (m @ v[..., None])[..., 0]
-
-
-def to_matrix(q: Tensor) -> Tensor:
+def to_matrix(q: np.ndarray) -> np.ndarray:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
-    axes = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
-    return rotate(q[..., None, :], axes).mT
+    return np.ascontiguousarray(rotate(q[..., None, :], np.eye(3)).swapaxes(-1, -2))
 
 
-def from_rotvec(r: Tensor) -> Tensor:
+def from_rotvec(r: np.ndarray) -> np.ndarray:
     """Unit quaternions of rotation vectors [..., 3] rad (axis times angle)."""
-    angle = r.norm(dim=-1, keepdim=True)
-    half = 0.5 * angle
-    # torch.sinc is sin(pi x) / (pi x): smooth through zero.
-    return torch.cat([0.5 * torch.sinc(half / torch.pi) * r, half.cos()], -1)
+    half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
+    # sinc(x) of NumPy is sin(pi x) / (pi x): smooth through zero.
+    return np.concatenate([0.5 * np.sinc(half / np.pi) * r, np.cos(half)], -1)
 
 
-def to_rotvec(q: Tensor) -> Tensor:
+def to_rotvec(q: np.ndarray) -> np.ndarray:
     """Rotation vectors [..., 3] rad, of at most half a turn, of unit quaternions [..., 4]."""
-    q = torch.where(q[..., 3:] < 0, -q, q)
-    s = q[..., :3].norm(dim=-1, keepdim=True)
-    angle = 2.0 * torch.atan2(s, q[..., 3:])
-    tiny = s < 1e-12
-    return torch.where(tiny, 2.0 * q[..., :3], q[..., :3] * (angle / s.clamp_min(1e-30)))
+    q = np.where(q[..., 3:] < 0, -q, q)
+    s = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(s, q[..., 3:])
+    return q[..., :3] * np.where(s < 1e-12, 2.0, angle / np.maximum(s, 1e-30))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.physics.bodies import Bodies, State, Units
+from sdfsim.physics.bodies import Bodies, Units
 from sdfsim.physics.free_flight import MOST_TURN
+from sdfsim.physics.motion import Motion
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.contact_geometry import check_pieces
 
@@ -22,42 +24,63 @@ FASTEST = 1e6
 LINE = 1e-5
 
 
-def fault(
-    state: State, dt: float, units: Units, rows: np.ndarray | None = None, before: State | None = None
-) -> tuple[int, str] | None:
-    """The first of the bodies in `rows` [N] bool (None: all) whose state cannot be, and what is wrong with it; None
-    when all are sound. State and `dt` are in model units."""
-    from sdfsim.physics.solver.survey import first_fault  # numba takes its time to load
+def limits(dt: float) -> np.ndarray:
+    """[5] what the compiled step lets a state be at most in steps of `dt`, see `survey.broken`; model units."""
+    return np.array([UNIT, FARTHEST, FASTEST, MOST_TURN / dt, FASTEST])
+
+
+NO_LIMITS = np.full(5, np.inf)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A body whose state cannot be."""
+
+    body: int
+    wrong: int  # what is: see `survey.broken`
+    value: np.ndarray  # of that, model units
+
+    def described(self, units: Units, dt: float) -> str:
+        """What is wrong, in SI units, after a step of `dt` model units."""
+        name, unit, what = (
+            ("orientation", 1.0, ""),
+            ("position", units.length, "m from the origin, too far to be placed exactly"),
+            ("velocity", units.velocity, "m/s, too fast for any contact"),
+            ("angular_velocity", 1.0 / units.time, "rad/s, too fast to be followed"),
+            ("way", units.velocity, "m/s through the step, too fast for any contact"),
+        )[self.wrong]
+        if not np.isfinite(self.value).all():
+            return f"{name} is not finite"
+        if not what:
+            return "orientation is not a unit quaternion"
+        return f"{float(np.linalg.norm(self.value)) * unit:.3g} {what} (at most {limits(dt)[self.wrong] * unit:.3g})"
+
+
+def fault_of(body: int, wrong: int, state: Motion, before: np.ndarray, dt: float) -> Fault:
+    """What the compiled check has found at a body that was at `before` [3] a step of `dt` earlier."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        way = (state.position[body] - before) / dt
+    values = (state.orientation, state.position, state.velocity, state.angular_velocity)
+    return Fault(body, wrong, way if wrong == 4 else values[wrong][body])
+
+
+def first_fault(state: Motion, dt: float, rows: np.ndarray | None = None, before: Motion | None = None) -> Fault | None:
+    """The first of the bodies in `rows` [N] bool (None: all) whose state cannot be, a step of `dt` after `before`; None
+    when all are sound. In model units."""
+    from sdfsim.physics.solver import survey  # numba takes its time to load
 
     rows = np.ones(len(state.position), bool) if rows is None else rows
-    place, orientation, velocity, spin = (
-        t.cpu().numpy() for t in (state.position, state.orientation, state.velocity, state.angular_velocity)
-    )
-    earlier = place if before is None else before.position.cpu().numpy()
-    most = np.array([1.0, FARTHEST, FASTEST, MOST_TURN / dt, FASTEST])
-    body, wrong = first_fault(rows, place, orientation, velocity, spin, earlier, dt, UNIT, most)
-    if body < 0:
-        return None
-    with np.errstate(over="ignore", invalid="ignore"):
-        way = (place[body] - earlier[body]) / dt
-        name, value, unit, what = (
-            ("orientation", orientation[body], 1.0, ""),
-            ("position", place[body], units.length, "m from the origin, too far to be placed exactly"),
-            ("velocity", velocity[body], units.velocity, "m/s, too fast for any contact"),
-            ("angular_velocity", spin[body], 1.0 / units.time, "rad/s, too fast to be followed"),
-            ("way", way, units.velocity, "m/s through the step, too fast for any contact"),
-        )[wrong]
-    if not np.isfinite(value).all():
-        return body, f"{name} is not finite"
-    if not what:
-        return body, "orientation is not a unit quaternion"
-    return body, f"{float(np.linalg.norm(value)) * unit:.3g} {what} (at most {most[wrong] * unit:.3g})"
+    earlier = state.position if before is None else before.position
+    moved = (state.position, state.orientation, state.velocity, state.angular_velocity)
+    place, turn, speed, spin = map(np.ascontiguousarray, moved)
+    body, wrong = survey.first_fault(rows, place, turn, speed, spin, np.ascontiguousarray(earlier), dt, limits(dt))
+    return None if body < 0 else fault_of(body, wrong, state, earlier[body], dt)
 
 
 def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
     """Raises SdfsimError where a body that has an end is too large for its surface to keep to where points are placed
     exactly; a model unit is so many `metres`."""
-    large = ((bodies.size > FARTHEST) & bodies.size.isfinite()).nonzero()[:, 0]
+    large = np.flatnonzero((bodies.size > FARTHEST) & np.isfinite(bodies.size))
     if len(large):
         size = float(bodies.size[large[0]]) * metres
         raise SdfsimError(

@@ -6,18 +6,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.steppers import Carry, Stepper
 
 
-def side_by_side(scene: Scene, world: Sequence[int], units: Units, device: torch.device) -> tuple[Bodies, State]:
+def side_by_side(scene: Scene, world: Sequence[int], units: Units) -> tuple[Bodies, State]:
     """The bodies of a scene, each in its `world` [N] of 0, 1, ...; those in -1, behind all others, are in all of them.
     In model units."""
-    bodies, state = from_scene(scene, units, device)
-    return replace(bodies, world=torch.tensor(world, dtype=torch.int64, device=device)), state
+    bodies, state = from_scene(scene, units)
+    return replace(bodies, world=np.array(world, dtype=np.int64)), state
 
 
 def placed(
@@ -25,8 +24,8 @@ def placed(
 ) -> State:
     """The first bodies as arrays [K, *] have them, in model units; those behind them, of all worlds, as they are."""
 
-    def of(rows: np.ndarray, known: torch.Tensor) -> torch.Tensor:
-        return torch.cat([torch.from_numpy(np.ascontiguousarray(rows)).to(known.device), known[len(rows) :]])
+    def of(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
+        return np.concatenate([rows, known[len(rows) :]])
 
     return replace(
         state,

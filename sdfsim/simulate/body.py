@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
@@ -34,14 +33,14 @@ class LiveScene:
     @property
     def state(self) -> State:
         """Bodies and how they move. Give it another one to start from there, or to change bodies:
-        `simulator.state = replace(simulator.state, velocity=...)`; its tensors are not to be written into."""
+        `simulator.state = replace(simulator.state, velocity=...)`; its arrays are not to be written into."""
         return self._state
 
     @state.setter
     def state(self, state: State) -> None:
         self._state, self._handed = state, True
 
-    def change(self, row: int, **fields: torch.Tensor | None) -> None:
+    def change(self, row: int, **fields: np.ndarray | None) -> None:
         """Replace fields of the state, of which only those of one body differ."""
         self._state = replace(self._state, **fields)
         self._changed[row] = True
@@ -143,8 +142,8 @@ class BodyHandle:
         if at is not None and self._simulator.options.rotation:
             sim, row = self._simulator, self._row
             turn = np.cross(_vector("at", at) - self.centre, given)
-            axes = pose.to_matrix(sim.state.orientation[row]).cpu().numpy()
-            inertia = axes @ sim.bodies.inertia[row].cpu().numpy() @ axes.T * sim.units.mass * sim.units.length**2
+            axes = pose.to_matrix(sim.state.orientation[row])
+            inertia = axes @ sim.bodies.inertia[row] @ axes.T * sim.units.mass * sim.units.length**2
             self.angular_velocity = self.angular_velocity + np.linalg.solve(inertia, turn)
 
     def pull(self, force: Numbers, at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)) -> None:
@@ -163,27 +162,26 @@ class BodyHandle:
         if at is not None:
             moment = moment + np.cross(_vector("at", at) - self.centre, given)
         u, state = sim.units, sim.state
-        load = torch.zeros(len(sim.bodies), 6, dtype=torch.float64) if state.load is None else state.load.clone()
-        load[self._row, :3] = torch.from_numpy(given / (u.mass * u.acceleration))
-        load[self._row, 3:] = torch.from_numpy(moment / u.energy)
-        sim.change(self._row, load=load if bool(load.any()) else None)
+        load = np.zeros((len(sim.bodies), 6)) if state.load is None else state.load.copy()
+        load[self._row, :3] = given / (u.mass * u.acceleration)
+        load[self._row, 3:] = moment / u.energy
+        sim.change(self._row, load=load if load.any() else None)
 
     def _of(self, name: str) -> np.ndarray:
-        return getattr(self._simulator.state, name)[self._row].cpu().numpy().copy()
+        return getattr(self._simulator.state, name)[self._row].copy()
 
     def _arm(self, quat: np.ndarray) -> np.ndarray:
         """[3] m from the shape's origin to the centre of mass, world."""
         sim = self._simulator
-        com = sim.bodies.com[self._row].cpu()
-        return pose.rotate(torch.from_numpy(quat), com).numpy() * sim.units.length
+        return pose.rotate(quat, sim.bodies.com[self._row]) * sim.units.length
 
     def _set(self, name: str, value: np.ndarray) -> None:
         sim = self._simulator
         if sim.scene.bodies[self._row].motion == "kinematic" or "velocity" in name:
             self._must_move(f"be given a {name.replace('_', ' ')}")
-        tensor = getattr(sim.state, name).clone()
-        tensor[self._row] = torch.from_numpy(value).to(tensor)
-        sim.change(self._row, **{name: tensor})
+        array = getattr(sim.state, name).copy()
+        array[self._row] = value
+        sim.change(self._row, **{name: array})
 
     def _must_move(self, what: str) -> None:
         motion = self._simulator.scene.bodies[self._row].motion

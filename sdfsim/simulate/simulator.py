@@ -7,10 +7,9 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import torch
 
 from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
@@ -19,19 +18,20 @@ from sdfsim.base.version import __version__
 from sdfsim.learned.model import Model, load_model
 from sdfsim.learned.training_ranges import deep_starts
 from sdfsim.physics.bodies import State, from_scene
-from sdfsim.physics.free_flight import MOTION
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.units import inner_steps
-from sdfsim.physics.validity import check_nodes, check_sizes, fault
+from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
-from sdfsim.simulate.steppers import COUNTS, PHASES, Carry, FreeFlight, stepper_of
+from sdfsim.simulate.steppers import COUNTS, PHASES, Carry, Frames, FreeFlight, energies_of, stepper_of
 
 if TYPE_CHECKING:
     from sdfsim.scene.builder import SceneBuilder
 
+GLANCE = 0.1  # s between two looks at a run that goes on
 BYTES_AN_EDGE = 4096  # of the network, while it is worked on
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
 # what a variant may change: how many numbers a vector has (0: a number), and the most that a number may be
@@ -88,7 +88,7 @@ class Simulator(LiveScene):
     ) -> None:
         scene = scene if isinstance(scene, Scene) else scene.load()
         self.scene = scene
-        self.device = pick_device(device)
+        self.device = "cpu" if device == "cpu" else str(pick_device(device))
         effects = plan(scene)
         model = model if model is not None else scene.model
         asked = effects.contact.on or free_flight == "learned"
@@ -97,7 +97,7 @@ class Simulator(LiveScene):
         rows = None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE))
         stepper = stepper_of(model, contact=effects.contact.on, free_flight=free_flight, rows=rows)
         if not stepper.on_surfaces:
-            self.device = torch.device("cpu")
+            self.device = "cpu"
         self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed
         self.units = stepper.units(scene, dt)
@@ -105,14 +105,14 @@ class Simulator(LiveScene):
         self.outside_training = stepper.unknown([scene], self.units)
         worked_on = replace(scene, shapes=tuple(stepper.surface(shape) for shape in scene.shapes))
         check_nodes(worked_on)
-        self.bodies, state = from_scene(worked_on, self.units, self.device)
+        self.bodies, state = from_scene(worked_on, self.units)
         self._names = tuple(b.name for b in scene.bodies)
         check_sizes(self.bodies, self._names, self.units.length)
         if effects.contact.on and self.model.ranges:
             self.outside_training += deep_starts(self.bodies, state, self._names, self.units.length)
         stepper = stepper.distrusted() if self.outside_training else stepper
         self.stepper = replace(stepper, model=self.model)
-        gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
+        gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
         self._options = Options(
             gravity=gravity,
@@ -125,45 +125,53 @@ class Simulator(LiveScene):
         )
         super().__init__(self.stepper.began(state, self.bodies, self._options))
         dynamic = self.bodies.moves
-        weight = self.bodies.mass[dynamic] * gravity.norm()
+        weight = self.bodies.mass[dynamic] * np.linalg.norm(gravity)
         lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
         self._meta = {
             "model": self.model.name,
             "seed": self.seed,
             "dt": self.dt,
-            "device": str(self.device),
+            "device": self.device,
             "outside_training": self.outside_training,
             "free_flight": free_flight,
             "lift_energy": lift,
             "sdfsim": __version__,
-            "torch": torch.__version__,
             "python": platform.python_version(),
         }
         self.steps_done = 0
         self._given = 0.0  # model energy that came from outside since the last frame
-        if broken := self._fault(self.state):
-            raise SdfsimError(broken)
+        if broken := first_fault(self.state, self._options.dt):
+            raise SdfsimError(self._described(broken))
         self._good = self._start = self.state
 
     def steps(self, count: int) -> Iterator[State]:
         """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError for a state that
         cannot be; its `rollout` is one frame here, the last good state."""
         for _ in range(count):
-            self._step()
+            self._advance(1)
             yield self.si_state()
-
-    def frames(self, count: int) -> Iterator[Rollout]:
-        """Advance by `count` steps, yielding a rollout of one frame after each; raises as `steps` does."""
-        for _ in range(count):
-            started = time.perf_counter()
-            self._step()
-            yield self._frame(1e3 * (time.perf_counter() - started))
 
     def step(self, count: int = 1) -> State:
         """Advance by `count` steps; the state after them (SI units). Raises as `steps` does."""
-        for _ in range(count):
-            self._step()
+        self._advance(count)
         return self.si_state()
+
+    def frames(self, count: int, at_once: int | None = None) -> Iterator[Rollout]:
+        """Advance by `count` steps, yielding all frames since the last time as one rollout; raises as `steps` does.
+
+        Steps are made `at_once` in one call of compiled code (None: as many as take about `GLANCE` seconds), which
+        changes no result.
+        """
+        made, some = 0, at_once or 1
+        while made < count:
+            some = min(some, count - made)
+            started = time.perf_counter()
+            self._advance(some, keep=True)
+            spent = time.perf_counter() - started
+            yield self._rollout(cast("Frames", self.carry.frames), 1e3 * spent / some)
+            made += some
+            if at_once is None:
+                some = max(1, min(2 * some, int(some * GLANCE / max(spent, 1e-6))))
 
     @property
     def options(self) -> Options:
@@ -171,19 +179,20 @@ class Simulator(LiveScene):
 
     @options.setter
     def options(self, options: Options) -> None:
-        if not torch.equal(options.gravity, self._options.gravity):
+        if not np.array_equal(options.gravity, self._options.gravity):
             self._accept()
             nobody = np.zeros(len(self.bodies), bool)
             self._state = self._good = self.stepper.announce(self._state, self.carry, nobody, gravity=True)
         self._options = options
         if self._carry is not None:
-            self._carry.options, self._carry.weights = options, None
+            self._carry.options, self._carry.weights, self._carry.tensors = options, None, None
 
     @property
     def carry(self) -> Carry:
         """What the stepper keeps of this run, made when first asked for."""
         if self._carry is None:
             self._carry = self.stepper.init(self.bodies, self._state, self._options)
+            self._carry.checked = True
         return self._carry
 
     def reset(self) -> None:
@@ -194,8 +203,8 @@ class Simulator(LiveScene):
         """Go on from a state that steps have led to, here or in another simulator of the same scene, as they would have
         gone on there: to the last bit, and what slept sleeps on. One that somebody has changed is for `state`. Raises
         SdfsimError for a state that cannot be."""
-        if broken := self._fault(state):
-            raise SdfsimError(broken)
+        if broken := first_fault(state, self._options.dt):
+            raise SdfsimError(self._described(broken))
         self._state = self._good = state
         self._changed[:], self._handed = False, False
         self._carry, self._given = None, 0.0
@@ -242,7 +251,7 @@ class Simulator(LiveScene):
         """
         scenes = [varied(self.scene, variant) for variant in variants]
         pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
-        same = {"device": str(self.device), "seed": self.seed, **self._asked}
+        same = {"device": self.device, "seed": self.seed, **self._asked}
         jobs = [([scenes[k] for k in piece], self.model, same, seconds, steps) for piece in pieces]
         found = dict(parallel(_run_each, jobs))
         return [rollout for k in range(len(jobs)) for rollout in found[k]]
@@ -255,13 +264,12 @@ class Simulator(LiveScene):
         """
         if steps is None:
             steps = self.steps_in(self.scene.duration if seconds is None else seconds)
-        frames = [self.initial_rollout()]
+        parts = [self.initial_rollout()]
         try:
-            for frame in self.frames(steps):
-                frames.append(frame)
+            parts += self.frames(steps)
         except SimulationError as error:
-            raise SimulationError(error.message, join(frames)) from None
-        return join(frames)
+            raise SimulationError(error.message, join([*parts, error.rollout])) from None
+        return join(parts)
 
     def steps_in(self, seconds: float) -> int:
         """The number of steps that comes nearest to `seconds`: none for 0 s, else at least one. Raises SdfsimError
@@ -272,34 +280,40 @@ class Simulator(LiveScene):
     def initial_rollout(self) -> Rollout:
         """The present state as a rollout of one frame; raises as `steps` does."""
         self._accept()
-        return self._frame(0.0)
+        state, (points, pairs, depth) = self._state, self.stepper.touching(self._state, self._carry)
+        counts = dict.fromkeys((*COUNTS, *PHASES), 0.0) if self._carry is None else self._carry.counts
+        frames = Frames(
+            **{name: getattr(state, name)[None] for name in MOTION},
+            energy=np.array([[*energies_of(self.bodies, state, self._options.gravity), 0.0]]),
+            depth=np.array([depth]),
+            touching=np.array([len(pairs)]),
+            pair=pairs,
+            point=points,
+            counts={name: np.array([value], float) for name, value in counts.items()},
+        )
+        return self._rollout(frames, 0.0)
 
     def si_state(self) -> State:
-        """The present state in metres and seconds, on the CPU."""
+        """The present state in metres and seconds: motion and time alone."""
         s, u = self.state, self.units
         return State(
-            position=(s.position * u.length).cpu(),
-            orientation=s.orientation.cpu(),
-            velocity=(s.velocity * u.velocity).cpu(),
-            angular_velocity=(s.angular_velocity / u.time).cpu(),
+            position=s.position * u.length,
+            orientation=s.orientation,
+            velocity=s.velocity * u.velocity,
+            angular_velocity=s.angular_velocity / u.time,
             time=s.time * u.time,
         )
 
-    def _step(self) -> None:
+    def _advance(self, count: int, *, keep: bool = False) -> None:
+        """Make `count` steps, all in one call where the stepper can."""
         self._accept()
-        before = self._state
-        after, _ = self.stepper.advance(before, self.carry)
-        awake = self.bodies.moves.cpu().numpy()
-        if after.touch is not None:
-            awake = awake & (after.touch.island.numpy() < 0)
-        if broken := self._fault(after, awake, before):
-            raise self._broke(broken)
-        if (load := before.load) is not None:
-            force, torque = load.split(3, 1)
-            turning = 0.5 * self._options.dt * (before.angular_velocity + after.angular_velocity)
-            self._given += float((force * (after.position - before.position)).sum() + (torque * turning).sum())
+        after, carry = self.stepper.advance(self._state, self.carry, count, keep=keep)
         self._state = self._good = after
-        self.steps_done += 1
+        self.steps_done += carry.done
+        if not keep:
+            self._given += carry.given
+        if carry.fault is not None:
+            raise self._broke(self._described(carry.fault), carry.frames if keep else None)
 
     def _accept(self) -> None:
         """What came from outside is looked at before anything is computed from it, and the stepper is told."""
@@ -308,61 +322,58 @@ class Simulator(LiveScene):
         state, good, changed = self._state, self._good, self._changed.copy()
         if self._handed:
             for name in MOTION:
-                changed |= (getattr(state, name) != getattr(good, name)).any(-1).cpu().numpy()
+                changed |= (getattr(state, name) != getattr(good, name)).any(-1)
         self._changed[:], self._handed = False, False
-        broken = self._fault(state)
+        found = first_fault(state, self._options.dt)
+        broken = None if found is None else self._described(found)
         if broken is None and not np.isfinite(state.time):
             broken = "time is not finite"
         if broken:
             self._state = good
             raise self._broke(broken)
-        self._given += sum(self._energies(state)) - sum(self._energies(good))
+        gravity = self._options.gravity
+        self._given += sum(energies_of(self.bodies, state, gravity)) - sum(energies_of(self.bodies, good, gravity))
         self._state = self._good = self.stepper.announce(state, self.carry, changed)
 
-    def _fault(self, state: State, rows: np.ndarray | None = None, before: State | None = None) -> str | None:
-        found = fault(state, self._options.dt, self.units, rows, before)
-        return None if found is None else f"body {self._names[found[0]]!r}: {found[1]}"
+    def _described(self, fault: Fault) -> str:
+        return f"body {self._names[fault.body]!r}: {fault.described(self.units, self._options.dt)}"
 
-    def _broke(self, what: str) -> SimulationError:
+    def _broke(self, what: str, frames: Frames | None = None) -> SimulationError:
+        """The error, with the `frames` up to the last good state, or that state alone."""
         last = f"the last good state is that of step {self.steps_done}, t = {self.steps_done * self.dt:.4g} s"
-        return SimulationError(f"step {self.steps_done + 1}: {what}; {last}", self.initial_rollout())
+        told = f"step {self.steps_done + 1}: {what}; {last}"
+        known = self.initial_rollout() if frames is None else self._rollout(frames, 0.0)
+        return SimulationError(told, known)
 
-    def _frame(self, milliseconds: float) -> Rollout:
-        state, u = self.si_state(), self.units
-        counts = dict.fromkeys((*COUNTS, *PHASES), 0.0) if self._carry is None else self._carry.counts
-        points, pairs, depth = self.stepper.touching(self._state, self._carry)
-        kinetic, potential = self._energies(self.state)
-        given, self._given = self._given, 0.0
+    def _rollout(self, frames: Frames, milliseconds: float) -> Rollout:
+        """Frames up to the present step in SI units, each of which took so many milliseconds."""
+        u, k = self.units, len(frames.depth)
+        given = frames.energy[:, 2].copy()
+        if k:
+            given[0] += self._given
+            self._given = 0.0
         counters = {
-            "kinetic_energy": kinetic * u.energy,
-            "potential_energy": potential * u.energy,
+            "kinetic_energy": frames.energy[:, 0] * u.energy,
+            "potential_energy": frames.energy[:, 1] * u.energy,
             "energy_given": given * u.energy,
-            "contacts": float(len(pairs)),
-            "worst_penetration": depth * u.length,
-            **counts,
-            "step_ms": milliseconds,
+            "contacts": frames.touching.astype(float),
+            "worst_penetration": frames.depth * u.length,
+            **frames.counts,
+            "step_ms": np.full(k, milliseconds),
         }
         return Rollout(
-            time=np.array([self.steps_done * self.dt]),
-            position=state.position.numpy()[None],
-            orientation=state.orientation.numpy()[None],
-            velocity=state.velocity.numpy()[None],
-            angular_velocity=state.angular_velocity.numpy()[None],
-            contact_count=np.array([len(pairs)]),
-            contact_point=points * u.length,
-            contact_body=pairs,
-            counters={k: np.array([v]) for k, v in counters.items()},
+            time=np.arange(self.steps_done - k + 1, self.steps_done + 1) * self.dt,
+            position=frames.position * u.length,
+            orientation=frames.orientation,
+            velocity=frames.velocity * u.velocity,
+            angular_velocity=frames.angular_velocity / u.time,
+            contact_count=frames.touching,
+            contact_point=frames.point * u.length,
+            contact_body=frames.pair,
+            counters=counters,
             names=self._names,
             meta=self._meta,
         )
-
-    def _energies(self, s: State) -> tuple[float, float]:
-        """Kinetic and potential energy of all dynamic bodies in a state, model units."""
-        from sdfsim.physics.solver.survey import energies
-
-        b = self.bodies
-        known = (b.mass, b.inertia, self._options.gravity, s.position, s.orientation, s.velocity, s.angular_velocity)
-        return energies(*(t.cpu().numpy() for t in known))
 
 
 def varied(scene: Scene, variant: Variant) -> Scene:

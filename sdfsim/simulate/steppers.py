@@ -1,9 +1,9 @@
 """What takes a state to the next one: free flight alone, the contact solve, and the networks, all by one contract.
 
 `stepper_of` makes a stepper of a model. `init` gives a `Carry` for the bodies and the start of a run, `advance` makes
-steps, and `announce` is told what somebody has changed between steps. Each stage sees only what is in play: an effect
-that is off is not computed, a body without contact is not in a network's graph, and what sleeps is not looked at until
-something moves beside it.
+one step or many in one call, and `announce` reports what somebody has changed between steps. Each stage sees only what
+is in play: an effect that is off is not computed, a body without contact is not in a network's graph, and what sleeps
+is not looked at until something moves beside it.
 """
 
 from __future__ import annotations
@@ -15,23 +15,27 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.model import SOLVER, SURFACE, Model
 from sdfsim.learned.training_ranges import outside_training
 from sdfsim.physics.bodies import Bodies, State, Units, awake
-from sdfsim.physics.free_flight import MOTION, driven, fly, with_rows
+from sdfsim.physics.free_flight import driven, fly, with_history
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import SUBSTEPS, Options
 from sdfsim.physics.units import scene_units
+from sdfsim.physics.validity import NO_LIMITS, Fault, first_fault, limits
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
 
-if TYPE_CHECKING:  # numba takes its time to load
+if TYPE_CHECKING:  # numba and torch take their time to load
+    import torch
+
     from sdfsim.learned.families import Family
     from sdfsim.learned.near import Contacts, Pairs
+    from sdfsim.learned.tensors import BodyTensors
     from sdfsim.physics.solver.impulse import Weights
-    from sdfsim.physics.solver.prepare import Compiled
+    from sdfsim.physics.solver.prepare import Compiled, Steps
     from sdfsim.physics.solver.record import Edges
 
 FreeFlight = Literal["exact", "learned"]
@@ -53,14 +57,38 @@ PHASES = {
 
 
 @dataclass
+class Frames:
+    """What a recording keeps of each of K steps, model units."""
+
+    position: np.ndarray  # [K, N, 3]
+    orientation: np.ndarray  # [K, N, 4]
+    velocity: np.ndarray  # [K, N, 3]
+    angular_velocity: np.ndarray  # [K, N, 3]
+    energy: np.ndarray  # [K, 3] kinetic and potential; what pulls have given in the step
+    depth: np.ndarray  # [K] the deepest penetration
+    touching: np.ndarray  # [K] int64, points where bodies touch
+    pair: np.ndarray  # [sum(touching), 2] int64, the bodies that touch there
+    point: np.ndarray  # [sum(touching), 3]
+    counts: dict[str, np.ndarray]  # [K] each, see `COUNTS` and `PHASES`
+
+
+@dataclass
 class Carry:
     """What a stepper keeps of one run from step to step, beside the state. None of it changes a result."""
 
     bodies: Bodies
     options: Options
+    checked: bool = False  # whether `advance` ends where a state cannot be
     counts: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*COUNTS, *PHASES), 0.0))  # of a step
+    done: int = 0  # steps that the latest `advance` has made
+    fault: Fault | None = None  # of the state after these, where that cannot be
+    given: float = 0.0  # model energy that pulls have given in these
+    frames: Frames | None = None  # of these, where they were asked for
     scene: Compiled | None = None  # as compiled code wants it, where any is asked
-    weights: Weights | None = None  # likewise of a network on the solve
+    # weights: likewise of a network on the solve; tensors: the bodies as one on surface nodes wants them. Both are made
+    # of the options too.
+    weights: Weights | None = None
+    tensors: BodyTensors | None = None
     edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
     near: Contacts | Pairs | None = None  # where a network on surface nodes saw bodies near each other
 
@@ -69,8 +97,6 @@ class Carry:
         """Add the time that a block takes to a phase."""
         started = time.perf_counter()
         yield
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
         self.counts[phase] += 1e3 * (time.perf_counter() - started)
 
 
@@ -128,16 +154,26 @@ class Stepper:
             scene.place(state)
         return state
 
-    @torch.no_grad()
-    def advance(self, state: State, carry: Carry, n: int = 1) -> tuple[State, Carry]:
-        """Make `n` steps; the counts of the carry are then those of the last one."""
-        bodies = carry.bodies
+    def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
+        """Make `n` steps, fewer where the state after one cannot be and the carry is `checked`; `keep` their frames.
+        The counts of the carry are then those of the last one."""
+        bodies, dt, frames = carry.bodies, carry.options.dt, []
+        carry.done, carry.fault, carry.given, carry.frames = 0, None, 0.0, None
         for _ in range(n):
             carry.counts = dict.fromkeys(carry.counts, 0.0)
-            state = self._step(driven(bodies, state, carry.options.dt), carry)
-            asleep = 0 if state.touch is None else int(np.count_nonzero(state.touch.island.numpy() >= 0))
-            moving = np.count_nonzero(bodies.moves.cpu().numpy())
-            carry.counts |= {"asleep": asleep, "free": moving - asleep - carry.counts["active"]}
+            after = self._step(driven(bodies, state, dt), carry)
+            asleep = np.zeros(len(bodies), bool) if after.touch is None else after.touch.island >= 0
+            if carry.checked:
+                carry.fault = first_fault(after, dt, bodies.moves & ~asleep, state)
+                if carry.fault is not None:
+                    break
+            carry.counts |= {"asleep": asleep.sum(), "free": bodies.moves.sum() - asleep.sum() - carry.counts["active"]}
+            given = _given(state, after, dt)
+            carry.given, carry.done, state = carry.given + given, carry.done + 1, after
+            if keep:
+                frames.append((after, given, dict(carry.counts), self.touching(after, carry)))
+        if keep:
+            carry.frames = _stacked(state, frames, bodies, carry.options)
         return state, carry
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
@@ -175,13 +211,33 @@ class Solver(Stepper):
         found = contact_points(state)
         return found.point, found.pair, float((-found.gap).max(initial=0.0))
 
-    def _step(self, state: State, carry: Carry) -> State:
-        from sdfsim.physics.solver.prepare import solver_step
+    def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
+        """All steps in one call of compiled code."""
+        started = time.perf_counter()
+        made = self._steps(state, carry, n, keep=keep)
+        spent = 1e3 * (time.perf_counter() - started) / max(n, 1)
+        carry.done, carry.fault, carry.given = made.done, made.fault, made.given
+        moving = int(carry.bodies.moves.sum())
+        carry.frames = None
+        if keep:
+            kept = {name: getattr(made.kept, name)[: made.done] for name in made.kept._fields}
+            pairs, contacts, active, asleep, touching = kept.pop("count").T
+            counts = {"pairs": pairs, "contacts": contacts, "active": active, "asleep": asleep}
+            counts |= {"free": moving - asleep - active, "contact_ms": np.full(made.done, spent)}
+            counts = {name: counts.get(name, np.zeros(made.done)).astype(float) for name in (*COUNTS, *PHASES)}
+            carry.frames = Frames(**kept, touching=touching, pair=made.pair, point=made.point, counts=counts)
+        return made.state, carry
 
+    def _steps(self, state: State, carry: Carry, n: int, *, keep: bool = False) -> Steps:
+        most = limits(carry.options.dt) if carry.checked else NO_LIMITS
+        made = cast("Compiled", carry.scene).advance(state, carry.options, n, most, keep=keep)
+        carry.edges = made.edges
+        carry.counts |= dict(zip(("pairs", "contacts", "active"), made.counts, strict=True))
+        return made
+
+    def _step(self, state: State, carry: Carry) -> State:
         with carry.timed("contact_ms"):
-            after, carry.edges, counts = solver_step(cast("Compiled", carry.scene), state, carry.options)
-        carry.counts |= dict(zip(("pairs", "contacts", "active"), counts, strict=True))
-        return after
+            return self._steps(state, carry, 1).state
 
 
 @dataclass(frozen=True)
@@ -191,7 +247,7 @@ class OnSolver(Solver):
     trust: float = 1.0  # in what the network adds to the solve; 0 where a scene is beyond its training
 
     network = True
-    unknown = Stepper.unknown
+    unknown, advance = Stepper.unknown, Stepper.advance
 
     def distrusted(self) -> Stepper:
         return replace(self, trust=0.0)
@@ -231,63 +287,120 @@ class OnSurfaces(Stepper):
     def distances(self) -> bool:
         return self.contact and self.family.distances
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights of the network are."""
+        return next(iter(self.model.network.state_dict().values())).device
+
     def surface(self, shape: Shape) -> Shape:
         return self.family.surface(shape, self.model.nodes)
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
-        from sdfsim.learned.surfaces import with_history
-
         return with_history(state, bodies, options)
 
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
         """Bodies that were changed have come from where their velocities lead from."""
-        from sdfsim.learned.surfaces import with_history
-
-        rows = torch.from_numpy(changed).to(carry.bodies.device)
-        return with_history(super().announce(state, carry, changed), carry.bodies, carry.options, rows)
+        return with_history(super().announce(state, carry, changed), carry.bodies, carry.options, changed)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         """The edges were found at the start of the step; their points are told where `state` has the bodies."""
         if carry is None or carry.near is None or not len(near := carry.near):
             return super().touching(state, carry)
         from sdfsim.learned.near import where
+        from sdfsim.learned.tensors import state_tensors
 
-        pairs = torch.stack([near.owner, near.body], -1).cpu().numpy()
-        return where(state, carry.bodies, near).cpu().numpy(), pairs, float((-near.distance).clamp_min(0.0).max())
+        pairs = np.stack([near.owner.cpu().numpy(), near.body.cpu().numpy()], -1)
+        points = where(state_tensors(state, self.device), self._tensors(carry), near).cpu().numpy()
+        return points, pairs, float((-near.distance).clamp_min(0.0).max())
+
+    def _tensors(self, carry: Carry) -> BodyTensors:
+        from sdfsim.learned.tensors import body_tensors
+
+        if carry.tensors is None:
+            bodies = carry.bodies
+            if not carry.options.friction:
+                bodies = replace(bodies, friction=np.zeros_like(bodies.friction))
+            if not carry.options.restitution:
+                bodies = replace(bodies, restitution=np.zeros_like(bodies.restitution))
+            carry.tensors = body_tensors(bodies, self.device)
+        return carry.tensors
 
     def _step(self, state: State, carry: Carry) -> State:
-        from sdfsim.learned.surfaces import compact, predict
+        import torch
 
-        bodies, options, family = carry.bodies, carry.options, self.family
+        from sdfsim.learned.surfaces import compact, predict
+        from sdfsim.learned.tensors import state_tensors
+
+        options, family, tensors = carry.options, self.family, self._tensors(carry)
         if state.earlier_position is None:  # of a stepper that needs none
-            state = self.began(state, bodies, options)
+            state = self.began(state, carry.bodies, options)
         free = super()._step(state, carry)
-        with carry.timed("contact_ms"):
-            near = family.none(bodies.device)
-            if self.contact:
-                near = family.near(bodies, state, options.gravity, self.model.reach, options.dt, carry.scene)
-        active = torch.unique(torch.cat([near.owner, near.body, *([awake(bodies, state)] if self.learned else [])]))
-        chosen = bodies.moves[active]
-        carry.near = near
-        carry.counts |= {"active": int(chosen.sum()), "contacts": len(near)}
-        if not bool(chosen.any()):
-            return free
-        if not options.friction:
-            bodies = replace(bodies, friction=torch.zeros_like(bodies.friction))
-        if not options.restitution:
-            bodies = replace(bodies, restitution=torch.zeros_like(bodies.restitution))
-        with carry.timed("network_ms"):
-            some, start, among = compact(bodies, state, near, active)
-            graph = family.graph(some, start, among)
-            predicted = predict(cast("Any", self.model.network), graph, some, start, options.dt, self.rows)
+        with torch.no_grad():
+            now = state_tensors(state, self.device)
+            with carry.timed("contact_ms"):
+                near = family.none(self.device)
+                if self.contact:
+                    near = family.near(tensors, now, options.gravity, self.model.reach, options.dt, carry.scene)
+            ends = [near.owner, near.body]
+            if self.learned:
+                ends.append(torch.from_numpy(awake(carry.bodies, state)).to(self.device))
+            active = torch.unique(torch.cat(ends))
+            chosen = tensors.moves[active]
+            carry.near = near
+            carry.counts |= {"active": int(chosen.sum()), "contacts": len(near)}
+            if not bool(chosen.any()):
+                return free
+            with carry.timed("network_ms"):
+                some, start, among = compact(tensors, now, near, active)
+                graph = family.graph(some, start, among)
+                predicted = predict(cast("Any", self.model.network), graph, some, start, options.dt, self.rows)
+                moved = {name: getattr(predicted, name)[chosen].cpu().numpy() for name in MOTION}
         carry.counts |= {"nodes": len(graph), "edges": graph.edge_count}
-        rows = active[chosen]
-        orientation, angular = predicted.orientation[chosen], predicted.angular_velocity[chosen]
+        rows = active[chosen].cpu().numpy()
         if not options.rotation:
-            orientation, angular = state.orientation[rows], torch.zeros_like(angular)
-        now = {name: getattr(free, name) for name in MOTION}
-        moved = (predicted.position[chosen], orientation, predicted.velocity[chosen], angular)
-        return replace(free, **with_rows(now, rows, moved))
+            moved |= {"orientation": state.orientation[rows], "angular_velocity": np.zeros((len(rows), 3))}
+        arrays = {name: getattr(free, name).copy() for name in MOTION}
+        for name, values in moved.items():
+            arrays[name][rows] = values
+        return replace(free, **arrays)
+
+
+def _given(before: State, after: State, dt: float) -> float:
+    """What the forces and torques that pull at bodies have given them in a step."""
+    if before.load is None:
+        return 0.0
+    force, torque = before.load[:, :3], before.load[:, 3:]
+    turning = 0.5 * dt * (before.angular_velocity + after.angular_velocity)
+    return float((force * (after.position - before.position)).sum() + (torque * turning).sum())
+
+
+def energies_of(bodies: Bodies, state: State, gravity: np.ndarray) -> tuple[float, float]:
+    """Kinetic and potential energy of all dynamic bodies, model units."""
+    from sdfsim.physics.solver.survey import energies
+
+    moved = (np.ascontiguousarray(getattr(state, name)) for name in MOTION)
+    return energies(bodies.mass, bodies.inertia, gravity, *moved)
+
+
+def _stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: Bodies, options: Options) -> Frames:
+    """The frames of single steps: each the state after it, what pulls gave, counts, and where bodies touch."""
+    states = [state for state, *_ in kept]
+    arrays = {
+        name: np.stack([getattr(s, name) for s in states]) if states else getattr(like, name)[None][:0]
+        for name in MOTION
+    }
+    energy = [(*energies_of(bodies, state, options.gravity), given) for state, given, *_ in kept]
+    points, pairs, depths = zip(*(found for *_, found in kept), strict=True) if kept else ((), (), ())
+    counts = {name: np.array([counts[name] for _, _, counts, _ in kept], float) for name in (*COUNTS, *PHASES)}
+    return Frames(
+        **arrays,
+        energy=np.array(energy).reshape(-1, 3),
+        depth=np.array(depths, float),
+        touching=np.array([len(one) for one in pairs], np.int64),
+        pair=np.concatenate([np.zeros((0, 2), np.int64), *pairs]),
+        point=np.concatenate([np.zeros((0, 3)), *points]),
+        counts=counts,
+    )
 
 
 def stepper_of(

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_arrays
@@ -213,13 +212,13 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     substep, found = engine_substep(files[0].parent), conditions_of(files[0].parent)
     group = [Trajectory.load(file) for file in files]
     shapes = load_shapes(files[0].parent, {str(n) for t in group for n in t.shape})
-    bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"), found.floor)
+    bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), found.floor)
     inner = how.inner or how.stride * inner_steps(group[0].dt, substep)
-    gravity = torch.from_numpy(np.asarray(group[0].gravity, dtype=np.float64))
+    gravity = np.asarray(group[0].gravity, dtype=np.float64)
     options = Options(gravity, group[0].dt * how.stride, inner, record=True)
     if found.by_teacher:
         options = replace(options, margin=MARGIN, adds=True, cone=False)
-    solver, moves = stepper_of(load_model()), bodies.moves.numpy()
+    solver, moves = stepper_of(load_model()), bodies.moves
     count = min(len(t.position) for t in group)
     parts = []
     for draw in range(how.draws):
@@ -236,12 +235,12 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
 
 
 def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generator) -> State:
-    moves = bodies.moves.numpy()[:, None]
-    lever = 2.0 / np.minimum(bodies.size.numpy(), 1e3)[:, None]
+    moves = bodies.moves[:, None]
+    lever = 2.0 / np.minimum(bodies.size, 1e3)[:, None]
     part = how.least ** rng.random((len(bodies), 1)) * moves
 
-    def draw(scale: float | np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(rng.standard_normal((len(bodies), 3)) * part * scale)
+    def draw(scale: float | np.ndarray) -> np.ndarray:
+        return rng.standard_normal((len(bodies), 3)) * part * scale
 
     turn = pose.from_rotvec(draw(how.shift * lever))
     return replace(
@@ -264,7 +263,7 @@ def _of_step(
     if not len(edges.pair):
         return []
     floor = len(bodies) - 1
-    world = bodies.world.numpy()
+    world = bodies.world
     of_edge = world[edges.pair[:, 0]]
     order = np.argsort(of_edge, kind="stable")
     used, count = np.unique(of_edge, return_counts=True)
@@ -275,8 +274,8 @@ def _of_step(
     length = time**2
     speed = length / time
 
-    def body(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
-        return (values.numpy()[rows] / unit).astype(np.float32)
+    def body(values: np.ndarray, unit: float = 1.0) -> np.ndarray:
+        return (values[rows] / unit).astype(np.float32)
 
     def edge(column: int, unit: float = 1.0) -> np.ndarray:
         return (edges.value[order, column] / unit).astype(np.float32)
@@ -307,7 +306,7 @@ def _of_step(
             **motion(after, ("solved_velocity", "solved_angular", "solved_moved", "solved_turned")),
             **motion(recorded, ("end_velocity", "end_angular", "moved", "turned")),
             mass=body(bodies.mass),
-            inertia=body(bodies.inertia.diagonal(dim1=-2, dim2=-1), length**2),
+            inertia=body(bodies.inertia.diagonal(axis1=-2, axis2=-1), length**2),
             friction=body(bodies.friction),
             restitution=body(bodies.restitution),
             size=body(bodies.size, length),
@@ -321,7 +320,7 @@ def _of_step(
             gap=edge(APART, length),
             when=edge(WHEN),
             dt=STEP,
-            gravity=options.gravity.numpy(),
+            gravity=options.gravity,
             trajectories=np.zeros(1, dtype=np.int64),
         )
     ]

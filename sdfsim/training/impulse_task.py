@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from sdfsim.data.dataset import ranges_of
+from sdfsim.learned import pose
 from sdfsim.learned.contact_graph import ContactGraph, number_pairs
 from sdfsim.learned.impulse import ImpulseNetwork, Velocities
-from sdfsim.physics import pose
 from sdfsim.training.contact_cache import ContactFrames
 from sdfsim.training.distributed import ALONE, Team
 

@@ -16,6 +16,7 @@ from sdfsim.learned.families import FAMILIES
 from sdfsim.learned.message_passing import Graph, GraphNetwork, flipped
 from sdfsim.learned.near import Contacts, Pairs
 from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
+from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.physics.solver.prepare import Compiled
@@ -71,29 +72,31 @@ class SurfaceTask:
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
         bodies, state, after = self.scenes(rng, count, team)
+        scene = Compiled(bodies, state) if self.family.distances else None
+        bodies, state = body_tensors(bodies, self.device), state_tensors(state, self.device)
         # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
-        target = target_acceleration(bodies, state, *after)
-        graph = self.family.graph(bodies, state, self.near(bodies, state))
+        target = target_acceleration(bodies, state, *(torch.from_numpy(pose).to(self.device) for pose in after))
+        graph = self.family.graph(bodies, state, self.near(bodies, state, scene))
         return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 
-    def near(self, bodies: Bodies, state: State, scene: Compiled | None = None) -> Contacts | Pairs:
+    def near(self, bodies: BodyTensors, state: StateTensors, scene: Compiled | None) -> Contacts | Pairs:
         """What is near what; see `Family.near`."""
-        gravity = torch.tensor(self.trajectories[0].gravity, dtype=torch.float64, device=self.device)
+        gravity = np.asarray(self.trajectories[0].gravity, dtype=np.float64)
         return self.family.near(bodies, state, gravity, self.reach, self.dt, scene)
 
     def scenes(
         self, rng: np.random.Generator, count: int, team: Team = ALONE
-    ) -> tuple[Bodies, State, tuple[Tensor, Tensor]]:
+    ) -> tuple[Bodies, State, tuple[np.ndarray, np.ndarray]]:
         """Bodies of `count` recorded steps side by side, how they move before, and their poses [N, *] after."""
         picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
         frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
-        yaw = pose.from_rotvec(torch.tensor([0.0, 0.0, rng.uniform(0, 2 * np.pi)], dtype=torch.float64))
+        yaw = pose.from_rotvec(np.array([0.0, 0.0, rng.uniform(0, 2 * np.pi)]))
         noise = self._noise(picked, rng, team)
         picked, frames = picked[team.share(count)], frames[team.share(count)]
         units = Units(1.0, 1.0, 1.0)
-        bodies, state = merged(picked, frames, self.shapes, units, self.device, self.floor, self.plane)
+        bodies, state = merged(picked, frames, self.shapes, units, self.floor, self.plane)
         recorded = [state_at(picked, [k + offset for k in frames], state) for offset in (-2, -1, 0, 1)]
-        yaw = yaw.to(self.device).expand_as(state.orientation)
+        yaw = np.broadcast_to(yaw, state.orientation.shape)
         poses = [(pose.rotate(yaw, one.position), pose.multiply(yaw, one.orientation)) for one in recorded]
         noisy = poses if noise is None else _disturbed(poses, bodies, noise)
         state = State(
@@ -101,8 +104,8 @@ class SurfaceTask:
             orientation=noisy[2][1],
             velocity=(noisy[2][0] - noisy[1][0]) / self.dt,
             angular_velocity=pose.to_rotvec(pose.multiply(noisy[2][1], pose.conjugate(noisy[1][1]))) / self.dt,
-            earlier_position=torch.stack([noisy[0][0], noisy[1][0]]),
-            earlier_orientation=torch.stack([noisy[0][1], noisy[1][1]]),
+            earlier_position=np.stack([noisy[0][0], noisy[1][0]]),
+            earlier_orientation=np.stack([noisy[0][1], noisy[1][1]]),
         )
         return bodies, state, poses[3]
 
@@ -131,7 +134,7 @@ class SurfaceTask:
             np.array([self.floor]),
         )
 
-    def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> Tensor | None:
+    def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> np.ndarray | None:
         """Noise [3, 2, N + 1, 3] m of each input pose, shifts and turns at the surface, of its bodies and the floor:
         that of the whole batch, so that it does not depend on the team's size; then this one's part of it."""
         if self.noise is None:
@@ -141,13 +144,13 @@ class SurfaceTask:
         steps = rng.normal(scale=self.noise / np.sqrt(3), size=(3, 2, ends[-1] + 1, 3))
         mine = team.share(len(picked))
         rows = [*range(ends[mine.start], ends[mine.stop]), ends[-1]]
-        return torch.from_numpy(steps[:, :, rows]).to(self.device)
+        return steps[:, :, rows]
 
 
-def _disturbed(poses, bodies: Bodies, noise: Tensor):
+def _disturbed(poses: list[tuple[np.ndarray, np.ndarray]], bodies: Bodies, noise: np.ndarray):
     """Rigid displacements that walk over the three input poses by the steps `noise` [3, 2, N, 3] m."""
-    lever = torch.where(bodies.moves, 2.0 / bodies.size, torch.zeros_like(bodies.size))[:, None]
-    shift, turn = (noise * bodies.moves[:, None]).cumsum(0).unbind(1)
+    lever = np.where(bodies.moves, 2.0 / bodies.size, 0.0)[:, None]
+    shift, turn = (noise * bodies.moves[:, None]).cumsum(0).swapaxes(0, 1)
     walked = [
         (position + s, pose.multiply(pose.from_rotvec(t * lever), quat))
         for (position, quat), s, t in zip(poses, shift, turn, strict=False)

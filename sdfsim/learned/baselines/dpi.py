@@ -11,11 +11,11 @@ from sdfsim.learned.baselines.mgn import WORLD, world_edges
 from sdfsim.learned.message_passing import EdgeKind, Graph, Layout
 from sdfsim.learned.near import Pairs
 from sdfsim.learned.surfaces import NODES, STAR, motion_features, star
-from sdfsim.physics.bodies import Bodies, State
+from sdfsim.learned.tensors import BodyTensors, StateTensors
 
 DPI = Layout(NODES, STAR | {"contact": EdgeKind("node", "node", WORLD)})
 
 
-def dpi_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
+def dpi_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
     """Of DPI."""
     return Graph(motion_features(bodies, state), star(bodies, state) | {"contact": world_edges(pairs)})

@@ -14,14 +14,14 @@ from torch import Tensor
 from sdfsim.learned.message_passing import EdgeKind, Features, Graph, Layout, both_ways
 from sdfsim.learned.near import Pairs
 from sdfsim.learned.surfaces import MESH, NODES, STAR, mesh_edges, motion_features, star
-from sdfsim.physics.bodies import Bodies, State
+from sdfsim.learned.tensors import BodyTensors, StateTensors
 
 FACE = Features(34, (0, 4, 7, 10, 16, 19, 22, 28, 31))
 FIGNET_STAR = Layout(NODES, STAR | {"face": EdgeKind("node", "node", FACE, corners=3)})
 FIGNET = Layout(NODES, FIGNET_STAR.edges | {"mesh": MESH})
 
 
-def fignet_star_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
+def fignet_star_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
     """Of FIGNet*."""
     p = pairs
     forth = _features(p.way, p.from_first, p.from_second, p.normal_first, p.normal_second)
@@ -30,7 +30,7 @@ def fignet_star_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
     return Graph(motion_features(bodies, state), star(bodies, state) | face)
 
 
-def fignet_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
+def fignet_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
     """Of FIGNet."""
     made = fignet_star_graph(bodies, state, pairs)
     return Graph(made.nodes, made.edges | {"mesh": mesh_edges(bodies, state)})

@@ -11,13 +11,13 @@ import torch
 from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, Layout, both_ways
 from sdfsim.learned.near import Pairs
 from sdfsim.learned.surfaces import MESH, NODE, mesh_edges, motion_features
-from sdfsim.physics.bodies import Bodies, State
+from sdfsim.learned.tensors import BodyTensors, StateTensors
 
 WORLD = Features(4, (0,))
 MGN = Layout({"node": NODE}, {"mesh": MESH, "world": EdgeKind("node", "node", WORLD)})
 
 
-def mgn_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
+def mgn_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
     """Of MeshGraphNets."""
     nodes = {"node": motion_features(bodies, state)["node"]}
     return Graph(nodes, {"mesh": mesh_edges(bodies, state), "world": world_edges(pairs)})

@@ -38,4 +38,4 @@ def kept() -> Iterator[None]:
 
 
 with kept():
-    from sdfsim.physics.solver import advance as advance
+    from sdfsim.physics.solver import run as run

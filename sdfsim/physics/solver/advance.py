@@ -16,7 +16,7 @@ from sdfsim.physics.solver.sleep import put_to_sleep, woken
 from sdfsim.physics.solver.time_of_impact import time_of_impact
 from sdfsim.physics.solver.vectors import (
     BARE,
-    ENTRY,
+    FAST,
     add,
     along,
     cross,
@@ -34,7 +34,7 @@ from sdfsim.physics.solver.vectors import (
 MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 
 
-@njit(**ENTRY)
+@njit(**FAST)
 def advance(shapes, world, work, motion, rules, manifolds):
     """Advance `motion` by one step, in place; time is that of the bodies that go, however many others there are.
 

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-import torch
 
-from sdfsim.base.compiling import tell_compiling
+from sdfsim.base.compiling import warn_compiling
 from sdfsim.physics import pose
-from sdfsim.physics.bodies import Bodies, State, Touch
+from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
+from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
-from sdfsim.physics.solver.advance import advance as compiled_step
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
+from sdfsim.physics.solver.edges import nodes_within
 from sdfsim.physics.solver.record import Edges
+from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
+from sdfsim.physics.validity import NO_LIMITS, Fault, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
@@ -32,6 +35,7 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 SLOP, SLOP_A_TIME = 5e-4, 0.125
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
+NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 6)))
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
 
 
@@ -39,7 +43,7 @@ class Compiled:
     """One scene, its bodies in model units, as the compiled step wants it."""
 
     def __init__(self, bodies: Bodies, state: State) -> None:
-        tell_compiling(compiled_step, "the contact step", "two minutes")
+        warn_compiling(run_steps, "the contact step", "two minutes")
         self.bodies = bodies
         self.shapes = compiled_shapes(bodies)
         self.place(state)
@@ -49,50 +53,113 @@ class Compiled:
         self.world = compiled_world(self.bodies, state, self.shapes)
         n = len(self.bodies)
         self.work = compiled.Work(
-            matrix=np.ascontiguousarray(pose.to_matrix(state.orientation.cpu()).numpy()), inverse=np.zeros((n, 3, 3)),
+            matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n, 3, 3)),
             free=np.zeros((n, 9)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), wrench=np.zeros((n, 6)),
             part=np.ones(n), ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
         )  # fmt: skip
+        self._load: np.ndarray | None = None
+        self._latest: State | None = None  # what `_motion` and `_manifolds` are the arrays of
 
     def run(
-        self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
-    ) -> tuple[compiled.Manifolds, Edges, tuple[int, ...]]:
-        """One step: `motion` is written to; the contacts at its end, what they did, and what was counted."""
-        return compiled_step(self.shapes, self.world, self.work, motion, rules, manifolds)
+        self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules, steps: int = 1,
+        script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, keep: bool = False,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        """So many steps: `motion` is written to. Returns what `run_steps` does, and last what is kept of each."""
+        n, bodies = steps if keep else 0, len(self.bodies)
+        kept = Kept(
+            np.empty((n, bodies, 3)), np.empty((n, bodies, 4)), np.empty((n, bodies, 3)), np.empty((n, bodies, 3)),
+            np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n),
+        )  # fmt: skip
+        known = (self.shapes, self.world, self.work, motion, rules, manifolds, script, most, kept, TOUCHING, steps)
+        return *run_steps(*known), kept
+
+    def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
+        """Make so many steps of the contact solve from `state`, fewer where one leads to a state that is more than
+        `most` lets it be (see `survey.broken`); `keep` what a recording wants of each."""
+        if state is not self._latest:
+            self._motion, self._manifolds = taken_up(state)
+            self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
+        if state.load is not self._load:
+            self.work.wrench[:] = 0.0 if state.load is None else state.load
+            self._load = state.load
+        rules, motion = compiled_rules(options), self._motion
+        script, time = _script(self.bodies.tracks, state.time, rules.substep_dt * rules.substeps, steps)
+        self._latest = None  # where the rest of this does not come to its end
+        manifolds, edges, counts, done, body, wrong, before, given, pair, point, kept = self.run(
+            motion, self._manifolds, rules, steps, script, most, keep=keep
+        )
+        fault = None
+        if body >= 0:
+            found = Motion(motion.position, motion.orientation, motion.velocity, motion.angular)
+            fault = fault_of(body, wrong, found, np.array(before), options.dt)
+            if not done:
+                return Steps(state, edges, (0, 0, 0), 0, fault, 0.0, kept, pair, point)
+            # The motion is beyond the last good state, which the same steps but one lead to once more.
+            again = self.advance(state, options, done, NO_LIMITS)
+            return replace(again, fault=fault, kept=kept, pair=pair, point=point)
+        self._manifolds, rows = manifolds, self.world.going
+        assert self._before.touch is not None
+        touch = self._before.touch.with_rows(
+            rows,
+            {
+                "touching": motion.touching[rows], "quiet": motion.quiet[rows],
+                "anchor": motion.anchor[rows], "island": motion.island[rows],
+            },
+            pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
+        )  # fmt: skip
+        arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
+        moved = {name: array[rows] for name, array in zip(MOTION, arrays, strict=True)}
+        self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load)
+        return Steps(self._latest, edges, counts, done, fault, given, kept, pair, point)
 
 
-def solver_step(scene: Compiled, state: State, options: Options) -> tuple[State, Edges, tuple[int, ...]]:
-    """Advance `state` by one step of the contact solve; scripted bodies have the velocities of the coming step. Returns
-    what contacts did where that is recorded, and counts: pairs looked at, contacts, bodies that contacts moved."""
-    rules, (motion, manifolds) = compiled_rules(options), taken_up(state)
-    scene.work.wrench[:] = 0.0 if state.load is None else state.load.numpy()
-    manifolds, edges, counts = scene.run(motion, manifolds, rules)
-    known = (motion.touching, motion.quiet, motion.anchor, motion.island, *manifolds)
-    after = replace(
-        state,
-        position=torch.from_numpy(motion.position),
-        orientation=torch.from_numpy(motion.orientation),
-        velocity=torch.from_numpy(motion.velocity),
-        angular_velocity=torch.from_numpy(motion.angular),
-        time=state.time + rules.substep_dt * rules.substeps,
-        touch=Touch(*map(torch.from_numpy, known)),
-    )
-    return scene.bodies.led(after), edges, counts
+@dataclass(frozen=True)
+class Steps:
+    """What several steps of the contact solve have led to."""
+
+    state: State  # the last good one
+    edges: Edges  # what contacts did in the last step, where that is recorded
+    counts: tuple[int, ...]  # of the last step: pairs looked at, contacts, bodies that contacts moved
+    done: int  # how many steps were made
+    fault: Fault | None  # of the state after them, which is not kept
+    given: float  # what pulls have given
+    kept: Kept  # of each step
+    pair: np.ndarray  # [C, 2] int64, bodies that touched in a step that is kept, one step after the other
+    point: np.ndarray  # [C, 3] where they did
+
+
+def _script(tracks: Tracks | None, time: float, dt: float, steps: int) -> tuple[Script, float]:
+    """Where paths lead in so many steps, and the time after them."""
+    times = [time]
+    for _ in range(steps):
+        times.append(times[-1] + dt)  # as single steps add up, to the last bit
+    if tracks is None:
+        return NO_SCRIPT, times[-1]
+    poses = [np.concatenate(tracks.at(t), -1) for t in times[1:]]
+    speeds = [np.concatenate(tracks.velocity(t, dt), -1) for t in times[:-1]]
+    return Script(tracks.body, np.stack(poses), np.stack(speeds)), times[-1]
 
 
 def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
     """Copies of a state as the compiled step writes to them."""
     poses = (state.position, state.orientation, state.velocity, state.angular_velocity)
-    position, orientation, *velocities = (np.array(t.cpu().numpy(), dtype=np.float64, order="C") for t in poses)
+    position, orientation, *velocities = (np.array(array, dtype=np.float64, order="C") for array in poses)
     touch = state.touch
     if touch is None:
         still, nobody = np.zeros(len(position), np.int64), np.full(len(position), -1, np.int64)
         known = still > 0, still, np.concatenate([position, orientation, position, orientation], 1), nobody
     else:
-        known = (np.array(t.numpy()) for t in (touch.touching, touch.quiet, touch.anchor, touch.island))
+        known = (array.copy() for array in (touch.touching, touch.quiet, touch.anchor, touch.island))
     return compiled.Motion(position, orientation, *velocities, *known), _manifolds(touch)
+
+
+def _touch(motion: compiled.Motion, manifolds: compiled.Manifolds) -> Touch:
+    return Touch(
+        touching=motion.touching.copy(), quiet=motion.quiet.copy(), anchor=motion.anchor.copy(),
+        island=motion.island.copy(), pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
+    )  # fmt: skip
 
 
 def disturbed(state: State, changed: np.ndarray, *, gravity: bool = False) -> State:
@@ -101,25 +168,34 @@ def disturbed(state: State, changed: np.ndarray, *, gravity: bool = False) -> St
     touch = state.touch
     if touch is None:
         return state
-    island, quiet, touching = (np.array(t.numpy()) for t in (touch.island, touch.quiet, touch.touching))
-    beside = touch.pair.numpy()[touch.count.numpy() > 0]
+    island, quiet, touching = (array.copy() for array in (touch.island, touch.quiet, touch.touching))
+    beside = touch.pair[touch.count > 0]
     restless = changed.copy()
     restless[beside[changed[beside[:, 1]], 0]] = True
     restless[beside[changed[beside[:, 0]], 1]] = True
     up = np.full(len(island), gravity) | np.isin(island, island[restless & (island >= 0)])
     island[up], quiet[up | changed], touching[changed] = -1, 0, False
-    parts = {"island": island, "quiet": quiet, "touching": touching}
-    return replace(state, touch=replace(touch, **{name: torch.from_numpy(part) for name, part in parts.items()}))
+    return replace(state, touch=replace(touch, island=island, quiet=quiet, touching=touching))
 
 
 def contact_points(state: State) -> Touching:
     """Where bodies touch in a state."""
-    return touching(_manifolds(state.touch), state.position.numpy(), state.orientation.numpy(), TOUCHING)
+    return touching(_manifolds(state.touch), state.position, state.orientation, TOUCHING)
+
+
+def nodes_near(
+    scene: Compiled, state: State, gravity: np.ndarray, reach: float, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where surface nodes come within `reach` of other bodies in a step of `dt` under `gravity` [3], model units; see
+    `edges.nodes_within`."""
+    rules = compiled_rules(Options(gravity, dt, 1))._replace(contact_margin=reach)
+    motion, bodies = taken_up(state)[0], scene.bodies
+    return nodes_within(scene.shapes, scene.world, scene.work, motion, rules, bodies.node, bodies.node_start)
 
 
 def compiled_rules(options: Options) -> compiled.Rules:
     """The options of a run as the compiled step wants them."""
-    gravity, inner = options.gravity.cpu().numpy(), options.dt / options.substeps
+    gravity, inner = options.gravity, options.dt / options.substeps
     return compiled.Rules(
         gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,
         options.restitution, options.rotation, options.sleep, options.margin, options.adds, options.cone,
@@ -133,7 +209,7 @@ def _manifolds(touch: Touch | None) -> compiled.Manifolds:
         return compiled.Manifolds(
             np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros((0, compiled.POINTS, compiled.COLUMNS))
         )
-    return compiled.Manifolds(touch.pair.numpy(), touch.count.numpy(), touch.point.numpy())
+    return compiled.Manifolds(touch.pair, touch.count, touch.point)
 
 
 def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
@@ -223,8 +299,8 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         "world", "bounds",
     )  # fmt: skip
     # Copies: who changes a world, as a fit of coefficients does, must not change the bodies that it was made of.
-    array = {name: getattr(bodies, name).cpu().numpy().copy() for name in names}
-    array["allowed"] = bodies.allowed.cpu().numpy()  # as large as pairs of groups are many, and never changed
+    array = {name: getattr(bodies, name).copy() for name in names}
+    array["allowed"] = bodies.allowed  # as large as pairs of groups are many, and never changed
     bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
     inertia = array["inertia"]
     moves = array["moves"]
@@ -232,13 +308,13 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
     isotropic = eigen[:, 2] - eigen[:, 0] <= 1e-9 * eigen[:, 2]
     scripted = np.zeros(len(moves), bool)
     if bodies.tracks is not None:
-        scripted[bodies.tracks.body.cpu().numpy()] = True
+        scripted[bodies.tracks.body] = True
     infinite = ~np.isfinite(array["radius"])
     plane = np.flatnonzero(infinite & (array["shape"] >= 0))
     still = np.flatnonzero(~infinite & ~moves & ~scripted & (array["shape"] >= 0))
     centre, half = bounds.mean(1), 0.5 * (bounds[:, 1] - bounds[:, 0])
-    turn = pose.to_matrix(state.orientation.cpu()).numpy()[still]
-    middle = state.position.cpu().numpy()[still] + np.einsum("nij,nj->ni", turn, centre[still])
+    turn = pose.to_matrix(state.orientation[still])
+    middle = state.position[still] + np.einsum("nij,nj->ni", turn, centre[still])
     wide = np.einsum("nij,nj->ni", np.abs(turn), half[still])
     low, high = middle - wide, middle + wide
     axis = int(np.argmax(np.ptp(low, axis=0))) if len(still) else 0

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.physics.solver.vectors import ENTRY, add, dot, get, put, rotated, scale, sub, turn, vector
+from sdfsim.physics.solver.vectors import BARE, ENTRY, add, dot, get, put, rotated, scale, sub, turn, vector
 from sdfsim.physics.solver.world import GAP, NORMAL, NORMAL_IMPULSE, TANGENTIAL
 
 
@@ -21,24 +21,39 @@ class Touching(NamedTuple):
     gap: np.ndarray  # [E] below 0 where they are in each other
 
 
-@njit(**ENTRY)
-def first_fault(looked_at, position, orientation, velocity, angular, before, dt, unit, most):
-    """The first of the bodies `looked_at` [N] bool whose state cannot be, -1 where all are sound; and what is wrong.
+@njit(**BARE)
+def broken(position, orientation, velocity, angular, before, i, b, dt, most):
+    """What is wrong with the state of body b, which was at `before` [i] at the start of a step of `dt`; -1 where it is
+    sound: 0 where |q|^2 is away from 1 by more than most[0]; 1 to 4 where the position, velocity, angular velocity or
+    the speed of the way is more than most[1] to most[4], or not a number."""
+    x, y, z, w = orientation[b, 0], orientation[b, 1], orientation[b, 2], orientation[b, 3]
+    if not abs(x * x + y * y + z * z + w * w - 1.0) <= most[0]:
+        return 0
+    way = scale(sub(get(position, b), get(before, i)), 1.0 / dt)
+    for k, v in enumerate((get(position, b), get(velocity, b), get(angular, b), way)):
+        if not dot(v, v) <= most[k + 1] * most[k + 1]:
+            return k + 1
+    return -1
 
-    What is wrong: 0 where |q|^2 is away from 1 by more than `unit`; 1 to 4 where the position, velocity, angular
-    velocity or the way since `before` [N, 3] over `dt` is longer than `most` [5] allows, or not a number.
-    """
+
+@njit(**ENTRY)
+def first_fault(looked_at, position, orientation, velocity, angular, before, dt, most):
+    """The first of the bodies `looked_at` [N] bool whose state cannot be, -1 where all are sound; and what is wrong,
+    see `broken`, with those that were at `before` [N, 3]."""
     for b in range(len(looked_at)):
-        if not looked_at[b]:
-            continue
-        x, y, z, w = orientation[b]
-        if not abs(x * x + y * y + z * z + w * w - 1.0) <= unit:
-            return b, 0
-        way = scale(sub(get(position, b), get(before, b)), 1.0 / dt)
-        for k, v in enumerate((get(position, b), get(velocity, b), get(angular, b), way)):
-            if not dot(v, v) <= most[k + 1] * most[k + 1]:
-                return b, k + 1
+        if looked_at[b]:
+            wrong = broken(position, orientation, velocity, angular, before, b, b, dt, most)
+            if wrong >= 0:
+                return b, wrong
     return -1, 0
+
+
+@njit(**BARE)
+def energy(mass, inertia, gravity, position, orientation, velocity, angular, b):
+    """Kinetic and potential energy of body b."""
+    v, spin = get(velocity, b), rotated(orientation, b, get(angular, b), -1.0)
+    kinetic = 0.5 * (mass * dot(v, v) + dot(spin, turn(inertia, b, spin)))
+    return kinetic, -mass * dot(vector(gravity), get(position, b))
 
 
 @njit(**ENTRY)
@@ -47,9 +62,8 @@ def energies(mass, inertia, gravity, position, orientation, velocity, angular):
     kinetic = potential = 0.0
     for b in range(len(mass)):
         if mass[b] > 0.0:
-            v, spin = get(velocity, b), rotated(orientation, b, get(angular, b), -1.0)
-            kinetic += 0.5 * (mass[b] * dot(v, v) + dot(spin, turn(inertia, b, spin)))
-            potential -= mass[b] * dot(vector(gravity), get(position, b))
+            moving, lifted = energy(mass[b], inertia, gravity, position, orientation, velocity, angular, b)
+            kinetic, potential = kinetic + moving, potential + lifted
     return kinetic, potential
 
 

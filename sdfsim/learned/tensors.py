@@ -1,0 +1,71 @@
+"""Bodies and their state as torch tensors, on the device of a network on surface nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.motion import Motion
+
+
+@dataclass(frozen=True)
+class BodyTensors:
+    """What such a network asks of N bodies with M surface nodes: fields of `Bodies`."""
+
+    inverse_mass: Tensor  # [N] float64
+    friction: Tensor  # [N] float64
+    restitution: Tensor  # [N] float64
+    moves: Tensor  # [N] bool
+    size: Tensor  # [N] float64
+    node: Tensor  # [M, 3] float64
+    node_start: Tensor  # [N + 1] int64
+    face: Tensor  # [F, 3] int64
+    group: Tensor  # [N] int64
+    allowed: Tensor  # [G, G] bool
+    world: Tensor  # [N] int64
+
+    def __len__(self) -> int:
+        return len(self.moves)
+
+    @property
+    def device(self) -> torch.device:
+        return self.moves.device
+
+    def may_meet(self, a: Tensor, b: Tensor) -> Tensor:
+        """[P] bool: whether bodies `a` [P] and `b` [P] may touch; at least one of a pair is dynamic."""
+        one, other = self.world[a], self.world[b]
+        together = (one == other) | (one < 0) | (other < 0)
+        return together & (self.moves[a] | self.moves[b]) & self.allowed[self.group[a], self.group[b]]
+
+
+@dataclass(frozen=True)
+class StateTensors:
+    """Where N bodies are and how they move, float64; see `State`."""
+
+    position: Tensor  # [N, 3]
+    orientation: Tensor  # [N, 4]
+    velocity: Tensor  # [N, 3]
+    angular_velocity: Tensor  # [N, 3]
+    earlier_position: Tensor | None = None  # [2, N, 3]
+    earlier_orientation: Tensor | None = None  # [2, N, 4]
+
+
+def body_tensors(bodies: Bodies, device: torch.device) -> BodyTensors:
+    """The bodies on `device`."""
+    return BodyTensors(**{f.name: torch.from_numpy(getattr(bodies, f.name)).to(device) for f in fields(BodyTensors)})
+
+
+def state_tensors(state: Motion, device: torch.device) -> StateTensors:
+    """The state on `device`."""
+    arrays = {f.name: getattr(state, f.name, None) for f in fields(StateTensors)}
+    return StateTensors(**{k: torch.from_numpy(v).to(device) for k, v in arrays.items() if v is not None})
+
+
+def state_arrays(state: StateTensors) -> State:
+    """The state as NumPy has it."""
+    tensors: dict[str, Any] = {f.name: getattr(state, f.name) for f in fields(state)}
+    return State(**{k: v.cpu().numpy() for k, v in tensors.items() if v is not None})

@@ -1,0 +1,127 @@
+"""Many steps in one call, compiled: they are checked here, and what a recording keeps of each is written down."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sdfsim.physics.solver.advance import advance
+from sdfsim.physics.solver.record import no_edges
+from sdfsim.physics.solver.survey import broken, energy, touching
+from sdfsim.physics.solver.vectors import BARE, ENTRY, add, dot, get, put, sub
+
+ROOM = 64  # contact points that a recording has room for at first
+
+
+class Script(NamedTuple):
+    """Where the paths of S scripted bodies lead in each of n steps."""
+
+    body: np.ndarray  # [S] int64
+    pose: np.ndarray  # [n, S, 7] position and orientation at the end of a step
+    velocity: np.ndarray  # [n, S, 6] velocity and angular velocity that lead there
+
+
+class Kept(NamedTuple):
+    """What is kept of each of n steps, none where nobody wants a recording. N bodies, model units."""
+
+    position: np.ndarray  # [n, N, 3]
+    orientation: np.ndarray  # [n, N, 4]
+    velocity: np.ndarray  # [n, N, 3]
+    angular_velocity: np.ndarray  # [n, N, 3]
+    energy: np.ndarray  # [n, 3] kinetic and potential; what pulls have given in the step
+    count: np.ndarray  # [n, 5] int64: pairs looked at, contacts, active bodies, sleeping ones, points where they touch
+    depth: np.ndarray  # [n] the deepest penetration
+
+
+@njit(**ENTRY, nogil=True)
+def run_steps(shapes, world, work, motion, rules, manifolds, script, most, kept, within, steps):
+    """Advance `motion` by so many steps, in place; the first state that cannot be ends it early.
+
+    Args:
+        most: [6] what a state may be, see `survey.broken`.
+        within: bodies that are no farther apart touch.
+
+    Returns:
+        The manifolds at the end; what contacts did in the last step, where it is to be noted; its counts, as in `Kept`;
+        how many steps were made; the body whose state cannot be after the next one (-1: none) and what is wrong with
+        it; where that body was before that step; what pulls have given; and of all steps that are kept, one after the
+        other, the pairs of bodies that touch [C, 2] and the points [C, 3] where they do.
+    """
+    going, dt = world.going, rules.substep_dt * rules.substeps
+    place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
+    pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
+    edges, counts, given = no_edges(), (0, 0, 0), 0.0
+    for k in range(steps):
+        for s in range(len(script.body)):
+            b = script.body[s]
+            for x in range(3):
+                motion.velocity[b, x], motion.angular[b, x] = script.velocity[k, s, x], script.velocity[k, s, 3 + x]
+        for i in range(len(going)):
+            put(place, i, get(motion.position, going[i]))
+            put(spin, i, get(motion.angular, going[i]))
+        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds)
+        for s in range(len(script.body)):
+            b = script.body[s]
+            for x in range(3):
+                motion.position[b, x] = script.pose[k, s, x]
+            for x in range(4):
+                motion.orientation[b, x] = script.pose[k, s, 3 + x]
+        for i in range(len(going)):
+            b = going[i]
+            if world.moves[b] and motion.island[b] < 0:
+                wrong = broken(
+                    motion.position, motion.orientation, motion.velocity, motion.angular, place, i, b, dt, most
+                )
+                if wrong >= 0:
+                    return manifolds, edges, counts, k, b, wrong, get(place, i), given, pair[:found], point[:found]
+        pulled = _pulled(going, work.wrench, motion, place, spin, dt)
+        given += pulled
+        if len(kept.depth):
+            kept.position[k], kept.orientation[k] = motion.position, motion.orientation
+            kept.velocity[k], kept.angular_velocity[k] = motion.velocity, motion.angular
+            kept.energy[k, 0], kept.energy[k, 1] = _energies(world, motion, rules)
+            kept.energy[k, 2] = pulled
+            here = touching(manifolds, motion.position, motion.orientation, within)
+            while found + len(here.pair) > len(pair):
+                pair, point = np.concatenate((pair, pair)), np.concatenate((point, point))
+            pair[found : found + len(here.pair)], point[found : found + len(here.pair)] = here.pair, here.point
+            found += len(here.pair)
+            for x in range(3):
+                kept.count[k, x] = counts[x]
+            asleep = 0
+            for b in going:
+                asleep += motion.island[b] >= 0
+            kept.count[k, 3], kept.count[k, 4] = asleep, len(here.pair)
+            kept.depth[k] = 0.0
+            for gap in here.gap:
+                kept.depth[k] = max(kept.depth[k], -gap)
+    return manifolds, edges, counts, steps, -1, 0, (0.0, 0.0, 0.0), given, pair[:found], point[:found]
+
+
+@njit(**BARE)
+def _pulled(going, wrench, motion, place, spin, dt):
+    """What forces and torques at bodies have given them in a step, from where they were and how they turned before."""
+    given = 0.0
+    for i in range(len(going)):
+        b = going[i]
+        force, torque = (wrench[b, 0], wrench[b, 1], wrench[b, 2]), (wrench[b, 3], wrench[b, 4], wrench[b, 5])
+        given += dot(force, sub(get(motion.position, b), get(place, i)))
+        given += 0.5 * dt * dot(torque, add(get(spin, i), get(motion.angular, b)))
+    return given
+
+
+@njit(**BARE)
+def _energies(world, motion, rules):
+    """Kinetic and potential energy of the bodies that move."""
+    kinetic = potential = 0.0
+    for b in world.going:
+        if world.moves[b]:
+            mass = 1.0 / world.inverse_mass[b]
+            moving, lifted = energy(
+                mass, world.inertia, rules.gravity, motion.position, motion.orientation, motion.velocity,
+                motion.angular, b,
+            )  # fmt: skip
+            kinetic, potential = kinetic + moving, potential + lifted
+    return kinetic, potential
