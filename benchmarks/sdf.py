@@ -28,8 +28,9 @@ from sdfsim.data.public_shapes import public_folder
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, machine, markdown, measure, number
 from sdfsim.geometry.mesh_io import load_mesh
 from sdfsim.geometry.solidify import solidify
+from sdfsim.sdf.fit import FIT_VERSION, Recipe
 from sdfsim.sdf.fit.certificate import EXACT
-from sdfsim.sdf.fit.train import FIT_VERSION, RECIPES, Recipe
+from sdfsim.sdf.fit.train import RECIPES
 from sdfsim.sdf.grid import sample_grid
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf

@@ -254,7 +254,7 @@ def run_one(project: Project, stage: str, *, again: bool) -> None:
     inputs = before["made"] if before else hash_of_photos(Path(project.options.photos))
     depends = project.options.of_stage(stage) | {"own_budget": project.own_budget}
     if stage == "fit":
-        from sdfsim.sdf.fit.train import FIT_VERSION
+        from sdfsim.sdf.fit import FIT_VERSION
 
         depends["fit_version"] = FIT_VERSION
     text = json.dumps([stage, STAGES[stage].version, inputs, depends], sort_keys=True)

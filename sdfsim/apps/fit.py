@@ -15,7 +15,7 @@ from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
 from sdfsim.scene.schema import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall
-from sdfsim.sdf.fit.train import FIT_VERSION, Recipe
+from sdfsim.sdf.fit import FIT_VERSION, Recipe
 from sdfsim.shape.make import fit_mesh, remarks
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from timeit import timeit
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from sdfsim.base.errors import SdfsimError
+
+if TYPE_CHECKING:
+    import torch
+else:
+    from sdfsim.base.lazy import torch
 
 Progress = Callable[[float, str], None]  # called with the fraction of the work that is done, and a message
 StageProgress = Callable[[str, float, str], None]  # the same, behind the name of one stage of several
@@ -25,7 +29,7 @@ def silent(fraction: float, message: str) -> None:
     """Progress that is not shown."""
 
 
-_most = torch.get_num_threads()  # Before anything here has changed it.
+_most = 0  # threads that torch has by itself; 0 where nobody has asked
 
 
 def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
@@ -51,7 +55,9 @@ def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> t
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         _most = 1
-        torch.set_num_threads(1)
+        os.environ["OMP_NUM_THREADS"] = "1"  # of torch, where it is not there yet
+        if "torch" in sys.modules:
+            torch.set_num_threads(1)
     return index, function(*job)
 
 
@@ -86,6 +92,8 @@ def choose_threads(work: Callable[[], object], threads: int | None = None) -> fl
 
     On a busy machine a second thread slows a computation down by up to ten times.
     """
+    global _most
+    _most = _most or torch.get_num_threads()
     took = {}
     for count in {threads} if threads else {1, _most}:
         torch.set_num_threads(count)

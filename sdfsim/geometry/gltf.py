@@ -17,7 +17,6 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sdfsim.geometry.mesh_formats import FileMesh, looked_up, read_image, side_file, strip
 
@@ -348,6 +347,8 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     matrix = np.eye(4)
+    from scipy.spatial.transform import Rotation  # it takes its time to load
+
     turn = Rotation.from_quat(np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=np.float64)).as_matrix()
     matrix[:3, :3] = turn * np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
     matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
+from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
 from sdfsim.scene.collision_filter import contact_groups
@@ -138,7 +137,7 @@ def energies(scene: Scene, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np
         inertia = body.inertia
         if inertia is None:
             inertia = own.inertia * (body.mass / own.volume * body.scale**2)
-        local = Rotation.from_quat(rollout.orientation[:, k]).inv().apply(rollout.angular_velocity[:, k])
+        local = pose.rotate(pose.conjugate(rollout.orientation[:, k]), rollout.angular_velocity[:, k])
         spin = np.einsum("ti,ij,tj->t", local, inertia, local)
         kinetic[:, k] = 0.5 * body.mass * np.square(rollout.velocity[:, k]).sum(1) + 0.5 * spin
         potential[:, k] = -body.mass * (rollout.position[:, k] - rollout.position[0, k]) @ scene.gravity
@@ -318,7 +317,7 @@ def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
 
 def placed(course_scene: Scene, rollout: Rollout, frame: np.ndarray, body: np.ndarray) -> Placed:
     """Bodies [K] in frames [K], their solids called by their shapes' numbers."""
-    turn = Rotation.from_quat(rollout.orientation[frame, body]).as_matrix()
+    turn = pose.to_matrix(rollout.orientation[frame, body])
     shape = np.array([b.shape for b in course_scene.bodies])[body]
     scale = np.array([b.scale for b in course_scene.bodies])[body]
     com = np.stack([s.com for s in course_scene.shapes])[shape] * scale[:, None]
@@ -342,6 +341,8 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
     found = []
     small = every[~wide]
     if len(small) > 1:
+        from scipy.spatial import KDTree  # it takes its time to load
+
         close = KDTree(middle[small]).query_pairs(2 * float(radius[small].max()), output_type="ndarray")
         found.append(small[close])
     for k in every[wide]:
@@ -458,7 +459,7 @@ def _turning(course: _Course, frame: int) -> np.ndarray:
     """[N] rad/s, of turns that move a body's surface to where it was not."""
     spin = course.rollout.angular_velocity[frame]
     kind = np.array([course.solids[b.shape].turns_into_itself for b in course.scene.bodies])
-    axis = Rotation.from_quat(course.rollout.orientation[frame]).as_matrix()[:, :, 2]
+    axis = pose.to_matrix(course.rollout.orientation[frame])[:, :, 2]
     across = np.linalg.norm(np.cross(spin, axis), axis=1)
     return np.select([kind == 2, kind == 1], [np.zeros(len(kind)), across], np.linalg.norm(spin, axis=1))
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.sdf.sdf import accepts_numpy
+from sdfsim.sdf.sdf import accepts_tensors
+
+if TYPE_CHECKING:
+    import torch
 
 
 class ClosedForm(ABC):
@@ -39,7 +41,7 @@ class ClosedForm(ABC):
         raise NotImplementedError
 
     @abstractmethod
-    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
 
     def to(self, device: torch.device | str) -> Self:
@@ -51,8 +53,8 @@ class ClosedForm(ABC):
         values = vars(self).values()
         return type(self)(*(tuple(x * factor for x in v) if isinstance(v, tuple) else v * factor for v in values))
 
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    @accepts_tensors
+    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
         return self._measure(points)
 
@@ -68,8 +70,8 @@ class PlaneSdf(ClosedForm):
         """[2, 3] m: infinite but for the top."""
         return np.array([[-np.inf] * 3, [np.inf, np.inf, 0.0]])
 
-    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return points[:, 2].clone(), _up(points)
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return points[:, 2].copy(), _up(points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +84,11 @@ class SphereSdf(ClosedForm):
     def _reach(self) -> tuple[float, ...]:
         return (self.radius,) * 3
 
-    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        length = points.norm(dim=1)
-        tiny = torch.finfo(points.dtype).tiny
-        unit = points / length.clamp_min(tiny)[:, None]
-        return length - self.radius, torch.where((length > tiny)[:, None], unit, _up(points))
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        length = _norm(points)
+        tiny = np.finfo(points.dtype).tiny
+        unit = points / np.maximum(length, tiny)[:, None]
+        return length - length.dtype.type(self.radius), np.where((length > tiny)[:, None], unit, _up(points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,17 +102,17 @@ class BoxSdf(ClosedForm):
     def _reach(self) -> tuple[float, ...]:
         return self.half
 
-    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        side = torch.where(points < 0, -1.0, 1.0).to(points.dtype)
-        excess = points.abs() - points.new_tensor(self.half)
-        beyond = excess.clamp_min(0)
-        length = beyond.norm(dim=1)
-        deepest, axis = excess.max(dim=1)
-        inward = torch.nn.functional.one_hot(axis, 3).to(points.dtype)
-        tiny = torch.finfo(points.dtype).tiny
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        side = np.where(points < 0, -1.0, 1.0).astype(points.dtype)
+        excess = np.abs(points) - np.array(self.half, points.dtype)
+        beyond = np.maximum(excess, 0)
+        length = _norm(beyond)
+        axis = excess.argmax(1)
+        deepest, inward = excess[np.arange(len(axis)), axis], np.eye(3, dtype=points.dtype)[axis]
+        tiny = np.finfo(points.dtype).tiny
         outside = length > tiny
-        gradient = torch.where(outside[:, None], beyond / length.clamp_min(tiny)[:, None], inward)
-        return torch.where(outside, length, deepest), side * gradient
+        gradient = np.where(outside[:, None], beyond / np.maximum(length, tiny)[:, None], inward)
+        return np.where(outside, length, deepest), side * gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +126,9 @@ class CapsuleSdf(ClosedForm):
     def _reach(self) -> tuple[float, ...]:
         return self.radius, self.radius, self.half + self.radius
 
-    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        axis = torch.zeros_like(points)
-        axis[:, 2] = points[:, 2].clamp(-self.half, self.half)
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        axis = np.zeros_like(points)
+        axis[:, 2] = np.clip(points[:, 2], -self.half, self.half)
         return SphereSdf(self.radius)._measure(points - axis)
 
 
@@ -142,29 +144,34 @@ class CylinderSdf(ClosedForm):
     def _reach(self) -> tuple[float, ...]:
         return self.radius, self.radius, self.half
 
-    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        tiny = torch.finfo(points.dtype).tiny
-        away = points[:, :2].norm(dim=1)
-        outward = torch.zeros_like(points)
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        tiny, radius, half = np.finfo(points.dtype).tiny, points.dtype.type(self.radius), points.dtype.type(self.half)
+        away = _norm(points[:, :2])
+        outward = np.zeros_like(points)
         outward[:, 0] = 1.0
-        unit = points[:, :2] / away.clamp_min(tiny)[:, None]
-        outward[:, :2] = torch.where((away > tiny)[:, None], unit, outward[:, :2])
-        end = torch.zeros_like(points)
-        end[:, 2] = torch.where(points[:, 2] < 0, -1.0, 1.0).to(points.dtype)
-        aside, above = away - self.radius, points[:, 2].abs() - self.half
+        unit = points[:, :2] / np.maximum(away, tiny)[:, None]
+        outward[:, :2] = np.where((away > tiny)[:, None], unit, outward[:, :2])
+        end = np.zeros_like(points)
+        end[:, 2] = np.where(points[:, 2] < 0, -1.0, 1.0)
+        aside, above = away - radius, np.abs(points[:, 2]) - half
         corner = (aside > 0) & (above > 0)
-        length = torch.sqrt(aside.clamp_min(0) ** 2 + above.clamp_min(0) ** 2)
-        slanted = (aside[:, None] * outward + above[:, None] * end) / length.clamp_min(tiny)[:, None]
+        length = np.hypot(np.maximum(aside, 0), np.maximum(above, 0))
+        slanted = (aside[:, None] * outward + above[:, None] * end) / np.maximum(length, tiny)[:, None]
         side = aside > above
-        distance = torch.where(corner, length, torch.maximum(aside, above))
-        gradient = torch.where(corner[:, None], slanted, torch.where(side[:, None], outward, end))
+        distance = np.where(corner, length, np.maximum(aside, above))
+        gradient = np.where(corner[:, None], slanted, np.where(side[:, None], outward, end))
         return distance, gradient
 
 
 CLOSED_FORMS = {kind.KIND: kind for kind in (PlaneSdf, SphereSdf, BoxSdf, CapsuleSdf, CylinderSdf)}
 
 
-def _up(points: torch.Tensor) -> torch.Tensor:
-    up = torch.zeros_like(points)
+def _up(points: np.ndarray) -> np.ndarray:
+    up = np.zeros_like(points)
     up[:, 2] = 1.0
     return up
+
+
+def _norm(vectors: np.ndarray) -> np.ndarray:
+    """[P] lengths."""
+    return np.linalg.norm(vectors, axis=1)

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from sdfsim.geometry.mesh import Frame
+
+if TYPE_CHECKING:
+    import torch
+
+    Inner = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+else:
+    from sdfsim.base.lazy import torch
 
 # Half extent of the box, in the normalised frame, on which distances are fitted or sampled (the paper's sampling box).
 BOX = 0.7
@@ -19,7 +26,6 @@ SLOPE = (0.9, 1.1)
 CAUTION, FADE = 0.03, 0.1
 
 # Points [P, 3] in the box -> value [P], gradient [P, 3].
-Inner = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
 def in_metres(

@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.mesh import Frame, lattice, normal_frame
 from sdfsim.sdf.far_field import BOX, in_metres
 from sdfsim.sdf.sdf import accepts_numpy
+
+if TYPE_CHECKING:
+    import torch
+else:
+    from sdfsim.base.lazy import torch
 
 # Points of a grid evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point.
 CHUNK = 262_144

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.sdf.reference import MeshDistance
-from sdfsim.sdf.sdf import accepts_numpy
+from sdfsim.sdf.sdf import accepts_tensors
+
+if TYPE_CHECKING:
+    import torch
 
 # All lengths of `MeshSdf` are relative to the mesh's largest extent. The hierarchy works in float32, so closest points
 # are off by some 1e-7: nearer than this the offset to them gives no direction, and differences over the step do.
@@ -59,12 +62,12 @@ class MeshSdf:
         """The solid `factor` times as large."""
         return MeshSdf(replace(self.mesh, vertices=self.mesh.vertices * factor))
 
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    @accepts_tensors
+    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m: along the line to the closest point, on the
         surface along the normal (at an edge or corner between normals), and where there is neither, up."""
-        distance, gradient = self._exact(points.detach().cpu().numpy().astype(np.float64))
-        return torch.from_numpy(distance).to(points), torch.from_numpy(gradient).to(points)
+        distance, gradient = self._exact(points.astype(np.float64))
+        return distance.astype(points.dtype), gradient.astype(points.dtype)
 
     def _exact(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         low, high = self.bounds

@@ -9,14 +9,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
 
 from sdfsim.geometry.mesh import Frame
 from sdfsim.sdf.far_field import in_metres
 from sdfsim.sdf.sdf import accepts_numpy
+
+if TYPE_CHECKING:
+    import torch
+else:
+    from sdfsim.base.lazy import torch
 
 Activation = Literal["wave", "relu"]
 

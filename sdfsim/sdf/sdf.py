@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:
+    import torch
+else:
+    from sdfsim.base.lazy import torch
 
 
 @runtime_checkable
@@ -38,15 +42,33 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
     @wraps(call)
     def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
-        given = points if isinstance(points, torch.Tensor) else np.asarray(points)
-        if given.ndim != 2 or given.shape[1] != 3:
-            raise ValueError(f"points must be [P, 3], got {list(given.shape)}")
+        given = _checked(points)
         if isinstance(given, torch.Tensor):
             return call(self, given)
-        if not np.issubdtype(given.dtype, np.floating):
-            given = given.astype(np.float64)
         tensor = torch.from_numpy(np.ascontiguousarray(given)).to(getattr(self, "device", "cpu"))
         distance, gradient = call(self, tensor)
         return distance.cpu().numpy(), gradient.cpu().numpy()
 
     return wrapper
+
+
+def accepts_tensors(call: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Callable[..., tuple[Any, Any]]:
+    """The same of an Sdf that computes in NumPy: it also takes a tensor, and then answers in tensors."""
+
+    @wraps(call)
+    def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
+        given = _checked(points)
+        if isinstance(given, np.ndarray):
+            return call(self, given)
+        distance, gradient = call(self, given.detach().cpu().numpy())
+        return torch.from_numpy(distance).to(given), torch.from_numpy(gradient).to(given)
+
+    return wrapper
+
+
+def _checked(points: Any) -> Any:
+    given = points if hasattr(points, "detach") else np.asarray(points)
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise ValueError(f"points must be [P, 3], got {list(given.shape)}")
+    whole = isinstance(given, np.ndarray) and not np.issubdtype(given.dtype, np.floating)
+    return given.astype(np.float64) if whole else given

@@ -9,10 +9,9 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import user_cache
@@ -23,11 +22,14 @@ from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, lattice
 from sdfsim.geometry.mesh_io import GLTF, load_mesh
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
-from sdfsim.sdf.fit.train import FIT_VERSION, Recipe, fit_sdf
+from sdfsim.sdf.fit import FIT_VERSION, Recipe
 from sdfsim.sdf.reference import MeshDistance, PiecesDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.shape import DEFAULT_RESOLUTION, FORMAT_VERSION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
 from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
+
+if TYPE_CHECKING:
+    import torch
 
 # m, sizes of meshes that need no word; without known units the largest is less, for few things that move are larger.
 USUAL, LARGE = (1e-3, 100.0), 5.0
@@ -240,6 +242,8 @@ def fit_mesh(
     def pick(sdf: Sdf) -> np.ndarray:
         return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
 
+    from sdfsim.sdf.fit.train import fit_sdf  # torch takes its time to load
+
     sdf, points, certificate = fit_sdf(MeshDistance(solid), recipe, budget, seed, pick, on_progress, device)
     source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
     source |= {"notes": list(solid.notes)} if solid.notes else {}
@@ -274,6 +278,8 @@ def fit_pieces(
     def pick(sdf: Sdf) -> np.ndarray:
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
         return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
+
+    from sdfsim.sdf.fit.train import fit_sdf
 
     sdf, points, certificate = fit_sdf(oracle, "default", None, 0, pick, silent, "cpu")
     single = len(pieces) == 1 and is_closed(pieces[0])

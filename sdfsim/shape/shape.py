@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_bytes, write_json
@@ -26,6 +25,11 @@ from sdfsim.sdf.reference import MeshDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.contact_geometry import ContactGeometry
 from sdfsim.shape.surface_nodes import sample_nodes
+
+if TYPE_CHECKING:
+    import torch
+else:
+    from sdfsim.base.lazy import torch
 
 SdfKind = Literal["mlp", "grid", "mesh"]
 

@@ -1,1 +1,10 @@
 """SDF networks from exact distances: training, and the certificate at its end."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Recipe = Literal["quick", "default", "paper"]
+
+# Changes whenever the same mesh would come out differently; part of every cache key.
+FIT_VERSION = 8

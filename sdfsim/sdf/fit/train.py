@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,18 +16,15 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, choose_threads
 from sdfsim.geometry.mesh import normal_frame, sample_surface
 from sdfsim.sdf.far_field import BOX
+from sdfsim.sdf.fit import Recipe
 from sdfsim.sdf.fit.certificate import SIGN_FROM, certify
 from sdfsim.sdf.fit.soap import Soap
 from sdfsim.sdf.mlp import Activation, MlpSdf, Tape, value_and_gradient
 from sdfsim.sdf.reference import DistanceOracle
 from sdfsim.sdf.sdf import Sdf
 
-Recipe = Literal["quick", "default", "paper"]
 # Weights and biases per layer, [out, in] and [out].
 Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
-
-# Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 8
 
 # Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
 MARGIN = 1.15

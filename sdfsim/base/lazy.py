@@ -1,0 +1,16 @@
+"""Torch, imported when something of it is first asked for: who simulates with the solver alone never waits for it."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+
+class _Torch:
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(importlib.import_module("torch"), name)
+        setattr(self, name, found)
+        return found
+
+
+torch = _Torch()
