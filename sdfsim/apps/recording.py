@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
@@ -21,9 +20,10 @@ from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.steppers import PHASES
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # these take their time to load
     import rerun as rr
     import rerun.blueprint as rrb
+    from PIL import Image
 
 WORLD = "world"
 CONTACTS = "world/contacts"
@@ -245,6 +245,8 @@ def save_reconstruction(
         )
         stream.log(entity, pinhole, static=True)
         if photo.image is not None and photo.image.exists():
+            from PIL import Image
+
             image = rr.Image(_reduced(Image.open(photo.image), _PHOTO_PIXELS))
             stream.log(entity, image.compress(jpeg_quality=80), static=True)
     write_bytes(path, encoded.read() or b"")
@@ -328,6 +330,8 @@ def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
     """With its own texture or colours, or `color` where it has neither."""
+    from PIL import Image
+
     mesh, normals = with_normals(mesh)
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,

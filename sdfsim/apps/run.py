@@ -16,7 +16,7 @@ import yaml
 from sdfsim.apps.recording import Playback, framed, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
 from sdfsim.base.console import columns, plain
-from sdfsim.base.devices import pick_device
+from sdfsim.base.devices import check_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import (
     CONFIG,
@@ -82,7 +82,7 @@ def simulate(
     what was computed before is in the folder.
     """
     # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
-    pick_device(device)
+    check_device(device)
     if seconds is not None:
         check_seconds(seconds)
     if model:

@@ -11,9 +11,16 @@ if TYPE_CHECKING:
     import torch
 
 
+def check_device(name: str) -> None:
+    """Raises SdfsimError where `name` is not a device ("auto", "cpu", "cuda" or "cuda:0"), or there is no CUDA. Only
+    CUDA takes torch to know."""
+    if name not in ("auto", "cpu"):
+        pick_device(name)
+
+
 def pick_device(name: str) -> torch.device:
     """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError for another name, or where there is no CUDA."""
-    import torch
+    import torch  # it takes its time to load
 
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

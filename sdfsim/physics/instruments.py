@@ -340,7 +340,9 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
     wide = endless | (radius > 4 * np.median(radius[~endless]) if (~endless).any() else True)
     found = []
     small = every[~wide]
-    if len(small) > 1:
+    if 1 < len(small) <= FEW_BODIES:
+        found.append(small[np.stack(np.triu_indices(len(small), 1), 1)])
+    elif len(small) > FEW_BODIES:
         from scipy.spatial import KDTree  # it takes its time to load
 
         close = KDTree(middle[small]).query_pairs(2 * float(radius[small].max()), output_type="ndarray")

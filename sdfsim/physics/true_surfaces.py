@@ -17,6 +17,7 @@ import numpy as np
 
 from sdfsim.geometry.bvh import Winding
 from sdfsim.geometry.mesh import Mesh, convex_hull
+from sdfsim.geometry.primitives import box
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape
@@ -77,7 +78,7 @@ def _closed_form(sdf: ClosedForm) -> TrueSurface:
         none = np.zeros((0, 3, 3))
         return TrueSurface(none, np.zeros(0), np.zeros(1, int), np.zeros((0, 4)), bounds, distance, same, True, 1, 0.0)
     if isinstance(sdf, BoxSdf):
-        corners = convex_hull(bounds[np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3), [0, 1, 2]])
+        corners = box(tuple(np.ptp(bounds, axis=0)))
         corner = corners.vertices[corners.faces]
         return _clustered(corner, np.full(len(corner), np.inf), bounds, distance, same, turns=0)
     turn = 2 * np.pi * np.arange(AROUND) / AROUND

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from sdfsim.base.devices import pick_device
+from sdfsim.base.devices import check_device, pick_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import parallel
 from sdfsim.base.version import __version__
@@ -88,7 +88,7 @@ class Simulator(LiveScene):
     ) -> None:
         scene = scene if isinstance(scene, Scene) else scene.load()
         self.scene = scene
-        self.device = "cpu" if device == "cpu" else str(pick_device(device))
+        check_device(device)
         effects = plan(scene)
         model = model if model is not None else scene.model
         asked = effects.contact.on or free_flight == "learned"
@@ -96,8 +96,7 @@ class Simulator(LiveScene):
         memory, self._asked = scene.limits.memory_gib, {"dt": dt, "free_flight": free_flight}
         rows = None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE))
         stepper = stepper_of(model, contact=effects.contact.on, free_flight=free_flight, rows=rows)
-        if not stepper.on_surfaces:
-            self.device = "cpu"
+        self.device = str(pick_device(device)) if stepper.on_surfaces else "cpu"
         self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed
         self.units = stepper.units(scene, dt)
