@@ -8,7 +8,7 @@ that chaos has no time to grow, and long enough to tell a rebound from a slide.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -20,13 +20,12 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
-from sdfsim.physics.bodies import State
 from sdfsim.physics.options import STEP, SUBSTEPS, Options
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.simulate.batch import placed, side_by_side, states
-from sdfsim.simulate.steppers import stepper_of
+from sdfsim.simulate.batch import placed, side_by_side
+from sdfsim.simulate.steppers import Frames, stepper_of
 
 if TYPE_CHECKING:
     from sdfsim.physics.solver.prepare import Compiled
@@ -219,14 +218,17 @@ class Windows:
         self.world = cast("Compiled", self.carry.scene).world
         self.given = {name: getattr(self.world, name).copy() for name in ("inverse_mass", "inertia", "inverse_inertia")}
 
-    def _run(self) -> Iterator[State]:
-        return states(self.solver, self.start_state, self.carry, self.length)
+    def _run(self) -> Frames:
+        _, carry = self.solver.advance(self.start_state, self.carry, self.length, keep=True)
+        return cast("Frames", carry.frames)
 
     def _touched(self) -> set[tuple[int, int, int]]:
         """Window and pair of bodies of every contact; static ones count on from those that move."""
         many = len(self.moving)
         total, found = many * self.count, set()
-        for state in self._run():
+        state = self.start_state
+        for _ in range(self.length):
+            state, _ = self.solver.advance(state, self.carry)
             assert state.touch is not None
             for a, b in state.touch.pair[state.touch.count > 0].tolist():
                 other = b % many if b < total else many + b - total
@@ -255,12 +257,11 @@ class Windows:
             for name, power in (("inverse_mass", -1), ("inertia", 1), ("inverse_inertia", -1)):
                 getattr(self.world, name)[k:total:many] = self.given[name][k:total:many] * ratio**power
         size = self.bodies.size[:total, None]
-        errors = []
-        for t, state in enumerate(self._run()):
-            place, turn = (values[t].reshape(total, -1) for values in self.goal)
-            away = pose.multiply(state.orientation[:total], pose.conjugate(turn))
-            errors += [state.position[:total] - place, 0.5 * size * pose.to_rotvec(away)]
-        return np.nan_to_num(np.concatenate(errors).ravel(), nan=1e3) / OUTLIER
+        frames = self._run()
+        place, turn = (values.reshape(self.length, total, -1) for values in self.goal)
+        away = pose.multiply(frames.orientation[:, :total], pose.conjugate(turn))
+        errors = np.stack([frames.position[:, :total] - place, 0.5 * size * pose.to_rotvec(away)], 1)
+        return np.nan_to_num(errors.ravel(), nan=1e3) / OUTLIER
 
     def jacobian(self, parameters: np.ndarray, errors: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """[R, P] by central differences of `NUDGE`, one-sided at the bounds."""

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from timeit import timeit
 from typing import TYPE_CHECKING, Any
@@ -46,6 +47,19 @@ def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tu
     calls = (delayed(_one)(function, index, job, os.getpid()) for index, job in enumerate(jobs))
     ended: Any = Parallel(n_jobs=-1, return_as="generator_unordered")(calls)
     yield from ended
+
+
+def threads(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
+    """As `parallel`, in threads of this process, for functions that spend their time in compiled code which other
+    threads need not wait for."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        ahead = {pool.submit(function, *job): index for index, job in enumerate(jobs)}
+        try:
+            for future in as_completed(ahead):
+                yield ahead[future], future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:

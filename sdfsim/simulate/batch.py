@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.simulate.steppers import Carry, Stepper
 
 
 def side_by_side(scene: Scene, world: Sequence[int], units: Units) -> tuple[Bodies, State]:
@@ -34,10 +33,3 @@ def placed(
         velocity=of(velocity, state.velocity),
         angular_velocity=of(angular_velocity, state.angular_velocity),
     )
-
-
-def states(stepper: Stepper, state: State, carry: Carry, steps: int) -> Iterator[State]:
-    """The state after each of so many steps."""
-    for _ in range(steps):
-        state, carry = stepper.advance(state, carry)
-        yield state

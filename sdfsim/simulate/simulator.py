@@ -13,9 +13,9 @@ import numpy as np
 
 from sdfsim.base.devices import check_device, pick_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
-from sdfsim.base.parallel import parallel
+from sdfsim.base.parallel import parallel, threads
 from sdfsim.base.version import __version__
-from sdfsim.learned.model import Model, load_model
+from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.learned.training_ranges import deep_starts
 from sdfsim.physics.bodies import State, from_scene
 from sdfsim.physics.motion import MOTION
@@ -249,11 +249,8 @@ class Simulator(LiveScene):
         or a value that it cannot have; SimulationError where a state broke.
         """
         scenes = [varied(self.scene, variant) for variant in variants]
-        pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
         same = {"device": self.device, "seed": self.seed, **self._asked}
-        jobs = [([scenes[k] for k in piece], self.model, same, seconds, steps) for piece in pieces]
-        found = dict(parallel(_run_each, jobs))
-        return [rollout for k in range(len(jobs)) for rollout in found[k]]
+        return run_all(scenes, self.model, seconds, steps, **same)
 
     def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
         """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
@@ -410,6 +407,19 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
         if body.inertia is not None:
             new["inertia"] = body.inertia * (new["mass"] / body.mass)
     return replace(body, **new)
+
+
+def run_all(
+    scenes: Sequence[Scene], model: Model | None = None, seconds: float | None = None, steps: int | None = None,
+    **options: Any,
+) -> list[Rollout]:  # fmt: skip
+    """`run` of a `Simulator` of every scene, made with these options, on all cores: in threads where the steps are
+    compiled code that needs nothing of Python, else in processes. Raises as these do."""
+    model = model or load_model()
+    pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
+    jobs = [([scenes[k] for k in piece], model, options, seconds, steps) for piece in pieces]
+    found = dict((threads if model.kind == SOLVER else parallel)(_run_each, jobs))
+    return [rollout for k in range(len(jobs)) for rollout in found[k]]
 
 
 def _run_each(
