@@ -22,6 +22,12 @@ class Rows:
         new.__dict__.update(_before=self, _rows=rows, _changed=changed)
         return new
 
+    @property
+    def parts(self) -> tuple[Self, np.ndarray, dict[str, np.ndarray]] | None:
+        """What `with_rows` has made it of: the other record, the rows, and what they hold; None for one made whole."""
+        known = vars(self)
+        return (known["_before"], known["_rows"], known["_changed"]) if "_before" in known else None
+
     def __getattr__(self, name: str) -> np.ndarray:  # of what `with_rows` has left out
         if name.startswith("_") or name not in self._changed:
             raise AttributeError(name)

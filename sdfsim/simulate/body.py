@@ -28,7 +28,7 @@ class LiveScene:
 
     def __init__(self, state: State) -> None:
         self._state, self._handed = state, False
-        self._changed = np.zeros(len(state.position), bool)
+        self._changed: set[int] = set()
 
     @property
     def state(self) -> State:
@@ -43,7 +43,7 @@ class LiveScene:
     def change(self, row: int, **fields: np.ndarray | None) -> None:
         """Replace fields of the state, of which only those of one body differ."""
         self._state = replace(self._state, **fields)
-        self._changed[row] = True
+        self._changed.add(row)
 
 
 @dataclass(frozen=True)

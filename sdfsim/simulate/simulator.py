@@ -113,6 +113,7 @@ class Simulator(LiveScene):
         self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
+        self._si: tuple[State, State] | None = None  # a state that others differ from in some rows, and the same in SI
         self._options = Options(
             gravity=gravity,
             dt=self.model.dt,
@@ -205,7 +206,8 @@ class Simulator(LiveScene):
         if broken := first_fault(state, self._options.dt):
             raise SdfsimError(self._described(broken))
         self._state = self._good = state
-        self._changed[:], self._handed = False, False
+        self._handed = False
+        self._changed.clear()
         self._carry, self._given = None, 0.0
         self.steps_done = round(state.time / self._options.dt)
 
@@ -291,14 +293,21 @@ class Simulator(LiveScene):
 
     def si_state(self) -> State:
         """The present state in metres and seconds: motion and time alone."""
-        s, u = self.state, self.units
-        return State(
-            position=s.position * u.length,
-            orientation=s.orientation,
-            velocity=s.velocity * u.velocity,
-            angular_velocity=s.angular_velocity / u.time,
-            time=s.time * u.time,
-        )
+        u, state = self.units, self.state
+        units = dict(zip(MOTION, (u.length, 1.0, u.velocity, 1.0 / u.time), strict=True))
+
+        def whole(state: State) -> State:
+            return State(
+                **{name: getattr(state, name) * unit for name, unit in units.items()}, time=state.time * u.time
+            )
+
+        if (parts := state.parts) is None:
+            return whole(state)
+        before, rows, changed = parts
+        if self._si is None or self._si[0] is not before:
+            self._si = before, whole(before)
+        moved = {name: changed[name] * unit for name, unit in units.items()}
+        return self._si[1].with_rows(rows, moved, time=state.time * u.time)
 
     def _advance(self, count: int, *, keep: bool = False) -> None:
         """Make `count` steps, all in one call where the stepper can."""
@@ -313,13 +322,15 @@ class Simulator(LiveScene):
 
     def _accept(self) -> None:
         """What came from outside is looked at before anything is computed from it, and the stepper is told."""
-        if not (self._handed or self._changed.any()):
+        if not (self._handed or self._changed):
             return
-        state, good, changed = self._state, self._good, self._changed.copy()
+        state, good, changed = self._state, self._good, np.zeros(len(self.bodies), bool)
+        changed[list(self._changed)] = True
         if self._handed:
             for name in MOTION:
                 changed |= (getattr(state, name) != getattr(good, name)).any(-1)
-        self._changed[:], self._handed = False, False
+        self._handed = False
+        self._changed.clear()
         found = first_fault(state, self._options.dt)
         broken = None if found is None else self._described(found)
         if broken is None and not np.isfinite(state.time):

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -92,6 +93,11 @@ class Carry:
     edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
     near: Contacts | Pairs | None = None  # where a network on surface nodes saw bodies near each other
 
+    @cached_property
+    def moving(self) -> int:
+        """How many bodies are dynamic."""
+        return int(self.bodies.moves.sum())
+
     @contextmanager
     def timed(self, phase: str) -> Iterator[None]:
         """Add the time that a block takes to a phase."""
@@ -167,7 +173,7 @@ class Stepper:
                 carry.fault = first_fault(after, dt, bodies.moves & ~asleep, state)
                 if carry.fault is not None:
                     break
-            carry.counts |= {"asleep": asleep.sum(), "free": bodies.moves.sum() - asleep.sum() - carry.counts["active"]}
+            carry.counts |= {"asleep": asleep.sum(), "free": carry.moving - asleep.sum() - carry.counts["active"]}
             given = _given(state, after, dt)
             carry.given, carry.done, state = carry.given + given, carry.done + 1, after
             if keep:
@@ -217,13 +223,12 @@ class Solver(Stepper):
         made = self._steps(state, carry, n, keep=keep)
         spent = 1e3 * (time.perf_counter() - started) / max(n, 1)
         carry.done, carry.fault, carry.given = made.done, made.fault, made.given
-        moving = int(carry.bodies.moves.sum())
         carry.frames = None
         if keep:
             kept = {name: getattr(made.kept, name)[: made.done] for name in made.kept._fields}
             pairs, contacts, active, asleep, touching = kept.pop("count").T
             counts = {"pairs": pairs, "contacts": contacts, "active": active, "asleep": asleep}
-            counts |= {"free": moving - asleep - active, "contact_ms": np.full(made.done, spent)}
+            counts |= {"free": carry.moving - asleep - active, "contact_ms": np.full(made.done, spent)}
             counts = {name: counts.get(name, np.zeros(made.done)).astype(float) for name in (*COUNTS, *PHASES)}
             carry.frames = Frames(**kept, touching=touching, pair=made.pair, point=made.point, counts=counts)
         return made.state, carry
