@@ -6,9 +6,8 @@ joins single nodes, or the three corners of one face to those of another and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import cast
 
 import torch
@@ -96,13 +95,6 @@ class GraphConfig:
     steps: int = 10  # of message passing, each with weights of its own
 
 
-def by_rows(function: Callable[..., Tensor], rows: int | None, *inputs: Tensor) -> Tensor:
-    """`function` of inputs [E, ...] that treats every row alone, on at most `rows` of them at once."""
-    if rows is None or len(inputs[0]) <= rows:
-        return function(*inputs)
-    return torch.cat([function(*part) for part in zip(*(v.split(rows) for v in inputs), strict=True)])
-
-
 def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn.Sequential:
     """Two hidden layers, then LayerNorm unless it decodes."""
     layers = [nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs)]
@@ -173,20 +165,19 @@ class GraphNetwork(nn.Module):
         for name, edges in graph.edges.items():
             cast("Normaliser", self.scale[name]).observe(edges.features)
 
-    def forward(self, graph: Graph, *, rows: int | None = None) -> Tensor:
-        """Standardised accelerations (change of displacement a step) of the set "node", [n, 3]; updates no more than
-        `rows` edges at once."""
+    def forward(self, graph: Graph) -> Tensor:
+        """Standardised accelerations (change of displacement a step) of the set "node", [n, 3]."""
 
         def encoded(name: str, features: Tensor) -> Tensor:
-            return by_rows(lambda part: self.encode[name](self.scale[name](part)), rows, features)
+            return self.encode[name](self.scale[name](features))
 
         node = {name: encoded(name, features) for name, features in graph.nodes.items()}
         edge = {name: encoded(name, edges.features) for name, edges in graph.edges.items()}
         for step in cast("Iterable[Step]", self.steps):
             received = {name: [latent] for name, latent in node.items()}
             for name, kind in self.layout.edges.items():
-                ends, update = graph.edges[name], partial(step.edges[name], node[kind.sender], node[kind.receiver])
-                edge[name] = edge[name] + by_rows(update, rows, edge[name], ends.sender, ends.receiver)
+                ends, sent, received_by = graph.edges[name], node[kind.sender], node[kind.receiver]
+                edge[name] = edge[name] + step.edges[name](sent, received_by, edge[name], ends.sender, ends.receiver)
                 total = torch.zeros_like(node[kind.receiver])
                 messages = edge[name].reshape(-1, self.config.width)
                 received[kind.receiver].append(total.index_add_(0, ends.receiver.flatten(), messages))

@@ -149,11 +149,9 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
     )
 
 
-def predict(
-    network: GraphNetwork, graph: Graph, bodies: Bodies, state: State, dt: float, rows: int | None = None
-) -> State:
-    """One step of the published simulators, the network working on at most `rows` edges at once."""
-    return advance(bodies, state, network.target.undo(network(graph, rows=rows)).double(), dt)
+def predict(network: GraphNetwork, graph: Graph, bodies: Bodies, state: State, dt: float) -> State:
+    """One step of the published simulators."""
+    return advance(bodies, state, network.target.undo(network(graph)).double(), dt)
 
 
 def target_acceleration(bodies: Bodies, state: State, position: Tensor, orientation: Tensor) -> Tensor:

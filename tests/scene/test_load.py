@@ -68,7 +68,7 @@ TOP = [
     ("version: 2", "version: must be 1 (got 2)"),
     ("effects: {frictoin: off}", "effects.frictoin: unknown key (did you mean 'friction'?)"),
     ("effects: {sleep: maybe}", "effects.sleep: must be one of auto, on, off (got 'maybe')"),
-    ("limits: {memory_gib: 0}", "limits.memory_gib: must be > 0"),
+    ("limits: {memory_gib: 1}", "limits: unknown key"),
     ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
     ("shapes: {cup: {sphere: {}}}", "shapes.cup.sphere.radius: is required"),
     ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, plane is"),
