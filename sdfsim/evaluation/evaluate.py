@@ -14,7 +14,7 @@ from sdfsim.base.console import columns
 from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, parallel, silent
-from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
+from sdfsim.data.batching import batches, first_frames, model_units, roll_out, scene_of
 from sdfsim.data.dataset import (
     Trajectory,
     conditions_of,
@@ -54,7 +54,6 @@ def evaluate(
     split: str = "test",
     device: str = "cpu",
     free_flight: FreeFlight = "exact",
-    stride: int = 1,
     substeps: int | None = None,
     chaos_floor: bool = False,
     errors_only: bool = False,
@@ -66,7 +65,6 @@ def evaluate(
         model: bundled name, path or `Model`.
         steps: how far; errors are reported at the horizons of `HORIZONS` up to there, and there.
         free_flight: "exact" or (networks on surface nodes) "learned".
-        stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
         substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine where
             that is the teacher, and for those of `users_inner` where it is another.
         chaos_floor: also run the teacher again from starts that differ slightly (see `PERTURBATIONS`).
@@ -95,16 +93,12 @@ def evaluate(
     stepper = stepper_of(used, free_flight=free_flight)
     recorded, shapes = load_recorded(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
-    longest -= longest % stride
-    as_recorded = [first_frames(t, longest + 1) for t in recorded]
-    recorded = [every(t, stride) for t in as_recorded]
-    longest //= stride
+    recorded = [first_frames(t, longest + 1) for t in recorded]
     again: dict[str, Motions] = {}
     if chaos_floor:
         on_progress(0.0, "teacher, from starts that differ slightly")
         starts = load_recorded(data, split, as_recorded=True)[0]
-        again = teacher_again(data, starts, longest * stride)
-        again = {name: [every(motion, stride) for motion in motions] for name, motions in again.items()}
+        again = teacher_again(data, starts, longest)
     substep, conditions = engine_substep(data), conditions_of(data)
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
@@ -112,9 +106,9 @@ def evaluate(
     if substeps is not None:
         inner = substeps
     elif conditions.by_teacher:
-        inner = stride * inner_steps(as_recorded[0].dt, substep)
+        inner = inner_steps(recorded[0].dt, substep)
     else:
-        inner = stride * SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes)
+        inner = SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes)
     used = replace(used, inner=substeps or used.inner)
     stepper = replace(stepper, model=used)
     for k, group in enumerate(groups):

@@ -290,8 +290,8 @@ class OnSurfaces(Stepper):
 
 
 def stepper_of(model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact") -> Stepper:
-    """How a model steps scenes with `contact` or without. "learned" free flight is for networks on surface nodes: raises
-    SdfsimError where the model is another."""
+    """How a model steps scenes with `contact` or without. Only networks on surface nodes
+    know "learned" free flight; raises SdfsimError for any other model."""
     learned, on_surfaces = free_flight == "learned", model.kind in SURFACE
     if learned and not on_surfaces:
         raise SdfsimError(

@@ -48,8 +48,6 @@ TOGETHER = 25  # trajectories that are followed side by side
 class Solved:
     """How recordings are followed."""
 
-    stride: int = 1  # recorded steps in a step of the network
-    inner: int = 0  # inner steps of the solve in it; 0 for those of the recording engine
     draws: int = 2  # how often every recording is followed: first from the states as they are, then from disturbed ones
     # shift, speed: m and m/s, standard deviations of the disturbance of a body's place and velocity, and by turning and
     # spinning of its surface. Every body's is a part of it, log-uniform from `least` to all.
@@ -141,7 +139,7 @@ def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress
     """The contact frames of a dataset split: from the cache file beside it, else made now and cached. Raises
     SdfsimError for no trajectories, unreadable ones, some that differ in step or gravity, or none with a contact."""
     folder = data / "frames"
-    name = f"{split}-{how.stride}-{how.inner}-{how.draws}"
+    name = f"{split}-{how.draws}"
     made = list(folder.glob(f"{name}-*.npz"))
     if not (data / split).is_dir() and len(made) == 1:
         # A machine that only trains may have been given nothing but the cache.
@@ -214,9 +212,8 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     group = [Trajectory.load(file) for file in files]
     shapes = load_shapes(files[0].parent, {str(n) for t in group for n in t.shape})
     bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"), found.floor)
-    inner = how.inner or how.stride * inner_steps(group[0].dt, substep)
     gravity = torch.from_numpy(np.asarray(group[0].gravity, dtype=np.float64))
-    options = Options(gravity, group[0].dt * how.stride, inner, record=True)
+    options = Options(gravity, group[0].dt, inner_steps(group[0].dt, substep), record=True)
     if found.by_teacher:
         options = replace(options, margin=MARGIN, adds=True, cone=False)
     solver, moves = stepper_of(load_model()), bodies.moves.numpy()
@@ -225,12 +222,12 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     for draw in range(how.draws):
         rng = np.random.default_rng([draw, int(hashlib.sha256(files[0].name.encode()).hexdigest()[:8], 16)])
         carry, touch = solver.init(bodies, start, options), None
-        for now in range(0, count - how.stride, how.stride):
+        for now in range(count - 1):
             state = replace(state_at(group, [now] * len(group), start), touch=touch)
             state = _disturbed(bodies, state, how, rng) if draw else state
             after, _ = solver.advance(solver.announce(state, carry, moves), carry)
             touch = after.touch
-            recorded = state_at(group, [now + how.stride] * len(group), start)
+            recorded = state_at(group, [now + 1] * len(group), start)
             parts += _of_step(bodies, state, after, cast("Edges", carry.edges), recorded, options, found.floor)
     return parts
 
