@@ -20,7 +20,7 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import TEACHER_VERSION, engine_settings
-from tests.recordings import balls, trajectory
+from tests.helpers.recordings import balls, trajectory
 
 SUBSTEP, DT, GRAVITY = 0.004, 0.02, np.array([0.0, 0.0, -10.0])
 

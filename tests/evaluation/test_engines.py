@@ -19,17 +19,7 @@ from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape, shape_from_primitive
 from sdfsim.simulate.steppers import stepper_of
-
-SCENE = """
-version: 1
-duration: 0.4
-shapes:
-  box: {box: {size: [0.1, 0.1, 0.1]}}
-bodies:
-  - {name: floor, plane: {offset: 0.5}, friction: 0.8, restitution: 0.5}
-  - {name: low, shape: box, position: [0, 0, 0.5501], mass: 1.0, friction: 0.5, restitution: 0.1}
-  - {name: high, shape: box, position: [3, 0, 9], velocity: [1, 0, 0], angular_velocity: [0, 0, 2], mass: 2.0}
-"""
+from tests.helpers.scene_files import SCENE
 
 
 def started(folder, text: str = SCENE):

@@ -13,8 +13,8 @@ from sdfsim.evaluation.evaluate import evaluate, report_lines
 from sdfsim.geometry import primitives
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.recordings import bouncing, slab_data, sliding
-from tests.scenes import random_model
+from tests.helpers.recordings import bouncing, slab_data, sliding
+from tests.helpers.scenes import random_model
 
 
 @pytest.fixture

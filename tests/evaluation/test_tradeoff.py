@@ -18,7 +18,7 @@ from sdfsim.evaluation.tradeoff import Setting, arranged, cases_of_scene, load_c
 from sdfsim.learned.model import load_model
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.evaluation.test_engines import SCENE
+from tests.helpers.scene_files import SCENE
 
 
 @pytest.fixture(scope="module")

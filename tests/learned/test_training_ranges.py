@@ -10,7 +10,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.training_ranges import _products
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import make_body, random_model
+from tests.helpers.scenes import make_body, random_model
 
 RANGES = {
     "size": [0.7, 2.1],

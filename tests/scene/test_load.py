@@ -11,7 +11,7 @@ from sdfsim import SceneError, load_scene
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.shape.make import analytic_shape
-from tests.scene.conftest import HEAD, problems_of
+from tests.helpers.scene_files import HEAD, problems_of
 
 BODY = [
     ("mass: -0.3", "bodies[0].mass: must be > 0 (got -0.3 kg)"),

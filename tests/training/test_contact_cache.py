@@ -15,7 +15,7 @@ from sdfsim.physics.bodies import Units
 from sdfsim.shape.make import analytic_shape
 from sdfsim.training.contact_cache import STEP, Solved, _disturbed, contact_frames, inner_steps, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
-from tests.recordings import balls, bouncing, slab_data, sliding
+from tests.helpers.recordings import balls, bouncing, slab_data, sliding
 
 ONCE = Solved(draws=1)
 

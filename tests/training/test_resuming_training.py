@@ -11,7 +11,7 @@ from sdfsim.learned.model import load_model
 from sdfsim.training import contact_cache
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.train import train
-from tests.recordings import bouncing
+from tests.helpers.recordings import bouncing
 
 TRAIN, HELD_OUT = Solved(draws=2), Solved(draws=1)  # as training asks for them
 

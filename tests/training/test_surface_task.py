@@ -16,8 +16,8 @@ from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.distributed import Team
 from sdfsim.training.presets import PRESETS
 from sdfsim.training.surface_task import SurfaceTask
-from tests.recordings import bouncing, slab_data, sliding
-from tests.scenes import random_model
+from tests.helpers.recordings import bouncing, slab_data, sliding
+from tests.helpers.scenes import random_model
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]

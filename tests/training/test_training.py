@@ -26,7 +26,7 @@ from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
-from tests.scenes import contact_graph, in_single
+from tests.helpers.scenes import contact_graph, in_single
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]
