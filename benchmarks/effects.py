@@ -20,8 +20,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.engines import ours
 from benchmarks.results import ROOT, script, write_section
-from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.scene.load import load_scene

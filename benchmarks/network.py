@@ -20,11 +20,11 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.engines import ours
 from benchmarks.results import script, told
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of, read_info
-from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
 from sdfsim.learned.contact_graph import ContactGraph

@@ -28,6 +28,9 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.engines import in_metres, ours
+from benchmarks.engines.drake import drake
+from benchmarks.engines.newton import newton
 from benchmarks.results import script, told, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
@@ -36,7 +39,7 @@ from sdfsim.base.files import read_arrays, write_arrays, write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, conditions_of
 from sdfsim.evaluation import engines
-from sdfsim.evaluation.engines import Engine, in_metres, ours, rollout_motion, start_of_scene
+from sdfsim.evaluation.engines import Engine, rollout_motion, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
@@ -57,8 +60,8 @@ ENGINES: dict[str, Engine | None] = {
     "PyBullet, pieces": engines.bullet,
     "MuJoCo, pieces": engines.mujoco,
     "MuJoCo, SDF": partial(engines.mujoco, pieces=False),
-    "Drake, hydroelastic": engines.drake,
-    "Newton, XPBD": engines.newton,
+    "Drake, hydroelastic": drake,
+    "Newton, XPBD": newton,
 }
 FAST = list(ENGINES)[:3]
 INNER = (2, 5, 10, 20)  # inner steps in one of 20 ms; the last is an engine's own truth

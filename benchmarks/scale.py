@@ -29,12 +29,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.engines import in_metres
 from benchmarks.results import script, told, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, conditions_of
-from sdfsim.evaluation.engines import Engine, bullet, in_metres, mujoco, rollout_motion, start_of_scene
+from sdfsim.evaluation.engines import Engine, bullet, mujoco, rollout_motion, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
