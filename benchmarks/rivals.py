@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.engines import in_metres, ours
 from benchmarks.engines.drake import drake
 from benchmarks.engines.newton import newton
-from benchmarks.results import script, told, write_section
+from benchmarks.results import in_turn, script, spread, told, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
 from sdfsim.base.errors import SdfsimError
@@ -332,13 +332,13 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
     rows: list[tuple[str, ...]] = [("case, ms per s at 4 ms", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
     for k, case in enumerate(SHAPES):
         scenes = scenes_of(case, data, out / "scenes")
-        taken = np.array([
-            [np.mean([moved(name, scene, STEPS, USUAL, out / "scenes")[1] for scene in scenes]) for name in FAST]
-            for _ in range(rounds + 1)
-        ])[1:]  # the first loads and compiles  # fmt: skip
+
+        def mean(name: str, scenes: list[Scene] = scenes) -> float:
+            return float(np.mean([moved(name, scene, STEPS, USUAL, out / "scenes")[1] for scene in scenes]))
+
+        taken = in_turn([partial(mean, name) for name in FAST], rounds)
         told((k + 1) / len(SHAPES), case)
-        figures = [*taken.T, *(taken[:, :1] / taken[:, 1:]).T]
-        rows.append((case, *(f"{number(np.median(f))} ({number(f.min())} to {number(f.max())})" for f in figures)))
+        rows.append((case, *map(spread, [*taken.T, *(taken[:, :1] / taken[:, 1:]).T])))
     write_section("rivals in turn", "python benchmarks/rivals.py turns DATA -o DIR", markdown(rows))
 
 

@@ -22,6 +22,7 @@ import sys
 import time
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.engines import in_metres
-from benchmarks.results import script, told, write_section
+from benchmarks.results import in_turn, script, spread, told, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
@@ -235,11 +236,8 @@ def scenery(*, repeats: int = 7) -> None:
         simulators = [Simulator(with_far(count), model) for count in FAR]
         for simulator in simulators:
             simulator.options = replace(simulator.options, sleep=False)
-            simulator.step(2)  # not timed: it loads what is compiled
-        times = np.array([[slid(simulator) for simulator in simulators] for _ in range(repeats)])
-        ratio = times[:, 1] / times[:, 0]
-        span = f"{np.median(ratio):.1f} ({ratio.min():.1f} to {ratio.max():.1f})"
-        rows.append((f"`{model}`", *map(number, np.median(times, axis=0)), span))
+        times = in_turn([partial(slid, simulator) for simulator in simulators], repeats)
+        rows.append((f"`{model}`", *map(number, np.median(times, axis=0)), spread(times[:, 1] / times[:, 0])))
     write_section("scenery", "python benchmarks/scale.py scenery", markdown(rows))
 
 
