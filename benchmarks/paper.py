@@ -1,4 +1,4 @@
-"""The paper's comparison of networks, all on one footing: docs/paper.md.
+"""SDF-Sim and its baselines, all on one footing: docs/paper.md.
 
     python benchmarks/paper.py graphs DATA -o DIR
         edges, nodes, memory and time of a step, on recorded steps
@@ -9,8 +9,8 @@
     python benchmarks/paper.py sdf DATA -o DIR
         rollouts of the solver on networks of distances of several widths
 
-DATA is a MOVi-B dataset with train, validation and test. Graphs have as many surface nodes as the paper's, about 440 a
-body, and networks the published size. Networks of the last command have `NODES` nodes a body and the sizes `TRAINED`,
+DATA is a MOVi-B dataset with train, validation and test. Graphs have as many surface nodes as published, about 440 a body,
+and networks the published size. Networks of the last command have `NODES` nodes a body and the sizes `TRAINED`,
 so that an hour of a core is enough to learn something. Trainings go on where they were left, results that DIR holds
 are kept. Each command writes a table in Markdown into DIR.
 """
@@ -58,7 +58,7 @@ NAMES = {
     "dpi": "DPI",
 }  # fmt: skip
 STEPS_SEEN, STEPS_TIMED = 200, 20  # recorded steps whose graphs are counted, and passed through the network
-PUBLISHED_NODES = 440  # a body: what the paper's counts of edges leave
+PUBLISHED_NODES = 440  # a body: what the published counts of edges leave
 BOWLS = (2, 8, 32, 128, 512)
 SETTLED = 200  # steps of the solver before the networks see the bowl
 MEMORY = 12  # GiB that a process may take
@@ -78,7 +78,7 @@ def untrained(name: str, nodes: int | None) -> Model:
 
 
 def recorded(name: str, data: Path) -> dict[str, float]:
-    """A step's graph at random recorded steps of test trajectories, with as many nodes as in the paper; one thread.
+    """A step's graph at random recorded steps of test trajectories, with as many nodes as published; one thread.
 
     Returns:
         Means of edges between bodies (each once), of all edges and of the nodes of the graph; medians of the

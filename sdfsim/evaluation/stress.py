@@ -20,7 +20,7 @@ from sdfsim.base.version import __version__
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
 from sdfsim.evaluation.engines import Engine, bullet, rollout_motion, shape_urdf, start_motion, start_of_scene
-from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
+from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Trial, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
 from sdfsim.learned.model import Model, load_model, model_names
 from sdfsim.learned.training_ranges import constant_in_training
@@ -172,26 +172,26 @@ def _tried(case: Case, model: Model | tuple[str, Engine], device: str, out: Path
     return {"figures": figures, "broke": broke, "recording": recording, **told}
 
 
-def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Run:
+def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Trial:
     """Our motion of a scene; one that ran away counts as broken."""
     broke = ""
     try:
         rollout = Simulator(scene, model, device).run(seconds=seconds)
     except SimulationError as error:
         rollout, broke = error.rollout, error.message
-    run = Run(scene, rollout_motion(scene, rollout), broke, rollout)
+    run = Trial(scene, rollout_motion(scene, rollout), broke, rollout)
     return run if broke else replace(run, broke=ran_away(run))
 
 
-def by_engine(name: str, engine: Engine, scene: Scene, folder: Path, seconds: float) -> Run:
+def by_engine(name: str, engine: Engine, scene: Scene, folder: Path, seconds: float) -> Trial:
     """An engine's motion of a scene (see `start_of_scene`), with its files in `folder`. It has no sleep."""
     try:
         motion, _ = engine(start_of_scene(scene, folder), max(1, round(seconds / DT)))
     except SdfsimError as error:
         if name == TEACHER:
             raise
-        return Run(scene, start_motion(scene), error.message)
-    run = Run(scene, motion)
+        return Trial(scene, start_motion(scene), error.message)
+    run = Trial(scene, motion)
     return replace(run, broke=ran_away(run))
 
 

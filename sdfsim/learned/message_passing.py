@@ -41,7 +41,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Edges:
+class EdgeSet:
     """E edges of one kind."""
 
     features: Tensor  # [E, F] float32
@@ -51,11 +51,11 @@ class Edges:
 
 
 @dataclass(frozen=True)
-class Graph:
+class MultiGraph:
     """A graph of some layout."""
 
     nodes: dict[str, Tensor]  # features [n, F] float32 of each set
-    edges: dict[str, Edges]  # of each kind
+    edges: dict[str, EdgeSet]  # of each kind
 
     def __len__(self) -> int:
         """How many nodes there are."""
@@ -66,12 +66,12 @@ class Graph:
         """How many edges there are, each direction counted."""
         return sum(len(edges.sender) for edges in self.edges.values())
 
-    def mirrored(self, layout: Layout) -> Graph:
+    def mirrored(self, layout: Layout) -> MultiGraph:
         """What the mirror image of the scene would give: y of every vector feature reversed."""
         nodes = {name: flipped(x, layout.nodes[name]) for name, x in self.nodes.items()}
         kinds = layout.edges
         edges = {k: replace(e, features=flipped(e.features, kinds[k].features)) for k, e in self.edges.items()}
-        return Graph(nodes, edges)
+        return MultiGraph(nodes, edges)
 
 
 def flipped(values: Tensor, told: Features) -> Tensor:
@@ -81,10 +81,10 @@ def flipped(values: Tensor, told: Features) -> Tensor:
     return values * sign
 
 
-def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> Edges:
+def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> EdgeSet:
     """Edges in both directions: features `forth` [E, F] from `first` to `second` [E, corners], `back` the other way."""
     features = torch.cat([forth, back]).float()
-    return Edges(features, torch.cat([first, second]), torch.cat([second, first]))
+    return EdgeSet(features, torch.cat([first, second]), torch.cat([second, first]))
 
 
 @dataclass(frozen=True)
@@ -158,14 +158,14 @@ class GraphNetwork(nn.Module):
         self.steps = nn.ModuleList([Step(layout, width) for _ in range(config.steps)])
         self.decode = mlp(width, width, 3, normalised=False)
 
-    def observe(self, graph: Graph) -> None:
+    def observe(self, graph: MultiGraph) -> None:
         """Count the features of a graph into the statistics."""
         for name, features in graph.nodes.items():
             cast("Normaliser", self.scale[name]).observe(features)
         for name, edges in graph.edges.items():
             cast("Normaliser", self.scale[name]).observe(edges.features)
 
-    def forward(self, graph: Graph) -> Tensor:
+    def forward(self, graph: MultiGraph) -> Tensor:
         """Standardised accelerations (change of displacement a step) of the set "node", [n, 3]."""
 
         def encoded(name: str, features: Tensor) -> Tensor:

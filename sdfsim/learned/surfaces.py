@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sdfsim.learned.matching import match_shapes
-from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, GraphNetwork
+from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, GraphNetwork, MultiGraph
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
 from sdfsim.physics.free_flight import fly
@@ -97,15 +97,15 @@ def motion_features(bodies: Bodies, state: State) -> dict[str, Tensor]:
     return {"body": body.float(), "node": node.float()}
 
 
-def star(bodies: Bodies, state: State) -> dict[str, Edges]:
+def star(bodies: Bodies, state: State) -> dict[str, EdgeSet]:
     """Edges between the surface nodes and their body's node, up and down: the node from the centre, now and at rest."""
     owner = node_owner(bodies)
     features = _now_and_at_rest(_arms(bodies, state), bodies.node)
     node, body = torch.arange(len(owner), device=owner.device)[:, None], owner[:, None]
-    return {"intra_up": Edges(features, node, body), "intra_down": Edges(features, body, node)}
+    return {"intra_up": EdgeSet(features, node, body), "intra_down": EdgeSet(features, body, node)}
 
 
-def mesh_edges(bodies: Bodies, state: State) -> Edges:
+def mesh_edges(bodies: Bodies, state: State) -> EdgeSet:
     """Edges along the sides of the mesh's faces, each once a direction: sender from receiver, now and at rest."""
     sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
     sides = sides[sides[:, 0] != sides[:, 1]]  # those of the plane's one node
@@ -115,7 +115,7 @@ def mesh_edges(bodies: Bodies, state: State) -> Edges:
     sender, receiver = key // count, key % count
     arm = _arms(bodies, state)
     features = _now_and_at_rest(arm[sender] - arm[receiver], bodies.node[sender] - bodies.node[receiver])
-    return Edges(features, sender[:, None], receiver[:, None])
+    return EdgeSet(features, sender[:, None], receiver[:, None])
 
 
 def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
     )
 
 
-def predict(network: GraphNetwork, graph: Graph, bodies: Bodies, state: State, dt: float) -> State:
+def predict(network: GraphNetwork, graph: MultiGraph, bodies: Bodies, state: State, dt: float) -> State:
     """One step of the published simulators."""
     return advance(bodies, state, network.target.undo(network(graph)).double(), dt)
 

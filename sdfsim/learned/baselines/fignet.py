@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sdfsim.learned.message_passing import EdgeKind, Features, Graph, Layout, both_ways
+from sdfsim.learned.message_passing import EdgeKind, Features, Layout, MultiGraph, both_ways
 from sdfsim.learned.near import Pairs
 from sdfsim.learned.surfaces import MESH, NODES, STAR, mesh_edges, motion_features, star
 from sdfsim.physics.bodies import Bodies, State
@@ -21,19 +21,19 @@ FIGNET_STAR = Layout(NODES, STAR | {"face": EdgeKind("node", "node", FACE, corne
 FIGNET = Layout(NODES, FIGNET_STAR.edges | {"mesh": MESH})
 
 
-def fignet_star_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
+def fignet_star_graph(bodies: Bodies, state: State, pairs: Pairs) -> MultiGraph:
     """Of FIGNet*."""
     p = pairs
     forth = _features(p.way, p.from_first, p.from_second, p.normal_first, p.normal_second)
     back = _features(-p.way, p.from_second, p.from_first, p.normal_second, p.normal_first)
     face = {"face": both_ways(forth, back, p.first, p.second)}
-    return Graph(motion_features(bodies, state), star(bodies, state) | face)
+    return MultiGraph(motion_features(bodies, state), star(bodies, state) | face)
 
 
-def fignet_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
+def fignet_graph(bodies: Bodies, state: State, pairs: Pairs) -> MultiGraph:
     """Of FIGNet."""
     made = fignet_star_graph(bodies, state, pairs)
-    return Graph(made.nodes, made.edges | {"mesh": mesh_edges(bodies, state)})
+    return MultiGraph(made.nodes, made.edges | {"mesh": mesh_edges(bodies, state)})
 
 
 def _features(way: Tensor, sending: Tensor, receiving: Tensor, normal: Tensor, other: Tensor) -> Tensor:
