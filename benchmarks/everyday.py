@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.engines import motion_rollout
 from benchmarks.engines.drake import drake
-from benchmarks.results import script, told, write_section
+from benchmarks.results import progress, script, write_section
 from benchmarks.rivals import USUAL, in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import DT
@@ -62,7 +62,7 @@ class NotRun(SdfsimError):
 
 
 def runner(name: str, folder: Path) -> Runner:
-    """Who runs scenes with an engine, its files in `folder`. It raises NotRun, and tells of motions that broke."""
+    """Runs scenes with an engine, whose files are in `folder`; raises NotRun where it cannot. See `Runner`."""
 
     def timely(scene: Scene, seconds: float) -> tuple[Rollout, str]:
         began = time.process_time()
@@ -246,7 +246,7 @@ def compared(rows: list[str], at: Setting, out: Path) -> Results:
         if is_installed(name)
         for row in rows
     ]
-    return measure(jobs, out / "results", on_progress=told)
+    return measure(jobs, out / "results", on_progress=progress)
 
 
 def scenes(*, out: Path, full: bool = False) -> None:

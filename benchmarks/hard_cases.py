@@ -17,7 +17,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.engines.drake import drake
-from benchmarks.results import ROOT, script, told, write_section
+from benchmarks.results import ROOT, progress, script, write_section
 from sdfsim.base.files import read_json, write_json
 from sdfsim.evaluation.engines import mujoco
 from sdfsim.evaluation.hard_cases import GROUPS
@@ -69,11 +69,11 @@ def slipped_back(study: Study, file: Path) -> list[str]:
 
 
 def main(*, out: Path, quick: bool = False) -> None:
-    study = stress(out / "quick", quick=True, engines=ENGINES, on_progress=told)
+    study = stress(out / "quick", quick=True, engines=ENGINES, on_progress=progress)
     write_report(study, out / "quick")
     write_json(RATCHET, accepted(study))
     if not quick:
-        study = stress(out, engines=ENGINES, on_progress=told)
+        study = stress(out, engines=ENGINES, on_progress=progress)
         write_report(study, out)
     command = f"python benchmarks/hard_cases.py -o DIR{' --quick' if quick else ''}"
     pictures = "\n".join(f"![{GROUPS[group].title}](images/{name})" for group, name in PICTURES.items())

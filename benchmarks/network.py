@@ -21,7 +21,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.engines import ours
-from benchmarks.results import script, told
+from benchmarks.results import progress, script
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of, read_info
@@ -37,7 +37,7 @@ from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
 from sdfsim.training.train import train
 
-HORIZON = "50"  # steps up to which errors are told
+HORIZON = "50"  # steps over which errors are taken
 SPLITS = ("validation", "test")
 TIMED, STEPS_TIMED = 5, 100  # scenes, and steps of each
 
@@ -114,7 +114,7 @@ def trained(folders: list[Path], out: Path, preset: str, seed: int, steps: int |
     place = out / "runs" / f"{preset}-{seed}"
     if not (place / "model.safetensors").exists():
         resume = (place / "checkpoint.npz").exists()
-        train(folders, place, preset=preset, seed=seed, steps=steps, resume=resume, on_progress=told)
+        train(folders, place, preset=preset, seed=seed, steps=steps, resume=resume, on_progress=progress)
     return str(place / "model.safetensors")
 
 
@@ -141,7 +141,7 @@ def main(data: list[Path], *, out: Path, seeds: int = 3, steps: int | None = Non
                 jobs.append(Job(split, f"{name}, seed {seed}", [content, split], judged, arguments))
             if seed == 0:
                 jobs.append(Job("time", name, content, timed, (model, method, first)))
-    results = measure(jobs, out / "results", on_progress=told)
+    results = measure(jobs, out / "results", on_progress=progress)
 
     def errors(name: str, who: str) -> list[list[dict[str, Any]]]:
         """By split and seed, the errors of the model or of the teacher again."""

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told, write_section
+from benchmarks.results import progress, script, write_section
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_json
 from sdfsim.data.pybullet_sim import import_pybullet
@@ -127,7 +127,7 @@ def fitted_start(toss: Toss, gravity: float = GRAVITY) -> FittedStart:
 
 def fall(tosses: Sequence[Toss]) -> tuple[float, float]:
     """The acceleration with which recorded cubes fall, m/s^2, and its standard error: a parabola without a given one.
-    That of gravity, where lengths and times are as told."""
+    It is that of gravity where the given lengths and times are right."""
     known, weight = [], []
     for toss in tosses:
         time = toss.dt * np.arange(flight(toss))
@@ -305,13 +305,13 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     result: dict[str, Any] = {}
     rows: list[tuple[str, ...]] = [("engine", "position, % of the side", "rotation, degrees", "on those 60", "found")]
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items()):
-        told(k / len(ENGINES), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
+        progress(k / len(ENGINES), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
         values = identified(lambda values, engine=engine: cost(engine(fit, dt, gravity, values), fit_truth), bounds)
         own = errors(engine(fit, dt, gravity, values), fit_truth)
         judged = errors(engine(test, dt, gravity, values), test_truth)
         result[name] = {"values": values, "fit": own, "test": judged}
         found = ", ".join(f"{of} {number(value)}" for of, value in values.items())
-        rows.append((name, *map(_told, judged), " / ".join(number(error.mean()) for error in own), found))
+        rows.append((name, *map(_cell, judged), " / ".join(number(error.mean()) for error in own), found))
     falls, sure = fall(known)
     every = [*fit, *test]
     off = 1e3 * np.median([start.off for start in every])
@@ -325,7 +325,7 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     write_section("reality", "python benchmarks/reality.py TOSSES -o DIR", text)
 
 
-def _told(error: np.ndarray) -> str:
+def _cell(error: np.ndarray) -> str:
     low, high = map(number, interval(error))
     return f"{number(float(error.mean()))} [{low}, {high}]"
 

@@ -49,7 +49,7 @@ def script(doc: str | None, *functions: Callable[..., None]) -> None:
     run_main(lambda: chosen.pop("function")(**chosen))
 
 
-def told(fraction: float, message: str) -> None:
+def progress(fraction: float, message: str) -> None:
     """Progress, a line each."""
     print(f"{fraction:6.1%}  {message}", flush=True)
 

@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.engines import in_metres, ours
 from benchmarks.engines.drake import drake
 from benchmarks.engines.newton import newton
-from benchmarks.results import in_turn, script, spread, told, write_section
+from benchmarks.results import in_turn, progress, script, spread, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
 from sdfsim.base.errors import SdfsimError
@@ -298,7 +298,7 @@ def compared(cases: list[str], data: Path | None, out: Path) -> Results:
         for case in cases
         for name in ENGINES
     ]
-    return measure(jobs, out / "results", where="fresh", on_progress=told)
+    return measure(jobs, out / "results", where="fresh", on_progress=progress)
 
 
 def why_not(result: dict[str, Any]) -> str:
@@ -337,7 +337,7 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
             return float(np.mean([moved(name, scene, STEPS, USUAL, out / "scenes")[1] for scene in scenes]))
 
         taken = in_turn([partial(mean, name) for name in FAST], rounds)
-        told((k + 1) / len(SHAPES), case)
+        progress((k + 1) / len(SHAPES), case)
         rows.append((case, *map(spread, [*taken.T, *(taken[:, :1] / taken[:, 1:]).T])))
     write_section("rivals in turn", "python benchmarks/rivals.py turns DATA -o DIR", markdown(rows))
 

@@ -31,7 +31,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.engines import in_metres
-from benchmarks.results import in_turn, script, spread, told, write_section
+from benchmarks.results import in_turn, progress, script, spread, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
@@ -150,7 +150,7 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
 
 def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None:
     """Write the section and scale.png."""
-    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=told)
+    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=progress)
     bowls = {key: found for key, found in results.items() if "bowl" in key[0]}
     panels = []
     for name in ("ms", "peak_mib"):
@@ -193,7 +193,7 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
 def large(*, out: Path) -> None:
     """Write the section and a movie each."""
     jobs = [Job("to the end", name, [name], to_the_end, (name, out)) for name in HEAPS]
-    results = measure(jobs, out / "large", where="fresh", on_progress=told)
+    results = measure(jobs, out / "large", where="fresh", on_progress=progress)
     titles = {"bodies": "bodies", "nodes": "nodes", "steps": "steps", "s": "s from command to recording", "mib": "MiB",
               "worst": "deepest, mm", "lost": "below the floor"}  # fmt: skip
     rows = [("", *titles.values())]

@@ -22,7 +22,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import in_turn, script, told
+from benchmarks.results import in_turn, progress, script
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
 from sdfsim.data.public_shapes import public_folder
@@ -43,7 +43,7 @@ ERRORS = tuple(EXACT)
 
 
 def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | None = None) -> dict:
-    """Fit a mesh, keep the shape, and tell the errors of its certificate, and the seconds that it took."""
+    """Fit a mesh and keep the shape; the errors of its certificate, and the seconds that it took."""
     plan = replace(RECIPES[recipe], width=width or RECIPES[recipe].width)
     began = time.monotonic()
     with patch.dict(RECIPES, {recipe: plan}):
@@ -109,10 +109,10 @@ def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
         for method, plan in methods.items():
             content = [FIT_VERSION, load_mesh(file), plan, RECIPES[plan[0]], machine()]
             jobs.append(Job(name, method, content, fit, (file, out / "shapes" / method / name, *plan)))
-    fits = measure(jobs, out / "results", on_progress=told)
+    fits = measure(jobs, out / "results", on_progress=progress)
     fitted = [out / "shapes" / method / first for method in ("ours", "paper's recipe")]
     asked = Job(first, "queries", [jobs[0].content], queries, (files[first], *fitted))
-    timed = measure([asked], out / "results", on_progress=told)[first, "queries"]
+    timed = measure([asked], out / "results", on_progress=progress)[first, "queries"]
     panels = []
     for key in ("error_within_0.01", "error_in_box"):
         ours = [*(f"ours, {b:g} s" for b in BUDGETS), "ours"]

@@ -320,7 +320,7 @@ def tradeoff(
 
     check_matplotlib()
     report = study.tradeoff(source, out, models=model or [], quick=quick, on_progress=session.stage_progress)
-    rows, notes = study.told(report)
+    rows, notes = study.report_table(report)
     session.report(report, [*columns(rows), *notes])
 
 

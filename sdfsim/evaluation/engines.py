@@ -148,7 +148,7 @@ def solid_bodies(scene: Scene) -> np.ndarray:
 
 
 def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Trajectory, Timing]:
-    """PyBullet's motion of `steps` recorded steps, in the teacher's own inner steps unless told.
+    """PyBullet's motion of `steps` recorded steps, by default in the teacher's own inner steps.
 
     Raises:
         SdfsimError: PyBullet is not installed, a step that the teacher does not make, or another inertia than recorded.
@@ -319,10 +319,10 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
         sizes = {"size": [2.0 * half for half in sdf.half]} if isinstance(sdf, BoxSdf) else {"radius": [sdf.radius]}
         if isinstance(sdf, CylinderSdf | CapsuleSdf):
             sizes["length"] = [2.0 * sdf.half]
-        told = {name: " ".join(f"{value:.9g}" for value in values) for name, values in sizes.items()}
-        urdf = folder / f"{sdf.KIND}-{'-'.join(told.values()).replace(' ', '-')}.urdf"
+        written = {name: " ".join(f"{value:.9g}" for value in values) for name, values in sizes.items()}
+        urdf = folder / f"{sdf.KIND}-{'-'.join(written.values()).replace(' ', '-')}.urdf"
         folder.mkdir(parents=True, exist_ok=True)
-        attributes = " ".join(f'{name}="{value}"' for name, value in told.items())
+        attributes = " ".join(f'{name}="{value}"' for name, value in written.items())
         return urdf if urdf.exists() else write_urdf(f"<{sdf.KIND} {attributes}/>", urdf)
     urdf = folder / f"pieces-{shape.mesh.digest()[:16]}.urdf"
     if not urdf.exists():

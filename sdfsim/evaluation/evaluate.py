@@ -40,7 +40,7 @@ from sdfsim.training.contact_cache import inner_steps
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
-# m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
+# m/s; 0 shows what a recording alone cannot restore: an engine keeps more state than its recorded frames.
 PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}
 
 Rows = list[tuple[str, ...]]
@@ -77,10 +77,10 @@ def evaluate(
         "outside_training": what of the scenes the model has not seen, one line each.
         "median_survival_s": of all of them, by limit in m: until half of the bodies are farther from the recording.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
-        "engine_substep": s, the recording engine's inner step; 0 where no dataset.json tells it.
-        "floor": its "friction" and "restitution", and whether a dataset.json "told" them.
+        "engine_substep": s, the recording engine's inner step; 0 where no dataset.json has it.
+        "floor": its "friction" and "restitution"; "told" is whether a dataset.json has them.
         "as_teacher": whether the solve has the teacher's habits: only for recordings of PyBullet as the teacher is set,
-            which a dataset.json tells. All others are judged with the solve as `Simulator` runs it, on their floor.
+            according to a dataset.json. All others are judged with the solve as `Simulator` runs it, on their floor.
         "inner_steps": of the solve in a step.
         Further counts, and "ms_per_step_per_trajectory".
 
@@ -134,7 +134,7 @@ def evaluate(
         "floor": {
             "friction": conditions.friction,
             "restitution": conditions.restitution,
-            "told": conditions.floor_told,
+            "told": conditions.floor_given,
         },
         "as_teacher": conditions.by_teacher,
         "inner_steps": used.inner or inner,
@@ -270,12 +270,14 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 
     def quality(who: str) -> list[str]:
         depth, gain = report["penetration"][who], report["energy_gain"][who]
-        told = {
+        shown = {
             "{:.4f} m": [depth["percentile_95"], depth["worst"]],
             "{:.2f} %": [value and 100 * value for value in (gain["mean"], gain["worst"])],
             "{:.4f} m/s": [report["resting_speed"][who]],
         }
-        return [NOTHING if value is None else form.format(value) for form, values in told.items() for value in values]
+        return [
+            NOTHING if value is None else form.format(value) for form, values in figures.items() for value in values
+        ]
 
     others = {f"teacher, {size} m/s off": f"teacher {size}" for size in _perturbed(report)} | {"ballistic": "ballistic"}
     return [
@@ -289,12 +291,12 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 def notes(report: dict[str, Any]) -> list[str]:
     """What has to be known beside the tables, a line each."""
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
-    ground, told = report["floor"], "as dataset.json tells" if report["floor"]["told"] else "that of our recipes"
+    ground, source = report["floor"], "from dataset.json" if report["floor"]["told"] else "that of our recipes"
     how = f"The solve has the teacher's habits: bodies larger by {MARGIN:g} m, pushes that add to rebounds."
     if not report["as_teacher"]:
         how = f"The solve is as users run it, in {report['inner_steps']} inner steps: no dataset.json has the teacher."
     lines = [
-        f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {told}.",
+        f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {source}.",
         how,
         f"Penetration: the deepest node in every {depth['every']}th frame with contact.",
         "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
@@ -307,7 +309,9 @@ def notes(report: dict[str, Any]) -> list[str]:
     if steps < report["steps_asked"]:
         lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
     if not report["engine_substep"]:
-        lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
+        lines.append(
+            "No dataset.json has the engine's inner step: velocities count as those at the positions' instants."
+        )
     if floor:
         farthest = f"{floor['median_farthest_unperturbed_m']:.1g} m (median of the trajectories)"
         lines.append(f"Run again unperturbed, the teacher departs from its recording by up to {farthest}.")

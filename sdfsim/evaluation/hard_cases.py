@@ -86,7 +86,7 @@ class Figure:
     digits: int = 2  # shown after the point; differences that are not shown do not count
     limit: float | None = None  # what is wanted is at most this; None where only the teacher says how good one can be
     largest: bool = False  # of several repetitions the largest counts, not the mean
-    judged: bool = True  # lower is better; the others tell, such as the height of a rebound
+    judged: bool = True  # lower is better; other figures inform, such as the height of a rebound
     longer: bool = False  # higher is better instead
 
 
@@ -452,10 +452,10 @@ def rebound(trials: Sequence[Trial], *, restitution: float) -> dict[str, float]:
 
 
 def slipped(trials: Sequence[Trial], *, friction: float, offsets: Sequence[float]) -> dict[str, float]:
-    """Where a body on a slope begins to slide, in degrees from atan(friction); trials start at rest, by rising `offsets`.
+    """Where a body on a slope begins to slide, in degrees from atan(friction); trials from rest, by rising offsets.
 
-    The first of the angles tried at which it travels more than half of what it would slide two degrees beyond the
-    critical one tells: from its distance we go back as far as Coulomb's law says that each degree adds.
+    The first angle counts at which it travels more than half of what it would slide two degrees beyond the critical
+    one. From that distance we go back by as much as each degree adds, by Coulomb's law.
     """
     critical = float(np.degrees(np.arctan(friction)))
     travelled = np.array([np.linalg.norm(trial.path[-1, 0] - trial.path[0, 0]) for trial in trials])

@@ -168,8 +168,8 @@ def _tried(case: Case, model: Model | tuple[str, Engine], device: str, out: Path
             (out / recording).parent.mkdir(parents=True, exist_ok=True)
             watched = shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum()))
             save_rollout(shown.scene, watched, out / recording)
-    told = {"outside": list(dict.fromkeys(outside)), "laws": laws}
-    return {"figures": figures, "broke": broke, "recording": recording, **told}
+    lines = {"outside": list(dict.fromkeys(outside)), "laws": laws}
+    return {"figures": figures, "broke": broke, "recording": recording, **lines}
 
 
 def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Trial:
@@ -211,10 +211,10 @@ def noise(result: dict[str, Any], figure: Figure) -> float:
 
 
 def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
-    """A figure with its spread, and its state: "missed" what is wanted, "behind" the teacher, "fine", or "told"."""
+    """A figure with its spread, and its state: "missed" what is wanted, "behind" the teacher, "fine", or "shown"."""
     result, teacher = study.results.get((case.name, who)), study.results.get((case.name, TEACHER))
     if result is None:
-        return "-", "told"
+        return "-", "shown"
     now, spread = value(result, figure), noise(result, figure)
     shown = f"{round(now, figure.digits) + 0.0:.{figure.digits}f}"  # no minus before a zero
     if float(f"{spread:.{figure.digits}f}") > 0:
@@ -225,7 +225,7 @@ def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
     elif result["outside"]:
         shown += f" {OUTSIDE}"
     if not figure.judged:
-        return shown, "told"
+        return shown, "shown"
     if result["broke"] or (figure.limit is not None and now > figure.limit):
         return shown, "missed"
     if figure.limit is None and teacher and who != TEACHER and not teacher["broke"]:
@@ -254,7 +254,7 @@ def losses(study: Study) -> dict[str, dict[str, int]]:
         mine = [case for case in study.cases if (case.name, who) in study.results]
         states = [cell(study, case, figure, who)[1] for case in mine for figure in case.figures]
         found[who] = {
-            "figures": sum(state != "told" for state in states),
+            "figures": sum(state != "shown" for state in states),
             "missed": states.count("missed"),
             "behind the teacher": states.count("behind"),
             "cases that blew up": sum(bool(study.results[case.name, who]["broke"]) for case in mine),
@@ -299,7 +299,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
     """
     drawn = [name for name in GROUPS if draw_group(study, name, out / "plots" / f"{name}.png")]
     plots = "\n".join(f"![{GROUPS[name].title}](plots/{name}.png)" for name in drawn)
-    told = [
+    outside = [
         f"- {who}, {case}: {line}"
         for (case, who), result in study.results.items()
         for line in [*result["broke"], *result["outside"]]
@@ -311,7 +311,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         table(study),
         plots,
         "## Blew up, or outside of training",
-        "\n".join(told),
+        "\n".join(outside),
         "## Laws broken, by instruments that do not know the contacts",
         "\n".join(f"- {who}, {case}: {lines[0]} ({len(lines)} in all)" for case, who, lines in broken),
     ]

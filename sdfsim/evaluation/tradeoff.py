@@ -141,7 +141,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
         raise SdfsimError(f"{scene.path}: {next(problem for problem, there in problems.items() if there)}")
     shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}
     t = start.motion
-    # The engine's flights are those of bodies that are half an inner step of gravity faster than it is told.
+    # The engine flies bodies as if they were faster than given by half an inner step of gravity.
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
@@ -434,8 +434,8 @@ def table(points: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def told(report: dict[str, Any]) -> tuple[Rows, list[str]]:
-    """The report for people: a row a point, by time, and where to look."""
+def report_table(report: dict[str, Any]) -> tuple[Rows, list[str]]:
+    """The report for people: a row for each point, by time, and where the files are."""
     steps, best = str(report["horizon_steps"]), set(report["front"])
     rows: Rows = [("", "ms / s", "p95", "m", "degrees", "penetration m", "MiB")]
     for p in sorted(report["points"], key=lambda p: p.get("ms", float("inf"))):

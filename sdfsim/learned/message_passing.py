@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Features:
-    """How many numbers something is told by, and the columns at which vectors begin (their y turns in a mirror)."""
+    """The number of features, and the columns at which vectors begin (a mirror reverses their y)."""
 
     size: int
     vectors: tuple[int, ...] = ()
@@ -74,10 +74,10 @@ class MultiGraph:
         return MultiGraph(nodes, edges)
 
 
-def flipped(values: Tensor, told: Features) -> Tensor:
+def flipped(values: Tensor, kind: Features) -> Tensor:
     """`values` [n, F] with y of their vectors reversed."""
     sign = torch.ones(values.shape[-1], dtype=values.dtype, device=values.device)
-    sign[[column + 1 for column in told.vectors]] = -1.0
+    sign[[column + 1 for column in kind.vectors]] = -1.0
     return values * sign
 
 
@@ -149,7 +149,7 @@ class GraphNetwork(nn.Module):
         super().__init__()
         self.layout, self.config = layout, config
         width, kinds = config.width, layout.edges
-        sizes = {name: told.size for name, told in layout.nodes.items()}
+        sizes = {name: features.size for name, features in layout.nodes.items()}
         sizes |= {name: kind.features.size for name, kind in kinds.items()}
         outputs = {name: width * (kinds[name].corners if name in kinds else 1) for name in sizes}
         self.scale = nn.ModuleDict({name: Normaliser(size) for name, size in sizes.items()})

@@ -60,7 +60,7 @@ class Solved:
 class ContactFrames:
     """F frames with contact out of many trajectories, flattened.
 
-    Units are metres, seconds and kilograms where the step is `STEP`. Frames of other steps are told in units in which
+    Units are metres, seconds and kilograms where the step is `STEP`. Frames of other steps are in units in which
     it is that long and gravity is what it is (Froude scaling): to a network, which knows no other step, their bodies
     are larger or smaller.
 
@@ -183,7 +183,7 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
 
 
 def inner_steps(dt: float, substep: float) -> int:
-    """Inner steps of `substep` s in a recorded step of `dt` s; what is not told (0) counts as in our own recordings.
+    """Inner steps of `substep` s in a recorded step of `dt` s; 0 (unknown) counts as in our own recordings.
     Raises SdfsimError for more than 5."""
     count = round(dt / substep) if substep > 0 else SUBSTEPS
     if not 1 <= count <= SUBSTEPS:
@@ -194,8 +194,8 @@ def inner_steps(dt: float, substep: float) -> int:
 def _fingerprint(files: list[Path], how: Solved) -> str:
     """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are solved."""
     digest = hashlib.sha256(f"{FRAMES_VERSION} {how} {[(f.name, f.stat().st_size) for f in files]}".encode())
-    told = [home / INFO] if (home := home_of(files[0].parent)) else []
-    for record in (*told, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))):
+    info = [home / INFO] if (home := home_of(files[0].parent)) else []
+    for record in (*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))):
         digest.update(record.read_bytes())
     return digest.hexdigest()[:12]
 

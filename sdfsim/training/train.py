@@ -83,7 +83,7 @@ def train(
 
 
 def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]:
-    """What a model's card tells of a dataset; how many trajectories there were, where they are not here."""
+    """What a model's card says of a dataset. The numbers of trajectories count where these are not here."""
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
     known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}

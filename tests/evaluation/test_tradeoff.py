@@ -84,7 +84,7 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     assert len(rows) == 6 and float(rows[0]["translation_rmse_50"]) == pytest.approx(error["solver"], rel=1e-4)
     assert (tmp_path / "tradeoff.png").stat().st_size > 500
     assert json.loads((tmp_path / "report.json").read_text())["front"] == report["front"]
-    table, notes = study.told(report)
+    table, notes = study.report_table(report)
     assert len(table) == 7 and any("front of ours" in note for note in notes)
     monkeypatch.setattr(study, "measure_ours", lambda *_: pytest.fail("measured again"))
     assert run()["points"] == report["points"]
