@@ -275,9 +275,7 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
             "{:.2f} %": [value and 100 * value for value in (gain["mean"], gain["worst"])],
             "{:.4f} m/s": [report["resting_speed"][who]],
         }
-        return [
-            NOTHING if value is None else form.format(value) for form, values in figures.items() for value in values
-        ]
+        return [NOTHING if value is None else form.format(value) for form, values in shown.items() for value in values]
 
     others = {f"teacher, {size} m/s off": f"teacher {size}" for size in _perturbed(report)} | {"ballistic": "ballistic"}
     return [
