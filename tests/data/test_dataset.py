@@ -68,7 +68,7 @@ def test_the_floor_is_what_the_dataset_says_else_the_recipes():
     wrong += [{"friction": 0.2, "restitution": value} for value in (1.5, -0.1, float("nan"), "0.3", None, True)]
     wrong += [{"friction": float("inf"), "restitution": 0.1}]
     for told in wrong:
-        with pytest.raises(SdfsimError, match=r"^data.dataset\.json: floor: must have friction and restitution"):
+        with pytest.raises(SdfsimError, match=r"^data.dataset\.json: floor: "):
             floor_of({"floor": told}, Path("data"))
 
 
@@ -90,7 +90,7 @@ def test_datasets_of_another_version_of_the_teacher_are_refused_and_those_of_oth
     ours = {"recipe": "movi-b", "engine": "pybullet", "engine_settings": {"timeStep": 0.004}}
     for version in ({}, {"teacher": 9}):
         write_json(tmp_path / "dataset.json", ours | version)
-        with pytest.raises(SdfsimError, match="of the teacher, not by 2"):
+        with pytest.raises(SdfsimError, match=r"\bteacher\b.*\b2$"):
             read_info(tmp_path)
     for others in ({"recipe": "balls"}, {**ours, "engine": "mujoco"}, ours | {"teacher": TEACHER_VERSION}):
         write_json(tmp_path / "dataset.json", others)
@@ -135,5 +135,5 @@ def test_a_loaded_trajectory_has_the_velocities_at_instants_unless_asked_as_reco
     np.testing.assert_array_equal(Trajectory.load(file, as_recorded=True).velocity, symplectic().velocity)
     for settings in ("x", {"timeStep": -1}, {"timeStep": 1e9}):
         write_json(tmp_path / "dataset.json", {"engine_settings": settings})
-        with pytest.raises(SdfsimError, match=r"engine_settings.timeStep: must be 0 \(unknown\) to 1 s"):
+        with pytest.raises(SdfsimError, match=r"engine_settings\.timeStep: .*\b1 s"):
             Trajectory.load(file)

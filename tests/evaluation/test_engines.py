@@ -80,7 +80,7 @@ def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_tells_i
     bullet(replace(start, own_inertia=False), 2)
     doubled = replace(start.motion, inertia=2 * start.motion.inertia)
     bullet(replace(start, motion=doubled), 2)
-    with pytest.raises(SdfsimError, match="inertia is not the recorded one"):
+    with pytest.raises(SdfsimError, match="inertia"):
         bullet(replace(start, motion=doubled, own_inertia=False), 2)
 
 

@@ -183,9 +183,7 @@ def test_the_report_says_which_floor_and_which_habits(tmp_path):
         (tmp_path / name).mkdir()
         lines = report_lines(evaluate(slab_data(tmp_path / name, "test", sliding(0.2), info)))
         teacher = name == "teacher"
-        floor = (
-            "0.3, restitution 0.5, that of our recipes" if teacher else "0.2, restitution 0.1, from dataset.json"
-        )
+        floor = "0.3, restitution 0.5, that of our recipes" if teacher else "0.2, restitution 0.1, from dataset.json"
         assert f"Floor: friction {floor}." in lines
         assert any(line.startswith("The solve has the teacher's habits") for line in lines) is teacher
         assert any(line.startswith("The solve is as users run it") for line in lines) is not teacher

@@ -86,7 +86,7 @@ def test_the_acceleration_of_falling_is_found():
 
 
 def test_a_toss_that_begins_on_the_table_has_no_start():
-    with pytest.raises(SdfsimError, match="0 frames before its first impact"):
+    with pytest.raises(SdfsimError, match=r"\b0 frames"):
         fitted_start(thrown(np.zeros(3), np.zeros(3), height=0.05))
 
 
@@ -150,7 +150,7 @@ def test_no_recordings_are_told(tmp_path):
     with pytest.raises(SdfsimError, match=r"cube\.npz: cannot be read"):
         load_tosses(tmp_path)
     np.savez(tmp_path / "cube.npz", start=[0, 3], dt=DT, position=np.zeros((3, 3)))
-    with pytest.raises(SdfsimError, match=r"cube\.npz: there is no array 'quat_xyzw'"):
+    with pytest.raises(SdfsimError, match=r"cube\.npz: .*'quat_xyzw'"):
         load_tosses(tmp_path)
 
 

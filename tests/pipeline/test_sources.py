@@ -399,7 +399,7 @@ def test_what_is_wrong_in_a_text_model_is_named(tmp_path, line, camera, words):
 def test_a_camera_model_that_is_not_read_is_named(tmp_path, number, name):
     write_binary_model(tmp_path / "m")
     (tmp_path / "m" / "cameras.bin").write_bytes(struct.pack("<QIiQQ3d", 1, 7, number, 120, 90, *SIMPLE))
-    with pytest.raises(SdfsimError, match=f"the camera model {name} is not supported") as caught:
+    with pytest.raises(SdfsimError, match=rf"\b{name}\b") as caught:
         read_cameras(tmp_path / "m")
     assert "SIMPLE_RADIAL" in caught.value.hint
 

@@ -114,7 +114,7 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
             lambda data: SurfaceTask(data, "train", SDF_SIM, CPU),
             lambda data: contact_frames(data, "train", Solved()),
         ):
-            with pytest.raises(SdfsimError, match=r"train: its trajectories differ in step or gravity"):
+            with pytest.raises(SdfsimError, match=r"train: .*\bstep\b.*\bgravity\b"):
                 read(tmp_path / "data")
 
 
