@@ -24,7 +24,7 @@ if __name__ == "__main__":
 
 import numpy as np
 
-from benchmarks.results import script, write_section
+from benchmarks.results import in_turn, script, write_section
 from benchmarks.scale import FAR, apart, with_far, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.base.errors import SdfsimError
@@ -110,7 +110,7 @@ def main(data: Path | None = None, *, check: bool = False, repeats: int = 5) -> 
     rows, ratios = [("a step", "of", "ms", "of", "ms", "second / first")], {}
     with tempfile.TemporaryDirectory() as scratch:
         for name, (one, other, call) in pairs(data, Path(scratch)).items():
-            times = np.array([call() for _ in range(repeats)])
+            times = in_turn([call], repeats)[:, 0]
             first, second = np.median(times, axis=0)
             ratios[name] = round(float(np.median(times[:, 1] / times[:, 0])), 3)
             rows.append((name, one, number(first), other, number(second), f"{ratios[name]:.2f}"))

@@ -20,8 +20,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.engines import ours
 from benchmarks.results import ROOT, script, write_section
-from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.scene.load import load_scene
@@ -54,8 +54,8 @@ def main() -> None:
             for effect in (field.name for field in fields(scene.effects)):
                 ms, end = cost(replace(scene, effects=replace(scene.effects, **{effect: "off"})))
                 away = float(np.linalg.norm(end - there, axis=1).max()) / size
-                told = "the same" if away < 0.01 else f"up to {number(away, 2)} sizes away"
-                rows.append((name, effect, number(ms), number(ms / usual, 2), told))
+                shift = "the same" if away < 0.01 else f"up to {number(away, 2)} sizes away"
+                rows.append((name, effect, number(ms), number(ms / usual, 2), shift))
     write_section("effects", "python benchmarks/effects.py", markdown(rows))
 
 

@@ -26,12 +26,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told, write_section
+from benchmarks.engines import motion_rollout
+from benchmarks.engines.drake import drake
+from benchmarks.results import progress, script, write_section
 from benchmarks.rivals import USUAL, in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import DT
 from sdfsim.evaluation import engines, everyday
-from sdfsim.evaluation.engines import LONGEST, Engine, NotInstalled, TooSlow, motion_rollout, start_of_scene
+from sdfsim.evaluation.engines import LONGEST, Engine, NotInstalled, TooSlow, start_of_scene
 from sdfsim.evaluation.everyday import ROWS, Check, Runner, Setting, checks, solved
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
 from sdfsim.learned.model import SOLVER
@@ -48,7 +50,7 @@ ENGINES: dict[str, tuple[str, Engine | None]] = {  # their package, and how they
     OURS: ("sdfsim", None),
     "PyBullet": ("pybullet", engines.bullet),
     "MuJoCo": ("mujoco", partial(engines.mujoco, elliptic=True)),
-    DRAKE: ("pydrake", engines.drake),
+    DRAKE: ("pydrake", drake),
 }
 
 
@@ -60,7 +62,7 @@ class NotRun(SdfsimError):
 
 
 def runner(name: str, folder: Path) -> Runner:
-    """Who runs scenes with an engine, its files in `folder`. It raises NotRun, and tells of motions that broke."""
+    """Runs scenes with an engine, whose files are in `folder`; raises NotRun where it cannot. See `Runner`."""
 
     def timely(scene: Scene, seconds: float) -> tuple[Rollout, str]:
         began = time.process_time()
@@ -236,14 +238,15 @@ def table(results: Results) -> str:
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
     """Every installed engine's results of rows."""
     content = [at.full, str(at), USUAL, LONGEST, inspect.getsource(everyday)]
-    how = {name: inspect.getsource(engines) if name != OURS else "" for name in ENGINES}
+    sources = inspect.getsource(engines) + inspect.getsource(sys.modules[drake.__module__])
+    how = {name: sources if name != OURS else "" for name in ENGINES}
     jobs = [
         Job(row, name, [content, how[name]], counted, (row, at, name, out / "scenes"))
         for name in ENGINES
         if is_installed(name)
         for row in rows
     ]
-    return measure(jobs, out / "results", on_progress=told)
+    return measure(jobs, out / "results", on_progress=progress)
 
 
 def scenes(*, out: Path, full: bool = False) -> None:

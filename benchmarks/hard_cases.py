@@ -16,12 +16,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import ROOT, script, told, write_section
+from benchmarks.engines.drake import drake
+from benchmarks.results import ROOT, progress, script, write_section
 from sdfsim.base.files import read_json, write_json
+from sdfsim.evaluation.engines import mujoco
 from sdfsim.evaluation.hard_cases import GROUPS
 from sdfsim.evaluation.stress import (
-    ENGINES,
-    TEACHER,
+    USUAL,
     Study,
     draw_group,
     figures,
@@ -31,6 +32,7 @@ from sdfsim.evaluation.stress import (
     write_report,
 )
 
+ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
 DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
 SPREADS = 3.0  # so many standard deviations are noise
@@ -42,7 +44,7 @@ def accepted(study: Study) -> dict[str, Any]:
     """What the ratchet file holds: each model's figures, and the cases in which it blew up."""
     models = {}
     for who, found in figures(study).items():
-        if who not in ENGINES:
+        if who in study.models:
             blown = [case for (case, one), result in study.results.items() if one == who and result["broke"]]
             models[who] = {"figures": found, "blew_up": blown}
     return {"quick": study.quick, "models": models}
@@ -67,18 +69,18 @@ def slipped_back(study: Study, file: Path) -> list[str]:
 
 
 def main(*, out: Path, quick: bool = False) -> None:
-    study = stress(out / "quick", quick=True, engines=tuple(ENGINES), on_progress=told)
+    study = stress(out / "quick", quick=True, engines=ENGINES, on_progress=progress)
     write_report(study, out / "quick")
     write_json(RATCHET, accepted(study))
     if not quick:
-        study = stress(out, engines=tuple(ENGINES), on_progress=told)
+        study = stress(out, engines=ENGINES, on_progress=progress)
         write_report(study, out)
     command = f"python benchmarks/hard_cases.py -o DIR{' --quick' if quick else ''}"
     pictures = "\n".join(f"![{GROUPS[group].title}](images/{name})" for group, name in PICTURES.items())
     write_section("hard cases", command, f"{table(study)}\n{pictures}", DOCUMENT)
     write_section("hard cases", command, "\n".join(f"- {line}" for line in loss_lines(study)))
     # Beside engines that know no restitution nothing else could be seen.
-    others = replace(study, who=[who for who in study.who if who == TEACHER or who not in ENGINES])
+    others = replace(study, engines=list(USUAL))
     for group, name in PICTURES.items():
         draw_group(others, group, ROOT / "docs" / "images" / name)
 

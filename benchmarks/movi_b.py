@@ -65,7 +65,7 @@ def instants(data: Path) -> None:
         again = small["chaos_floor"]["perturbations"]["1e-3"]
         found = {"`solver`": solver["model"], "`small`": small["model"], "all contact ignored": small["ballistic"]}
         found["the engine again, starts 1e-3 m/s off"] = again
-        cells = {name: told(errors[str(step)]["at_frame"]) for name, errors in found.items()}
+        cells = {name: cell(errors[str(step)]["at_frame"]) for name, errors in found.items()}
         cells["bodies that have met nothing yet"] = f"{100 * flying(recorded, step):.0f} %"
         published = f"{metres} m" + (f", {degrees} degrees" if degrees else "")
         cells["HOPNet, on its own recordings"] = f"{published}, at {frame / RATE:.3f} s"
@@ -74,14 +74,14 @@ def instants(data: Path) -> None:
     write_section("instants", COMMAND, markdown(rows))
 
 
-def told(found: dict) -> str:
+def cell(found: dict) -> str:
     """Metres with their interval, and degrees."""
     metres, low, high = map(number, (found["translation_rmse"], *found["translation_rmse_95"]))
     return f"{metres} m [{low}, {high}], {number(found['rotation_error'])} degrees"
 
 
 def flying(recorded: list[Trajectory], step: int) -> float:
-    """Share of the bodies that move which are still in free flight, as far as their positions tell."""
+    """Share of the bodies that move which are still in free flight, by their positions."""
     away = []
     for t in recorded:
         seconds = step * t.dt

@@ -2,7 +2,7 @@
 
     python benchmarks/network.py DATA [MORE ...] -o DIR [--seeds 3] [--steps N]
 
-Trains the presets *alone*, *small* and *long* with every seed on the training trajectories of DATA and MORE, then rolls
+Trains the presets *alone* and *small* with every seed on the training trajectories of DATA and MORE, then rolls
 them out beside the solver with as many inner steps, on validation and test trajectories of DATA. Trainings resume, and
 results that DIR holds are kept. Writes DIR/table.md.
 """
@@ -20,11 +20,11 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told
+from benchmarks.engines import ours
+from benchmarks.results import progress, script
 from sdfsim.base.files import write_text
-from sdfsim.data.batching import every, scene_of
+from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of, read_info
-from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
 from sdfsim.learned.contact_graph import ContactGraph
@@ -35,40 +35,35 @@ from sdfsim.simulate.simulator import Simulator
 from sdfsim.simulate.steppers import stepper_of
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
-from sdfsim.training.presets import PRESETS
 from sdfsim.training.train import train
 
-HORIZON = "50"  # steps up to which errors are told
+HORIZON = "50"  # steps over which errors are taken
 SPLITS = ("validation", "test")
 TIMED, STEPS_TIMED = 5, 100  # scenes, and steps of each
 
 
 @dataclass(frozen=True)
 class Method:
-    """A preset, or the solver (None), with steps of so many recorded ones and so many inner steps of the solve."""
+    """A preset, or the solver (None), with so many inner steps of the solve in a recorded step."""
 
     preset: str | None
-    stride: int = 1
     substeps: int | None = None
 
 
 METHODS = {
     "solver, 4 ms": Method(None),
-    "solver, 10 ms": Method(None, 1, 2),
-    "solver, 20 ms": Method(None, 1, 1),
-    "solver, 40 ms": Method(None, 2, 1),
+    "solver, 10 ms": Method(None, 2),
+    "solver, 20 ms": Method(None, 1),
     "network alone, 20 ms": Method("alone"),
     "network on the solve, 4 ms": Method("small"),
-    "network on the solve, 20 ms": Method("long"),
-    "network on the solve, 40 ms": Method("long", 2),
 }
 
 
 def judged(model: str, method: Method, data: Path, split: str, floor: bool) -> dict[str, Any]:
     """Errors up to `HORIZON`; of the teacher run again, where asked for."""
     report = evaluate(
-        data, model=model, split=split, steps=int(HORIZON), stride=method.stride, substeps=method.substeps,
-        chaos_floor=floor, errors_only=True,
+        data, model=model, split=split, steps=int(HORIZON), substeps=method.substeps, chaos_floor=floor,
+        errors_only=True,
     )  # fmt: skip
     found = {"model": report["model"][max(report["model"], key=int)]}
     again = report.get("chaos_floor", {}).get("perturbations", {})
@@ -80,24 +75,22 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
     used, taken = load_model(model), []
     with one_thread():
         recorded, shapes = load_recorded(data, "validation", most=TIMED)
-        for start in (every(t, method.stride) for t in recorded):
+        for start in recorded:
             scene = scene_of([start], [0], shapes, conditions_of(data).floor)[0]
             simulator = Simulator(scene, used, dt=start.dt)
-            substeps = method.substeps or used.inner or SUBSTEPS * method.stride
+            substeps = method.substeps or used.inner or SUBSTEPS
             simulator.options = replace(simulator.options, substeps=substeps)
             simulator.stepper = stepper_of(used)  # trusted, whatever the scene
-            taken.append(1e3 * ours(simulator, STEPS_TIMED // method.stride)[1].cpu_ms / method.stride)
+            taken.append(1e3 * ours(simulator, STEPS_TIMED)[1].cpu_ms)
     return {"us": statistics.median(taken)}
 
 
 def one_step(folders: list[Path], models: dict[str, list[str]]) -> str:
-    """Held-out one-step losses of free flight, the solve, and each preset's networks on the frames that it knows."""
+    """Held-out one-step losses of free flight, the solve, and each preset's networks."""
     lines = []
+    task = ImpulseTask(join_frames([contact_frames(f, "validation", Solved(1)) for f in folders]), torch.device("cpu"))
+    batches = [task.draw(np.random.default_rng(seed), 64) for seed in range(8)]
     for preset, paths in models.items():
-        plan = PRESETS[preset]
-        sets = [contact_frames(f, "validation", Solved(k, plan.inner, 1)) for f in folders for k in plan.strides]
-        task = ImpulseTask(join_frames(sets), torch.device("cpu"))
-        batches = [task.draw(np.random.default_rng(seed), 64) for seed in range(8)]
         ways: dict[str, Any] = {"free flight": _free, "solve": _solve} | {
             f"seed {k}": load_model(p).network for k, p in enumerate(paths)
         }
@@ -121,7 +114,7 @@ def trained(folders: list[Path], out: Path, preset: str, seed: int, steps: int |
     place = out / "runs" / f"{preset}-{seed}"
     if not (place / "model.safetensors").exists():
         resume = (place / "checkpoint.npz").exists()
-        train(folders, place, preset=preset, seed=seed, steps=steps, resume=resume, on_progress=told)
+        train(folders, place, preset=preset, seed=seed, steps=steps, resume=resume, on_progress=progress)
     return str(place / "model.safetensors")
 
 
@@ -148,7 +141,7 @@ def main(data: list[Path], *, out: Path, seeds: int = 3, steps: int | None = Non
                 jobs.append(Job(split, f"{name}, seed {seed}", [content, split], judged, arguments))
             if seed == 0:
                 jobs.append(Job("time", name, content, timed, (model, method, first)))
-    results = measure(jobs, out / "results", on_progress=told)
+    results = measure(jobs, out / "results", on_progress=progress)
 
     def errors(name: str, who: str) -> list[list[dict[str, Any]]]:
         """By split and seed, the errors of the model or of the teacher again."""

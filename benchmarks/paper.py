@@ -1,4 +1,4 @@
-"""The paper's comparison of networks, all on one footing: docs/paper.md.
+"""SDF-Sim and its baselines, all on one footing: docs/paper.md.
 
     python benchmarks/paper.py graphs DATA -o DIR
         edges, nodes, memory and time of a step, on recorded steps
@@ -9,7 +9,7 @@
     python benchmarks/paper.py sdf DATA -o DIR
         rollouts of the solver on networks of distances of several widths
 
-DATA is a MOVi-B dataset with train, validation and test. Graphs have as many surface nodes as the paper's, about 440 a
+DATA is a MOVi-B dataset with train, validation and test. Graphs have the published number of surface nodes, about 440 a
 body, and networks the published size. Networks of the last command have `NODES` nodes a body and the sizes `TRAINED`,
 so that an hour of a core is enough to learn something. Trainings go on where they were left, results that DIR holds
 are kept. Each command writes a table in Markdown into DIR.
@@ -31,7 +31,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told
+from benchmarks.results import progress, script
 from samples.large import write_scene
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import batches, first_frames, roll_out
@@ -59,7 +59,7 @@ NAMES = {
     "dpi": "DPI",
 }  # fmt: skip
 STEPS_SEEN, STEPS_TIMED = 200, 20  # recorded steps whose graphs are counted, and passed through the network
-PUBLISHED_NODES = 440  # a body: what the paper's counts of edges leave
+PUBLISHED_NODES = 440  # a body: what the published counts of edges leave
 BOWLS = (2, 8, 32, 128, 512)
 SETTLED = 200  # steps of the solver before the networks see the bowl
 MEMORY = 12  # GiB that a process may take
@@ -80,7 +80,7 @@ def untrained(name: str, nodes: int | None) -> Model:
 
 
 def recorded(name: str, data: Path) -> dict[str, float]:
-    """A step's graph at random recorded steps of test trajectories, with as many nodes as in the paper; one thread.
+    """A step's graph at random recorded steps of test trajectories, with as many nodes as published; one thread.
 
     Returns:
         Means of edges between bodies (each once), of all edges and of the nodes of the graph; medians of the
@@ -164,7 +164,7 @@ def graphs(data: Path, *, out: Path) -> None:
     for name in NAMES:
         content = [PRESETS[name], STEPS_SEEN, STEPS_TIMED, PUBLISHED_NODES, read_info(data)]
         jobs.append(Job("movi-b", name, content, recorded, (name, data)))
-    results = measure(jobs, out / "graphs", where="fresh", on_progress=told)
+    results = measure(jobs, out / "graphs", where="fresh", on_progress=progress)
     columns = {
         "contacts": "collision edges", "edges": "graph edges", "nodes": "nodes", "contact_ms": "ms to find them",
         "network_ms": "ms of the network", "mib": "MiB",
@@ -181,12 +181,12 @@ def growth(*, out: Path) -> None:
         home = out / "scenes" / str(count)
         file = home / "scene.yaml" if (home / "scene.yaml").exists() else write_scene("bowl", home, count, 64)
         jobs += [Job(f"{count} spheres", name, [PRESETS[name], SETTLED, MEMORY], grown, (name, file)) for name in NAMES]
-    results = measure(jobs, out / "growth", where="fresh", on_progress=told)
+    results = measure(jobs, out / "growth", where="fresh", on_progress=progress)
     rows: list[tuple[str, ...]] = [("ms of the network / MiB", *NAMES.values())]
     for count in BOWLS:
         row = (results[f"{count} spheres", name] for name in NAMES)
-        told_of = (f.get("failed") or f"{number(f['network_ms'])} / {number(f['mib'])}" for f in row)
-        rows.append((f"{count} spheres", *told_of))
+        shown = (f.get("failed") or f"{number(f['network_ms'])} / {number(f['mib'])}" for f in row)
+        rows.append((f"{count} spheres", *shown))
     panels = []
     for key, label in (("edges", "edges of the graph"), ("network_ms", "ms of the network"), ("mib", "MiB")):
         lines = []
@@ -214,7 +214,7 @@ def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
                 torch.set_num_threads(1)
                 place, budget = out / "runs" / name, 60 * spent
                 resume = (place / "checkpoint.npz").exists()
-                train(seen_by, place, preset=plan_of(name), resume=resume, budget=budget, on_progress=told)
+                train(seen_by, place, preset=plan_of(name), resume=resume, budget=budget, on_progress=progress)
                 (place / "model.safetensors").rename(file)
             jobs = []
             for split in ("validation", "test") if spent == minutes[-1] else ("validation",):
@@ -274,7 +274,7 @@ def sdf(data: Path, *, out: Path) -> None:
         Job("rollouts", name, [width, read_info(data)], rolled_out, (data, width, out / "shapes" / str(width)))
         for name, width in ways.items()
     ]
-    results = measure(jobs, out / "sdf", on_progress=told)
+    results = measure(jobs, out / "sdf", on_progress=progress)
     rows = [("distances", f"validation, {FRAME} steps"), *((name, _cell(results["rollouts", name])) for name in ways)]
     written(out / "sdf.md", markdown(rows))
 
@@ -283,8 +283,8 @@ def accuracy_table(results: dict[tuple[str, str], dict[str, Any]], minutes: list
     """Errors by network and minutes; a table for each form of free flight."""
     parts = []
     for way in ("exact", "learned"):
-        told_of = (*(f"{m:g} min" for m in minutes), "by a power law at 10 h", f"test, {minutes[-1]:g} min")
-        rows: list[tuple[str, ...]] = [(f"free flight {way}", *told_of)]
+        shown = (*(f"{m:g} min" for m in minutes), "by a power law at 10 h", f"test, {minutes[-1]:g} min")
+        rows: list[tuple[str, ...]] = [(f"free flight {way}", *shown)]
         for name, title in COMPARED.items():
             found = [results.get((f"validation, {way}", _case(name, m)), {}) for m in minutes]
             test = results.get((f"test, {way}", _case(name, minutes[-1])), {})

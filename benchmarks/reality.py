@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told, write_section
+from benchmarks.results import progress, script, write_section
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_json
 from sdfsim.data.pybullet_sim import import_pybullet
@@ -54,7 +54,7 @@ class Toss:
 
 
 @dataclass(frozen=True)
-class Start:
+class FittedStart:
     """Pose and velocities at a recording's first frame, and how the flight that they were fitted to differs from it."""
 
     position: np.ndarray  # [3] m
@@ -67,7 +67,7 @@ class Start:
     turned_off: float
 
 
-class Motion(NamedTuple):
+class Poses(NamedTuple):
     """Poses of B tosses in the frames after their first."""
 
     position: np.ndarray  # [B, T, 3] m
@@ -95,7 +95,7 @@ def flight(toss: Toss) -> int:
     return int(near.argmax()) if near.any() else len(near)
 
 
-def fitted_start(toss: Toss, gravity: float = GRAVITY) -> Start:
+def fitted_start(toss: Toss, gravity: float = GRAVITY) -> FittedStart:
     """A parabola and an even turn (a cube's free rotation) through the flight before the first impact. Raises
     SdfsimError for fewer frames than `FLIGHT`."""
     count = flight(toss)
@@ -114,7 +114,7 @@ def fitted_start(toss: Toss, gravity: float = GRAVITY) -> Start:
 
     found = least_squares(apart, np.concatenate([np.zeros(3), rate]), x_scale=[0.01] * 3 + [0.1] * 3)
     off, turned_off = fallen - even @ straight, found.fun.reshape(-1, 3)
-    return Start(
+    return FittedStart(
         position=straight[0],
         quat_xyzw=(Rotation.from_rotvec(found.x[:3]) * turns[0]).as_quat(),
         velocity=straight[1],
@@ -127,7 +127,7 @@ def fitted_start(toss: Toss, gravity: float = GRAVITY) -> Start:
 
 def fall(tosses: Sequence[Toss]) -> tuple[float, float]:
     """The acceleration with which recorded cubes fall, m/s^2, and its standard error: a parabola without a given one.
-    That of gravity, where lengths and times are as told."""
+    It is that of gravity where the given lengths and times are right."""
     known, weight = [], []
     for toss in tosses:
         time = toss.dt * np.arange(flight(toss))
@@ -150,27 +150,27 @@ def split(tosses: Sequence[Toss]) -> tuple[list[Toss], list[Toss]]:
     return [usable[k] for k in order[:FIT]], [usable[k] for k in order[FIT : FIT + TEST]]
 
 
-def recorded(tosses: Sequence[Toss]) -> Motion:
+def recorded(tosses: Sequence[Toss]) -> Poses:
     """What is compared of recordings."""
     frames = slice(1, FRAMES + 1)
-    return Motion(*(np.array([getattr(toss, name)[frames] for toss in tosses]) for name in Motion._fields))
+    return Poses(*(np.array([getattr(toss, name)[frames] for toss in tosses]) for name in Poses._fields))
 
 
-def errors(found: Motion, truth: Motion) -> tuple[np.ndarray, np.ndarray]:
+def errors(found: Poses, truth: Poses) -> tuple[np.ndarray, np.ndarray]:
     """[B] root mean square distances over frames in % of the side, and [B] mean angles in degrees."""
     way = np.linalg.norm(found.position - truth.position, axis=-1)
     angle = (_turns(found) * _turns(truth).inv()).magnitude().reshape(way.shape)
     return 100.0 / SIDE * np.sqrt(np.square(way).mean(1)), np.degrees(angle).mean(1)
 
 
-def _turns(motion: Motion) -> Rotation:
+def _turns(motion: Poses) -> Rotation:
     return Rotation.from_quat(motion.quat_xyzw.reshape(-1, 4))
 
 
 # --- engines ---
 
 
-def ours(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, float]) -> Motion:
+def ours(starts: Sequence[FittedStart], dt: float, gravity: float, values: dict[str, float]) -> Poses:
     """All tosses side by side in one scene, where cubes meet the table alone."""
     side = values["side"] * SIDE
     cubes = [
@@ -193,10 +193,10 @@ def ours(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, f
     simulator = Simulator(scene, "solver", dt=dt)
     rollout = simulator.run(steps=FRAMES)
     poses = (rollout.position, rollout.orientation)
-    return Motion(*(np.swapaxes(pose[1:, :-1], 0, 1) for pose in poses))
+    return Poses(*(np.swapaxes(pose[1:, :-1], 0, 1) for pose in poses))
 
 
-def mujoco(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, float]) -> Motion:
+def mujoco(starts: Sequence[FittedStart], dt: float, gravity: float, values: dict[str, float]) -> Poses:
     """MuJoCo's elliptic cone; its contacts are damped springs, of a time constant s and a damping ratio."""
     engine, rollout = (engine_module(name, "MuJoCo", "bench") for name in ("mujoco", "mujoco.rollout"))
     spec, step = engine.MjSpec(), dt / INNER
@@ -218,10 +218,10 @@ def mujoco(starts: Sequence[Start], dt: float, gravity: float, values: dict[str,
     ]  # fmt: skip
     states = rollout.rollout(model, engine.MjData(model), np.array(state), nstep=FRAMES * INNER)[0]
     found = states[:, INNER - 1 :: INNER]
-    return Motion(found[..., 1:4], np.roll(found[..., 4:8], -1, axis=-1))
+    return Poses(found[..., 1:4], np.roll(found[..., 4:8], -1, axis=-1))
 
 
-def bullet(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, float]) -> Motion:
+def bullet(starts: Sequence[FittedStart], dt: float, gravity: float, values: dict[str, float]) -> Poses:
     """PyBullet as it is without settings."""
     engine = import_pybullet()
     client, step = engine.connect(engine.DIRECT), dt / INNER
@@ -253,10 +253,10 @@ def bullet(starts: Sequence[Start], dt: float, gravity: float, values: dict[str,
     finally:
         engine.disconnect(client)
     poses = (np.array([[one[k] for one in frame] for frame in frames]) for k in range(2))
-    return Motion(*(np.swapaxes(pose, 0, 1) for pose in poses))
+    return Poses(*(np.swapaxes(pose, 0, 1) for pose in poses))
 
 
-def _half_a_step_ago(start: Start, step: float, gravity: float) -> np.ndarray:
+def _half_a_step_ago(start: FittedStart, step: float, gravity: float) -> np.ndarray:
     """The velocity with which engines that add gravity first, and move by the sum, fly along the exact parabola."""
     return start.velocity + np.array([0.0, 0.0, 0.5 * step * gravity])
 
@@ -267,7 +267,7 @@ SOFT = {
     "friction": (0.05, 0.4), "softness": (0.003, 0.04), "damping": (0.05, 1.2), "height": (-0.006, 0.003),
     "side": (0.9, 1.02),
 }  # fmt: skip
-Engine = Callable[[Sequence[Start], float, float, dict[str, float]], Motion]
+Engine = Callable[[Sequence[FittedStart], float, float, dict[str, float]], Poses]
 ENGINES: dict[str, tuple[Engine, dict[str, tuple[float, float]]]] = {
     "sdfsim": (ours, SOLID),
     "MuJoCo, elliptic cone": (mujoco, SOFT),
@@ -275,7 +275,7 @@ ENGINES: dict[str, tuple[Engine, dict[str, tuple[float, float]]]] = {
 }
 
 
-def cost(found: Motion, truth: Motion) -> float:
+def cost(found: Poses, truth: Poses) -> float:
     """Position error in % and rotation error in degrees, added up. A cube that comes to lie on another face counts as
     far off, no more: else the few that do so by chance decide about the fit."""
     return float(sum(np.minimum(error, FAR).mean() for error in errors(found, truth)))
@@ -305,13 +305,13 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     result: dict[str, Any] = {}
     rows: list[tuple[str, ...]] = [("engine", "position, % of the side", "rotation, degrees", "on those 60", "found")]
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items()):
-        told(k / len(ENGINES), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
+        progress(k / len(ENGINES), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
         values = identified(lambda values, engine=engine: cost(engine(fit, dt, gravity, values), fit_truth), bounds)
         own = errors(engine(fit, dt, gravity, values), fit_truth)
         judged = errors(engine(test, dt, gravity, values), test_truth)
         result[name] = {"values": values, "fit": own, "test": judged}
         found = ", ".join(f"{of} {number(value)}" for of, value in values.items())
-        rows.append((name, *map(_told, judged), " / ".join(number(error.mean()) for error in own), found))
+        rows.append((name, *map(_cell, judged), " / ".join(number(error.mean()) for error in own), found))
     falls, sure = fall(known)
     every = [*fit, *test]
     off = 1e3 * np.median([start.off for start in every])
@@ -325,7 +325,7 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     write_section("reality", "python benchmarks/reality.py TOSSES -o DIR", text)
 
 
-def _told(error: np.ndarray) -> str:
+def _cell(error: np.ndarray) -> str:
     low, high = map(number, interval(error))
     return f"{number(float(error.mean()))} [{low}, {high}]"
 

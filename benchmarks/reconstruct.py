@@ -86,7 +86,7 @@ def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str,
     """Measured errors, mm, beside the uncertainty that the run says of the same places.
 
     Each vertex of what is displayed counts by its area: the scenery as shown, and the closed bodies. First those of
-    which the photos tell something, in quarters from the surest on, and the least sure twentieth; then what is guessed
+    which the photos show something, in quarters from the surest on, and the least sure twentieth; then what is guessed
     there, and what is guessed of all that the scene is made of, also where nothing is displayed.
     """
     truth = _scene(_read(photos / "truth.ply"))

@@ -6,12 +6,15 @@ import argparse
 import inspect
 import re
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sdfsim.base.errors import run_main
 from sdfsim.base.files import write_text
+from sdfsim.evaluation.harness import number
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = Path(__file__).with_name("RESULTS.md")
@@ -46,9 +49,20 @@ def script(doc: str | None, *functions: Callable[..., None]) -> None:
     run_main(lambda: chosen.pop("function")(**chosen))
 
 
-def told(fraction: float, message: str) -> None:
+def progress(fraction: float, message: str) -> None:
     """Progress, a line each."""
     print(f"{fraction:6.1%}  {message}", flush=True)
+
+
+def in_turn(calls: Sequence[Callable[[], Any]], rounds: int) -> np.ndarray:
+    """What each call gives, [rounds, calls, ...], all of them in turn: a shared machine that slows one down slows all.
+    A first round, which loads and compiles, is left out."""
+    return np.array([[call() for call in calls] for _ in range(rounds + 1)])[1:]
+
+
+def spread(values: np.ndarray) -> str:
+    """Median and range of [rounds]."""
+    return f"{number(float(np.median(values)))} ({number(values.min())} to {number(values.max())})"
 
 
 def write_section(name: str, command: str, content: str, page: Path = PAGE) -> None:

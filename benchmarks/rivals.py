@@ -28,7 +28,10 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told, write_section
+from benchmarks.engines import in_metres, ours
+from benchmarks.engines.drake import drake
+from benchmarks.engines.newton import newton
+from benchmarks.results import in_turn, progress, script, spread, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
 from sdfsim.base.errors import SdfsimError
@@ -36,7 +39,7 @@ from sdfsim.base.files import read_arrays, write_arrays, write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, conditions_of
 from sdfsim.evaluation import engines
-from sdfsim.evaluation.engines import Engine, in_metres, ours, rollout_motion, start_of_scene
+from sdfsim.evaluation.engines import Engine, rollout_motion, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
@@ -57,8 +60,8 @@ ENGINES: dict[str, Engine | None] = {
     "PyBullet, pieces": engines.bullet,
     "MuJoCo, pieces": engines.mujoco,
     "MuJoCo, SDF": partial(engines.mujoco, pieces=False),
-    "Drake, hydroelastic": engines.drake,
-    "Newton, XPBD": engines.newton,
+    "Drake, hydroelastic": drake,
+    "Newton, XPBD": newton,
 }
 FAST = list(ENGINES)[:3]
 INNER = (2, 5, 10, 20)  # inner steps in one of 20 ms; the last is an engine's own truth
@@ -295,7 +298,7 @@ def compared(cases: list[str], data: Path | None, out: Path) -> Results:
         for case in cases
         for name in ENGINES
     ]
-    return measure(jobs, out / "results", where="fresh", on_progress=told)
+    return measure(jobs, out / "results", where="fresh", on_progress=progress)
 
 
 def why_not(result: dict[str, Any]) -> str:
@@ -329,13 +332,13 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
     rows: list[tuple[str, ...]] = [("case, ms per s at 4 ms", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
     for k, case in enumerate(SHAPES):
         scenes = scenes_of(case, data, out / "scenes")
-        taken = np.array([
-            [np.mean([moved(name, scene, STEPS, USUAL, out / "scenes")[1] for scene in scenes]) for name in FAST]
-            for _ in range(rounds + 1)
-        ])[1:]  # the first loads and compiles  # fmt: skip
-        told((k + 1) / len(SHAPES), case)
-        figures = [*taken.T, *(taken[:, :1] / taken[:, 1:]).T]
-        rows.append((case, *(f"{number(np.median(f))} ({number(f.min())} to {number(f.max())})" for f in figures)))
+
+        def mean(name: str, scenes: list[Scene] = scenes) -> float:
+            return float(np.mean([moved(name, scene, STEPS, USUAL, out / "scenes")[1] for scene in scenes]))
+
+        taken = in_turn([partial(mean, name) for name in FAST], rounds)
+        progress((k + 1) / len(SHAPES), case)
+        rows.append((case, *map(spread, [*taken.T, *(taken[:, :1] / taken[:, 1:]).T])))
     write_section("rivals in turn", "python benchmarks/rivals.py turns DATA -o DIR", markdown(rows))
 
 

@@ -22,6 +22,7 @@ import sys
 import time
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told, write_section
+from benchmarks.engines import in_metres
+from benchmarks.results import in_turn, progress, script, spread, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, conditions_of
-from sdfsim.evaluation.engines import Engine, bullet, in_metres, mujoco, rollout_motion, start_of_scene
+from sdfsim.evaluation.engines import Engine, bullet, mujoco, rollout_motion, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
@@ -148,7 +150,7 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
 
 def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None:
     """Write the section and scale.png."""
-    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=told)
+    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=progress)
     bowls = {key: found for key, found in results.items() if "bowl" in key[0]}
     panels = []
     for name in ("ms", "peak_mib"):
@@ -191,7 +193,7 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
 def large(*, out: Path) -> None:
     """Write the section and a movie each."""
     jobs = [Job("to the end", name, [name], to_the_end, (name, out)) for name in HEAPS]
-    results = measure(jobs, out / "large", where="fresh", on_progress=told)
+    results = measure(jobs, out / "large", where="fresh", on_progress=progress)
     titles = {"bodies": "bodies", "nodes": "nodes", "steps": "steps", "s": "s from command to recording", "mib": "MiB",
               "worst": "deepest, mm", "lost": "below the floor"}  # fmt: skip
     rows = [("", *titles.values())]
@@ -234,11 +236,8 @@ def scenery(*, repeats: int = 7) -> None:
         simulators = [Simulator(with_far(count), model) for count in FAR]
         for simulator in simulators:
             simulator.options = replace(simulator.options, sleep=False)
-            simulator.step(2)  # not timed: it loads what is compiled
-        times = np.array([[slid(simulator) for simulator in simulators] for _ in range(repeats)])
-        ratio = times[:, 1] / times[:, 0]
-        span = f"{np.median(ratio):.1f} ({ratio.min():.1f} to {ratio.max():.1f})"
-        rows.append((f"`{model}`", *map(number, np.median(times, axis=0)), span))
+        times = in_turn([partial(slid, simulator) for simulator in simulators], repeats)
+        rows.append((f"`{model}`", *map(number, np.median(times, axis=0)), spread(times[:, 1] / times[:, 0])))
     write_section("scenery", "python benchmarks/scale.py scenery", markdown(rows))
 
 

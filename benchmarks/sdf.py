@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -21,7 +22,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import script, told
+from benchmarks.results import in_turn, progress, script
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
 from sdfsim.data.public_shapes import public_folder
@@ -43,7 +44,7 @@ ERRORS = tuple(EXACT)
 
 
 def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | None = None) -> dict:
-    """Fit a mesh, keep the shape, and tell the errors of its certificate, and the seconds that it took."""
+    """Fit a mesh and keep the shape; the errors of its certificate, and the seconds that it took."""
     plan = replace(RECIPES[recipe], width=width or RECIPES[recipe].width)
     began = time.monotonic()
     with patch.dict(RECIPES, {recipe: plan}):
@@ -83,15 +84,16 @@ def queries(file: Path, default: Path, paper: Path) -> dict:
         f"voxel grid {GRID}^3": (lambda: grid(points), 4 * GRID**3),
         "exact mesh distance": (lambda: exact(metres), 12 * (len(mesh.vertices) + len(mesh.faces))),
     }
-    taken: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(REPEATS + 1):  # in turns, so that whatever else the machine does hits all alike; the first is lost
-        for name, (call, _) in calls.items():
-            began = time.perf_counter()
-            call()
-            taken[name].append(time.perf_counter() - began)
+
+    def seconds(call: Callable[[], object]) -> float:
+        began = time.perf_counter()
+        call()
+        return time.perf_counter() - began
+
+    taken = np.median(in_turn([partial(seconds, call) for call, _ in calls.values()], REPEATS), axis=0)
     return {
-        name: {"seconds": 1e6 / POINTS * float(np.median(took[1:])), "bytes": calls[name][1]}
-        for name, took in taken.items()
+        name: {"seconds": 1e6 / POINTS * float(took), "bytes": size}
+        for (name, (_, size)), took in zip(calls.items(), taken, strict=True)
     }
 
 
@@ -108,10 +110,10 @@ def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
         for method, plan in methods.items():
             content = [FIT_VERSION, load_mesh(file), plan, RECIPES[plan[0]], machine()]
             jobs.append(Job(name, method, content, fit, (file, out / "shapes" / method / name, *plan)))
-    fits = measure(jobs, out / "results", on_progress=told)
+    fits = measure(jobs, out / "results", on_progress=progress)
     fitted = [out / "shapes" / method / first for method in ("ours", "paper's recipe")]
     asked = Job(first, "queries", [jobs[0].content], queries, (files[first], *fitted))
-    timed = measure([asked], out / "results", on_progress=told)[first, "queries"]
+    timed = measure([asked], out / "results", on_progress=progress)[first, "queries"]
     panels = []
     for key in ("error_within_0.01", "error_in_box"):
         ours = [*(f"ours, {b:g} s" for b in BUDGETS), "ours"]

@@ -13,14 +13,14 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import ROOT, script, told, write_section
+from benchmarks.results import ROOT, progress, script, write_section
 from sdfsim.evaluation import tradeoff as study
 from sdfsim.evaluation.harness import markdown
 
 
 def main(data: Path, *, out: Path) -> None:
-    report = study.tradeoff(data, out, on_progress=lambda _, fraction, message: told(fraction, message))
-    rows, notes = study.told(report)
+    report = study.tradeoff(data, out, on_progress=lambda _, fraction, message: progress(fraction, message))
+    rows, notes = study.report_table(report)
     shutil.copyfile(out / "tradeoff.png", ROOT / "docs" / "images" / "tradeoff.png")
     text = f"{markdown(rows)}\n{notes[0]}.\n\n![Error against time](../docs/images/tradeoff.png)"
     write_section("tradeoff", "python benchmarks/tradeoff.py DATA -o DIR", text)

@@ -1,6 +1,6 @@
 """`export`: a shape, a scene or a run becomes a file that other programs open.
 
-Pose frames are the shapes' own origins in every format. What a format cannot hold is told in the report's `left_out`;
+Pose frames are the shapes' own origins in every format. The report's `left_out` says what a format cannot hold;
 docs/export.md says it of each format.
 """
 
@@ -120,18 +120,18 @@ def _extra(module: str) -> Any:
 
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
-    told = partial(on_progress, "shapes")
+    progress = partial(on_progress, "shapes")
     run = None
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
-        scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=told)
+        scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:
         raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
     elif (source / RECORD_FILE).is_file():
         shape = load_shape(source)
         moves = "dynamic" if shape.volume > 0 else "static"
-        scene = SceneBuilder().add(shape.name, asset=source, motion=moves).load(told)
+        scene = SceneBuilder().add(shape.name, asset=source, motion=moves).load(progress)
     elif source.suffix.lower() in (".yaml", ".yml"):
-        scene = load_scene(source, told, allow_outside=allow_outside)
+        scene = load_scene(source, progress, allow_outside=allow_outside)
     else:
         raise SdfsimError(f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder")
     if run is not None:
@@ -233,12 +233,12 @@ def _write_xml(path: Path, root: XML) -> None:
 def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> list[str]:
     """What a format leaves out that has no motion, or no textures."""
     led = any(body.motion == "kinematic" for body in take.scene.bodies)
-    told = {
+    lines = {
         "the motion: the scene is as it is at the start": take.moving and not motion,
         "the paths of kinematic bodies: they stand where they start": led and not (take.moving and motion),
         "textures": not textures and any(shape.skin is not None for shape in take.scene.shapes),
     }
-    return [line for line, missing in told.items() if missing]
+    return [line for line, missing in lines.items() if missing]
 
 
 # --- glTF ---
@@ -332,9 +332,9 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         if surface not in materials:
             materials[surface] = shade.Material.Define(stage, f"/World/materials/surface_{len(materials)}")
             made, (friction, restitution) = materials[surface].GetPrim(), surface
-            told = {"staticFriction": friction, "dynamicFriction": friction, "restitution": restitution}
-            _usd_apply(made, "PhysicsMaterialAPI", **told)
-            # PhysX takes the mean of two bodies' coefficients unless told. Its schema is not part of OpenUSD.
+            values = {"staticFriction": friction, "dynamicFriction": friction, "restitution": restitution}
+            _usd_apply(made, "PhysicsMaterialAPI", **values)
+            # By default PhysX takes the mean of two bodies' coefficients. Its schema is not part of OpenUSD.
             made.AddAppliedSchema("PhysxMaterialAPI")
             for what in ("friction", "restitution"):
                 made.CreateAttribute(f"physxMaterial:{what}CombineMode", sdf.ValueTypeNames.Token).Set("multiply")
@@ -358,7 +358,7 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
             made.CreateFilteredGroupsRel().AddTarget(f"/World/groups/group_{other}")
 
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"stage{out.suffix.lower()}"  # the ending tells OpenUSD what to write
+        file = Path(folder) / f"stage{out.suffix.lower()}"  # OpenUSD chooses the format by the ending
         if not stage.GetRootLayer().Export(str(file)):
             raise SdfsimError(f"{file}: OpenUSD cannot write it")
         write_bytes(out, file.read_bytes())
@@ -483,7 +483,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         for solid, label in zip(solids, geoms[-1], strict=True):
             _add(node, "geom", name=label, **solid, **surface)
 
-    # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few:
+    # Between bodies of one material the square is the product. Other pairs are written one by one, while they are few:
     # those of few geoms first, since the floor is one.
     pairs = []
     surfaces = [(b.friction, b.restitution) for b in scene.bodies]

@@ -260,7 +260,7 @@ def train(
     ],
     out: Out,
     preset: Annotated[
-        Literal["small", "long", "alone", "base", "sdf-sim", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        Literal["small", "alone", "sdf-sim", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
@@ -320,7 +320,7 @@ def tradeoff(
 
     check_matplotlib()
     report = study.tradeoff(source, out, models=model or [], quick=quick, on_progress=session.stage_progress)
-    rows, notes = study.told(report)
+    rows, notes = study.report_table(report)
     session.report(report, [*columns(rows), *notes])
 
 

@@ -167,7 +167,7 @@ def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
 
 
 def every(trajectory: Trajectory, stride: int) -> Trajectory:
-    """Every so many-th frame, told as one of longer steps."""
+    """Every `stride`-th frame, as a trajectory with longer steps."""
     frames = {name: getattr(trajectory, name)[::stride] for name in RECORDED}
     return replace(trajectory, dt=trajectory.dt * stride, **frames)
 

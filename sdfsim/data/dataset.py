@@ -60,7 +60,7 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: Path, *, as_recorded: bool = False) -> Trajectory:
-        """Read and check one file. The `dataset.json` beside it, or in the folder above, tells the engine's inner step;
+        """Read and check one file. The `dataset.json` beside it, or in the folder above, has the engine's inner step;
         `as_recorded` leaves velocities as the engine recorded them, from which it goes on when it is started again.
         Raises SdfsimError with the file and the field that is wrong."""
         recorded = cls(**_checked(path, read_arrays(path, "a trajectory")))
@@ -84,7 +84,7 @@ def at_instants(recorded: Trajectory, substep: float) -> Trajectory:
 
 
 def engine_substep(data: Path) -> float:
-    """The recording engine's inner step in s, where the dataset (a folder or one of its splits) tells it; 0 elsewhere.
+    """The recording engine's inner step in s, where the dataset (a folder or one of its splits) has it; 0 elsewhere.
     Raises SdfsimError where the `dataset.json` holds something else there."""
     home = home_of(data)
     settings = (read_info(home).get("engine_settings") or {}) if home else {}
@@ -151,8 +151,8 @@ def read_info(folder: Path) -> dict:
         raise SdfsimError(f"{folder / INFO}: must be a JSON object")
     ours = info.get("engine") == "pybullet" and {"recipe", "engine_settings"} <= set(info)
     if ours and (version := info.get("teacher", 1)) != TEACHER_VERSION:
-        told = f"{folder}: made by version {version!r} of the teacher, not by {TEACHER_VERSION}"
-        raise SdfsimError(told, "make it again with `sdfsim dataset`")
+        fault = f"{folder}: made by version {version!r} of the teacher, not by {TEACHER_VERSION}"
+        raise SdfsimError(fault, "make it again with `sdfsim dataset`")
     return info
 
 
@@ -163,11 +163,11 @@ def home_of(data: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a dataset tells of how it was recorded."""
+    """How a dataset was recorded, by its `dataset.json`."""
 
     friction: float  # friction, restitution: of the floor
     restitution: float
-    floor_told: bool  # whether a dataset.json told these; else they are those of the recipes' floor
+    floor_given: bool  # whether a dataset.json has these; else they are those of the recipes' floor
     by_teacher: bool  # whether a dataset.json names PyBullet as the teacher has it set
 
     @property
@@ -182,19 +182,19 @@ def conditions_of(data: Path) -> Conditions:
     home = home_of(data)
     info = read_info(home) if home else {}
     floor = floor_of(info, home or data)
-    return Conditions(*floor, floor_told=info.get("floor") is not None, by_teacher=set_as_teacher(info))
+    return Conditions(*floor, floor_given=info.get("floor") is not None, by_teacher=set_as_teacher(info))
 
 
 def floor_of(info: dict, folder: Path = Path()) -> tuple[float, float]:
-    """Friction and restitution of the floor in the `dataset.json` of a folder, or the recipes' own where it tells none.
+    """Friction and restitution of the floor in the `dataset.json` of a folder, or the recipes' own where it has none.
     Raises SdfsimError where either is missing, negative or no number, or the restitution is above 1."""
-    told = info.get("floor")
-    if told is None:
+    floor = info.get("floor")
+    if floor is None:
         return FLOOR
-    values: list[Any] = [told.get(name) if isinstance(told, dict) else None for name in ("friction", "restitution")]
+    values: list[Any] = [floor.get(name) if isinstance(floor, dict) else None for name in ("friction", "restitution")]
     friction, restitution = (float(v) if type(v) in (int, float) else np.nan for v in values)
     if not (0.0 <= friction < np.inf and 0.0 <= restitution <= 1.0):
-        where = f"{folder / INFO}: floor: must have friction and restitution, >= 0 and 0 to 1 (got {told!r})"
+        where = f"{folder / INFO}: floor: must have friction and restitution, >= 0 and 0 to 1 (got {floor!r})"
         raise SdfsimError(where, "leave it out for the floor of the recipes, {:g} and {:g}".format(*FLOOR))
     return friction, restitution
 

@@ -30,8 +30,8 @@ ARCHIVE = ".tar.gz"
 # Of every set: its files, as they lie in the set's folder, and their SHA-256.
 SUMS: dict[str, dict[str, str]] = {}
 for line in Path(__file__).with_suffix(".sha256").read_text(encoding="utf-8").splitlines():
-    told, path = line.split()
-    SUMS.setdefault(path.split("/")[0], {})[path.partition("/")[2]] = told
+    checksum, path = line.split()
+    SUMS.setdefault(path.split("/")[0], {})[path.partition("/")[2]] = checksum
 
 
 def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
@@ -73,7 +73,7 @@ def _fetched(url: str, hint: str) -> dict[str, bytes]:
     """The files of an archive by their last names alone, so that no path in it decides anything; a single one by ""."""
     import pooch
 
-    pooch.get_logger().setLevel("WARNING")  # it would tell the sum of each download
+    pooch.get_logger().setLevel("WARNING")  # it would log the checksum of each download
     try:
         with tempfile.TemporaryDirectory() as scratch:
             file = Path(pooch.retrieve(url, known_hash=None, fname="download", path=scratch))

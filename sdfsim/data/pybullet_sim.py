@@ -14,7 +14,7 @@ import numpy as np
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
 
-TEACHER_VERSION = 2  # `dataset.json` tells it; datasets of another version are not used
+TEACHER_VERSION = 2  # written to `dataset.json`; datasets of another version are refused
 RATES = {50: 5, 60: 4}  # recorded frames a second -> inner steps in one
 FPS = 50  # unless another rate is asked for
 DT = 1.0 / FPS  # s, one recorded step at that rate

@@ -1,18 +1,15 @@
-"""PyBullet (the teacher), MuJoCo, Drake and Newton, run from one start: of a recording, or of a scene.
+"""PyBullet (the teacher) and MuJoCo, run from one start: of a recording, or of a scene.
 
-Each takes the geometry that it is made for: PyBullet and MuJoCo convex pieces, MuJoCo also a mesh as an SDF (its own
-octree), Drake tetrahedra and Newton triangles. Spheres and boxes are exact in all of them, and so are cylinders and
-capsules but in Newton.
+Both take convex pieces, MuJoCo also a mesh as an SDF (its own octree). Spheres, boxes, cylinders and capsules are
+exact.
 """
 
 from __future__ import annotations
 
 import importlib
 import re
-import tempfile
 import time
 from collections.abc import Callable
-from contextlib import chdir
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,13 +30,9 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape, own_pieces
-from sdfsim.simulate.simulator import Simulator, join
 
 SAME_INERTIA = 1e-3  # relative
 SOFTEST = 3.0  # MuJoCo: time in which a contact swings over 2 pi, in steps of the engine; it is stable from 2 on
-MODULUS = 1e7  # Pa, of Drake's compliant bodies: its own default
-TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
-ITERATIONS = 10  # of Newton's XPBD in an inner step
 LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
 SI = Units(1.0, 1.0, 1.0)
@@ -88,13 +81,6 @@ def timed(advance: Callable[[int], object], steps: int) -> Timing:
     return Timing(1e3 * first, 1e3 * wall / count, 1e3 * cpu / count)
 
 
-def ours(simulator: Simulator, steps: int) -> tuple[Rollout, Timing]:
-    """Our motion, and its time."""
-    frames: list[Rollout] = []
-    timing = timed(lambda count: frames.extend(simulator.frames(count)), steps)
-    return join(frames), timing
-
-
 def start_of_scene(scene: Scene, folder: Path, units: Units = SI) -> Start:
     """A scene whose only plane, if any, is a level floor; shapes are called by their index in it.
 
@@ -123,7 +109,7 @@ def centred_mesh(shape: Shape) -> Mesh:
 def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
     """The start of a scene's bodies but for planes as a recording of one frame, shapes called by their index."""
     bodies, state = from_scene(scene, units)
-    solid = _solid(scene)
+    solid = solid_bodies(scene)
 
     def of(values: np.ndarray) -> np.ndarray:
         return values[solid].copy()
@@ -148,52 +134,20 @@ def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
 def rollout_motion(scene: Scene, rollout: Rollout) -> Trajectory:
     """Our motion of a scene as `start_motion` has its start."""
     frames = (rollout.position, rollout.orientation, rollout.velocity, rollout.angular_velocity)
-    found = {name: values[:, _solid(scene)] for name, values in zip(MOTION, frames, strict=True)}
+    found = {name: values[:, solid_bodies(scene)] for name, values in zip(MOTION, frames, strict=True)}
     return replace(start_motion(scene), **found, dt=float(rollout.meta["dt"]))
 
 
-def motion_rollout(scene: Scene, motion: Trajectory, units: Units = SI) -> Rollout:
-    """An engine's motion from a `start_of_scene` in `units` as a rollout of the scene in SI units, without contacts."""
-    steps, solid = len(motion.position), _solid(scene)
-    arrays = {name: np.zeros((steps, len(solid), 4 if name == "quat_xyzw" else 3)) for name in MOTION}
-    planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
-    own = {"position": units.length, "velocity": units.velocity, "angular_velocity": 1.0 / units.time}
-    for name, values in arrays.items():
-        values[:, solid] = own.get(name, 1.0) * getattr(motion, name)
-    for k, plane in zip(np.flatnonzero(~solid), planes, strict=True):
-        arrays["position"][:, k], arrays["quat_xyzw"][:, k] = plane.position, plane.quat_xyzw
-        arrays["position"][:, solid, 2] += plane.position[2]
-    dt = float(motion.dt) * units.time
-    return Rollout(
-        time=dt * np.arange(steps),
-        position=arrays["position"],
-        orientation=arrays["quat_xyzw"],
-        velocity=arrays["velocity"],
-        angular_velocity=arrays["angular_velocity"],
-        contact_count=np.zeros(steps, np.int64),
-        contact_point=np.zeros((0, 3)),
-        contact_body=np.zeros((0, 2), np.int64),
-        names=tuple(b.name for b in scene.bodies),
-        meta={"dt": dt},
-    )
-
-
-def _solid(scene: Scene) -> np.ndarray:
+def solid_bodies(scene: Scene) -> np.ndarray:
     """[N] bool: which bodies are no planes."""
     return np.array([not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies])
-
-
-def in_metres(motion: Trajectory, units: Units) -> Trajectory:
-    """An engine's motion from a `start_of_scene` in `units`, with positions, scales and velocities in m and m/s."""
-    lengths = {"position": units.length, "scale": units.length, "velocity": units.velocity}
-    return replace(motion, **{name: factor * getattr(motion, name) for name, factor in lengths.items()})
 
 
 # --- PyBullet ---
 
 
 def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Trajectory, Timing]:
-    """PyBullet's motion of `steps` recorded steps, in the teacher's own inner steps unless told.
+    """PyBullet's motion of `steps` recorded steps, by default in the teacher's own inner steps.
 
     Raises:
         SdfsimError: PyBullet is not installed, a step that the teacher does not make, or another inertia than recorded.
@@ -296,7 +250,7 @@ def mujoco(
         if any(warning.number for warning in unstable):
             raise SdfsimError("MuJoCo found the motion unstable, and put it back to its start")
 
-    return _motion(t, steps, advance, state)
+    return engine_motion(t, steps, advance, state)
 
 
 def engine_module(module: str, title: str, extra: str) -> Any:
@@ -307,7 +261,7 @@ def engine_module(module: str, title: str, extra: str) -> Any:
         raise NotInstalled(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
 
 
-def _motion(
+def engine_motion(
     start: Trajectory, steps: int, advance: Callable[[], None], state: Callable[[], tuple[np.ndarray, ...]]
 ) -> tuple[Trajectory, Timing]:
     """The motion of an engine of `steps` calls of `advance`, and its time.
@@ -350,171 +304,6 @@ def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.nda
     return [(engine.mjtGeom.mjGEOM_MESH, {"uservert": piece.vertices}) for piece in pieces]
 
 
-# --- Drake ---
-
-
-def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
-    """Drake's motion with hydroelastic contact: bodies that move are compliant tetrahedra, others rigid triangles.
-
-    It combines two coefficients of friction by their harmonic mean, where the teacher multiplies. So every body carries
-    its own square (one that moves alone, its product with the roughest thing that it may meet), and floor and static
-    bodies what suits the median body: exact where all that move have one friction, of at least half of the others'.
-    Restitution is 0.
-
-    Raises:
-        SdfsimError: Drake or fTetWild are not installed, or the motion fails.
-    """
-    lib = engine_module("pydrake.all", "Drake", "rivals")
-    t, builder = start.motion, lib.DiagramBuilder()
-    settings = lib.MultibodyPlantConfig(time_step=t.dt / substeps, contact_model="hydroelastic_with_fallback")
-    plant, _ = lib.AddMultibodyPlant(settings, builder)
-    plant.mutable_gravity_field().set_gravity_vector(t.gravity)
-
-    def surface(friction: float, compliant: bool, size: float) -> Any:
-        found = lib.ProximityProperties()
-        lib.AddContactMaterial(dissipation=None, friction=lib.CoulombFriction(friction, friction), properties=found)
-        if compliant:
-            lib.AddCompliantHydroelasticProperties(0.25 * size, MODULUS, found)
-        else:
-            lib.AddRigidHydroelasticProperties(0.25 * size, found)
-        return found
-
-    moving = ~t.static if (~t.static).any() else t.static
-    others = [*t.friction[t.static], *(start.floor or ())[:1]]
-    own = t.friction * (max(others, default=1.0) if (~t.static).sum() == 1 else t.friction)
-
-    def beside(friction: float) -> float:
-        wanted = friction * t.friction[moving]
-        return float(np.median(wanted * own[moving] / np.maximum(2.0 * own[moving] - wanted, 1e-3)))
-
-    if start.floor:
-        world, friction = (plant.world_body(), lib.RigidTransform()), beside(start.floor[0])
-        plant.RegisterCollisionGeometry(*world, lib.HalfSpace(), "floor", surface(friction, False, 1.0))
-    bodies = []
-    with tempfile.TemporaryDirectory() as scratch:  # files are read when the simulator is made
-        for i, name in enumerate(map(str, t.shape)):
-            kind, sizes = form_of(start.urdfs[name])
-            place = lib.RigidTransform(lib.Quaternion(np.roll(t.quat_xyzw[0, i], 1)), t.position[0, i])
-            scale, moves = float(t.scale[i]), not t.static[i]
-            if kind == "mesh":
-                file, mesh = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj"), start.meshes[name]
-                if not file.exists():
-                    write_text(file, _tetrahedra(mesh, start.urdfs[name]) if moves else wavefront([mesh]))
-                form, smallest = lib.Mesh(str(file), scale), np.ptp(mesh.vertices, axis=0).min()
-            else:
-                known = {"sphere": lib.Sphere, "box": lib.Box, "cylinder": lib.Cylinder, "capsule": lib.Capsule}
-                form, smallest = known[kind](*(scale * sizes)), sizes.min()
-            friction = float(own[i]) if moves else beside(float(t.friction[i]))
-            properties = surface(friction, moves, scale * float(smallest))
-            if not moves:
-                plant.RegisterCollisionGeometry(plant.world_body(), place, form, f"g{i}", properties)
-                continue
-            inertia = lib.UnitInertia(*(t.inertia[i] / t.mass[i]))
-            body = plant.AddRigidBody(f"b{i}", lib.SpatialInertia(float(t.mass[i]), np.zeros(3), inertia))
-            plant.RegisterCollisionGeometry(body, lib.RigidTransform(), form, f"g{i}", properties)
-            bodies.append((i, body, place))
-        plant.Finalize()
-        simulator = lib.Simulator(builder.Build())
-    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    for i, body, place in bodies:
-        plant.SetFreeBodyPose(context, body, place)
-        speed = lib.SpatialVelocity(t.angular_velocity[0, i], t.velocity[0, i])
-        plant.SetFreeBodySpatialVelocity(context=context, body=body, V_JpJc=speed)
-    simulator.Initialize()
-
-    def state() -> tuple[np.ndarray, ...]:
-        places = [plant.EvalBodyPoseInWorld(context, body) for _, body, _ in bodies]
-        speeds = [plant.EvalBodySpatialVelocityInWorld(context, body) for _, body, _ in bodies]
-        quat = np.roll([place.rotation().ToQuaternion().wxyz() for place in places], -1, axis=-1)
-        velocities = (np.array([getattr(v, of)() for v in speeds]) for of in ("translational", "rotational"))
-        return np.array([place.translation() for place in places]), quat, *velocities
-
-    return _motion(t, steps, lambda: simulator.AdvanceTo(round(context.get_time() / t.dt + 1) * t.dt), state)
-
-
-def _tetrahedra(mesh: Mesh, beside: Path) -> str:
-    """A VTK file of tetrahedra that fill a closed mesh, kept beside the shape's URDF."""
-    kept = beside.with_suffix(".vtk").resolve()
-    if not kept.exists():
-        filler = engine_module("pytetwild", "fTetWild", "rivals")
-        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file where it runs
-            points, cells = filler.tetrahedralize(
-                mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA
-            )
-        corner = points[cells[:, 0], None]
-        volume = np.linalg.det(points[cells[:, 1:]] - corner)
-        cells = np.where(volume[:, None] < 0, cells[:, [0, 2, 1, 3]], cells)[np.abs(volume) > 0]
-        lines = ["# vtk DataFile Version 3.0", "tetrahedra", "ASCII", "DATASET UNSTRUCTURED_GRID"]
-        lines += [f"POINTS {len(points)} double", *(" ".join(f"{x:.9g}" for x in point) for point in points)]
-        lines += [f"CELLS {len(cells)} {5 * len(cells)}", *("4 " + " ".join(map(str, cell)) for cell in cells)]
-        lines += [f"CELL_TYPES {len(cells)}", *["10"] * len(cells)]
-        write_text(kept, "\n".join(lines) + "\n")
-    return kept.read_text(encoding="utf-8")
-
-
-# --- Newton ---
-
-
-def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
-    """Newton's motion on the CPU, by XPBD on triangle meshes, contacts searched in every inner step.
-
-    It takes the mean of two coefficients of friction. So every body carries its square, and the floor what suits the
-    median body: exact where all have one friction. Its kernels compile for a minute on a machine's first run.
-
-    Raises:
-        SdfsimError: Newton is not installed, or the motion fails.
-    """
-    warp, lib = (engine_module(name, "Newton", "rivals") for name in ("warp", "newton"))
-    warp.config.quiet = True
-    t, builder = start.motion, lib.ModelBuilder(gravity=tuple(map(float, start.motion.gravity)))
-
-    def surface(friction: float) -> Any:
-        return lib.ModelBuilder.ShapeConfig(mu=friction, density=0.0)
-
-    own = t.friction**2
-    if start.floor:
-        builder.add_ground_plane(cfg=surface(max(0.0, float(np.median(2.0 * start.floor[0] * t.friction - own)))))
-    meshes, moving = {}, []
-    for i, name in enumerate(map(str, t.shape)):
-        kind, sizes = form_of(start.urdfs[name])
-        scale, body, place = float(t.scale[i]), -1, warp.transform(t.position[0, i], t.quat_xyzw[0, i])
-        if not t.static[i]:
-            inertia = warp.mat33(np.diag(t.inertia[i]))
-            body = builder.add_body(xform=place, mass=float(t.mass[i]), inertia=inertia, lock_inertia=True)
-            moving.append(i)
-        shape = {"cfg": surface(float(own[i])), "xform": place if body < 0 else None}
-        if kind == "sphere":
-            builder.add_shape_sphere(body, radius=scale * float(sizes[0]), **shape)
-        elif kind == "box":
-            half = 0.5 * scale * sizes
-            builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2], **shape)
-        else:
-            if name not in meshes:
-                mesh = start.meshes[name]
-                meshes[name] = lib.Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32).ravel())
-            builder.add_shape_mesh(body, mesh=meshes[name], scale=(scale,) * 3, **shape)
-    model = builder.finalize(device="cpu")
-    solver = lib.solvers.SolverXPBD(model, iterations=ITERATIONS)
-    pipeline = lib.CollisionPipeline(model)
-    contacts, now, then = pipeline.contacts(), model.state(), model.state()
-    speeds = np.concatenate([t.velocity[0, moving], t.angular_velocity[0, moving]], axis=1).astype(np.float32)
-    now.body_qd.assign(speeds)
-
-    def advance() -> None:
-        nonlocal now, then
-        for _ in range(substeps):
-            now.clear_forces()
-            pipeline.collide(now, contacts)
-            solver.step(now, then, None, contacts, t.dt / substeps)
-            now, then = then, now
-
-    def state() -> tuple[np.ndarray, ...]:
-        places, speeds = now.body_q.numpy().astype(float), now.body_qd.numpy().astype(float)
-        return places[:, :3], places[:, 3:], speeds[:, :3], speeds[:, 3:]
-
-    return _motion(t, steps, advance, state)
-
-
 # --- the engine's files ---
 
 
@@ -529,10 +318,10 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
         sizes = {"size": [2.0 * half for half in sdf.half]} if isinstance(sdf, BoxSdf) else {"radius": [sdf.radius]}
         if isinstance(sdf, CylinderSdf | CapsuleSdf):
             sizes["length"] = [2.0 * sdf.half]
-        told = {name: " ".join(f"{value:.9g}" for value in values) for name, values in sizes.items()}
-        urdf = folder / f"{sdf.KIND}-{'-'.join(told.values()).replace(' ', '-')}.urdf"
+        written = {name: " ".join(f"{value:.9g}" for value in values) for name, values in sizes.items()}
+        urdf = folder / f"{sdf.KIND}-{'-'.join(written.values()).replace(' ', '-')}.urdf"
         folder.mkdir(parents=True, exist_ok=True)
-        attributes = " ".join(f'{name}="{value}"' for name, value in told.items())
+        attributes = " ".join(f'{name}="{value}"' for name, value in written.items())
         return urdf if urdf.exists() else write_urdf(f"<{sdf.KIND} {attributes}/>", urdf)
     urdf = folder / f"pieces-{shape.mesh.digest()[:16]}.urdf"
     if not urdf.exists():

@@ -14,7 +14,7 @@ from sdfsim.base.console import columns
 from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, parallel, silent
-from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
+from sdfsim.data.batching import batches, first_frames, model_units, roll_out, scene_of
 from sdfsim.data.dataset import (
     Trajectory,
     conditions_of,
@@ -40,7 +40,7 @@ from sdfsim.training.contact_cache import inner_steps
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
-# m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
+# m/s; 0 shows what a recording alone cannot restore: an engine keeps more state than its recorded frames.
 PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}
 
 Rows = list[tuple[str, ...]]
@@ -54,7 +54,6 @@ def evaluate(
     split: str = "test",
     device: str = "cpu",
     free_flight: FreeFlight = "exact",
-    stride: int = 1,
     substeps: int | None = None,
     chaos_floor: bool = False,
     errors_only: bool = False,
@@ -66,7 +65,6 @@ def evaluate(
         model: bundled name, path or `Model`.
         steps: how far; errors are reported at the horizons of `HORIZONS` up to there, and there.
         free_flight: "exact" or (networks on surface nodes) "learned".
-        stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
         substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine where
             that is the teacher, and for those of `users_inner` where it is another.
         chaos_floor: also run the teacher again from starts that differ slightly (see `PERTURBATIONS`).
@@ -79,10 +77,10 @@ def evaluate(
         "outside_training": what of the scenes the model has not seen, one line each.
         "median_survival_s": of all of them, by limit in m: until half of the bodies are farther from the recording.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
-        "engine_substep": s, the recording engine's inner step; 0 where no dataset.json tells it.
-        "floor": its "friction" and "restitution", and whether a dataset.json "told" them.
+        "engine_substep": s, the recording engine's inner step; 0 where no dataset.json has it.
+        "floor": its "friction" and "restitution"; "told" is whether a dataset.json has them.
         "as_teacher": whether the solve has the teacher's habits: only for recordings of PyBullet as the teacher is set,
-            which a dataset.json tells. All others are judged with the solve as `Simulator` runs it, on their floor.
+            according to a dataset.json. All others are judged with the solve as `Simulator` runs it, on their floor.
         "inner_steps": of the solve in a step.
         Further counts, and "ms_per_step_per_trajectory".
 
@@ -94,16 +92,12 @@ def evaluate(
     stepper = stepper_of(used, free_flight=free_flight)
     recorded, shapes = load_recorded(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
-    longest -= longest % stride
-    as_recorded = [first_frames(t, longest + 1) for t in recorded]
-    recorded = [every(t, stride) for t in as_recorded]
-    longest //= stride
+    recorded = [first_frames(t, longest + 1) for t in recorded]
     again: dict[str, Motions] = {}
     if chaos_floor:
         on_progress(0.0, "teacher, from starts that differ slightly")
         starts = load_recorded(data, split, as_recorded=True)[0]
-        again = teacher_again(data, starts, longest * stride)
-        again = {name: [every(motion, stride) for motion in motions] for name, motions in again.items()}
+        again = teacher_again(data, starts, longest)
     substep, conditions = engine_substep(data), conditions_of(data)
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
@@ -111,9 +105,9 @@ def evaluate(
     if substeps is not None:
         inner = substeps
     elif conditions.by_teacher:
-        inner = stride * inner_steps(as_recorded[0].dt, substep)
+        inner = inner_steps(recorded[0].dt, substep)
     else:
-        inner = stride * SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes)
+        inner = SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes)
     used = replace(used, inner=substeps or used.inner)
     stepper = replace(stepper, model=used)
     for k, group in enumerate(groups):
@@ -139,7 +133,7 @@ def evaluate(
         "floor": {
             "friction": conditions.friction,
             "restitution": conditions.restitution,
-            "told": conditions.floor_told,
+            "told": conditions.floor_given,
         },
         "as_teacher": conditions.by_teacher,
         "inner_steps": used.inner or inner,
@@ -275,12 +269,12 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 
     def quality(who: str) -> list[str]:
         depth, gain = report["penetration"][who], report["energy_gain"][who]
-        told = {
+        shown = {
             "{:.4f} m": [depth["percentile_95"], depth["worst"]],
             "{:.2f} %": [value and 100 * value for value in (gain["mean"], gain["worst"])],
             "{:.4f} m/s": [report["resting_speed"][who]],
         }
-        return [NOTHING if value is None else form.format(value) for form, values in told.items() for value in values]
+        return [NOTHING if value is None else form.format(value) for form, values in shown.items() for value in values]
 
     others = {f"teacher, {size} m/s off": f"teacher {size}" for size in _perturbed(report)} | {"ballistic": "ballistic"}
     return [
@@ -294,12 +288,12 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 def notes(report: dict[str, Any]) -> list[str]:
     """What has to be known beside the tables, a line each."""
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
-    ground, told = report["floor"], "as dataset.json tells" if report["floor"]["told"] else "that of our recipes"
+    ground, source = report["floor"], "from dataset.json" if report["floor"]["told"] else "that of our recipes"
     how = f"The solve has the teacher's habits: bodies larger by {MARGIN:g} m, pushes that add to rebounds."
     if not report["as_teacher"]:
         how = f"The solve is as users run it, in {report['inner_steps']} inner steps: no dataset.json has the teacher."
     lines = [
-        f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {told}.",
+        f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {source}.",
         how,
         f"Penetration: the deepest node in every {depth['every']}th frame with contact.",
         "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
@@ -312,7 +306,9 @@ def notes(report: dict[str, Any]) -> list[str]:
     if steps < report["steps_asked"]:
         lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
     if not report["engine_substep"]:
-        lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
+        lines.append(
+            "No dataset.json has the engine's inner step: velocities count as those at the positions' instants."
+        )
     if floor:
         farthest = f"{floor['median_farthest_unperturbed_m']:.1g} m (median of the trajectories)"
         lines.append(f"Run again unperturbed, the teacher departs from its recording by up to {farthest}.")

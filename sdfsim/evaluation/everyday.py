@@ -41,7 +41,7 @@ KINDS = ("analytic", "mesh", "grid")
 DENSITY = 500.0  # kg/m^3
 Runner = Callable[[Scene, float], tuple[Rollout, str]]  # a scene, s -> its motion, and why that broke, if it did
 JUDGED = 60  # frames of a run, evenly spaced, in which surfaces are measured
-FACETS = 48  # of round meshes, unless told
+FACETS = 48  # of round meshes by default
 STILL = Rotation.identity()
 
 

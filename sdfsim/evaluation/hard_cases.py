@@ -55,7 +55,7 @@ RUNAWAY = 10.0  # times the energy at the start, and no motion is worth measurin
 
 
 @dataclass(frozen=True)
-class Run:
+class Trial:
     """One motion of one scene: of its bodies but for planes, up to the last good state."""
 
     scene: Scene
@@ -74,7 +74,7 @@ class Run:
         return self.motion.dt * np.arange(len(self.motion.position))
 
 
-Measure = Callable[[Sequence["Run"]], dict[str, float]]
+Measure = Callable[[Sequence["Trial"]], dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Figure:
     digits: int = 2  # shown after the point; differences that are not shown do not count
     limit: float | None = None  # what is wanted is at most this; None where only the teacher says how good one can be
     largest: bool = False  # of several repetitions the largest counts, not the mean
-    judged: bool = True  # lower is better; the others tell, such as the height of a rebound
+    judged: bool = True  # lower is better; other figures inform, such as the height of a rebound
     longer: bool = False  # higher is better instead
 
 
@@ -375,36 +375,36 @@ def size(scene: Scene) -> float:
     return float(np.mean([largest_extent(scene.shapes[b.shape]) * b.scale for b in _dynamic(scene)]))
 
 
-def ran_away(run: Run) -> str:
+def ran_away(trial: Trial) -> str:
     """When a motion had more than `RUNAWAY` times the energy it started with; empty if never.
 
     The energy at the start counts from one size below the lowest body, so that it is not zero.
     """
-    course, strength = energy(run.motion), float(np.linalg.norm(run.scene.gravity))
-    lowest = (run.path[0] @ -run.scene.gravity).min() - strength * size(run.scene)
-    given = course - run.motion.mass[~run.motion.static].sum() * lowest
+    course, strength = energy(trial.motion), float(np.linalg.norm(trial.scene.gravity))
+    lowest = (trial.path[0] @ -trial.scene.gravity).min() - strength * size(trial.scene)
+    given = course - trial.motion.mass[~trial.motion.static].sum() * lowest
     at = np.flatnonzero(given > RUNAWAY * given[0])
-    return f"more than {RUNAWAY:g} times the energy of the start from {run.time[at[0]]:.2f} s on" if len(at) else ""
+    return f"more than {RUNAWAY:g} times the energy of the start from {trial.time[at[0]]:.2f} s on" if len(at) else ""
 
 
-def rest(runs: Sequence[Run], *, times: Sequence[float]) -> dict[str, float]:
+def rest(trials: Sequence[Trial], *, times: Sequence[float]) -> dict[str, float]:
     """How a body at rest behaves: drift after each of `times`, and speed, height and motion over the last second."""
-    run = runs[0]
-    path, turn = run.path[:, 0], run.motion.quat_xyzw[:, ~run.motion.static][:, 0]
-    drift = 100 / size(run.scene) * np.linalg.norm((path - path[0])[:, :2], axis=1)
-    last = run.time >= run.time[-1] - 1.0
-    seconds = max(float(np.ptp(run.time[last])), 1e-9)
+    trial = trials[0]
+    path, turn = trial.path[:, 0], trial.motion.quat_xyzw[:, ~trial.motion.static][:, 0]
+    drift = 100 / size(trial.scene) * np.linalg.norm((path - path[0])[:, :2], axis=1)
+    last = trial.time >= trial.time[-1] - 1.0
+    seconds = max(float(np.ptp(trial.time[last])), 1e-9)
     return {
-        **{f"drift {t:g} s": float(drift[min(np.searchsorted(run.time, t), len(drift) - 1)]) for t in times},
+        **{f"drift {t:g} s": float(drift[min(np.searchsorted(trial.time, t), len(drift) - 1)]) for t in times},
         "speed": float(np.linalg.norm(np.diff(path[last], axis=0), axis=1).sum()) / seconds,
         "height": 100 * abs(float(path[-1, 2] - path[0, 2])) / float(path[0, 2]),
         "motion": float(np.abs(path[last] - path[-1]).max() + np.abs(turn[last] - turn[-1]).max()),
     }
 
 
-def standing(runs: Sequence[Run]) -> dict[str, float]:
+def standing(trials: Sequence[Trial]) -> dict[str, float]:
     """How many bodies of a stack have fallen, and how far the others have shifted sideways at most, % of size."""
-    path, scene = runs[0].path, runs[0].scene
+    path, scene = trials[0].path, trials[0].scene
     heights = []
     for body in _dynamic(scene):
         level = Rotation.from_quat(body.quat_xyzw).apply(scene.shapes[body.shape].mesh.vertices) @ UP
@@ -414,53 +414,53 @@ def standing(runs: Sequence[Run]) -> dict[str, float]:
     return {"fallen": float(fallen.sum()), "shift": float(shift[~fallen].max(initial=0.0))}
 
 
-def squeezed(runs: Sequence[Run]) -> dict[str, float]:
+def squeezed(trials: Sequence[Trial]) -> dict[str, float]:
     """Penetration of a stack, % of size, and how many have fallen."""
-    depth = depths(runs[0].scene, runs[0].motion)
-    return standing(runs) | {"worst depth": 100 * float(depth.max(initial=0.0)) / size(runs[0].scene)}
+    depth = depths(trials[0].scene, trials[0].motion)
+    return standing(trials) | {"worst depth": 100 * float(depth.max(initial=0.0)) / size(trials[0].scene)}
 
 
-def separated(runs: Sequence[Run]) -> dict[str, float]:
+def separated(trials: Sequence[Trial]) -> dict[str, float]:
     """Highest speed m/s of bodies that start in each other, and how deep they still are at the end, % of size."""
-    scene, motion = runs[0].scene, runs[0].motion
+    scene, motion = trials[0].scene, trials[0].motion
     speed = np.linalg.norm(motion.velocity[:, ~motion.static], axis=2)
     left = depths(scene, motion, every=max(1, len(motion.position) - 1)).max(initial=0.0)
     return {"exit speed": float(speed.max()), "depth left": 100 * float(left) / size(scene)}
 
 
-def passed(runs: Sequence[Run]) -> dict[str, float]:
+def passed(trials: Sequence[Trial]) -> dict[str, float]:
     """Share % of bodies thrown at a plate about the origin that have been below it while over its area."""
     shares = []
-    for run in runs:
-        plate = next(b for b in run.scene.bodies if b.motion == "static")
-        half = run.scene.shapes[plate.shape].sdf.bounds[1]
-        over = (np.abs(run.path[..., :2]) < half[:2]).all(-1)
-        below = run.path[..., 2] < plate.position[2] - 0.5 * size(run.scene)
+    for trial in trials:
+        plate = next(b for b in trial.scene.bodies if b.motion == "static")
+        half = trial.scene.shapes[plate.shape].sdf.bounds[1]
+        over = (np.abs(trial.path[..., :2]) < half[:2]).all(-1)
+        below = trial.path[..., 2] < plate.position[2] - 0.5 * size(trial.scene)
         shares.append(100 * float((over & below).any(0).mean()))
     return {"through": float(np.mean(shares))}
 
 
-def rebound(runs: Sequence[Run], *, restitution: float) -> dict[str, float]:
+def rebound(trials: Sequence[Trial], *, restitution: float) -> dict[str, float]:
     """Mean height of the first rebound of balls dropped onto the floor, % of what they fell, against e^2."""
-    scene, motion, shares = runs[0].scene, runs[0].motion, []
+    scene, motion, shares = trials[0].scene, trials[0].motion, []
     for k, body in enumerate(_dynamic(scene)):
-        low, rate = runs[0].path[:, k, 2] - scene.shapes[body.shape].sdf.bounds[1, 2], motion.velocity[:, k, 2]
+        low, rate = trials[0].path[:, k, 2] - scene.shapes[body.shape].sdf.bounds[1, 2], motion.velocity[:, k, 2]
         hit = np.flatnonzero(rate[1:] > rate[:-1])  # what flies gets slower upwards with every step
         up = np.flatnonzero(rate[hit[0] + 1 :] > 0) if len(hit) else hit
         shares.append(100 * max(0.0, float(low[hit[0] + 1 + up[0] :].max())) / float(low[0]) if len(up) else 0.0)
     return {"rebound": float(np.mean(shares)), "error": abs(float(np.mean(shares)) - 100 * restitution**2)}
 
 
-def slipped(runs: Sequence[Run], *, friction: float, offsets: Sequence[float]) -> dict[str, float]:
-    """Where a body on a slope begins to slide, in degrees from atan(friction); runs from rest go with rising `offsets`.
+def slipped(trials: Sequence[Trial], *, friction: float, offsets: Sequence[float]) -> dict[str, float]:
+    """Where a body on a slope begins to slide, in degrees from atan(friction); trials from rest, by rising offsets.
 
-    The first of the angles tried at which it travels more than half of what it would slide two degrees beyond the
-    critical one tells: from its distance we go back as far as Coulomb's law says that each degree adds.
+    The first angle counts at which it travels more than half of what it would slide two degrees beyond the critical
+    one. From that distance we go back by as much as each degree adds, by Coulomb's law.
     """
     critical = float(np.degrees(np.arctan(friction)))
-    travelled = np.array([np.linalg.norm(run.path[-1, 0] - run.path[0, 0]) for run in runs])
-    gravity = float(np.linalg.norm(runs[0].scene.gravity))
-    a_degree = slide(friction, critical + 2.0, float(runs[0].time[-1]), gravity) / 2.0
+    travelled = np.array([np.linalg.norm(trial.path[-1, 0] - trial.path[0, 0]) for trial in trials])
+    gravity = float(np.linalg.norm(trials[0].scene.gravity))
+    a_degree = slide(friction, critical + 2.0, float(trials[0].time[-1]), gravity) / 2.0
     over = np.flatnonzero(travelled > a_degree)
     begins = float(offsets[over[0]] - travelled[over[0]] / a_degree) if len(over) else float(offsets[-1])
     return {"slips at": begins, "error": abs(begins)}
@@ -472,13 +472,13 @@ def slide(friction: float, degrees: float, seconds: float, gravity: float) -> fl
     return 0.5 * gravity * max(0.0, float(np.sin(angle) - friction * np.cos(angle))) * seconds**2
 
 
-def heaped(runs: Sequence[Run]) -> dict[str, float]:
+def heaped(trials: Sequence[Trial]) -> dict[str, float]:
     """A pile in a bowl: penetration, who left through the wall, and energy beyond that of the start."""
-    scene, motion = runs[0].scene, runs[0].motion
+    scene, motion = trials[0].scene, trials[0].motion
     bowl = next(b for b in scene.bodies if b.name == "bowl")
     outer = 0.5 * bowl.scale
     middle = outer * (1 - 0.5 * WALL)
-    from_centre = runs[0].path - bowl.position
+    from_centre = trials[0].path - bowl.position
     radius, under = np.linalg.norm(from_centre, axis=2), from_centre[..., 2] < 0
     out = (under[:-1] & under[1:] & (radius[:-1] < middle) & (radius[1:] >= middle)).any(0)
     course, weight = energy(motion), motion.mass[~motion.static].sum() * np.linalg.norm(scene.gravity)
@@ -490,34 +490,34 @@ def heaped(runs: Sequence[Run]) -> dict[str, float]:
     }
 
 
-def created(runs: Sequence[Run]) -> dict[str, float]:
+def created(trials: Sequence[Trial]) -> dict[str, float]:
     """Energy that came from nothing: share % of steps that add more than `GAIN` of the start's, and the worst, %."""
-    courses = [energy(run.motion) for run in runs]
+    courses = [energy(trial.motion) for trial in trials]
     gains = np.concatenate([np.diff(course) / course[0] for course in courses])
     return {"steps with gain": 100 * float((gains > GAIN).mean()), "worst gain": 100 * float(gains.max(initial=0.0))}
 
 
-def turned_back(runs: Sequence[Run], *, degrees: Sequence[float]) -> dict[str, float]:
+def turned_back(trials: Sequence[Trial], *, degrees: Sequence[float]) -> dict[str, float]:
     """Deviation % of size, at the end, of turned scenes from themselves; `degrees` is one group's, the first 0."""
     apart = 0.0
-    for start in range(0, len(runs), len(degrees)):
+    for start in range(0, len(trials), len(degrees)):
         for offset, angle in enumerate(degrees[1:], 1):
             back = Rotation.from_euler("z", -angle, degrees=True)
-            apart = max(apart, float(_apart(runs[start], runs[start + offset], back)[-1]))
+            apart = max(apart, float(_apart(trials[start], trials[start + offset], back)[-1]))
     return {"deviation": apart}
 
 
-def diverged(runs: Sequence[Run]) -> dict[str, float]:
+def diverged(trials: Sequence[Trial]) -> dict[str, float]:
     """Mean time s until motions of the second half are 10 % of a size from the first half's; their length if never."""
-    half, times = len(runs) // 2, []
-    for one, other in zip(runs[:half], runs[half:], strict=True):
+    half, times = len(trials) // 2, []
+    for one, other in zip(trials[:half], trials[half:], strict=True):
         distance = _apart(one, other, Rotation.identity())
         away = np.flatnonzero(distance > 100 * APART)
         times.append(float(one.time[away[0] if len(away) else len(distance) - 1]))
     return {"diverges after": float(np.mean(times))}
 
 
-def _apart(reference: Run, other: Run, back: Rotation) -> np.ndarray:
+def _apart(reference: Trial, other: Trial, back: Rotation) -> np.ndarray:
     """[T] % of size: root mean square over the bodies of how far they are from each other."""
     frames = min(len(reference.path), len(other.path))
     returned = back.apply(other.path[:frames].reshape(-1, 3)).reshape(frames, -1, 3)

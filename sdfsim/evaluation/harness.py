@@ -222,16 +222,16 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def peak_memory() -> Iterator[dict[str, float | None]]:
-    """Puts under "mib" by how much the process grew inside the block at most; None where Linux does not tell."""
-    told: dict[str, float | None] = {"mib": None}
+    """Sets "mib" to the most by which the process grew inside the block; None where Linux does not report it."""
+    peak: dict[str, float | None] = {"mib": None}
     try:
         Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
         before = _status("VmRSS")
     except OSError:
-        yield told
+        yield peak
         return
-    yield told
-    told["mib"] = max(0.0, _status("VmHWM") - before) / 1024
+    yield peak
+    peak["mib"] = max(0.0, _status("VmHWM") - before) / 1024
 
 
 def _status(name: str) -> float:

@@ -1,4 +1,4 @@
-"""What rollouts are judged by: errors against a recording as the paper reports them, energy, rest, survival."""
+"""What rollouts are judged by: errors as Rubanova et al. (2024) report them, energy, rest, survival."""
 
 from __future__ import annotations
 

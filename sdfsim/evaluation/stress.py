@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -20,8 +19,8 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.base.version import __version__
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
-from sdfsim.evaluation.engines import bullet, drake, mujoco, rollout_motion, shape_urdf, start_motion, start_of_scene
-from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
+from sdfsim.evaluation.engines import Engine, bullet, rollout_motion, shape_urdf, start_motion, start_of_scene
+from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Trial, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
 from sdfsim.learned.model import Model, load_model, model_names
 from sdfsim.learned.training_ranges import constant_in_training
@@ -33,7 +32,7 @@ from sdfsim.simulate.steppers import stepper_of
 
 VERSION = 5  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
-ENGINES = {TEACHER: bullet, "MuJoCo": mujoco, "Drake": drake}
+USUAL = {TEACHER: bullet}
 OUTSIDE = "†"
 WATCHED = 10.0  # s of a recording
 OWN = 1e4  # about how long a case with scenes of its own takes, as `work` counts
@@ -51,7 +50,8 @@ class Study:
     """All results of the hard cases.
 
     Attributes:
-        who: models, then engines; the teacher where PyBullet is installed.
+        models: their names.
+        engines: their names; the teacher where PyBullet is installed.
         results: (case, who) -> figures (name -> a value a repetition), broke, outside and laws (lines; the last are
             those that a motion of ours breaks, by instruments that know no contacts) and recording (a path in the
             folder, or None); nothing for a case that one cannot take part in.
@@ -59,9 +59,15 @@ class Study:
     """
 
     cases: list[Case]
-    who: list[str]
+    models: list[str]
+    engines: list[str]
     results: Results
     quick: bool
+
+    @property
+    def who(self) -> list[str]:
+        """Models, then engines."""
+        return [*self.models, *self.engines]
 
 
 def stress(
@@ -71,7 +77,7 @@ def stress(
     quick: bool = False,
     shapes: Path | None = None,
     device: str = "cpu",
-    engines: Sequence[str] = (TEACHER,),
+    engines: Mapping[str, Engine] = USUAL,
     on_progress: Progress = silent,
 ) -> Study:
     """Run every case that `out` does not hold the result of yet. It holds results/, the engine's files, and in
@@ -81,7 +87,7 @@ def stress(
         models: names or paths; none for the solver and all bundled networks.
         quick: fewer and shorter cases.
         shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
-        engines: of `ENGINES`.
+        engines: by name; the teacher is `TEACHER`.
 
     Raises:
         SdfsimError: no such model or device, two models of one name, unusable shapes or none to be fetched, another run
@@ -89,14 +95,14 @@ def stress(
     """
     device = str(pick_device(device))
     tested = [load_model(name) for name in models or model_names()]
-    who = [model.name for model in tested]
-    if twice := {name for name in who if who.count(name) > 1}:
+    names, others = [model.name for model in tested], list(engines)
+    if twice := {name for name in names if names.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")
     found = cases(quick=quick, shapes=shapes and public_folder(shapes, on_progress))
-    with suppress(SdfsimError):
+    try:
         import_pybullet()
-        who += [TEACHER] if TEACHER in engines else []
-    who += [name for name in engines if name != TEACHER]
+    except SdfsimError:
+        others = [name for name in others if name != TEACHER]
     scenes = {case.name: [case.scenes(repeat) for repeat in range(case.repeats)] for case in found}
 
     def work(case: Case) -> float:
@@ -114,9 +120,9 @@ def stress(
             if not case.cuda or (stepper_of(model).network and torch.cuda.is_available()):
                 arguments = (case, model, device, out)
                 jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments))
-        for name in who[len(tested) :] if case.engines else []:
+        for name in others if case.engines else []:
             settings = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
-            jobs.append(Job(case.name, name, [content, settings], _tried, (case, name, device, out)))
+            jobs.append(Job(case.name, name, [content, settings], _tried, (case, (name, engines[name]), device, out)))
             cut |= {id(shape): shape for scene in scenes[case.name][0] for shape in scene.shapes}
     with locked(out):
         for shape in cut.values():  # before the work is split up, so that no two processes cut one mesh into pieces
@@ -125,11 +131,11 @@ def stress(
         results = measure(jobs, out / "results", where="cores", on_progress=on_progress)
     if failed := [f"{case} with {one}: {r['failed']}" for (case, one), r in results.items() if "failed" in r]:
         raise SdfsimError(failed[0])
-    return Study(found, who, results, quick)
+    return Study(found, names, others, results, quick)
 
 
-def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, Any]:
-    """All repetitions of a case with one model, or with an engine by name: see `Study.results`."""
+def _tried(case: Case, model: Model | tuple[str, Engine], device: str, out: Path) -> dict[str, Any]:
+    """All repetitions of a case with one model, or with an engine and its name: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
     broke, outside, laws, recording = [], [], [], None
     if isinstance(model, Model) and (about := GROUPS[case.group].about) in constant_in_training(model):
@@ -140,8 +146,8 @@ def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, 
             for name, value in case.own(model).items():
                 figures[name].append(value)
             continue
-        if isinstance(model, str):
-            runs = [by_engine(model, scene, out / "engine", case.seconds) for scene in scenes]
+        if not isinstance(model, Model):
+            runs = [by_engine(*model, scene, out / "engine", case.seconds) for scene in scenes]
         else:
             places = [device, "cuda"] if case.cuda else [device]
             runs = [simulated(scene, model, place, case.seconds) for place in places for scene in scenes]
@@ -162,30 +168,30 @@ def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, 
             (out / recording).parent.mkdir(parents=True, exist_ok=True)
             watched = shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum()))
             save_rollout(shown.scene, watched, out / recording)
-    told = {"outside": list(dict.fromkeys(outside)), "laws": laws}
-    return {"figures": figures, "broke": broke, "recording": recording, **told}
+    lines = {"outside": list(dict.fromkeys(outside)), "laws": laws}
+    return {"figures": figures, "broke": broke, "recording": recording, **lines}
 
 
-def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Run:
+def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Trial:
     """Our motion of a scene; one that ran away counts as broken."""
     broke = ""
     try:
         rollout = Simulator(scene, model, device).run(seconds=seconds)
     except SimulationError as error:
         rollout, broke = error.rollout, error.message
-    run = Run(scene, rollout_motion(scene, rollout), broke, rollout)
+    run = Trial(scene, rollout_motion(scene, rollout), broke, rollout)
     return run if broke else replace(run, broke=ran_away(run))
 
 
-def by_engine(name: str, scene: Scene, folder: Path, seconds: float) -> Run:
+def by_engine(name: str, engine: Engine, scene: Scene, folder: Path, seconds: float) -> Trial:
     """An engine's motion of a scene (see `start_of_scene`), with its files in `folder`. It has no sleep."""
     try:
-        motion, _ = ENGINES[name](start_of_scene(scene, folder), max(1, round(seconds / DT)))
+        motion, _ = engine(start_of_scene(scene, folder), max(1, round(seconds / DT)))
     except SdfsimError as error:
         if name == TEACHER:
             raise
-        return Run(scene, start_motion(scene), error.message)
-    run = Run(scene, motion)
+        return Trial(scene, start_motion(scene), error.message)
+    run = Trial(scene, motion)
     return replace(run, broke=ran_away(run))
 
 
@@ -205,10 +211,10 @@ def noise(result: dict[str, Any], figure: Figure) -> float:
 
 
 def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
-    """A figure with its spread, and its state: "missed" what is wanted, "behind" the teacher, "fine", or "told"."""
+    """A figure with its spread, and its state: "missed" what is wanted, "behind" the teacher, "fine", or "shown"."""
     result, teacher = study.results.get((case.name, who)), study.results.get((case.name, TEACHER))
     if result is None:
-        return "-", "told"
+        return "-", "shown"
     now, spread = value(result, figure), noise(result, figure)
     shown = f"{round(now, figure.digits) + 0.0:.{figure.digits}f}"  # no minus before a zero
     if float(f"{spread:.{figure.digits}f}") > 0:
@@ -219,7 +225,7 @@ def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
     elif result["outside"]:
         shown += f" {OUTSIDE}"
     if not figure.judged:
-        return shown, "told"
+        return shown, "shown"
     if result["broke"] or (figure.limit is not None and now > figure.limit):
         return shown, "missed"
     if figure.limit is None and teacher and who != TEACHER and not teacher["broke"]:
@@ -248,7 +254,7 @@ def losses(study: Study) -> dict[str, dict[str, int]]:
         mine = [case for case in study.cases if (case.name, who) in study.results]
         states = [cell(study, case, figure, who)[1] for case in mine for figure in case.figures]
         found[who] = {
-            "figures": sum(state != "told" for state in states),
+            "figures": sum(state != "shown" for state in states),
             "missed": states.count("missed"),
             "behind the teacher": states.count("behind"),
             "cases that blew up": sum(bool(study.results[case.name, who]["broke"]) for case in mine),
@@ -293,7 +299,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
     """
     drawn = [name for name in GROUPS if draw_group(study, name, out / "plots" / f"{name}.png")]
     plots = "\n".join(f"![{GROUPS[name].title}](plots/{name}.png)" for name in drawn)
-    told = [
+    outside = [
         f"- {who}, {case}: {line}"
         for (case, who), result in study.results.items()
         for line in [*result["broke"], *result["outside"]]
@@ -305,7 +311,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         table(study),
         plots,
         "## Blew up, or outside of training",
-        "\n".join(told),
+        "\n".join(outside),
         "## Laws broken, by instruments that do not know the contacts",
         "\n".join(f"- {who}, {case}: {lines[0]} ({len(lines)} in all)" for case, who, lines in broken),
     ]
@@ -321,7 +327,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         "failed_checks": [
             f"{case} with {who} blew up: {result['broke'][0]}"
             for (case, who), result in study.results.items()
-            if result["broke"] and who not in ENGINES
+            if result["broke"] and who in study.models
         ],
     }
     write_json(out / "report.json", report)

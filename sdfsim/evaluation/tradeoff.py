@@ -139,7 +139,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
         raise SdfsimError(f"{scene.path}: {next(problem for problem, there in problems.items() if there)}")
     shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}
     t = start.motion
-    # The engine's flights are those of bodies that are half an inner step of gravity faster than it is told.
+    # The engine flies bodies as if they were faster than given by half an inner step of gravity.
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
@@ -162,7 +162,7 @@ def _centred(shape: Shape, name: str) -> Shape:
 
 
 @dataclass(frozen=True)
-class Setting:
+class Variant:
     """One way to simulate. The defaults are those of `sdfsim evaluate`."""
 
     model: str  # name or path
@@ -180,7 +180,7 @@ class Setting:
         """The model and all that is not the default."""
         if not self.contact:
             return "ballistic"
-        usual, path = Setting(self.model), Path(self.model)
+        usual, path = Variant(self.model), Path(self.model)
         name = path.parent.name if path.name == "model.safetensors" else path.name.removesuffix(".safetensors")
         return ", ".join([name, *(f"{k} {v}" for k, v in asdict(self).items() if v != getattr(usual, k))])
 
@@ -189,12 +189,12 @@ class Setting:
         """Settings that differ in one knob alone."""
         if not self.contact:
             return "all contact ignored"
-        usual, name = Setting(self.model), self.label.partition(",")[0]
+        usual, name = Variant(self.model), self.label.partition(",")[0]
         knobs = {"nodes": "nodes", "sdf": "distances", "stride": "step", "substeps": "step"}
         return next((f"{name}: {what}" for k, what in knobs.items() if getattr(self, k) != getattr(usual, k)), name)
 
 
-def settings(models: Sequence[str], *, quick: bool) -> list[Setting]:
+def variants(models: Sequence[str], *, quick: bool) -> list[Variant]:
     """Each model with each of its knobs alone, and two useful combinations."""
     chosen = []
     for name in models:
@@ -205,17 +205,17 @@ def settings(models: Sequence[str], *, quick: bool) -> list[Setting]:
             knobs += [{"substeps": k} for k in ((2, 10) if quick else (1, 2, 3, 10, 20))]
             knobs += [{"sdf": kind} for kind in (() if quick else ("mlp", *(f"grid {k}" for k in GRIDS), "mesh"))]
             knobs += [{"stride": 2, "substeps": k} for k in ((1,) if quick else (1, 2, 4))]
-        chosen += [Setting(name, **knob) for knob in knobs]
-    return [*chosen, Setting(models[0], contact=False)]
+        chosen += [Variant(name, **knob) for knob in knobs]
+    return [*chosen, Variant(models[0], contact=False)]
 
 
-def arranged(setting: Setting, cases: Cases) -> dict[str, Shape]:
-    """The shapes with the nodes and distances that a setting wants."""
+def arranged(variant: Variant, cases: Cases) -> dict[str, Shape]:
+    """The shapes with the nodes and distances that a variant wants."""
     shapes = {}
-    kind, _, count = setting.nodes.partition(" ")
+    kind, _, count = variant.nodes.partition(" ")
     for name, shape in cases.shapes.items():
-        if setting.sdf != "own" and not isinstance(shape.sdf, ClosedForm):
-            way, _, cells = setting.sdf.partition(" ")
+        if variant.sdf != "own" and not isinstance(shape.sdf, ClosedForm):
+            way, _, cells = variant.sdf.partition(" ")
             if way == "grid":
                 pieces = own_pieces(shape)
                 exact = PiecesDistance(pieces) if pieces else MeshDistance(shape.mesh)
@@ -233,33 +233,33 @@ def arranged(setting: Setting, cases: Cases) -> dict[str, Shape]:
 # --- measuring ---
 
 
-def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
-    """Errors and times of our simulator in one setting: see `_judged` and `_times`."""
+def measure_ours(variant: Variant, cases: Cases) -> dict[str, Any]:
+    """Errors and times of our simulator in one variant: see `_judged` and `_times`."""
     with peak_memory() as memory:
         began = time.perf_counter()
-        model, shapes = load_model(setting.model), arranged(setting, cases)
+        model, shapes = load_model(variant.model), arranged(variant, cases)
         prepared = time.perf_counter() - began
-        starts, steps = [every(t, setting.stride) for t in cases.starts], cases.steps // setting.stride
+        starts, steps = [every(t, variant.stride) for t in cases.starts], cases.steps // variant.stride
         motions = roll_out(
-            model, starts, shapes, steps, contact=setting.contact, floor=cases.floor, substeps=setting.substeps,
-            as_teacher=setting.contact and cases.by_teacher,
+            model, starts, shapes, steps, contact=variant.contact, floor=cases.floor, substeps=variant.substeps,
+            as_teacher=variant.contact and cases.by_teacher,
         )  # fmt: skip
-    result = _judged(motions, cases, setting.stride) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
+    result = _judged(motions, cases, variant.stride) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
     if result["exploded"]:
         return result
-    return result | _times(lambda: _time_simulator(setting, model, shapes, cases), cases)
+    return result | _times(lambda: _time_simulator(variant, model, shapes, cases), cases)
 
 
-def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], cases: Cases) -> Timing:
+def _time_simulator(variant: Variant, model: Model, shapes: dict[str, Shape], cases: Cases) -> Timing:
     """One scene of the cases on its own, as `sdfsim simulate` runs it."""
-    start = every(cases.starts[cases.timed], setting.stride)
+    start = every(cases.starts[cases.timed], variant.stride)
     scene = scene_of([start], [0], shapes, cases.floor)[0]
-    effects = replace(scene.effects, sleep="off", contact="auto" if setting.contact else "off")
+    effects = replace(scene.effects, sleep="off", contact="auto" if variant.contact else "off")
     simulator = Simulator(replace(scene, effects=effects), model, dt=start.dt)
-    simulator.options = replace(simulator.options, substeps=model.inner or setting.substeps)
-    steps = min(TIMED, cases.steps // setting.stride)
+    simulator.options = replace(simulator.options, substeps=model.inner or variant.substeps)
+    steps = min(TIMED, cases.steps // variant.stride)
     taken = timed(lambda count: deque(simulator.steps(count), maxlen=0), steps)
-    return Timing(taken.first_ms, taken.wall_ms / setting.stride, taken.cpu_ms / setting.stride)
+    return Timing(taken.first_ms, taken.wall_ms / variant.stride, taken.cpu_ms / variant.stride)
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
@@ -308,7 +308,7 @@ def _times(run: Callable[[], Timing], cases: Cases) -> dict[str, Any]:
     """
     model = load_model(SOLVER)
     repeats, usual = zip(
-        *((run(), _time_simulator(Setting(SOLVER), model, cases.shapes, cases)) for _ in range(REPEATS)), strict=True
+        *((run(), _time_simulator(Variant(SOLVER), model, cases.shapes, cases)) for _ in range(REPEATS)), strict=True
     )
     taken, default = (np.array([r.cpu_ms for r in part]) for part in (repeats, usual))
     return {
@@ -338,7 +338,7 @@ def tradeoff(
             boxes and balls.
         out: folder to write; results that it holds already are kept.
         models: names or paths (none: the solver and all bundled networks).
-        quick: fewer settings on fewer, shorter scenes.
+        quick: fewer variants on fewer, shorter scenes.
 
     Returns:
         The content of report.json: `points`, each with its label, its kind ("ours", "engine", "floor", "baseline"),
@@ -359,11 +359,11 @@ def tradeoff(
             cases = cases_of_scene(scene, names[0], out / "engine", quick=quick)
         kinds, families, jobs = {FLOOR_LABEL: "floor"}, {}, []
         content = [VERSION, machine(), replace(cases, urdfs={}, solids={})]
-        for setting in settings(names, quick=quick):
-            kinds[setting.label] = "ours" if setting.contact else "baseline"
-            families[setting.label] = setting.family
-            weights = load_model(setting.model) if setting.contact else None
-            jobs.append(Job("cases", setting.label, [content, setting, weights], measure_ours, (setting, cases)))
+        for variant in variants(names, quick=quick):
+            kinds[variant.label] = "ours" if variant.contact else "baseline"
+            families[variant.label] = variant.family
+            weights = load_model(variant.model) if variant.contact else None
+            jobs.append(Job("cases", variant.label, [content, variant, weights], measure_ours, (variant, cases)))
         for name, counts in (ENGINES_QUICK if quick else ENGINES).items():
             for substeps in counts:
                 label = f"{name} {1e3 * DT / substeps:.3g} ms"
@@ -432,8 +432,8 @@ def table(points: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def told(report: dict[str, Any]) -> tuple[Rows, list[str]]:
-    """The report for people: a row a point, by time, and where to look."""
+def report_table(report: dict[str, Any]) -> tuple[Rows, list[str]]:
+    """The report for people: a row for each point, by time, and where the files are."""
     steps, best = str(report["horizon_steps"]), set(report["front"])
     rows: Rows = [("", "ms / s", "p95", "m", "degrees", "penetration m", "MiB")]
     for p in sorted(report["points"], key=lambda p: p.get("ms", float("inf"))):

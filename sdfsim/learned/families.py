@@ -19,7 +19,7 @@ from sdfsim.geometry.mesh import Mesh, convex_hull, joined
 from sdfsim.learned.baselines.dpi import DPI, dpi_graph
 from sdfsim.learned.baselines.fignet import FIGNET, FIGNET_STAR, fignet_graph, fignet_star_graph
 from sdfsim.learned.baselines.mgn import MGN, mgn_graph
-from sdfsim.learned.message_passing import Graph, Layout
+from sdfsim.learned.message_passing import Layout, MultiGraph
 from sdfsim.learned.near import Contacts, Pairs, face_pairs, find_contacts, no_contacts, no_pairs, node_pairs
 from sdfsim.learned.sdf_sim import SDF_SIM, sdf_sim_graph
 from sdfsim.learned.tensors import BodyTensors, StateTensors
@@ -84,7 +84,7 @@ class Family:
     # what of the bodies is near what, for bodies, state, gravity, reach, time step and the compiled scene of a run
     near: Callable[[BodyTensors, StateTensors, np.ndarray, float, float, Compiled | None], Contacts | Pairs]
     none: Callable[[device], Contacts | Pairs]  # the same of bodies that are near nothing
-    graph: Callable[[BodyTensors, StateTensors, Any], Graph]  # the graph of bodies, their state and what is near
+    graph: Callable[[BodyTensors, StateTensors, Any], MultiGraph]  # the graph of bodies, their state and what is near
     distances: bool = False  # whether `near` asks the compiled distances of a scene
 
 

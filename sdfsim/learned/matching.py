@@ -1,4 +1,4 @@
-"""Shape matching: the rigid motion that best explains displaced nodes (Müller et al., 2005; paper, section 3)."""
+"""Shape matching: the rigid motion that best explains displaced nodes (Müller et al., 2005), as SDF-Sim uses it."""
 
 from __future__ import annotations
 

@@ -6,9 +6,8 @@ joins single nodes, or the three corners of one face to those of another and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import cast
 
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Features:
-    """How many numbers something is told by, and the columns at which vectors begin (their y turns in a mirror)."""
+    """The number of features, and the columns at which vectors begin (a mirror reverses their y)."""
 
     size: int
     vectors: tuple[int, ...] = ()
@@ -42,7 +41,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Edges:
+class EdgeSet:
     """E edges of one kind."""
 
     features: Tensor  # [E, F] float32
@@ -52,11 +51,11 @@ class Edges:
 
 
 @dataclass(frozen=True)
-class Graph:
+class MultiGraph:
     """A graph of some layout."""
 
     nodes: dict[str, Tensor]  # features [n, F] float32 of each set
-    edges: dict[str, Edges]  # of each kind
+    edges: dict[str, EdgeSet]  # of each kind
 
     def __len__(self) -> int:
         """How many nodes there are."""
@@ -67,25 +66,25 @@ class Graph:
         """How many edges there are, each direction counted."""
         return sum(len(edges.sender) for edges in self.edges.values())
 
-    def mirrored(self, layout: Layout) -> Graph:
+    def mirrored(self, layout: Layout) -> MultiGraph:
         """What the mirror image of the scene would give: y of every vector feature reversed."""
         nodes = {name: flipped(x, layout.nodes[name]) for name, x in self.nodes.items()}
         kinds = layout.edges
         edges = {k: replace(e, features=flipped(e.features, kinds[k].features)) for k, e in self.edges.items()}
-        return Graph(nodes, edges)
+        return MultiGraph(nodes, edges)
 
 
-def flipped(values: Tensor, told: Features) -> Tensor:
+def flipped(values: Tensor, kind: Features) -> Tensor:
     """`values` [n, F] with y of their vectors reversed."""
     sign = torch.ones(values.shape[-1], dtype=values.dtype, device=values.device)
-    sign[[column + 1 for column in told.vectors]] = -1.0
+    sign[[column + 1 for column in kind.vectors]] = -1.0
     return values * sign
 
 
-def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> Edges:
+def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> EdgeSet:
     """Edges in both directions: features `forth` [E, F] from `first` to `second` [E, corners], `back` the other way."""
     features = torch.cat([forth, back]).float()
-    return Edges(features, torch.cat([first, second]), torch.cat([second, first]))
+    return EdgeSet(features, torch.cat([first, second]), torch.cat([second, first]))
 
 
 @dataclass(frozen=True)
@@ -94,13 +93,6 @@ class GraphConfig:
 
     width: int = 128  # of every latent and hidden layer
     steps: int = 10  # of message passing, each with weights of its own
-
-
-def by_rows(function: Callable[..., Tensor], rows: int | None, *inputs: Tensor) -> Tensor:
-    """`function` of inputs [E, ...] that treats every row alone, on at most `rows` of them at once."""
-    if rows is None or len(inputs[0]) <= rows:
-        return function(*inputs)
-    return torch.cat([function(*part) for part in zip(*(v.split(rows) for v in inputs), strict=True)])
 
 
 def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn.Sequential:
@@ -157,7 +149,7 @@ class GraphNetwork(nn.Module):
         super().__init__()
         self.layout, self.config = layout, config
         width, kinds = config.width, layout.edges
-        sizes = {name: told.size for name, told in layout.nodes.items()}
+        sizes = {name: features.size for name, features in layout.nodes.items()}
         sizes |= {name: kind.features.size for name, kind in kinds.items()}
         outputs = {name: width * (kinds[name].corners if name in kinds else 1) for name in sizes}
         self.scale = nn.ModuleDict({name: Normaliser(size) for name, size in sizes.items()})
@@ -166,27 +158,26 @@ class GraphNetwork(nn.Module):
         self.steps = nn.ModuleList([Step(layout, width) for _ in range(config.steps)])
         self.decode = mlp(width, width, 3, normalised=False)
 
-    def observe(self, graph: Graph) -> None:
+    def observe(self, graph: MultiGraph) -> None:
         """Count the features of a graph into the statistics."""
         for name, features in graph.nodes.items():
             cast("Normaliser", self.scale[name]).observe(features)
         for name, edges in graph.edges.items():
             cast("Normaliser", self.scale[name]).observe(edges.features)
 
-    def forward(self, graph: Graph, *, rows: int | None = None) -> Tensor:
-        """Standardised accelerations (change of displacement a step) of the set "node", [n, 3]; updates no more than
-        `rows` edges at once."""
+    def forward(self, graph: MultiGraph) -> Tensor:
+        """Standardised accelerations (change of displacement a step) of the set "node", [n, 3]."""
 
         def encoded(name: str, features: Tensor) -> Tensor:
-            return by_rows(lambda part: self.encode[name](self.scale[name](part)), rows, features)
+            return self.encode[name](self.scale[name](features))
 
         node = {name: encoded(name, features) for name, features in graph.nodes.items()}
         edge = {name: encoded(name, edges.features) for name, edges in graph.edges.items()}
         for step in cast("Iterable[Step]", self.steps):
             received = {name: [latent] for name, latent in node.items()}
             for name, kind in self.layout.edges.items():
-                ends, update = graph.edges[name], partial(step.edges[name], node[kind.sender], node[kind.receiver])
-                edge[name] = edge[name] + by_rows(update, rows, edge[name], ends.sender, ends.receiver)
+                ends, sent, received_by = graph.edges[name], node[kind.sender], node[kind.receiver]
+                edge[name] = edge[name] + step.edges[name](sent, received_by, edge[name], ends.sender, ends.receiver)
                 total = torch.zeros_like(node[kind.receiver])
                 messages = edge[name].reshape(-1, self.config.width)
                 received[kind.receiver].append(total.index_add_(0, ends.receiver.flatten(), messages))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, Layout
+from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, Layout, MultiGraph
 from sdfsim.learned.near import Contacts
 from sdfsim.learned.surfaces import NODES, STAR, motion_features, star
 from sdfsim.learned.tensors import BodyTensors, StateTensors
@@ -21,12 +21,12 @@ SDF_SIM = Layout(
 )
 
 
-def sdf_sim_graph(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> Graph:
+def sdf_sim_graph(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> MultiGraph:
     """The published graph."""
     features = _contact_features(bodies, state, contacts).float()
     node, body = contacts.node[:, None], contacts.body[:, None]
-    edges = {"contact_up": Edges(features, node, body), "contact_down": Edges(features, body, node)}
-    return Graph(motion_features(bodies, state), star(bodies, state) | edges)
+    edges = {"contact_up": EdgeSet(features, node, body), "contact_down": EdgeSet(features, body, node)}
+    return MultiGraph(motion_features(bodies, state), star(bodies, state) | edges)
 
 
 def _contact_features(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> Tensor:

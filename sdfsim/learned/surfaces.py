@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sdfsim.learned import pose
 from sdfsim.learned.matching import match_shapes
-from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, GraphNetwork
+from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, GraphNetwork, MultiGraph
 from sdfsim.learned.tensors import BodyTensors, StateTensors
 
 NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
@@ -97,15 +97,15 @@ def motion_features(bodies: BodyTensors, state: StateTensors) -> dict[str, Tenso
     return {"body": body.float(), "node": node.float()}
 
 
-def star(bodies: BodyTensors, state: StateTensors) -> dict[str, Edges]:
+def star(bodies: BodyTensors, state: StateTensors) -> dict[str, EdgeSet]:
     """Edges between the surface nodes and their body's node, up and down: the node from the centre, now and at rest."""
     owner = node_owner(bodies)
     features = _now_and_at_rest(_arms(bodies, state), bodies.node)
     node, body = torch.arange(len(owner), device=owner.device)[:, None], owner[:, None]
-    return {"intra_up": Edges(features, node, body), "intra_down": Edges(features, body, node)}
+    return {"intra_up": EdgeSet(features, node, body), "intra_down": EdgeSet(features, body, node)}
 
 
-def mesh_edges(bodies: BodyTensors, state: StateTensors) -> Edges:
+def mesh_edges(bodies: BodyTensors, state: StateTensors) -> EdgeSet:
     """Edges along the sides of the mesh's faces, each once a direction: sender from receiver, now and at rest."""
     sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
     sides = sides[sides[:, 0] != sides[:, 1]]  # those of the plane's one node
@@ -115,7 +115,7 @@ def mesh_edges(bodies: BodyTensors, state: StateTensors) -> Edges:
     sender, receiver = key // count, key % count
     arm = _arms(bodies, state)
     features = _now_and_at_rest(arm[sender] - arm[receiver], bodies.node[sender] - bodies.node[receiver])
-    return Edges(features, sender[:, None], receiver[:, None])
+    return EdgeSet(features, sender[:, None], receiver[:, None])
 
 
 def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
@@ -150,10 +150,10 @@ def advance(bodies: BodyTensors, state: StateTensors, acceleration: Tensor, dt: 
 
 
 def predict(
-    network: GraphNetwork, graph: Graph, bodies: BodyTensors, state: StateTensors, dt: float, rows: int | None = None
+    network: GraphNetwork, graph: MultiGraph, bodies: BodyTensors, state: StateTensors, dt: float
 ) -> StateTensors:
-    """One step of the published simulators, the network working on at most `rows` edges at once."""
-    return advance(bodies, state, network.target.undo(network(graph, rows=rows)).double(), dt)
+    """One step of the published simulators."""
+    return advance(bodies, state, network.target.undo(network(graph)).double(), dt)
 
 
 def target_acceleration(bodies: BodyTensors, state: StateTensors, position: Tensor, orientation: Tensor) -> Tensor:

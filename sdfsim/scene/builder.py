@@ -24,7 +24,7 @@ _HERE = "<scene>"  # what messages call a scene that is in no file
 
 class SceneBuilder:
     """A scene that is being written. `print` shows it as the file that `save` writes. Settings are keys of the file
-    itself: gravity, duration, seed, model, effects, limits; raises SceneError for no such key."""
+    itself: gravity, duration, seed, model, effects; raises SceneError for no such key."""
 
     def __init__(self, **settings: Any) -> None:
         known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies")]

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.document import Document
-from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
+from sdfsim.scene.scene import Body, Effects, Motion, Scene, Waypoints
 from sdfsim.scene.schema import FITTED, UNITS, BodyTable, SceneTable, ShapeTable
 from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.shape import Shape, load_shape, with_nodes, with_sdf, with_wall
@@ -68,7 +68,6 @@ def load_scene(
         seed=table.seed,
         model=table.model,
         effects=Effects(**dict(table.effects)),
-        limits=Limits(**dict(table.limits)),
         path=path,
         missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
         notes=tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", [])),

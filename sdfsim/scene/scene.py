@@ -30,13 +30,6 @@ class Effects:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of a run: `memory_gib`, GiB that one step may take for distances and edges; None for no limit."""
-
-    memory_gib: float | None = None
-
-
-@dataclass(frozen=True)
 class Waypoints:
     """The poses that a kinematic body passes through: straight and at an even turn in between, at rest outside.
 
@@ -100,7 +93,6 @@ class Scene:
         seed: random seed of the run.
         model: bundled model name or path, None for the default.
         effects: the switches of the file.
-        limits: of the run.
         path: the file it came from, if any.
         missed: shapes fitted for this scene that are not usable, with the reason, one line each.
         caveats: those that are, but are not as exact as fits can be; one line each.
@@ -114,7 +106,6 @@ class Scene:
     seed: int = 0
     model: str | None = None
     effects: Effects = Effects()
-    limits: Limits = Limits()
     path: Path | None = None
     missed: tuple[str, ...] = ()
     caveats: tuple[str, ...] = ()

@@ -215,14 +215,6 @@ class EffectsTable(Table):
     sleep: Switch = key("what rests is frozen until something disturbs it", "auto")
 
 
-class LimitsTable(Table):
-    """Limits of a run."""
-
-    memory_gib: Number | None = key(
-        "memory that one step may take for distances and edges; no limit without it", None, "GiB", gt=0
-    )
-
-
 class Primitive(Table):
     """A procedural shape."""
 
@@ -465,7 +457,6 @@ class SceneTable(Table):
     seed: Whole = key("of the run's random numbers", 0, ge=0)
     gravity: Vector = key("pull on every free body", DEFAULT_GRAVITY, "m/s^2")
     effects: EffectsTable = key("which effects to compute", EffectsTable())
-    limits: LimitsTable = key("limits of a run", LimitsTable())
     shapes: dict[str, ShapeTable] = key("shapes by name", {})
     bodies: Annotated[list[BodyTable], Field(min_length=1)] = key("all bodies")
 
@@ -515,7 +506,6 @@ class SceneTable(Table):
 _SECTIONS: dict[str, type[Table]] = {
     "The file": SceneTable,
     "effects": EffectsTable,
-    "limits": LimitsTable,
     "shapes: NAME": ShapeTable,
     "shapes: NAME: primitive": Primitive,
     "shapes: NAME: sphere": Sphere,

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from sdfsim.scene.builder import SceneBuilder
 
 GLANCE = 0.1  # s between two looks at a run that goes on
-BYTES_AN_EDGE = 4096  # of the network, while it is worked on
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
 # what a variant may change: how many numbers a vector has (0: a number), and the most that a number may be
 VARIED = {
@@ -93,9 +92,8 @@ class Simulator(LiveScene):
         model = model if model is not None else scene.model
         asked = effects.contact.on or free_flight == "learned"
         model = model if isinstance(model, Model) else load_model(model, weights=asked)
-        memory, self._asked = scene.limits.memory_gib, {"dt": dt, "free_flight": free_flight}
-        rows = None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE))
-        stepper = stepper_of(model, contact=effects.contact.on, free_flight=free_flight, rows=rows)
+        self._asked = {"dt": dt, "free_flight": free_flight}
+        stepper = stepper_of(model, contact=effects.contact.on, free_flight=free_flight)
         self.device = str(pick_device(device)) if stepper.on_surfaces else "cpu"
         self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed

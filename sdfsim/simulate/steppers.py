@@ -283,7 +283,6 @@ class OnSurfaces(Stepper):
     family: Family = field(kw_only=True)
     contact: bool = True
     learned: bool = False
-    rows: int | None = None  # how many edges the network works on at once; None for all
 
     on_surfaces = network = True
     forces = False
@@ -358,7 +357,7 @@ class OnSurfaces(Stepper):
             with carry.timed("network_ms"):
                 some, start, among = compact(tensors, now, near, active)
                 graph = family.graph(some, start, among)
-                predicted = predict(cast("Any", self.model.network), graph, some, start, options.dt, self.rows)
+                predicted = predict(cast("Any", self.model.network), graph, some, start, options.dt)
                 moved = {name: getattr(predicted, name)[chosen].cpu().numpy() for name in MOTION}
         carry.counts |= {"nodes": len(graph), "edges": graph.edge_count}
         rows = active[chosen].cpu().numpy()
@@ -408,11 +407,9 @@ def _stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: 
     )
 
 
-def stepper_of(
-    model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact", rows: int | None = None
-) -> Stepper:
-    """How a model steps scenes with `contact` or without. "learned" free flight, and edges in pieces of `rows`, are for
-    networks on surface nodes: raises SdfsimError where the model is another."""
+def stepper_of(model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact") -> Stepper:
+    """How a model steps scenes with `contact` or without. Only networks on surface nodes
+    know "learned" free flight; raises SdfsimError for any other model."""
     learned, on_surfaces = free_flight == "learned", model.kind in SURFACE
     if learned and not on_surfaces:
         raise SdfsimError(
@@ -423,5 +420,5 @@ def stepper_of(
     if on_surfaces:
         from sdfsim.learned.families import FAMILIES
 
-        return OnSurfaces(model, True, family=FAMILIES[model.kind], contact=contact, learned=learned, rows=rows)
+        return OnSurfaces(model, True, family=FAMILIES[model.kind], contact=contact, learned=learned)
     return Solver(model) if model.kind == SOLVER else OnSolver(model)

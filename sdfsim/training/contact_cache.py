@@ -47,8 +47,6 @@ TOGETHER = 25  # trajectories that are followed side by side
 class Solved:
     """How recordings are followed."""
 
-    stride: int = 1  # recorded steps in a step of the network
-    inner: int = 0  # inner steps of the solve in it; 0 for those of the recording engine
     draws: int = 2  # how often every recording is followed: first from the states as they are, then from disturbed ones
     # shift, speed: m and m/s, standard deviations of the disturbance of a body's place and velocity, and by turning and
     # spinning of its surface. Every body's is a part of it, log-uniform from `least` to all.
@@ -61,7 +59,7 @@ class Solved:
 class ContactFrames:
     """F frames with contact out of many trajectories, flattened.
 
-    Units are metres, seconds and kilograms where the step is `STEP`. Frames of other steps are told in units in which
+    Units are metres, seconds and kilograms where the step is `STEP`. Frames of other steps are in units in which
     it is that long and gravity is what it is (Froude scaling): to a network, which knows no other step, their bodies
     are larger or smaller.
 
@@ -140,7 +138,7 @@ def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress
     """The contact frames of a dataset split: from the cache file beside it, else made now and cached. Raises
     SdfsimError for no trajectories, unreadable ones, some that differ in step or gravity, or none with a contact."""
     folder = data / "frames"
-    name = f"{split}-{how.stride}-{how.inner}-{how.draws}"
+    name = f"{split}-{how.draws}"
     made = list(folder.glob(f"{name}-*.npz"))
     if not (data / split).is_dir() and len(made) == 1:
         # A machine that only trains may have been given nothing but the cache.
@@ -184,7 +182,7 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
 
 
 def inner_steps(dt: float, substep: float) -> int:
-    """Inner steps of `substep` s in a recorded step of `dt` s; what is not told (0) counts as in our own recordings.
+    """Inner steps of `substep` s in a recorded step of `dt` s; 0 (unknown) counts as in our own recordings.
     Raises SdfsimError for more than 5."""
     count = round(dt / substep) if substep > 0 else SUBSTEPS
     if not 1 <= count <= SUBSTEPS:
@@ -195,8 +193,8 @@ def inner_steps(dt: float, substep: float) -> int:
 def _fingerprint(files: list[Path], how: Solved) -> str:
     """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are solved."""
     digest = hashlib.sha256(f"{FRAMES_VERSION} {how} {[(f.name, f.stat().st_size) for f in files]}".encode())
-    told = [home / INFO] if (home := home_of(files[0].parent)) else []
-    for record in (*told, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))):
+    info = [home / INFO] if (home := home_of(files[0].parent)) else []
+    for record in (*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))):
         digest.update(record.read_bytes())
     return digest.hexdigest()[:12]
 
@@ -213,9 +211,8 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     group = [Trajectory.load(file) for file in files]
     shapes = load_shapes(files[0].parent, {str(n) for t in group for n in t.shape})
     bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), found.floor)
-    inner = how.inner or how.stride * inner_steps(group[0].dt, substep)
     gravity = np.asarray(group[0].gravity, dtype=np.float64)
-    options = Options(gravity, group[0].dt * how.stride, inner, record=True)
+    options = Options(gravity, group[0].dt, inner_steps(group[0].dt, substep), record=True)
     if found.by_teacher:
         options = replace(options, margin=MARGIN, adds=True, cone=False)
     solver, moves = stepper_of(load_model()), bodies.moves
@@ -224,12 +221,12 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     for draw in range(how.draws):
         rng = np.random.default_rng([draw, int(hashlib.sha256(files[0].name.encode()).hexdigest()[:8], 16)])
         carry, touch = solver.init(bodies, start, options), None
-        for now in range(0, count - how.stride, how.stride):
+        for now in range(count - 1):
             state = replace(state_at(group, [now] * len(group), start), touch=touch)
             state = _disturbed(bodies, state, how, rng) if draw else state
             after, _ = solver.advance(solver.announce(state, carry, moves), carry)
             touch = after.touch
-            recorded = state_at(group, [now + how.stride] * len(group), start)
+            recorded = state_at(group, [now + 1] * len(group), start)
             parts += _of_step(bodies, state, after, cast("Edges", carry.edges), recorded, options, found.floor)
     return parts
 

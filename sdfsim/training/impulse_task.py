@@ -20,7 +20,7 @@ CALM_SHARE = 0.2  # how often frames in which nothing is hit are drawn, against 
 
 
 @dataclass(frozen=True)
-class Batch:
+class ContactBatch:
     """A graph, what happened, and which bodies count."""
 
     graph: ContactGraph  # the input
@@ -54,12 +54,12 @@ class ImpulseTask:
         ratios = (heaviest / lightest)[heaviest > 0]
         return ranges_of(f.size[moving], speed, ratios, f.friction, f.restitution, f.floor)
 
-    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
+    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> ContactBatch:
         """A batch of `count` frames, or the part of it that falls to one of a team."""
         picked = np.sort(rng.choice(len(self.frames), size=count, p=self.weight))
         return self.batch(picked[team.share(count)])
 
-    def batch(self, picked: np.ndarray) -> Batch:
+    def batch(self, picked: np.ndarray) -> ContactBatch:
         """The frames `picked` [K] as one graph whose last body is the floor."""
         f = self.frames
         rows, body_of = _ranges(f.body_start, picked)
@@ -118,9 +118,9 @@ class ImpulseTask:
         truth = Velocities(body(f.end_velocity), body(f.end_angular), body(f.moved), body(f.turned))
         counts = torch.zeros_like(moves)
         counts[index.flatten()] = True
-        return Batch(graph, truth, body(f.size, 1.0), counts & moves)
+        return ContactBatch(graph, truth, body(f.size, 1.0), counts & moves)
 
-    def loss(self, network: ImpulseNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
+    def loss(self, network: ImpulseNetwork, batch: ContactBatch, *, mirrored: bool = False) -> Tensor:
         """Mean pseudo-Huber error of end and mean velocities, angular ones times half the body's size."""
         predicted = network(batch.graph, mirrored=mirrored)
         lever = 0.5 * batch.size[:, None]
@@ -132,7 +132,7 @@ class ImpulseTask:
         ]
         return torch.stack(terms).mean(0)[batch.counts].sum() / max(1, int(batch.counts.sum()))
 
-    def weight_of(self, batch: Batch) -> int:
+    def weight_of(self, batch: ContactBatch) -> int:
         """Over how many bodies a batch's loss is the mean."""
         return int(batch.counts.sum())
 

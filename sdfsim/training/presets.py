@@ -20,8 +20,6 @@ class Preset:
     noise: float | None = None  # m, standard deviation of their pose noise (None: none); *impulse* has its own
     # peak learning rate of Muon, which then trains the hidden matrices; None leaves all to Adam, as published
     matrix_rate: float | None = None
-    strides: tuple[int, ...] = (1,)  # recorded steps in a step (impulse); several for a network of several step lengths
-    inner: int = 0  # inner steps of the solve in a step; 0 for those of the recording engine
 
 
 LITTLE = {"width": 32, "rounds": 4}
@@ -33,8 +31,6 @@ RADII = {"sdf-sim": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-la
 PRESETS = {
     "small": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "alone": Preset("impulse", LITTLE | {"alone": 1}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
-    "long": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01, strides=(1, 2), inner=1),
-    "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
     **{
         name: Preset(
             name.removesuffix("-large"), PUBLISHED, 1_000_000, batch=8, rate=1e-3, reach=reach, nodes=64, noise=0.003

@@ -142,7 +142,6 @@ class Run:
             length=float(np.mean(ranges["size"])),
             reach=self.plan.reach,
             nodes=self.plan.nodes,
-            inner=self.plan.inner,
             ranges=ranges,
             card=card,
         )

@@ -13,7 +13,7 @@ from torch import Tensor
 from sdfsim.data.batching import PLANE, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
 from sdfsim.learned.families import FAMILIES
-from sdfsim.learned.message_passing import Graph, GraphNetwork, flipped
+from sdfsim.learned.message_passing import GraphNetwork, MultiGraph, flipped
 from sdfsim.learned.near import Contacts, Pairs
 from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
 from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
@@ -30,7 +30,7 @@ WARM_BATCHES = 20  # batches that set the feature statistics before the first st
 class Batch:
     """A graph, the accelerations [M, 3] that were recorded, and which nodes move [M]."""
 
-    graph: Graph
+    graph: MultiGraph
     target: Tensor
     moves: Tensor
 

@@ -63,9 +63,7 @@ def train(
     with locked(out) if team.leads else nullcontext():
         with team.in_turn():  # the first finds contacts and caches them, the others read
             task, held_out = _tasks(plan, folders, place, lambda _, message: on_progress(0.0, message))
-        # A folder's trajectories are followed once for each length of step.
-        counted = (t.counts[:: len(plan.strides)] for t in (task, held_out))
-        made = [_made(*one) for one in zip(folders, infos, *counted, strict=True)]
+        made = [_made(*one) for one in zip(folders, infos, task.counts, held_out.counts, strict=True)]
         run = Run(plan, task, total, seed, place, team)
         if checkpoint.exists():
             run.load(checkpoint)
@@ -85,7 +83,7 @@ def train(
 
 
 def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]:
-    """What a model's card tells of a dataset; how many trajectories there were, where they are not here."""
+    """What a model's card says of a dataset. The numbers of trajectories count where these are not here."""
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
     known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}
@@ -104,8 +102,7 @@ def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Pr
         from sdfsim.training.impulse_task import ImpulseTask
 
         def task(split: str, draws: int) -> ImpulseTask:
-            how = [Solved(stride, plan.inner, draws) for stride in plan.strides]
-            sets = [contact_frames(folder, split, h, on_progress=tell) for folder in folders for h in how]
+            sets = [contact_frames(folder, split, Solved(draws), on_progress=tell) for folder in folders]
             return ImpulseTask(join_frames(sets), device)
 
         return task("train", 2), task("validation", 1)

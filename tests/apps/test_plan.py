@@ -14,7 +14,6 @@ SCENE = """
 version: 1
 duration: 0.2
 effects: {restitution: off}
-limits: {memory_gib: 0.5}
 shapes:
   ball: {sphere: {radius: 0.5}}
 bodies:

@@ -65,7 +65,7 @@ def edited(file, old: str, new: str) -> None:
 def test_a_scene_that_was_edited_is_refused(made, what):
     run, file = made
     edited(file, *(SHAPES | OTHERS)[what])
-    with pytest.raises(SdfsimError, match=r"rollout\.npz: .*scene\.yaml is not the scene that it was made of: other "):
+    with pytest.raises(SdfsimError, match=r"rollout\.npz: .*scene\.yaml"):
         read_run(run)
     file.write_text(SCENE)
     assert len(read_run(run)[1]) > 0

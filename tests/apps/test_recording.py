@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +24,7 @@ from sdfsim.apps.recording import (
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import box, sphere
 from sdfsim.physics.rollout import Rollout
+from tests.helpers.runs import read
 
 STEPS = 6
 
@@ -84,24 +84,6 @@ def test_before_the_motion_is_known_the_view_reaches_down_to_the_floor(tmp_path)
     centre, radius = framed(load_scene(tmp_path / "scene.yaml"))
     for height in (0.0, 1.1):
         assert np.linalg.norm(centre - [3, 0, height]) < radius < 1.0
-
-
-def read(path: Path) -> dict[str, dict[str, list]]:
-    """Entity -> column -> rows of all its chunks, in time order; static columns under the entity's name and `!`."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, dict[str, list]] = {}
-    for chunk in RrdReader(str(path)).stream():
-        batch = chunk.to_record_batch().to_pydict()
-        columns = found.setdefault(str(chunk.entity_path) + ("!" if chunk.is_static else ""), {})
-        for name, rows in batch.items():
-            columns.setdefault(name, []).extend(rows)
-    for columns in found.values():
-        if "step" in columns:
-            order = np.argsort(columns["step"])
-            for name in columns:
-                columns[name] = [columns[name][i] for i in order]
-    return found
 
 
 def test_a_file_holds_the_rollout(scene, rollout, tmp_path):

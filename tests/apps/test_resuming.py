@@ -12,19 +12,10 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.sdf.grid import sample_grid
 from sdfsim.shape.make import analytic_shape
-from tests.scenes import make_body, random_model
+from tests.helpers.runs import Killed, simulate
+from tests.helpers.scenes import make_body, random_model
 
 TOWER = Path(__file__).resolve().parents[2] / "samples" / "tower.yaml"
-
-
-def simulate(scene: Path, out: Path, *, stop: float | None = None, kind=KeyboardInterrupt, seconds=0.15, **options):
-    def on_progress(stage: str, fraction: float, message: str) -> None:
-        if stop is not None and stage == "simulate" and stop < fraction < 1:
-            raise kind
-
-    settings = {"model": None, "seed": None, "viewer": "none", "device": "cpu"}
-    settings |= {"on_progress": on_progress, "say": print, "seconds": seconds}
-    return run.simulate(scene, out, **(settings | options))
 
 
 @pytest.fixture
@@ -37,10 +28,6 @@ def sleepy(tmp_path) -> Path:
         "  - {name: far, shape: ball, position: [9, 0, 3]}\n"
     )
     return path
-
-
-class Killed(Exception):
-    """Ends a run without a chance to keep anything more."""
 
 
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, Killed])

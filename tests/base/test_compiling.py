@@ -18,7 +18,7 @@ from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import make_body
+from tests.helpers.scenes import make_body
 
 SOURCE = "from numba import njit\n\n\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"
 

@@ -4,20 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from typer.testing import CliRunner
 
-import cli
 from sdfsim.learned.model import Model, new_network
-
-SCENE = """
-version: 1
-duration: 0.2
-shapes:
-  ball: {sphere: {radius: 0.5}}
-bodies:
-  - {name: floor, plane: {}}
-  - {name: ball, shape: ball, position: [0, 0, 5]}
-"""
+from tests.helpers.command import SCENE
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +22,3 @@ def model(tmp_path_factory) -> str:
 def scene(tmp_path) -> str:
     (tmp_path / "scene.yaml").write_text(SCENE)
     return str(tmp_path / "scene.yaml")
-
-
-def run(*arguments: object):
-    return CliRunner().invoke(cli.app, [str(a) for a in arguments])

@@ -20,7 +20,7 @@ from sdfsim.apps import run as runs
 from sdfsim.base.arguments import seconds_of
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import write_ply
-from tests.cli.conftest import SCENE, run
+from tests.helpers.command import SCENE, run
 
 ROOT = Path(__file__).resolve().parents[2]
 

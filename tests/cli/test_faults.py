@@ -11,7 +11,7 @@ import pytest
 from sdfsim import Rollout, SdfsimError
 from sdfsim.base.errors import run_main
 from sdfsim.simulate.simulator import SimulationError, Simulator
-from tests.cli.conftest import run
+from tests.helpers.command import run
 
 
 def stop_after(steps: int, how):

@@ -20,7 +20,7 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import TEACHER_VERSION, engine_settings
-from tests.recordings import balls, trajectory
+from tests.helpers.recordings import balls, trajectory
 
 SUBSTEP, DT, GRAVITY = 0.004, 0.02, np.array([0.0, 0.0, -10.0])
 
@@ -68,17 +68,17 @@ def test_the_floor_is_what_the_dataset_says_else_the_recipes():
     wrong += [{"friction": 0.2, "restitution": value} for value in (1.5, -0.1, float("nan"), "0.3", None, True)]
     wrong += [{"friction": float("inf"), "restitution": 0.1}]
     for told in wrong:
-        with pytest.raises(SdfsimError, match=r"^data.dataset\.json: floor: must have friction and restitution"):
+        with pytest.raises(SdfsimError, match=r"^data.dataset\.json: floor: "):
             floor_of({"floor": told}, Path("data"))
 
 
 def test_a_split_is_recorded_as_its_dataset_tells(tmp_path):
     (tmp_path / "test").mkdir()
-    assert conditions_of(tmp_path / "test") == Conditions(*FLOOR, floor_told=False, by_teacher=False)
+    assert conditions_of(tmp_path / "test") == Conditions(*FLOOR, floor_given=False, by_teacher=False)
     told = {"engine": "pybullet", "engine_settings": engine_settings(1 / 240, 1)}
     write_json(tmp_path / "dataset.json", told | {"floor": {"friction": 0.7, "restitution": 0.1}})
     found = conditions_of(tmp_path / "test")
-    assert found == conditions_of(tmp_path) == Conditions(0.7, 0.1, floor_told=True, by_teacher=True)
+    assert found == conditions_of(tmp_path) == Conditions(0.7, 0.1, floor_given=True, by_teacher=True)
     for name, value in engine_settings(0.02, 5).items():
         if name != "timeStep":
             settings = told["engine_settings"] | {name: not value}
@@ -90,7 +90,7 @@ def test_datasets_of_another_version_of_the_teacher_are_refused_and_those_of_oth
     ours = {"recipe": "movi-b", "engine": "pybullet", "engine_settings": {"timeStep": 0.004}}
     for version in ({}, {"teacher": 9}):
         write_json(tmp_path / "dataset.json", ours | version)
-        with pytest.raises(SdfsimError, match="of the teacher, not by 2"):
+        with pytest.raises(SdfsimError, match=r"\bteacher\b.*\b2$"):
             read_info(tmp_path)
     for others in ({"recipe": "balls"}, {**ours, "engine": "mujoco"}, ours | {"teacher": TEACHER_VERSION}):
         write_json(tmp_path / "dataset.json", others)
@@ -135,5 +135,5 @@ def test_a_loaded_trajectory_has_the_velocities_at_instants_unless_asked_as_reco
     np.testing.assert_array_equal(Trajectory.load(file, as_recorded=True).velocity, symplectic().velocity)
     for settings in ("x", {"timeStep": -1}, {"timeStep": 1e9}):
         write_json(tmp_path / "dataset.json", {"engine_settings": settings})
-        with pytest.raises(SdfsimError, match=r"engine_settings.timeStep: must be 0 \(unknown\) to 1 s"):
+        with pytest.raises(SdfsimError, match=r"engine_settings\.timeStep: .*\b1 s"):
             Trajectory.load(file)

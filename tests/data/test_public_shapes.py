@@ -83,7 +83,7 @@ def test_a_set_is_fetched_once(site, name):
 
 def test_a_file_with_another_sum_is_refused_and_nothing_kept(site):
     site.pack({VISUAL: CONTENT[VISUAL], COLLISION: b"v 6 6 6\n"})
-    with pytest.raises(SdfsimError, match=r"cone.tar.gz: collision_geometry.obj: another file than expected") as caught:
+    with pytest.raises(SdfsimError, match=r"cone\.tar\.gz: collision_geometry\.obj: ") as caught:
         public_folder(Path("kubasic"))
     for content in (b"v 6 6 6\n", CONTENT[COLLISION]):
         assert hashlib.sha256(content).hexdigest() in caught.value.message
@@ -102,7 +102,7 @@ def test_a_path_in_an_archive_leads_nowhere(site, tmp_path):
 def test_without_a_network_it_says_what_to_put_where(site):
     site.close()
     folder = site.cache / "sdfsim" / "public" / "kubasic"
-    with pytest.raises(SdfsimError, match=f"^{site.url}/cone.tar.gz: cannot be fetched: .*refused$") as caught:
+    with pytest.raises(SdfsimError, match=f"^{site.url}/cone.tar.gz: .*refused$") as caught:
         public_folder(Path("kubasic"))
     assert caught.value.hint == f"put these files into {folder} by hand: {VISUAL}, {COLLISION}"
     for file in (VISUAL, COLLISION):

@@ -14,8 +14,8 @@ from sdfsim.data.pybullet_sim import DT, RATES, SUBSTEP, Teacher, TeacherBody
 from sdfsim.data.scenarios import MATERIALS, REGION, SIZES, Cast
 from sdfsim.data.shape_assets import Origin, origins, prepare
 from sdfsim.evaluation.evaluate import evaluate
-from tests.recordings import balls
-from tests.scenes import random_model
+from tests.helpers.recordings import balls
+from tests.helpers.scenes import random_model
 
 GRAVITY = 10.0
 UNTURNED = (0.0, 0.0, 0.0, 1.0)

@@ -86,5 +86,5 @@ def test_random_solids_are_numbered_and_no_name_is_taken_twice(tmp_path):
     assert all(o.pieces is not None and o.pieces.exists() for o in origins(None, 1000))
     for name in ("one.ply", "one.off"):
         (tmp_path / name).write_text("")
-    with pytest.raises(SdfsimError, match="two shapes are called 'one'"):
+    with pytest.raises(SdfsimError, match="'one'"):
         origins(tmp_path)

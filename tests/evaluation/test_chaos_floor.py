@@ -10,7 +10,7 @@ pytest.importorskip("pybullet")
 from sdfsim.data.dataset import Trajectory, trajectory_files
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.evaluation.evaluate import evaluate, teacher_again
-from tests.scenes import random_model
+from tests.helpers.scenes import random_model
 
 
 @pytest.fixture

@@ -9,27 +9,19 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from benchmarks.engines.drake import drake
+from benchmarks.engines.newton import newton
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.evaluation import hard_cases
-from sdfsim.evaluation.engines import bullet, drake, mujoco, newton, shape_urdf, start_of_scene
+from sdfsim.evaluation.engines import bullet, mujoco, shape_urdf, start_of_scene
 from sdfsim.evaluation.stress import TEACHER, by_engine
 from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape, shape_from_primitive
 from sdfsim.simulate.steppers import stepper_of
-
-SCENE = """
-version: 1
-duration: 0.4
-shapes:
-  box: {box: {size: [0.1, 0.1, 0.1]}}
-bodies:
-  - {name: floor, plane: {offset: 0.5}, friction: 0.8, restitution: 0.5}
-  - {name: low, shape: box, position: [0, 0, 0.5501], mass: 1.0, friction: 0.5, restitution: 0.1}
-  - {name: high, shape: box, position: [3, 0, 9], velocity: [1, 0, 0], angular_velocity: [0, 0, 2], mass: 2.0}
-"""
+from tests.helpers.scene_files import SCENE
 
 
 def started(folder, text: str = SCENE):
@@ -72,7 +64,7 @@ def test_engines_fly_freely_and_rest(tmp_path, run, package, substeps):
 
 def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
     scene = hard_cases.tossed((3,))
-    motion = by_engine(TEACHER, scene, tmp_path, 0.04).motion
+    motion = by_engine(TEACHER, bullet, scene, tmp_path, 0.04).motion
     bodies = scene.bodies[:-1]
     assert motion.position.shape == (3, len(bodies), 3)
     np.testing.assert_allclose(motion.position[0], [b.position for b in bodies], atol=1e-12)
@@ -88,7 +80,7 @@ def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_tells_i
     bullet(replace(start, own_inertia=False), 2)
     doubled = replace(start.motion, inertia=2 * start.motion.inertia)
     bullet(replace(start, motion=doubled), 2)
-    with pytest.raises(SdfsimError, match="inertia is not the recorded one"):
+    with pytest.raises(SdfsimError, match="inertia"):
         bullet(replace(start, motion=doubled, own_inertia=False), 2)
 
 

@@ -13,8 +13,8 @@ from sdfsim.evaluation.evaluate import evaluate, report_lines
 from sdfsim.geometry import primitives
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.recordings import bouncing, slab_data, sliding
-from tests.scenes import random_model
+from tests.helpers.recordings import bouncing, slab_data, sliding
+from tests.helpers.scenes import random_model
 
 
 @pytest.fixture
@@ -183,9 +183,7 @@ def test_the_report_says_which_floor_and_which_habits(tmp_path):
         (tmp_path / name).mkdir()
         lines = report_lines(evaluate(slab_data(tmp_path / name, "test", sliding(0.2), info)))
         teacher = name == "teacher"
-        floor = (
-            "0.3, restitution 0.5, that of our recipes" if teacher else "0.2, restitution 0.1, as dataset.json tells"
-        )
+        floor = "0.3, restitution 0.5, that of our recipes" if teacher else "0.2, restitution 0.1, from dataset.json"
         assert f"Floor: friction {floor}." in lines
         assert any(line.startswith("The solve has the teacher's habits") for line in lines) is teacher
         assert any(line.startswith("The solve is as users run it") for line in lines) is not teacher

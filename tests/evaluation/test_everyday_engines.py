@@ -138,7 +138,7 @@ def test_bodies_on_a_path_and_tilted_planes_are_not_run_with_their_reason(tmp_pa
     led = replace(scene.bodies[1], motion="kinematic")
     tilted = replace(scene.bodies[2], quat_xyzw=about("x", 10).as_quat())
     for bodies in ((scene.bodies[0], led), (scene.bodies[0], tilted)):
-        with pytest.raises(NotRun, match="one level plane as the floor, and no bodies on a path"):
+        with pytest.raises(NotRun, match="level plane"):
             moved(name, replace(scene, bodies=bodies), 0.1, tmp_path)
 
 

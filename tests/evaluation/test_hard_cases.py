@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from sdfsim import Simulator
 from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import rollout_motion, start_motion
-from sdfsim.evaluation.hard_cases import Run, cases
+from sdfsim.evaluation.hard_cases import Trial, cases
 from sdfsim.evaluation.penetration import depths
 from sdfsim.scene.scene import Body, Effects, Scene
 
 DT = 0.01
 
 
-def motion(scene: Scene, steps: int, moved=None, velocity=None) -> Run:
+def motion(scene: Scene, steps: int, moved=None, velocity=None) -> Trial:
     """A run in which body k is displaced by `moved`[k] [T+1, 3] m and has `velocity`[k]; all others are still."""
     start = start_motion(scene)
     place, turn = (np.repeat(values, steps + 1, axis=0) for values in (start.position, start.quat_xyzw))
@@ -29,7 +29,7 @@ def motion(scene: Scene, steps: int, moved=None, velocity=None) -> Run:
     for k, values in (velocity or {}).items():
         speed[:, k] = values
     found = {"position": place, "quat_xyzw": turn, "velocity": speed, "angular_velocity": np.zeros_like(place)}
-    return Run(scene, replace(start, **found, dt=DT))
+    return Trial(scene, replace(start, **found, dt=DT))
 
 
 def line(steps: int, x=0.0, y=0.0, z=0.0) -> np.ndarray:

@@ -17,7 +17,7 @@ from sdfsim.learned.model import new_network
 from sdfsim.physics import solver as kernels
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.recordings import trajectory
+from tests.helpers.recordings import trajectory
 
 
 def noted(file: Path, value: float) -> dict:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim.evaluation.metrics import compared, energy, energy_gain, interval, resting, speeds, survival
-from tests.recordings import balls
+from tests.helpers.recordings import balls
 
 
 def test_translation_rmse_of_a_constant_offset_is_its_length():

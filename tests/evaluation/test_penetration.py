@@ -10,7 +10,7 @@ from sdfsim.evaluation.penetration import ExactSolid, deepest, exact_solids, pen
 from sdfsim.geometry import primitives
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.recordings import CUBE, balls
+from tests.helpers.recordings import CUBE, balls
 
 POLES = np.concatenate([np.eye(3), -np.eye(3)])
 BALL = ExactSolid(

@@ -1,4 +1,4 @@
-"""The trade-off study: what settings change, what a scene becomes, and the whole study in small."""
+"""The trade-off study: what variants change, what a scene becomes, and the whole study in small."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ pytest.importorskip("pybullet")
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import tradeoff as study
-from sdfsim.evaluation.tradeoff import Setting, arranged, cases_of_scene, load_cases, settings
+from sdfsim.evaluation.tradeoff import Variant, arranged, cases_of_scene, load_cases, variants
 from sdfsim.learned.model import load_model
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.evaluation.test_engines import SCENE
+from tests.helpers.scene_files import SCENE
 
 
 @pytest.fixture(scope="module")
@@ -28,18 +28,18 @@ def cases(cube_data):
 
 def test_every_setting_has_a_label_of_its_own():
     for quick in (False, True):
-        chosen = settings(["solver", "small"], quick=quick)
+        chosen = variants(["solver", "small"], quick=quick)
         assert len({s.label for s in chosen}) == len(chosen) and not any("/" in s.label for s in chosen)
-        assert chosen[0] == Setting("solver") and Setting("small") in chosen and chosen[-1].label == "ballistic"
+        assert chosen[0] == Variant("solver") and Variant("small") in chosen and chosen[-1].label == "ballistic"
 
 
 def test_networks_and_shapes_are_what_a_setting_says(cases):
     box = with_sdf(analytic_shape("box", size=(1.0, 0.6, 0.4)), "grid", resolution=48)
     cases = replace(cases, shapes={"box": box, "ball": analytic_shape("sphere", radius=0.5)})
-    few = arranged(Setting("solver", nodes="thin 10"), cases)["box"].nodes
+    few = arranged(Variant("solver", nodes="thin 10"), cases)["box"].nodes
     # Outermost first: of a box, the eight corners are among them.
     assert len(few) == 10 and (np.abs(np.abs(few) - [0.5, 0.3, 0.2]).max(1) < 1e-9).sum() == 8
-    grid = arranged(Setting("solver", nodes="grid 6"), cases)["box"].nodes
+    grid = arranged(Variant("solver", nodes="grid 6"), cases)["box"].nodes
     assert 8 <= len(grid) <= 6**3 and np.abs(np.asarray(box.sdf(grid)[0])).max() < 0.01
 
 
@@ -57,8 +57,8 @@ def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
 
 
 def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
-    chosen = [Setting("solver"), Setting("small", nodes="thin 20"), Setting("solver", contact=False)]
-    monkeypatch.setattr(study, "settings", lambda *_, **__: chosen)
+    chosen = [Variant("solver"), Variant("small", nodes="thin 20"), Variant("solver", contact=False)]
+    monkeypatch.setattr(study, "variants", lambda *_, **__: chosen)
     monkeypatch.setattr(study, "REPEATS", 2)
     monkeypatch.setattr(study, "MOST_QUICK", 1)
     monkeypatch.setattr(study, "ENGINES_QUICK", {"PyBullet": (5,), "MuJoCo": (5,)})
@@ -84,7 +84,7 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     assert len(rows) == 6 and float(rows[0]["translation_rmse_50"]) == pytest.approx(error["solver"], rel=1e-4)
     assert (tmp_path / "tradeoff.png").stat().st_size > 500
     assert json.loads((tmp_path / "report.json").read_text())["front"] == report["front"]
-    table, notes = study.told(report)
+    table, notes = study.report_table(report)
     assert len(table) == 7 and any("front of ours" in note for note in notes)
     monkeypatch.setattr(study, "measure_ours", lambda *_: pytest.fail("measured again"))
     assert run()["points"] == report["points"]

@@ -90,9 +90,7 @@ def test_a_binary_ply_of_triangles_and_quads_is_read(tmp_path: Path, order: str,
 def test_a_ply_that_is_cut_short_says_where(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(binary_ply("<")[:-cut])
-    with pytest.raises(
-        SdfsimError, match=r"a.ply: not a readable mesh \(cut short: \d+ of \d rows of element (edge|face|vertex)\)"
-    ):
+    with pytest.raises(SdfsimError, match=r"a\.ply: .*\b\d+ of \d\b.*\b(edge|face|vertex)\b"):
         load_mesh(path)
 
 
@@ -115,7 +113,7 @@ def test_a_text_ply_with_lists_of_unlike_lengths_is_read(tmp_path: Path) -> None
     path.write_text(
         text_ply(rows.rsplit("\n", 2)[0], len(MIXED), "property list uchar float texcoord\nproperty int material\n")
     )
-    with pytest.raises(SdfsimError, match="cut short: 6 of 7 rows of element face"):
+    with pytest.raises(SdfsimError, match=r"\b6 of 7\b.*\bface\b"):
         load_mesh(path)
 
 
@@ -190,19 +188,19 @@ def test_every_kind_of_off_is_read(tmp_path: Path, text: str, color) -> None:
     ("name", "text", "message"),
     [
         ("a.off", "OFF\n5 0 0\n" + 5 * "0 1 2\n", "mesh has no faces"),
-        ("a.off", "4OFF\n8 7 0\n", "vertices of 4OFF do not have three"),
-        ("a.off", "OFF BINARY\n8 7 0\n", "binary OFF is not read"),
-        ("a.off", off_text("OFF\n8 8 0"), "cut short: 7 of 8 faces"),
-        ("a.off", off_text("OFF\n8 7 0").replace("4 0 2 3 1", "4 0 2 3"), "cut short: a face has fewer corners"),
-        ("a.off", off_text("OFF\n8 7 0").replace("4 0 2 3 1", "4 0 2 3 8"), r"out of range \(0 to 7 allowed\)"),
+        ("a.off", "4OFF\n8 7 0\n", "4OFF"),
+        ("a.off", "OFF BINARY\n8 7 0\n", "binary OFF"),
+        ("a.off", off_text("OFF\n8 8 0"), "cut short: 7 of 8"),
+        ("a.off", off_text("OFF\n8 7 0").replace("4 0 2 3 1", "4 0 2 3"), "cut short"),
+        ("a.off", off_text("OFF\n8 7 0").replace("4 0 2 3 1", "4 0 2 3 8"), r"\b0 to 7\b"),
         ("a.ply", text_ply("", 0), "mesh has no faces"),
         ("a.ply", text_ply("", 0).split("element face")[0] + "end_header\n" + 8 * "0 1 2 0 0 0\n", "mesh has no faces"),
-        ("a.ply", text_ply("3 0 1 8\n", 1), r"out of range \(0 to 7 allowed\)"),
-        ("a.ply", text_ply("3 0 1 -1\n", 1), r"out of range \(0 to 7 allowed\)"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement a 1\nproperty quark x\nend_header\n0\n", "know: property quark x"),
+        ("a.ply", text_ply("3 0 1 8\n", 1), r"\b0 to 7\b"),
+        ("a.ply", text_ply("3 0 1 -1\n", 1), r"\b0 to 7\b"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement a 1\nproperty quark x\nend_header\n0\n", "property quark x"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "mesh has no faces"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -4\n", "line 4: a face has the index -4, 3 rows come before it"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "line 4: a face has the index 0"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -4\n", r"line 4: .*-4\b.*\b3\b"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", r"line 4: .*\b0\b"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said(tmp_path: Path, name: str, text: str, message: str) -> None:
@@ -253,11 +251,11 @@ def test_a_binary_stl_may_have_a_tail(tmp_path: Path) -> None:
         path.write_bytes(content)
         check_block(load_mesh(path))
     for content, message in (
-        (stl()[:-3], "cut short: 11 of 12 faces"),
-        (stl()[:300], "cut short: 4 of 12 faces"),
-        (stl()[:80] + bytes(4) + stl()[84:], "its header announces no faces, and 600 bytes follow"),
-        (stl()[:60], "no STL file, or cut short"),
-        (b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", "cut short: it has no endsolid"),
+        (stl()[:-3], "cut short: 11 of 12"),
+        (stl()[:300], "cut short: 4 of 12"),
+        (stl()[:80] + bytes(4) + stl()[84:], r"\b600 bytes"),
+        (stl()[:60], "STL"),
+        (b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", "endsolid"),
     ):
         path.write_bytes(content)
         with pytest.raises(SdfsimError, match=message):
@@ -445,7 +443,7 @@ def test_sparse_numbers_are_filled_in(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "VENDOR_unheard_of"])
 def test_what_a_gltf_needs_and_is_not_read_is_named(tmp_path: Path, name: str) -> None:
     file = block(extensionsUsed=[name], extensionsRequired=["KHR_materials_unlit", name])
-    with pytest.raises(SdfsimError, match=f"a.gltf: not a readable mesh .it needs the extension {name}"):
+    with pytest.raises(SdfsimError, match=rf"a\.gltf: .*\b{name}\b"):
         load_mesh(file.write(tmp_path / "a.gltf"))
     file.header["extensionsRequired"] = ["KHR_materials_unlit", "KHR_texture_transform"]
     check_block(load_mesh(file.write(tmp_path / "a.gltf")))
@@ -458,7 +456,7 @@ def test_a_buffer_that_only_an_extension_fills_is_told(tmp_path: Path) -> None:
     written = json.loads(path.read_text())
     written["buffers"].append({"byteLength": 96})
     path.write_text(json.dumps(written))
-    with pytest.raises(SdfsimError, match="it needs the extension EXT_meshopt_compression"):
+    with pytest.raises(SdfsimError, match="EXT_meshopt_compression"):
         load_mesh(path)
 
 

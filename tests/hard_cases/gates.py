@@ -15,7 +15,7 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape, load_shape
-from tests.scenes import make_body
+from tests.helpers.scenes import make_body
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples"
 EARTH = np.array([0.0, 0.0, -9.81])

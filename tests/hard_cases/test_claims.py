@@ -125,7 +125,7 @@ def test_a_photo_is_nothing_that_a_program_would_have_to_draw(tmp_path):
 
 
 def test_a_gltf_cannot_claim_what_is_not_there(tmp_path):
-    from tests.hard_cases.test_fuzz_mesh import ORIGINALS, glb, taken_apart
+    from tests.helpers.mesh_files import ORIGINALS, glb, taken_apart
 
     header, body = taken_apart(ORIGINALS["glb"])
     file = tmp_path / "a.glb"

@@ -13,7 +13,7 @@ import sdfsim
 from sdfsim.scene.scene import Effects
 from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
-from tests.scenes import make_body
+from tests.helpers.scenes import make_body
 
 
 def total(rollout) -> np.ndarray:

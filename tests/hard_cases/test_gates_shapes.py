@@ -15,8 +15,7 @@ from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
 from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
-from tests.learned.test_surface_networks import surface_model
-from tests.scenes import random_model
+from tests.helpers.scenes import random_model, surface_model
 
 LINE = np.linspace(-0.5, 0.5, 6)[:, None] * [1.0, 0.5, 0.0]
 FLAT = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.5], [0.0]), -1).reshape(-1, 3)

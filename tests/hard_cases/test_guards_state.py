@@ -16,7 +16,7 @@ from sdfsim import Rollout, SdfsimError
 from sdfsim.physics.solver import impulse
 from sdfsim.simulate.simulator import SimulationError, Simulator
 from tests.hard_cases import gates
-from tests.scenes import random_model
+from tests.helpers.scenes import random_model
 
 BROKEN = {
     "nan": ("velocity", torch.nan),

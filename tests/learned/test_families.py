@@ -14,7 +14,7 @@ from sdfsim.physics.options import Options
 from sdfsim.physics.pose import rotate
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
-from tests.scenes import make_body
+from tests.helpers.scenes import make_body
 
 CPU = torch.device("cpu")
 GRAVITY = torch.tensor([0.0, 0.0, -10.0], dtype=torch.float64)

@@ -15,7 +15,7 @@ from sdfsim.physics.solver.record import GIVEN
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import angle_between, contact_graph, in_single, make_body, random_model
+from tests.helpers.scenes import angle_between, contact_graph, in_single, make_body, random_model
 
 
 def linear_momentum(sim: Simulator) -> torch.Tensor:

@@ -22,8 +22,7 @@ from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.simulate.steppers import OnSolver
-from tests.physics.test_laws import cube
-from tests.scenes import POSE, contact_graph, make_body, random_model
+from tests.helpers.scenes import POSE, contact_graph, cube, make_body, random_model
 
 ROUNDING = 1e-5  # by the largest speed around
 

@@ -5,7 +5,7 @@ import torch
 
 from sdfsim.learned.model import load_model
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import random_model
+from tests.helpers.scenes import random_model
 
 META = torch.device("meta")  # stands in for a GPU
 

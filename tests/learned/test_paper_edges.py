@@ -12,7 +12,7 @@ from sdfsim.learned.near import find_contacts
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
-from tests.scenes import make_body
+from tests.helpers.scenes import make_body
 
 CPU = torch.device("cpu")
 GRAVITY = np.array([0.0, 0.0, -10.0])

@@ -1,7 +1,5 @@
 """Shapes with many nodes: no edge is missed."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -10,9 +8,9 @@ from sdfsim.learned.near import find_contacts
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import load_shape
-from tests.scenes import make_body
+from tests.helpers.scenes import make_body
+from tests.helpers.shapes import SHAPES
 
-SHAPES = Path(__file__).resolve().parents[2] / "samples" / "shapes"
 GRAVITY = torch.tensor([0.0, 0.0, -10.0], dtype=torch.float64)
 REACH, DT = 0.1, 0.02
 

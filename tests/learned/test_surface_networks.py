@@ -11,20 +11,12 @@ from sdfsim.learned.surfaces import advance, node_owner
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import angle_between, make_body, random_model
+from tests.helpers.scenes import angle_between, make_body, random_model, surface_model
 
 
 @pytest.fixture(params=SURFACE)
 def kind(request) -> str:
     return request.param
-
-
-def surface_model(kind: str = "sdf-sim", push: float = 1e-3):
-    """Untrained, its accelerations of the size of `push`."""
-    model = random_model(kind, width=16, steps=2)
-    model.network.target.total.fill_(1.0)
-    model.network.target.squares.fill_(push**2)
-    return model
 
 
 def test_without_acceleration_every_body_goes_on_as_it_came(dropped):

@@ -10,7 +10,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.training_ranges import _products
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import make_body, random_model
+from tests.helpers.scenes import make_body, random_model
 
 RANGES = {
     "size": [0.7, 2.1],
@@ -97,7 +97,7 @@ def test_starts_inside_one_another_are_flagged_from_a_sixth_of_the_size_on(dropp
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf])
 def test_steps_that_are_none_are_refused(dropped, dt):
-    with pytest.raises(SdfsimError, match="dt: must be > 0 s and finite"):
+    with pytest.raises(SdfsimError, match=r"^dt: .*> 0 s"):
         Simulator(dropped, random_model("impulse"), dt=dt)
 
 

@@ -8,7 +8,7 @@ from sdfsim.physics import pose
 from sdfsim.physics.free_flight import torque_free
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import angle_between, make_body, random_model
+from tests.helpers.scenes import angle_between, make_body, random_model
 
 TOP = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))[None]
 

@@ -25,7 +25,7 @@ from sdfsim.physics.solver.world import (
 )
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
-from tests.physics.test_laws import body
+from tests.helpers.scenes import make_body as body
 from tests.reference import impulses
 
 KINDS = (

@@ -20,7 +20,7 @@ from sdfsim.scene.scene import Body, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.simulator import Simulator
-from tests.scenes import make_body
+from tests.helpers.scenes import make_body
 
 G = np.array([0.0, 0.0, -9.81])
 DT = 0.01

@@ -12,6 +12,8 @@ from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.simulator import Simulator
+from tests.helpers.scenes import ball, cube
+from tests.helpers.scenes import make_body as body
 
 G = 9.81  # m/s^2
 STARTS = (0.95, 0.98, 1.0, 1.03, 1.07)
@@ -23,16 +25,6 @@ def size(request) -> float:
     return request.param
 
 
-def body(name: str, shape: int, position, mass: float = 1.0, **fields) -> Body:
-    usual = {
-        "motion": "dynamic", "scale": 1.0, "quat_xyzw": STILL, "velocity": np.zeros(3),
-        "angular_velocity": np.zeros(3), "friction": 0.5, "restitution": 0.5,
-    }  # fmt: skip
-    vectors = {k: np.asarray(v, dtype=float) for k, v in fields.items() if k.endswith("velocity") or k == "quat_xyzw"}
-    place = np.asarray(position, dtype=float)
-    return Body(name=name, shape=shape, position=place, mass=mass, **(usual | fields | vectors))
-
-
 def simulator(shapes: list[Shape], bodies: list[Body], *, tilt: float = 0.0, weight: float = 1.0) -> Simulator:
     """On a floor with coefficients 1, so that products are the bodies' own; gravity leans by `tilt` rad to +x."""
     floor = body("floor", len(shapes), [0, 0, 0], 0.0, motion="static", friction=1.0, restitution=1.0)
@@ -42,14 +34,6 @@ def simulator(shapes: list[Shape], bodies: list[Body], *, tilt: float = 0.0, wei
 
 def run(shapes, bodies, seconds: float, **how) -> Rollout:
     return simulator(shapes, bodies, **how).run(seconds)
-
-
-def ball(size: float) -> Shape:
-    return analytic_shape("sphere", radius=size / 2)
-
-
-def cube(size: float) -> Shape:
-    return analytic_shape("box", size=(size,) * 3)
 
 
 @pytest.mark.parametrize("e", [0.3, 0.5, 0.7, 0.9, 1.0])
@@ -231,13 +215,3 @@ def test_the_mean_levers_of_square_and_disc():
     x = (np.arange(1000) + 0.5) / 1000 - 0.5
     assert np.hypot(*np.meshgrid(x, x)).mean() == pytest.approx(0.3826, abs=1e-4)
     assert 2 * pi * (0.5**3 / 3) / (pi * 0.25) == pytest.approx(1 / 3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["solver", "small"])
-def test_every_law_of_the_benchmark_holds(model):
-    """Within its wider bounds, so that what a network adds to the solve has room."""
-    from benchmarks.laws import LAWS
-
-    missed = [law for laws in LAWS for law in laws(model, 0.1) if not law[-1]]
-    assert missed == []

@@ -20,8 +20,8 @@ from sdfsim.scene.scene import Scene
 from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape, load_shape, with_sdf
-from tests.learned.test_scale import SHAPES
-from tests.physics.test_laws import body
+from tests.helpers.scenes import make_body as body
+from tests.helpers.shapes import SHAPES
 
 CONVEX = ("box", "stick", "plate", "sphere", "capsule", "cylinder", "disc", "hull", "cube mesh", "ball mesh")
 HOLLOW = ("ring", "bowl", "can", "torus mesh", "gear mesh", "bowl mesh")

@@ -14,10 +14,11 @@ from sdfsim.scene.scene import Scene
 from sdfsim.shape import contact_geometry
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import load_shape, with_sdf
-from tests.apps.test_resuming import Killed, simulate
 from tests.hard_cases import gates
-from tests.learned.test_scale import SHAPES
-from tests.physics.test_laws import ball, body, cube
+from tests.helpers.runs import Killed, simulate
+from tests.helpers.scenes import ball, cube
+from tests.helpers.scenes import make_body as body
+from tests.helpers.shapes import SHAPES
 
 
 def heap(seed: int, count: int = 6, weight: float = 9.81) -> Scene:

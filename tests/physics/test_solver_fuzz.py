@@ -10,8 +10,8 @@ from sdfsim import Rollout, Simulator
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape, load_shape
-from tests.learned.test_scale import SHAPES
-from tests.physics.test_laws import body
+from tests.helpers.scenes import make_body as body
+from tests.helpers.shapes import SHAPES
 
 FEW, MANY, STEPS = 40, 1000, 60
 

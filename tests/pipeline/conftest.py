@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from pipeline import stages
-
-
-def noise(folder: Path, names: Sequence[str], size: tuple[int, int] = (120, 90)) -> Path:
-    """Writes photos of noise, width x height, into a folder that is made where missing."""
-    for k, name in enumerate(names):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        pixels = np.random.default_rng(k).integers(0, 255, (*size[::-1], 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / name)
-    return folder
+from tests.helpers.photos import RESULTS, noise
 
 
 @pytest.fixture
@@ -55,9 +45,3 @@ def calls(act) -> list[str]:
     for name in stages.STAGES:
         act(name, action(name))
     return done
-
-
-RESULTS = {
-    "poses": {"posed": 3, "photos": 3, "mean_error": 0.5, "points": 9, "field_of_view": [60.0], "left_out": []},
-    "mesh": {"extent_m": [1.0, 1.0, 1.0], "size": "a ruler", "up_from": "plane", "up_within_degrees": 1.0},
-}

@@ -21,7 +21,7 @@ from pipeline.mesh.placement import Up, place
 from pipeline.sfm.poses import solve
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh
-from tests.pipeline.conftest import noise
+from tests.helpers.photos import noise
 from tests.pipeline.photo_sets import SAMPLES, TABLE_VASE
 
 sys.path.insert(0, str(SAMPLES))

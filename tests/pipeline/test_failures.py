@@ -124,7 +124,7 @@ def test_known_cameras_are_kept_and_checked(tmp_path):
     (wrong / "images").symlink_to(work / "images")
     moved = [type(v)(**{**v.__dict__, "name": o.name}) for v, o in zip(views, views[3:] + views[:3], strict=True)]
     save_views(moved, wrong / KNOWN_CAMERAS)
-    with pytest.raises(SdfsimError, match="the known cameras do not fit the photos"):
+    with pytest.raises(SdfsimError, match="known cameras"):
         solve(load_photos(work), wrong, wrong)
 
 

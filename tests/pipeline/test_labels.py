@@ -12,8 +12,7 @@ from pipeline.inputs.labels import UNKNOWN, load_labels, load_names
 from pipeline.inputs.photos import prepare_photos
 from pipeline.inputs.sources import find_source
 from sdfsim.base.errors import SdfsimError
-from tests.pipeline.conftest import noise
-from tests.pipeline.test_sources import write_transforms
+from tests.helpers.photos import noise, write_transforms
 
 NAMES = ["0.jpg", "1.jpg", "2.jpg"]
 

@@ -9,7 +9,7 @@ import pytest
 from pipeline.materials import MATERIALS, materials_of
 from pipeline.options import options_of, read_config
 from sdfsim.base.errors import SdfsimError
-from tests.cli.conftest import run as command
+from tests.helpers.command import run as command
 
 ROOT = Path(__file__).parents[2]
 # What the Engineering ToolBox has for dry pairs: from the least of the sliding to the most of the static friction.

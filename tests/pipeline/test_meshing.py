@@ -25,8 +25,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed
 from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
-from tests.pipeline.test_objects import TABLE, TOP, both, box
-from tests.pipeline.test_surface import look_at
+from tests.helpers.surfaces import TABLE, TOP, both, box, look_at
 
 WIDTH = 2 * TABLE[0]
 SPECK = (-0.3, 0.2, 0.5)

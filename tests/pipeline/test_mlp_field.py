@@ -12,8 +12,8 @@ from pipeline.field.mlp_field import MlpField, MlpSize, encoded
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, MlpTrainer, Trained, Trainer, load_field, save_field
-from tests.pipeline.helpers import NOTHING
-from tests.pipeline.test_field import UNIT, one_thread, toy_rays  # noqa: F401  a fixture
+from tests.helpers.fields import UNIT, one_thread, toy_rays  # noqa: F401  a fixture
+from tests.helpers.sparse import NOTHING
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
 VOLSDF = PRESETS["volsdf"]

@@ -14,35 +14,11 @@ from pipeline.mesh.extraction import EXTENT, FieldSurface, ball, sample_volume
 from sdfsim.geometry.bvh import Winding
 from sdfsim.geometry.mass import mass_properties
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
-from tests.pipeline.helpers import NOTHING, sparse_of
+from tests.helpers.sparse import NOTHING, sparse_of
+from tests.helpers.surfaces import TABLE, TOP, WALL, both, box, cup, table
 
 FINEST = 0.02
-TABLE = (0.5, 0.35, 0.05)  # half sides of the top and half its thickness
-TOP = 0.1  # height of the table's upper side
-WALL = 0.035
 NO_POINTS = np.zeros((0, 3))
-
-
-def box(points: np.ndarray, center, half) -> np.ndarray:
-    q = np.abs(points - np.asarray(center)) - np.asarray(half)
-    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
-
-
-def cup(points: np.ndarray, at=(0.1, -0.05), radius: float = 0.12, height: float = 0.3) -> np.ndarray:
-    """An open vessel that stands on the table, its inside as deep as its wall allows."""
-    p = points - [*at, TOP]
-    r = np.hypot(p[:, 0], p[:, 1])
-
-    def cylinder(low: float, high: float, outer: float) -> np.ndarray:
-        return np.maximum(r - outer, np.maximum(low - p[:, 2], p[:, 2] - high))
-
-    return np.maximum(cylinder(0, height, radius), -cylinder(WALL, height + 1, radius - WALL))
-
-
-def table(points: np.ndarray) -> np.ndarray:
-    top = box(points, (0, 0, TOP - TABLE[2]), TABLE)
-    legs = [box(points, (x, y, -0.25), (0.05, 0.05, 0.3)) for x in (-0.4, 0.4) for y in (-0.25, 0.25)]
-    return np.minimum.reduce([top, *legs, points[:, 2] + 0.5])
 
 
 def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarray | None = None) -> FieldSurface:
@@ -71,10 +47,6 @@ def parts_of(
 def some_rotation(seed: int) -> np.ndarray:
     q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return q * np.sign(np.linalg.det(q))
-
-
-def both(points: np.ndarray) -> np.ndarray:
-    return np.minimum(table(points), cup(points))
 
 
 @pytest.mark.parametrize("turn", [np.eye(3), some_rotation(3)], ids=["upright", "turned"])

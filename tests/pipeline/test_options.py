@@ -7,7 +7,7 @@ import yaml
 
 from pipeline.options import Options, names_of, options_of, read_config, write_config
 from sdfsim.base.errors import SdfsimError
-from tests.cli.conftest import run as command
+from tests.helpers.command import run as command
 
 
 @pytest.mark.parametrize(

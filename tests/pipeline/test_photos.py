@@ -17,7 +17,7 @@ from PIL import ExifTags, Image, ImageOps
 from pipeline.inputs.images import read_photo
 from pipeline.inputs.photos import load_photos, prepare_photos
 from sdfsim.base.errors import EXIT_ERROR, SdfsimError
-from tests.pipeline.conftest import noise
+from tests.helpers.photos import noise
 
 
 def picture(width: int = 120, height: int = 80, seed: int = 0) -> Image.Image:

@@ -5,46 +5,23 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.cameras import view_span
-from pipeline.inputs.photos import Photo, prepare_photos
+from pipeline.inputs.photos import prepare_photos
 from pipeline.sfm import poses
 from pipeline.sfm.agreement import agreement, contradicting, epipolar_errors, excess, excess_of_photos, unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find, views_of
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import write_arrays, write_json
+from tests.helpers.photos import photo, result
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TABLE_VASE = ROOT / "samples" / "photos" / "table_vase"
-
-
-def photo(index: int, width: int = 640, height: int = 480, focal: float | None = None, fault: str = "") -> Photo:
-    size = (width, height)
-    return Photo(f"{index:04d}.jpg", f"IMG_{index}.JPG", *size, size, None, focal, "", False, 0.4, fault)
-
-
-def result(count: int, posed: int, *, focal: float = 600.0, error: float = 0.5, features: int = 2000,
-           span: float = 360.0, still: float = 0.0, matches: int = 200) -> dict:  # fmt: skip
-    """What the worker would say of `posed` of `count` photos on an arc around the origin, all in a chain of pairs."""
-    views = []
-    for k in range(posed):
-        a = np.radians(span) * k / max(posed, 1)
-        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-        views.append({"name": f"{k:04d}.jpg", "width": 640, "height": 480, "focal": focal, "cx": 320, "cy": 240,
-                      "k": 0, "rotation": turn.tolist(), "translation": [0, 0, 3]})  # fmt: skip
-    names = [f"{k:04d}.jpg" for k in range(count)]
-    counts = {name: {"features": features, "best_matches": 10, "partners": 1} for name in names}
-    pairs = [{"a": a, "b": b, "matches": matches, "still": still} for a, b in pairwise(names)]
-    agreed = [{"a": pair["a"], "b": pair["b"], "matches": matches, "error": 0.3 if k < posed - 1 else None,
-               "own": 0.25, "cost": 0.1} for k, pair in enumerate(pairs)]  # fmt: skip
-    return {"views": views, "counts": counts, "pairs": pairs, "agreement": agreed, "mean_error": error,
-            "points": 900, "turn_only": 0.0, "cameras": [names], "judged": [dict(pair) for pair in agreed]}  # fmt: skip
 
 
 PHOTOS = [photo(k) for k in range(10)]

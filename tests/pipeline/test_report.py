@@ -14,7 +14,7 @@ from pipeline.sfm.pose_checks import check, views_of
 from pipeline.stages import reconstruct
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import write_arrays
-from tests.pipeline.test_poses import photo, result
+from tests.helpers.photos import photo, result
 
 
 def test_the_page_names_every_photo_and_the_recording_shows_the_cameras(photos, tmp_path, act):

@@ -24,8 +24,8 @@ from pipeline.field.supervision import (
     supervision_of,
 )
 from pipeline.field.training import PRESETS
-from tests.pipeline.helpers import NOTHING
-from tests.pipeline.test_surface import ring
+from tests.helpers.sparse import NOTHING
+from tests.helpers.surfaces import ring
 
 DOUBLE = torch.float64
 CELL = 2 / 127  # of the preset quick

@@ -14,7 +14,7 @@ from pipeline.mesh.placement import check_distance, measured_scale
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import joined
-from tests.pipeline.test_surface import cube, ring
+from tests.helpers.surfaces import cube, ring
 
 METRES = 3.0  # a unit of normalised space in the world that the photos were taken in
 UP = np.array([0.0, 0, 1])

@@ -20,7 +20,7 @@ from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
-from tests.pipeline.test_surface import cube, scenery
+from tests.helpers.surfaces import cube, scenery
 
 PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m", size_assumed=True)
 

@@ -15,35 +15,15 @@ from pipeline.inputs.known_cameras import PARAMETERS, read_cameras
 from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
 from sdfsim.base.errors import SdfsimError
-from tests.pipeline.conftest import noise
+from tests.helpers.photos import NAMES, noise, turned, write_transforms
 
 SIZE = (120, 90)
 SIMPLE = [100.0, 60.0, 45.0]
 
 
-def turned(angle: float) -> np.ndarray:
-    """World to camera: about the y axis."""
-    return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-
-
 def fresh(folder: Path) -> Path:
     folder.mkdir()
     return folder
-
-
-NAMES = ["a.jpg", "b.jpg", "c.jpg"]
-
-
-def write_transforms(folder: Path, names: list[str] = NAMES, **more) -> Path:
-    frames = []
-    for k, name in enumerate(names):
-        pose = np.eye(4)
-        pose[:3, :3] = turned(0.3 * k).T @ np.diag([1.0, -1, -1])
-        pose[:3, 3] = [k, 2 * k, 3]
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    path = folder / "transforms.json"
-    path.write_text(json.dumps({"fl_x": 100.0, "w": 120, "h": 90, "frames": frames, **more}))
-    return path
 
 
 def write_text_model(folder: Path, camera: str = "1 SIMPLE_PINHOLE 120 90 100 60 45") -> None:
@@ -419,7 +399,7 @@ def test_what_is_wrong_in_a_text_model_is_named(tmp_path, line, camera, words):
 def test_a_camera_model_that_is_not_read_is_named(tmp_path, number, name):
     write_binary_model(tmp_path / "m")
     (tmp_path / "m" / "cameras.bin").write_bytes(struct.pack("<QIiQQ3d", 1, 7, number, 120, 90, *SIMPLE))
-    with pytest.raises(SdfsimError, match=f"the camera model {name} is not supported") as caught:
+    with pytest.raises(SdfsimError, match=rf"\b{name}\b") as caught:
         read_cameras(tmp_path / "m")
     assert "SIMPLE_RADIAL" in caught.value.hint
 

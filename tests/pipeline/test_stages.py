@@ -17,8 +17,8 @@ from pipeline.options import Options, read_config
 from pipeline.stages import STAGES, begin, finish, reconstruct, run_stage
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import locked
-from tests.cli.conftest import run as command
-from tests.pipeline.conftest import RESULTS, noise
+from tests.helpers.command import run as command
+from tests.helpers.photos import RESULTS, noise
 
 NAMES = list(STAGES)
 DEVICES = ("distill", "mesh", "fit")

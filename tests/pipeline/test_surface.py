@@ -5,40 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, View, camera_up, nearest_to_axes
+from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, camera_up, nearest_to_axes
 from pipeline.field.supervision import unit_sphere_of
 from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
-from tests.pipeline.helpers import sparse_of
+from tests.helpers.sparse import sparse_of
+from tests.helpers.surfaces import cube, look_at, ring, scenery
 
 
 def ball(center=(0.0, 0, 0), radius: float = 0.5):
     return lambda p: np.linalg.norm(p - np.asarray(center, np.float32), axis=1) - radius
-
-
-def cube(size: float = 1.0, center=(0.0, 0, 0)) -> Mesh:
-    import trimesh
-
-    made = trimesh.creation.box((size, size, size))
-    made = made.subdivide().subdivide().subdivide()
-    return Mesh(np.asarray(made.vertices) + center, np.asarray(made.faces, np.int64))
-
-
-def look_at(eye, target=(0.0, 0, 0), up=(0.0, 0, 1)) -> View:
-    forward = np.asarray(target, float) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return View("a", "a", 640, 480, 600.0, 320.0, 240.0, 0.0, rotation, -rotation @ np.asarray(eye, float))
-
-
-def ring(count: int = 12, height: float = 1.0, radius: float = 3.0) -> list[View]:
-    angles = np.arange(count) * 2 * np.pi / count
-    return [look_at(np.array([radius * np.cos(a), radius * np.sin(a), height])) for a in angles]
 
 
 def test_marching_cubes_of_a_ball():
@@ -192,18 +171,6 @@ def test_the_dominant_plane_is_the_largest_not_the_one_with_most_samples():
     found = plane_up(np.concatenate([floor, table]), normals, areas, np.array([0.0, 0, 1]), 0.02)
     assert found is not None
     assert np.degrees(np.arccos(np.clip(found[0] @ sloping, -1, 1))) < 0.01 and found[1] < 0.01
-
-
-def scenery() -> Mesh:
-    """A floor of 2 m with a block of 0.4 m on it."""
-    import trimesh
-
-    floor = trimesh.creation.box((2, 2, 0.02)).subdivide().subdivide().subdivide()
-    floor.apply_translation((0, 0, -0.01))
-    block = trimesh.creation.box((0.6, 0.6, 0.4)).subdivide().subdivide()
-    block.apply_translation((0.1, 0, 0.2))
-    both = trimesh.util.concatenate([floor, block])
-    return Mesh(np.asarray(both.vertices, float), np.asarray(both.faces, np.int64))
 
 
 def test_resting_height_is_the_floor_under_a_table():

@@ -8,8 +8,8 @@ import torch
 
 from pipeline.field.grid_field import GridField
 from pipeline.mesh.extraction import field_colors, field_distance
-from tests.pipeline.test_field import SMALL
-from tests.pipeline.test_surface import cube
+from tests.helpers.fields import SMALL
+from tests.helpers.surfaces import cube
 
 
 @pytest.mark.gpu

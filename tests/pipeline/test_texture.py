@@ -24,8 +24,8 @@ from sdfsim.geometry.mesh_io import read_glb, write_glb, write_ply
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import load_shape, scaled
-from tests.apps.test_recording import read
-from tests.pipeline.test_surface import cube, look_at
+from tests.helpers.runs import read
+from tests.helpers.surfaces import cube, look_at, plate
 
 GREY, RED = np.array([90.0, 90, 90]), np.array([250.0, 20, 20])
 
@@ -33,15 +33,6 @@ GREY, RED = np.array([90.0, 90, 90]), np.array([250.0, 20, 20])
 def pattern(points: np.ndarray) -> np.ndarray:
     """Colours [P, 3] in 0..255: waves 8 cm long on all axes."""
     return 127 + 100 * np.sin(2 * np.pi * points / 0.08 + [0, 1, 2])
-
-
-def plate(cells: int, z: float = 0.0, half: float = 0.5) -> Mesh:
-    """A level square in `cells` by `cells` cells, facing up."""
-    line = np.linspace(-half, half, cells + 1)
-    x, y = np.meshgrid(line, line, indexing="ij")
-    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    faces = np.concatenate([corner[:, None] + [0, cells + 1, cells + 2], corner[:, None] + [0, cells + 2, 1]])
-    return Mesh(np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3), faces)
 
 
 def photograph(folder: Path, views: list[View], meshes: list[Mesh], colors: list[Callable]) -> Shots:

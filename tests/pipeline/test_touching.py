@@ -20,8 +20,8 @@ from pipeline.mesh.visibility import hollow
 from pipeline.report import hollow_line
 from sdfsim.base.files import write_json
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
+from tests.helpers.sparse import NOTHING
 from tests.pipeline import photo_sets
-from tests.pipeline.helpers import NOTHING
 
 FINEST = 0.0157  # as of the quick preset
 

@@ -17,8 +17,8 @@ from pipeline.field.rendering import sdf_cache
 from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
 from pipeline.inputs.photos import save_photos
 from pipeline.report import notes
-from tests.pipeline.test_field import SMALL, posed_noise
-from tests.pipeline.test_poses import photo
+from tests.helpers.fields import SMALL, posed_noise
+from tests.helpers.photos import photo
 
 RED, SIDE = (200, 30, 30), 40
 

@@ -17,9 +17,8 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import load_mesh, read_attributes, write_ply
+from tests.helpers.surfaces import cube, look_at, plate
 from tests.pipeline.photo_sets import orbit, still_life, studio
-from tests.pipeline.test_surface import cube, look_at
-from tests.pipeline.test_texture import plate
 
 FLIP = np.diag([1.0, -1, -1])  # OpenGL camera axes to ours
 

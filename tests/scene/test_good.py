@@ -12,7 +12,7 @@ from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.scene.schema import reference
-from tests.scene.conftest import HEAD, problems_of
+from tests.helpers.scene_files import HEAD, problems_of
 
 
 def test_open_meshes_are_closed_as_the_file_says(load, tmp_path):

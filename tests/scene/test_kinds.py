@@ -15,7 +15,7 @@ from sdfsim.sdf.grid import GridSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.scene.test_load import problems_of
+from tests.helpers.scene_files import problems_of
 
 CRATE = {
     "box": "{box: {size: [0.4, 0.4, 0.4]}}",

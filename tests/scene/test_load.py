@@ -11,7 +11,7 @@ from sdfsim import SceneError, load_scene
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.shape.make import analytic_shape
-from tests.scene.conftest import HEAD, problems_of
+from tests.helpers.scene_files import HEAD, problems_of
 
 BODY = [
     ("mass: -0.3", "bodies[0].mass: must be > 0 (got -0.3 kg)"),
@@ -68,7 +68,7 @@ TOP = [
     ("version: 2", "version: must be 1 (got 2)"),
     ("effects: {frictoin: off}", "effects.frictoin: unknown key (did you mean 'friction'?)"),
     ("effects: {sleep: maybe}", "effects.sleep: must be one of auto, on, off (got 'maybe')"),
-    ("limits: {memory_gib: 0}", "limits.memory_gib: must be > 0"),
+    ("limits: {memory_gib: 1}", "limits: unknown key"),
     ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
     ("shapes: {cup: {sphere: {}}}", "shapes.cup.sphere.radius: is required"),
     ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, plane is"),

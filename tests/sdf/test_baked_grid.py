@@ -26,7 +26,7 @@ from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
 from sdfsim.shape.surface_nodes import edge_nodes, project
 from sdfsim.simulate.simulator import Simulator
-from tests.physics.test_laws import body
+from tests.helpers.scenes import make_body as body
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from sdfsim.sdf.grid import GridSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.shape import load_shape, scaled, with_sdf
-from tests.shape.test_shape import fitted
+from tests.helpers.shapes import fitted
 
 OTHERS = [("grid", GridSdf), ("mesh", MeshSdf)]
 

@@ -12,39 +12,11 @@ import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
-from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import Frame, Mesh
 from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.shape import shape as shape_module
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape, load_shape, scaled
-
-
-def fitted() -> Shape:
-    torch.manual_seed(0)
-    weights = (torch.randn(8, 3), torch.randn(8, 8), torch.randn(1, 8))
-    sdf = MlpSdf(
-        weights,
-        (torch.randn(8), torch.randn(8), torch.randn(1)),
-        "wave",
-        Frame(np.array([1.0, 2.0, 3.0]), 0.3),
-        np.array([[0.9, 1.9, 2.85], [1.1, 2.1, 3.15]]),
-    )
-    mesh = primitives.torus(segments=8, sides=5)
-    colors = np.arange(len(mesh.vertices) * 3, dtype=np.uint8).reshape(-1, 3)
-    return Shape(
-        name="ring",
-        mesh=Mesh(mesh.vertices, mesh.faces, colors),
-        sdf=sdf,
-        nodes=np.random.default_rng(0).random((20, 3)),
-        volume=0.125,
-        com=np.array([0.1, 0.2, 0.3]),
-        inertia=np.diag([1.0, 2.0, 3.0]) / 3,
-        certificate={"passed": False, "reason": "thin walls", "error_in_box": 0.01},
-        source={"file": "ring.obj"},
-        pieces=tuple(np.random.default_rng(k).random((4 + k, 3)) for k in range(3)),
-    )
+from tests.helpers.shapes import fitted
 
 
 def test_a_saved_shape_comes_back_bit_for_bit(tmp_path: Path) -> None:

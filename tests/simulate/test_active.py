@@ -17,8 +17,7 @@ from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate import steppers
 from sdfsim.simulate.simulator import Simulator
-from tests.learned.test_surface_networks import surface_model
-from tests.scenes import make_body, random_model
+from tests.helpers.scenes import make_body, random_model, surface_model
 
 
 def same(one, other) -> bool:

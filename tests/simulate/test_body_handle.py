@@ -11,7 +11,7 @@ from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate import simulator as simulator_module
 from sdfsim.simulate.simulator import varied
-from tests.scenes import make_body, random_model
+from tests.helpers.scenes import make_body, random_model
 
 G = np.array([0.0, 0.0, -9.81])
 

@@ -11,7 +11,7 @@ import torch
 from sdfsim import SdfsimError, Simulator
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import SimulationError
-from tests.scenes import make_body, random_model
+from tests.helpers.scenes import make_body, random_model
 
 
 def test_a_run_takes_the_steps_that_its_time_is(free_pair):

@@ -11,8 +11,7 @@ from sdfsim.learned.model import load_model
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
-from tests.learned.test_surface_networks import surface_model
-from tests.scenes import make_body, random_model
+from tests.helpers.scenes import make_body, random_model, surface_model
 
 MODELS = {
     "solver": load_model,

@@ -15,7 +15,7 @@ from sdfsim.physics.bodies import Units
 from sdfsim.shape.make import analytic_shape
 from sdfsim.training.contact_cache import STEP, Solved, _disturbed, contact_frames, inner_steps, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
-from tests.recordings import balls, bouncing, slab_data, sliding
+from tests.helpers.recordings import balls, bouncing, slab_data, sliding
 
 ONCE = Solved(draws=1)
 
@@ -30,18 +30,18 @@ def dataset(folder, *trajectories: Trajectory):
     return folder
 
 
-@pytest.mark.parametrize(("dt", "stride"), [(1 / 60, 1), (0.02, 1), (0.04, 1), (0.02, 2)])
-def test_another_step_is_another_size_in_the_same_gravity(tmp_path, dt, stride):
+@pytest.mark.parametrize("dt", [1 / 60, 0.02, 0.04])
+def test_another_step_is_another_size_in_the_same_gravity(tmp_path, dt):
     recorded = replace(bouncing(0), dt=dt)
-    frames = contact_frames(dataset(tmp_path, recorded), "train", replace(ONCE, stride=stride))
-    time = dt * stride / STEP
+    frames = contact_frames(dataset(tmp_path, recorded), "train", ONCE)
+    time = dt / STEP
     length = time**2
     assert len(frames) > 3 and frames.dt == STEP and np.array_equal(frames.gravity, recorded.gravity)
     np.testing.assert_allclose(frames.size, 1.0 / length, rtol=1e-6)
     ratio = (recorded.inertia / recorded.mass[:, None])[np.arange(len(frames.mass)) % 2]  # masses are relative
     np.testing.assert_allclose(frames.inertia / frames.mass[:, None], ratio / length**2, rtol=1e-6)
-    now = recorded.velocity[:-stride:stride].reshape(-1, 3) * time / length
-    gone = (recorded.position[stride::stride] - recorded.position[:-stride:stride]).reshape(-1, 3)
+    now = recorded.velocity[:-1].reshape(-1, 3) * time / length
+    gone = np.diff(recorded.position, axis=0).reshape(-1, 3)
     for velocity, moved in zip(frames.velocity, frames.moved, strict=True):
         k = np.abs(now - velocity).max(1).argmin()
         np.testing.assert_allclose(velocity, now[k], atol=1e-5)
@@ -91,7 +91,7 @@ def test_the_engines_inner_steps_are_counted():
     assert inner_steps(0.02, 0.004) == 5
     assert inner_steps(1 / 60, 1 / 240) == 4
     assert inner_steps(0.1, 0.0) == 5  # not told
-    with pytest.raises(SdfsimError, match="hold 20 inner"):
+    with pytest.raises(SdfsimError, match=r"\b20\b"):
         inner_steps(0.08, 0.004)
 
 

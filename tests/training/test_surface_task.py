@@ -16,8 +16,8 @@ from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.distributed import Team
 from sdfsim.training.presets import PRESETS
 from sdfsim.training.surface_task import SurfaceTask
-from tests.recordings import bouncing, slab_data, sliding
-from tests.scenes import random_model
+from tests.helpers.recordings import bouncing, slab_data, sliding
+from tests.helpers.scenes import random_model
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]
@@ -114,7 +114,7 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
             lambda data: SurfaceTask(data, "train", SDF_SIM, CPU),
             lambda data: contact_frames(data, "train", Solved()),
         ):
-            with pytest.raises(SdfsimError, match=r"train: its trajectories differ in step or gravity"):
+            with pytest.raises(SdfsimError, match=r"train: .*\bstep\b.*\bgravity\b"):
                 read(tmp_path / "data")
 
 

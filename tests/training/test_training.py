@@ -26,7 +26,7 @@ from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
-from tests.scenes import contact_graph, in_single
+from tests.helpers.scenes import contact_graph, in_single
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]
@@ -139,7 +139,7 @@ def test_an_interrupted_run_resumes_to_the_bit(ball_data, presets, tmp_path, mon
 
 def test_a_checkpoint_of_another_run_is_refused(ball_data, presets, tmp_path):
     train(ball_data, tmp_path, preset="tiny", steps=5)
-    with pytest.raises(SdfsimError, match="another preset, seed or number of steps"):
+    with pytest.raises(SdfsimError, match=r"checkpoint\.npz .*\bpreset\b"):
         train(ball_data, tmp_path, preset="tiny", steps=6, resume=True)
 
 
@@ -190,11 +190,11 @@ def test_joined_frames_are_the_frames_of_both(ball_data):
 
 def test_frames_of_another_gravity_cannot_be_joined(ball_data):
     frames = contact_frames(ball_data, "train", ONCE)
-    with pytest.raises(SdfsimError, match="must share gravity"):
+    with pytest.raises(SdfsimError, match="gravity"):
         join_frames([frames, replace(frames, gravity=0.5 * frames.gravity)])
 
 
 @pytest.mark.parametrize("steps", [0, -5])
 def test_steps_that_are_none_are_refused(ball_data, presets, tmp_path, steps):
-    with pytest.raises(SdfsimError, match="steps: must be at least 1"):
+    with pytest.raises(SdfsimError, match=r"^steps: .*\b1\b"):
         train(ball_data, tmp_path / "run", preset="tiny", steps=steps)

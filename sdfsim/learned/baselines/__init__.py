@@ -1,1 +1,1 @@
-"""The networks that the paper compares with: FIGNet, FIGNet*, MeshGraphNets, DPI."""
+"""The networks that SDF-Sim is compared with: FIGNet, FIGNet*, MeshGraphNets, DPI."""

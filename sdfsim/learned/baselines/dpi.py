@@ -8,7 +8,7 @@ that step (there one after the other, in every round with the same).
 from __future__ import annotations
 
 from sdfsim.learned.baselines.mgn import WORLD, world_edges
-from sdfsim.learned.message_passing import EdgeKind, Graph, Layout
+from sdfsim.learned.message_passing import EdgeKind, Layout, MultiGraph
 from sdfsim.learned.near import Pairs
 from sdfsim.learned.surfaces import NODES, STAR, motion_features, star
 from sdfsim.learned.tensors import BodyTensors, StateTensors
@@ -16,6 +16,6 @@ from sdfsim.learned.tensors import BodyTensors, StateTensors
 DPI = Layout(NODES, STAR | {"contact": EdgeKind("node", "node", WORLD)})
 
 
-def dpi_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
+def dpi_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
     """Of DPI."""
-    return Graph(motion_features(bodies, state), star(bodies, state) | {"contact": world_edges(pairs)})
+    return MultiGraph(motion_features(bodies, state), star(bodies, state) | {"contact": world_edges(pairs)})

@@ -1,6 +1,6 @@
 """FIGNet (Allen et al., 2023, arXiv 2212.03574) and FIGNet* (Lopez-Guevara et al., 2024, arXiv 2401.11985).
 
-Nodes are the vertices of meshes and one node a body. Edges join neighbours on a mesh, vertices and their body's node,
+Nodes are the vertices of meshes and one node a body. EdgeSet join neighbours on a mesh, vertices and their body's node,
 and the faces of two bodies that are near each other. A face edge knows the closest points of the two faces; its message
 has a part for each of the receiving face's three vertices, in the order of their distance to its closest point. FIGNet*
 is FIGNet without mesh edges.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sdfsim.learned.message_passing import EdgeKind, Features, Graph, Layout, both_ways
+from sdfsim.learned.message_passing import EdgeKind, Features, Layout, MultiGraph, both_ways
 from sdfsim.learned.near import Pairs
 from sdfsim.learned.surfaces import MESH, NODES, STAR, mesh_edges, motion_features, star
 from sdfsim.learned.tensors import BodyTensors, StateTensors
@@ -21,19 +21,19 @@ FIGNET_STAR = Layout(NODES, STAR | {"face": EdgeKind("node", "node", FACE, corne
 FIGNET = Layout(NODES, FIGNET_STAR.edges | {"mesh": MESH})
 
 
-def fignet_star_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
+def fignet_star_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
     """Of FIGNet*."""
     p = pairs
     forth = _features(p.way, p.from_first, p.from_second, p.normal_first, p.normal_second)
     back = _features(-p.way, p.from_second, p.from_first, p.normal_second, p.normal_first)
     face = {"face": both_ways(forth, back, p.first, p.second)}
-    return Graph(motion_features(bodies, state), star(bodies, state) | face)
+    return MultiGraph(motion_features(bodies, state), star(bodies, state) | face)
 
 
-def fignet_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
+def fignet_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
     """Of FIGNet."""
     made = fignet_star_graph(bodies, state, pairs)
-    return Graph(made.nodes, made.edges | {"mesh": mesh_edges(bodies, state)})
+    return MultiGraph(made.nodes, made.edges | {"mesh": mesh_edges(bodies, state)})
 
 
 def _features(way: Tensor, sending: Tensor, receiving: Tensor, normal: Tensor, other: Tensor) -> Tensor:

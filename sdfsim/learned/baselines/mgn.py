@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, Layout, both_ways
+from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, Layout, MultiGraph, both_ways
 from sdfsim.learned.near import Pairs
 from sdfsim.learned.surfaces import MESH, NODE, mesh_edges, motion_features
 from sdfsim.learned.tensors import BodyTensors, StateTensors
@@ -17,13 +17,13 @@ WORLD = Features(4, (0,))
 MGN = Layout({"node": NODE}, {"mesh": MESH, "world": EdgeKind("node", "node", WORLD)})
 
 
-def mgn_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Graph:
+def mgn_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
     """Of MeshGraphNets."""
     nodes = {"node": motion_features(bodies, state)["node"]}
-    return Graph(nodes, {"mesh": mesh_edges(bodies, state), "world": world_edges(pairs)})
+    return MultiGraph(nodes, {"mesh": mesh_edges(bodies, state), "world": world_edges(pairs)})
 
 
-def world_edges(pairs: Pairs) -> Edges:
+def world_edges(pairs: Pairs) -> EdgeSet:
     """Edges both ways between nodes of different bodies: from sender to receiver, and how far."""
     length = pairs.way.norm(dim=-1, keepdim=True)
     forth, back = torch.cat([pairs.way, length], -1), torch.cat([-pairs.way, length], -1)

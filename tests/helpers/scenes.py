@@ -17,23 +17,27 @@ from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, E
 from sdfsim.physics.solver.world import World
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape
 
 kernel = inference.compiled
 POSE = ("position", "orientation", "velocity", "angular_velocity")
 
 
-def make_body(name: str, shape: int, position, **fields) -> Body:
-    defaults = {
-        "motion": "dynamic",
-        "scale": 1.0,
-        "quat_xyzw": np.array([0.0, 0.0, 0.0, 1.0]),
-        "velocity": np.zeros(3),
-        "angular_velocity": np.zeros(3),
-        "mass": 1.0,
-        "friction": 0.5,
-        "restitution": 0.5,
-    }
-    return Body(name=name, shape=shape, position=np.asarray(position, dtype=float), **(defaults | fields))
+def make_body(name: str, shape: int, position, mass: float = 1.0, **fields) -> Body:
+    usual = {"motion": "dynamic", "scale": 1.0, "friction": 0.5, "restitution": 0.5}
+    usual |= {"quat_xyzw": [0.0, 0.0, 0.0, 1.0], "velocity": [0.0, 0.0, 0.0], "angular_velocity": [0.0, 0.0, 0.0]}
+    given = usual | fields
+    vectors = {key: np.asarray(given[key], dtype=float) for key in ("quat_xyzw", "velocity", "angular_velocity")}
+    return Body(name=name, shape=shape, position=np.asarray(position, dtype=float), mass=mass, **(given | vectors))
+
+
+def ball(size: float) -> Shape:
+    """A sphere of diameter `size` m."""
+    return analytic_shape("sphere", radius=size / 2)
+
+
+def cube(size: float) -> Shape:
+    return analytic_shape("box", size=(size,) * 3)
 
 
 def random_model(kind: str, seed: int = 0, push: float = 0.5, **config: int) -> Model:
@@ -114,3 +118,11 @@ def in_single(graph: ContactGraph) -> ContactGraph:
     """The graph in single precision, as a network has it."""
     values = {name: value for name, value in vars(graph).items() if isinstance(value, torch.Tensor)}
     return replace(graph, **{name: v.float() for name, v in values.items() if v.is_floating_point()})
+
+
+def surface_model(kind: str = "sdf-sim", push: float = 1e-3):
+    """Untrained, its accelerations of the size of `push`."""
+    model = random_model(kind, width=16, steps=2)
+    model.network.target.total.fill_(1.0)
+    model.network.target.squares.fill_(push**2)
+    return model

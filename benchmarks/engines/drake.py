@@ -1,0 +1,119 @@
+"""Drake, with hydroelastic contact of tetrahedra that fTetWild makes."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import chdir
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.base.files import write_text
+from sdfsim.data.dataset import Trajectory
+from sdfsim.data.pybullet_sim import SUBSTEPS
+from sdfsim.evaluation.engines import Start, Timing, engine_module, engine_motion, form_of
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import wavefront
+
+MODULUS = 1e7  # Pa, of compliant bodies: Drake's own default
+TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
+
+
+def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
+    """Drake's motion with hydroelastic contact: bodies that move are compliant tetrahedra, others rigid triangles.
+
+    It combines two coefficients of friction by their harmonic mean, where the teacher multiplies. So every body carries
+    its own square (one that moves alone, its product with the roughest thing that it may meet), and floor and static
+    bodies what suits the median body: exact where all that move have one friction, of at least half of the others'.
+    Restitution is 0.
+
+    Raises:
+        SdfsimError: Drake or fTetWild are not installed, or the motion fails.
+    """
+    lib = engine_module("pydrake.all", "Drake", "rivals")
+    t, builder = start.motion, lib.DiagramBuilder()
+    settings = lib.MultibodyPlantConfig(time_step=t.dt / substeps, contact_model="hydroelastic_with_fallback")
+    plant, _ = lib.AddMultibodyPlant(settings, builder)
+    plant.mutable_gravity_field().set_gravity_vector(t.gravity)
+
+    def surface(friction: float, compliant: bool, size: float) -> Any:
+        found = lib.ProximityProperties()
+        lib.AddContactMaterial(dissipation=None, friction=lib.CoulombFriction(friction, friction), properties=found)
+        if compliant:
+            lib.AddCompliantHydroelasticProperties(0.25 * size, MODULUS, found)
+        else:
+            lib.AddRigidHydroelasticProperties(0.25 * size, found)
+        return found
+
+    moving = ~t.static if (~t.static).any() else t.static
+    others = [*t.friction[t.static], *(start.floor or ())[:1]]
+    own = t.friction * (max(others, default=1.0) if (~t.static).sum() == 1 else t.friction)
+
+    def beside(friction: float) -> float:
+        wanted = friction * t.friction[moving]
+        return float(np.median(wanted * own[moving] / np.maximum(2.0 * own[moving] - wanted, 1e-3)))
+
+    if start.floor:
+        world, friction = (plant.world_body(), lib.RigidTransform()), beside(start.floor[0])
+        plant.RegisterCollisionGeometry(*world, lib.HalfSpace(), "floor", surface(friction, False, 1.0))
+    bodies = []
+    with tempfile.TemporaryDirectory() as scratch:  # files are read when the simulator is made
+        for i, name in enumerate(map(str, t.shape)):
+            kind, sizes = form_of(start.urdfs[name])
+            place = lib.RigidTransform(lib.Quaternion(np.roll(t.quat_xyzw[0, i], 1)), t.position[0, i])
+            scale, moves = float(t.scale[i]), not t.static[i]
+            if kind == "mesh":
+                file, mesh = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj"), start.meshes[name]
+                if not file.exists():
+                    write_text(file, _tetrahedra(mesh, start.urdfs[name]) if moves else wavefront([mesh]))
+                form, smallest = lib.Mesh(str(file), scale), np.ptp(mesh.vertices, axis=0).min()
+            else:
+                known = {"sphere": lib.Sphere, "box": lib.Box, "cylinder": lib.Cylinder, "capsule": lib.Capsule}
+                form, smallest = known[kind](*(scale * sizes)), sizes.min()
+            friction = float(own[i]) if moves else beside(float(t.friction[i]))
+            properties = surface(friction, moves, scale * float(smallest))
+            if not moves:
+                plant.RegisterCollisionGeometry(plant.world_body(), place, form, f"g{i}", properties)
+                continue
+            inertia = lib.UnitInertia(*(t.inertia[i] / t.mass[i]))
+            body = plant.AddRigidBody(f"b{i}", lib.SpatialInertia(float(t.mass[i]), np.zeros(3), inertia))
+            plant.RegisterCollisionGeometry(body, lib.RigidTransform(), form, f"g{i}", properties)
+            bodies.append((i, body, place))
+        plant.Finalize()
+        simulator = lib.Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    for i, body, place in bodies:
+        plant.SetFreeBodyPose(context, body, place)
+        speed = lib.SpatialVelocity(t.angular_velocity[0, i], t.velocity[0, i])
+        plant.SetFreeBodySpatialVelocity(context=context, body=body, V_JpJc=speed)
+    simulator.Initialize()
+
+    def state() -> tuple[np.ndarray, ...]:
+        places = [plant.EvalBodyPoseInWorld(context, body) for _, body, _ in bodies]
+        speeds = [plant.EvalBodySpatialVelocityInWorld(context, body) for _, body, _ in bodies]
+        quat = np.roll([place.rotation().ToQuaternion().wxyz() for place in places], -1, axis=-1)
+        velocities = (np.array([getattr(v, of)() for v in speeds]) for of in ("translational", "rotational"))
+        return np.array([place.translation() for place in places]), quat, *velocities
+
+    return engine_motion(t, steps, lambda: simulator.AdvanceTo(round(context.get_time() / t.dt + 1) * t.dt), state)
+
+
+def _tetrahedra(mesh: Mesh, beside: Path) -> str:
+    """A VTK file of tetrahedra that fill a closed mesh, kept beside the shape's URDF."""
+    kept = beside.with_suffix(".vtk").resolve()
+    if not kept.exists():
+        filler = engine_module("pytetwild", "fTetWild", "rivals")
+        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file where it runs
+            points, cells = filler.tetrahedralize(
+                mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA
+            )
+        corner = points[cells[:, 0], None]
+        volume = np.linalg.det(points[cells[:, 1:]] - corner)
+        cells = np.where(volume[:, None] < 0, cells[:, [0, 2, 1, 3]], cells)[np.abs(volume) > 0]
+        lines = ["# vtk DataFile Version 3.0", "tetrahedra", "ASCII", "DATASET UNSTRUCTURED_GRID"]
+        lines += [f"POINTS {len(points)} double", *(" ".join(f"{x:.9g}" for x in point) for point in points)]
+        lines += [f"CELLS {len(cells)} {5 * len(cells)}", *("4 " + " ".join(map(str, cell)) for cell in cells)]
+        lines += [f"CELL_TYPES {len(cells)}", *["10"] * len(cells)]
+        write_text(kept, "\n".join(lines) + "\n")
+    return kept.read_text(encoding="utf-8")

@@ -1,0 +1,65 @@
+"""Small fields, and rays to train them with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.cameras import PosedPhotos, Similarity, Sparse, View
+from pipeline.field.grid_field import (
+    FieldSize,
+)
+from pipeline.field.training import Rays
+from pipeline.inputs.photos import save_photos
+
+SMALL = FieldSize((8, 16), (2, 2), 16, 8)
+
+UNIT = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+def toy_rays(count: int = 2000) -> Rays:
+    """A red ball in front of grey, seen from two sides."""
+    rng = np.random.default_rng(0)
+    pixel = rng.integers(0, 40, (count, 2))
+    view = rng.integers(0, 2, count)
+    inside = ((pixel - 19.5) ** 2).sum(1) < 100
+    rgb = np.where(inside[:, None], [200, 30, 30], [128, 128, 128]).astype(np.uint8)
+    turn = np.diag([-1.0, 1, -1])
+    return Rays(
+        torch.tensor(rgb), None, torch.tensor(view.astype(np.int16)), torch.tensor(pixel.astype(np.int16)),
+        torch.tensor([[60.0, 20, 20, 0]] * 2), torch.tensor(np.stack([np.eye(3), turn]), dtype=torch.float32),
+        torch.tensor([[0.0, 0, -3], [0, 0, 3]]), torch.tensor([[40, 40]] * 2),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def posed_noise(folder: Path) -> PosedPhotos:
+    """Four photos of noise, as the photos stage leaves them, and cameras around points that mean nothing."""
+    from PIL import Image
+
+    from tests.helpers.photos import photo
+
+    (folder / "images").mkdir()
+    rng = np.random.default_rng(0)
+    views = []
+    for k in range(4):
+        Image.fromarray(rng.integers(0, 255, (40, 40, 3), dtype=np.uint8)).save(folder / "images" / f"{k}.jpg")
+        a = k * np.pi / 2
+        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        views.append(View(f"{k}.jpg", f"{k}.jpg", 40, 40, 50.0, 20.0, 20.0, 0.0, turn, np.array([0.0, 0, 3])))
+    save_photos([replace(photo(k, 40, 40), name=f"{k}.jpg") for k in range(4)], folder)
+    points = rng.normal(size=(50, 3)) * 0.3
+    point_of, view_of = np.repeat(np.arange(50), 4), np.tile(np.arange(4), 50)
+    sparse = Sparse(points, np.zeros((50, 3), np.uint8), np.full(50, 0.5), point_of, view_of)
+    return PosedPhotos(tuple(views), sparse)
