@@ -96,7 +96,7 @@ def one_step(folders: list[Path], models: dict[str, list[str]]) -> str:
     for preset, paths in models.items():
         plan = PRESETS[preset]
         sets = [contact_frames(f, "validation", Solved(k, plan.inner, 1)) for f in folders for k in plan.strides]
-        task = ImpulseTask(join_frames(sets), torch.device("cpu"))
+        task = ImpulseTask(join_frames(sets))
         batches = [task.draw(np.random.default_rng(seed), 64) for seed in range(8)]
         ways: dict[str, Any] = {"free flight": _free, "solve": _solve} | {
             f"seed {k}": load_model(p).network for k, p in enumerate(paths)

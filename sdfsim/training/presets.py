@@ -34,6 +34,10 @@ PRESETS = {
     "small": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "alone": Preset("impulse", LITTLE | {"alone": 1}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "long": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01, strides=(1, 2), inner=1),
+    # SDF-Sim's graph with a network that a CPU keeps up with
+    "sdf-sim-small": Preset(
+        "sdf-sim", {"width": 64, "steps": 5}, 20_000, batch=32, rate=1e-3, reach=RADII["sdf-sim"], nodes=64, noise=0.003
+    ),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
     **{
         name: Preset(
