@@ -88,7 +88,7 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
 def one_step(folders: list[Path], models: dict[str, list[str]]) -> str:
     """Held-out one-step losses of free flight, the solve, and each preset's networks."""
     lines = []
-    task = ImpulseTask(join_frames([contact_frames(f, "validation", Solved(1)) for f in folders]), torch.device("cpu"))
+    task = ImpulseTask(join_frames([contact_frames(f, "validation", Solved(1)) for f in folders]))
     batches = [task.draw(np.random.default_rng(seed), 64) for seed in range(8)]
     for preset, paths in models.items():
         ways: dict[str, Any] = {"free flight": _free, "solve": _solve} | {

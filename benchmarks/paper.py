@@ -87,7 +87,7 @@ def recorded(name: str, data: Path) -> dict[str, float]:
         milliseconds to find what is near and to pass the graph; peak memory.
     """
     plan = replace(PRESETS[name], nodes=PUBLISHED_NODES)
-    task, network = SurfaceTask(data, "test", plan, CPU), untrained(name, PUBLISHED_NODES).network
+    task, network = SurfaceTask(data, "test", plan), untrained(name, PUBLISHED_NODES).network
     found = []
     with one_thread(), torch.no_grad(), peak_memory() as memory:
         for k in range(STEPS_SEEN):

@@ -260,16 +260,20 @@ def train(
     ],
     out: Out,
     preset: Annotated[
-        Literal["small", "alone", "sdf-sim", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        Literal["small", "alone", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
+    workers: Annotated[
+        int, typer.Option(help="Processes that draw batches ahead, for networks on surface nodes on a GPU.", min=0)
+    ] = 0,
     device: str = "auto",
 ) -> None:
     """Train a model on datasets."""
     from sdfsim.training.train import train as run_training
 
-    session.report(run_training(data, out, preset=preset, resume=resume, device=device, on_progress=session.progress))
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device}
+    session.report(run_training(data, out, **how, on_progress=session.progress))
 
 
 @command

@@ -54,7 +54,7 @@ def scene_of(
 ) -> tuple[Scene, list[int]]:
     """One scene of all trajectories, each at its frame, and the world of each of its bodies (-1, the floor: in all)."""
     names = sorted({str(n) for t in trajectories for n in t.shape})
-    centred = [replace(shapes[n], com=np.zeros(3)) for n in names]
+    about = [centred(shapes[n]) for n in names]
     bodies, world = [], []
     for w, (t, frame) in enumerate(zip(trajectories, frames, strict=True)):
         for i, name in enumerate(t.shape):
@@ -76,8 +76,14 @@ def scene_of(
             world.append(w)
     zero, unturned = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
     bodies.append(Body("floor", len(names), "static", 1.0, zero, unturned, zero, zero, 0.0, *floor))
-    scene = Scene(shapes=(*centred, plane), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
+    scene = Scene(shapes=(*about, plane), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
     return scene, [*world, -1]
+
+
+def centred(shape: Shape) -> Shape:
+    """The shape with its origin as the centre of mass, as trajectories have it; itself where it is so, with all that
+    has been made of it for contact."""
+    return replace(shape, com=np.zeros(3)) if shape.com.any() else shape
 
 
 def state_at(trajectories: list[Trajectory], frames: list[int], like: State) -> State:

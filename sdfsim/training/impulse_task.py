@@ -30,11 +30,10 @@ class ContactBatch:
 
 
 class ImpulseTask:
-    """Draws batches from contact frames, hard ones more often."""
+    """Draws batches from contact frames, hard ones more often; on the CPU."""
 
-    def __init__(self, frames: ContactFrames, device: torch.device) -> None:
+    def __init__(self, frames: ContactFrames) -> None:
         self.frames = frames
-        self.device = device
         self.weight = _importance(frames)
         self.counts = frames.trajectories.tolist()  # trajectories of each set of frames
         self.dt = frames.dt
@@ -71,22 +70,22 @@ class ImpulseTask:
 
         def body(array: np.ndarray, fill: float | list[float] = 0.0) -> Tensor:
             last = np.broadcast_to(np.asarray(fill, dtype=np.float32), array.shape[1:])[None]
-            return torch.from_numpy(np.concatenate([array[rows], last])).to(self.device)
+            return torch.from_numpy(np.concatenate([array[rows], last]))
 
         mass, velocity, angular = body(f.mass), body(f.velocity), body(f.angular)
         moves = mass > 0
         rotation = pose.to_matrix(body(f.orientation, [0.0, 0.0, 0.0, 1.0]))
         inverse_inertia = rotation * (1.0 / body(f.inertia, 1.0))[:, None] @ rotation.mT * moves[:, None, None]
-        fall = torch.as_tensor(f.gravity * f.dt, dtype=torch.float32, device=self.device) * moves[:, None]
-        index = torch.from_numpy(np.stack([first, second]).astype(np.int64)).to(self.device)
+        fall = torch.as_tensor(f.gravity * f.dt, dtype=torch.float32) * moves[:, None]
+        index = torch.from_numpy(np.stack([first, second]).astype(np.int64))
 
         def edge(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(array[edges]).to(self.device)
+            return torch.from_numpy(array[edges])
 
         def product(own: np.ndarray, column: int) -> Tensor:
             """[E] of the coefficients of both bodies; every frame has a floor of its own."""
             one, other = body(own)[index]
-            floors = torch.from_numpy(f.floor[picked][edge_of, column]).to(self.device)
+            floors = torch.from_numpy(f.floor[picked][edge_of, column])
             return one * torch.where(index[1] == floor, floors, other)
 
         pair, pairs = number_pairs(index[0], index[1], len(mass))

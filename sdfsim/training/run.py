@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_arrays
+from sdfsim.training.batches import Drawn, Draws, batches, moved
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 
@@ -28,20 +32,21 @@ class Run:
     """Everything that changes while training, and how to save it.
 
     The task is an `ImpulseTask` or a `SurfaceTask`. The learning rate depends on `total`, the optimiser's steps of the
-    whole run; a `team` shares the work.
+    whole run; a `team` shares the work, and `workers` draw batches ahead.
     """
 
     def __init__(
-        self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE
+        self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE, workers: int = 0
     ) -> None:
         from sdfsim.learned.model import new_network
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
+        self.workers = workers
         self.origin = {"plan": json.loads(json.dumps(asdict(plan))), "seed": seed, "data": task.digest()}
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
-            task.prepare(self.network, np.random.default_rng([seed, 1]))
+            task.prepare(self.network, np.random.default_rng([seed, 1]), device)
         # Averaged are the trained weights; feature statistics are fixed before the first step.
         self.weights = dict(self.network.named_parameters())
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
@@ -49,11 +54,12 @@ class Run:
         self.step, self.seconds, self.loss, self.skipped = 0, 0.0, math.nan, 0
 
     def advance(self) -> None:
-        """One optimiser step on a batch that depends on (seed, step) alone."""
-        rng = np.random.default_rng([self.seed, 0, self.step])
-        flipped = rng.integers(2)
-        batch = self.task.draw(rng, self.plan.batch, self.team)
-        loss = self.task.loss(self.network, batch, mirrored=bool(flipped))
+        """One optimiser step on the step's batch."""
+        drawn = next(self.drawn)
+        if self.workers:
+            self.seconds += drawn.seconds
+        batch = moved(drawn.batch, self.device)
+        loss = self.task.loss(self.network, batch, mirrored=drawn.mirrored)
         weight = self.task.weight_of(batch)
         loss = loss * (weight / max(1.0, self.team.total(weight, self.device)))
         self.optimiser.zero_grad()
@@ -71,9 +77,17 @@ class Run:
         value = self.team.total(float(loss.detach()), self.device)
         self.loss = value if math.isnan(self.loss) else 0.99 * self.loss + 0.01 * value
         decay = min(EMA_DECAY, (1.0 + self.step) / (10.0 + self.step))
-        with torch.no_grad():
-            for name, weight in self.weights.items():
-                self.average[name].lerp_(weight, 1.0 - decay)
+        follow = get_ema_multi_avg_fn(decay)
+        follow([self.average[name] for name in self.weights], list(self.weights.values()), self.step)
+
+    @cached_property
+    def drawn(self) -> Iterator[Drawn]:
+        """What the coming steps train on."""
+        return batches(Draws(self.task, self.plan.batch, self.seed, self.team), self.step, self.workers)
+
+    def close(self) -> None:
+        """End the workers; the next step would have new ones."""
+        self.__dict__.pop("drawn", None)
 
     def share(self) -> float:
         """Of the peak learning rates: a warm-up over 2 % of all steps, 1000 at most, then a cosine to a hundredth."""
@@ -112,6 +126,7 @@ class Run:
             self.optimiser.load(states["optimiser"])
             self.step, self.seconds, self.loss = info["step"], info["seconds"], info["loss"]
             self.skipped = info["skipped"]
+            self.close()
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise SdfsimError(
                 f"{path}: not a checkpoint of this training: {error}", "delete it to start anew"
@@ -201,5 +216,5 @@ def held_out_loss(run: Run, task: Any, batches: int = 8) -> float:
     """Loss of the averaged weights on a fixed set of held-out batches."""
     network, rng = run.averaged(), np.random.default_rng(12345)
     with torch.no_grad():
-        losses = [float(task.loss(network, task.draw(rng, 64))) for _ in range(batches)]
+        losses = [float(task.loss(network, moved(task.draw(rng, 64), run.device))) for _ in range(batches)]
     return float(np.mean(losses))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sdfsim.data.batching import PLANE, merged, state_at
+from sdfsim.data.batching import PLANE, centred, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
 from sdfsim.learned.families import FAMILIES
 from sdfsim.learned.message_passing import GraphNetwork, MultiGraph, flipped
@@ -19,10 +20,13 @@ from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
 from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
-from sdfsim.physics.solver.prepare import Compiled
+from sdfsim.physics.solver.prepare import Compiled, compiled_shapes
+from sdfsim.training.batches import moved
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 
+SETS = 8  # sets of shapes that are kept as the compiled code wants them
+CPU = torch.device("cpu")
 WARM_BATCHES = 20  # batches that set the feature statistics before the first step
 
 
@@ -37,20 +41,32 @@ class Batch:
 
 class SurfaceTask:
     """Draws recorded steps of random trajectories, turned by a random yaw, with rigid noise on the input poses where
-    `noisy`."""
+    `noisy`; on the CPU, since contacts are found there."""
 
-    def __init__(self, data: Path, split: str, plan: Preset, device: torch.device, *, noisy: bool = False) -> None:
+    def __init__(self, data: Path, split: str, plan: Preset, *, noisy: bool = False) -> None:
+        self.made_of = (data, split, plan, noisy)
         files = trajectory_files(data, split)
         self.trajectories, self.floor = [Trajectory.load(f) for f in files], conditions_of(files[0].parent).floor
         check_alike(f"{data / split}", self.trajectories)
         names = {str(n) for t in self.trajectories for n in t.shape}
         self.family, self.nodes = FAMILIES[plan.kind], plan.nodes
-        self.shapes = {k: self.family.surface(s, plan.nodes) for k, s in load_shapes(data, names).items()}
+        shapes = load_shapes(data, names)
+        self.shapes = {k: self.family.surface(centred(s), plan.nodes) for k, s in shapes.items()}
         self.plane = self.family.surface(PLANE, plan.nodes)
-        self.reach, self.device, self.noise = plan.reach, device, plan.noise if noisy else None
+        self.reach, self.noise = plan.reach, plan.noise if noisy else None
         self.counts = [len(self.trajectories)]
         self.dt = self.trajectories[0].dt
         self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
+        # Scenes of a batch have few sets of shapes, mostly all of them.
+        self.compiled = lru_cache(SETS)(compiled_shapes)
+
+    def __getstate__(self) -> tuple:
+        """A process that draws batches makes its own."""
+        return self.made_of
+
+    def __setstate__(self, made_of: tuple) -> None:
+        data, split, plan, noisy = made_of
+        self.__init__(data, split, plan, noisy=noisy)
 
     def digest(self) -> str:
         """Changes with the data."""
@@ -62,20 +78,20 @@ class SurfaceTask:
             digest.update(name.encode() + np.ascontiguousarray(shape.nodes).tobytes())
         return digest.hexdigest()[:16]
 
-    def prepare(self, network: GraphNetwork, rng: np.random.Generator) -> None:
-        """Set the network's feature statistics from a few batches."""
+    def prepare(self, network: GraphNetwork, rng: np.random.Generator, device: torch.device) -> None:
+        """Set the feature statistics of a network, which is on a device, from a few batches."""
         for _ in range(WARM_BATCHES):
-            batch = self.draw(rng, 4)
+            batch = moved(self.draw(rng, 4), device)
             network.observe(batch.graph)
             network.target.observe(batch.target[batch.moves])
 
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
         bodies, state, after = self.scenes(rng, count, team)
-        scene = Compiled(bodies, state) if self.family.distances else None
-        bodies, state = body_tensors(bodies, self.device), state_tensors(state, self.device)
+        scene = Compiled(bodies, state, self.compiled(bodies.contact)) if self.family.distances else None
+        bodies, state = body_tensors(bodies, CPU), state_tensors(state, CPU)
         # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
-        target = target_acceleration(bodies, state, *(torch.from_numpy(pose).to(self.device) for pose in after))
+        target = target_acceleration(bodies, state, *map(torch.from_numpy, after))
         graph = self.family.graph(bodies, state, self.near(bodies, state, scene))
         return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 

@@ -13,8 +13,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from sdfsim.base.errors import SdfsimError, run_main
 from sdfsim.base.files import locked, write_text
 from sdfsim.base.parallel import Progress, silent
@@ -37,6 +35,7 @@ def train(
     seed: int = 0,
     device: str = "cpu",
     budget: float = math.inf,
+    workers: int = 0,
     on_progress: Progress = silent,
 ) -> dict:
     """Train a preset on one dataset or several; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
@@ -44,8 +43,10 @@ def train(
     Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. The preset is a
     name in `PRESETS`, or one of your own, with other `steps` if given. `resume` goes on from the checkpoint in `out`,
     with the result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after which it
-    stops early. Returns paths, losses and processor time. Raises SdfsimError for unusable data, a checkpoint in `out`
-    without `resume`, another run writing to it, or diverged training.
+    stops early. So many `workers` draw batches ahead, in processes of their own, and the result is the same: a GPU
+    would wait for the contacts of networks on surface nodes, which the CPU searches. Returns paths, losses and
+    processor time. Raises SdfsimError for unusable data, a checkpoint in `out` without `resume`, another run writing to
+    it, or diverged training.
     """
     from sdfsim.base.devices import pick_device
 
@@ -54,6 +55,8 @@ def train(
     total = plan.steps if steps is None else steps
     if total < 1:
         raise SdfsimError(f"steps: must be at least 1 (got {total})")
+    if workers < 0:
+        raise SdfsimError(f"workers: must be at least 0 (got {workers})")
     checkpoint = out / "checkpoint.npz"
     if checkpoint.exists() and not resume:
         raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
@@ -62,9 +65,9 @@ def train(
     place = pick_device(device)
     with locked(out) if team.leads else nullcontext():
         with team.in_turn():  # the first finds contacts and caches them, the others read
-            task, held_out = _tasks(plan, folders, place, lambda _, message: on_progress(0.0, message))
+            task, held_out = _tasks(plan, folders, lambda _, message: on_progress(0.0, message))
         made = [_made(*one) for one in zip(folders, infos, task.counts, held_out.counts, strict=True)]
-        run = Run(plan, task, total, seed, place, team)
+        run = Run(plan, task, total, seed, place, team, workers)
         if checkpoint.exists():
             run.load(checkpoint)
         team.wait()
@@ -95,7 +98,7 @@ def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]
     return known | {"shapes": len(shapes), "random_solids": solids, "trajectories": counts}
 
 
-def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Progress):
+def _tasks(plan: Preset, folders: Sequence[Path], tell: Progress):
     """Training and held-out tasks of a preset."""
     if plan.kind == "impulse":
         from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
@@ -103,7 +106,7 @@ def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Pr
 
         def task(split: str, draws: int) -> ImpulseTask:
             sets = [contact_frames(folder, split, Solved(draws), on_progress=tell) for folder in folders]
-            return ImpulseTask(join_frames(sets), device)
+            return ImpulseTask(join_frames(sets))
 
         return task("train", 2), task("validation", 1)
     from sdfsim.training.surface_task import SurfaceTask
@@ -111,7 +114,7 @@ def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Pr
     if len(folders) > 1:
         raise SdfsimError("networks on surface nodes train on one dataset", "give a single --data")
     data = folders[0]
-    return SurfaceTask(data, "train", plan, device, noisy=True), SurfaceTask(data, "validation", plan, device)
+    return SurfaceTask(data, "train", plan, noisy=True), SurfaceTask(data, "validation", plan)
 
 
 def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progress) -> None:
@@ -136,6 +139,7 @@ def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progre
                 run.save(out / "checkpoint.npz")
                 saved = time.monotonic()
     finally:
+        run.close()
         # Also on Ctrl-C: what has been learned is kept.
         if run.team.leads:
             run.save(out / "checkpoint.npz")
@@ -176,6 +180,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw batches ahead")
     parser.add_argument("--resume", action="store_true")
     options = vars(parser.parse_args())
     data, out = options.pop("data"), options.pop("out")

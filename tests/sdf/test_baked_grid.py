@@ -264,7 +264,7 @@ def test_the_compiled_distance_is_that_of_the_shape(kind, block):
         "mesh": lambda: block,
     }[kind]()
     scene = Scene((shape,), (body("a", 0, [0, 0, 0]),), np.zeros(3), 1.0)
-    shapes = compiled_shapes(from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))[0])
+    shapes = compiled_shapes(from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))[0].contact)
     slack = bake(block.sdf, block.nodes).error if shapes.table[0, 0] == GRID else 1e-12
     points = np.random.default_rng(1).uniform(-1.02, 1.02, (500, 3)) * shape.sdf.bounds[1]
     for p, exact, normal in zip(points, *shape.sdf(points), strict=True):

@@ -115,7 +115,7 @@ def test_frames_and_ranges_are_those_of_the_floor_that_dataset_json_tells(tmp_pa
     # In the first of five inner steps the slab only comes to bear on the floor.
     part = (frames.velocity[:, 0] - frames.solved_velocity[:, 0]) / (10.0 * floor[0] * 0.02)
     assert part.min() > 0.7 and part.max() < 1.01
-    task = ImpulseTask(frames, torch.device("cpu"))
+    task = ImpulseTask(frames)
     graph = task.batch(np.arange(5)).graph
     torch.testing.assert_close(graph.friction, torch.full_like(graph.friction, floor[0]))
     torch.testing.assert_close(graph.restitution, torch.full_like(graph.restitution, floor[1]))
@@ -130,7 +130,7 @@ def test_sets_of_several_floors_keep_each_its_own(tmp_path):
         told = {"engine": "mine", "floor": {"friction": friction, "restitution": 0.3}}
         sets.append(contact_frames(slab_data(tmp_path / name, "train", sliding(friction), told), "train", ONCE))
     whole = join_frames(sets)
-    task = ImpulseTask(whole, torch.device("cpu"))
+    task = ImpulseTask(whole)
     picked = np.array([3, len(sets[0]) + 2])
     edges = np.diff(whole.edge_start)[picked]
     found = task.batch(picked).graph.friction.numpy()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.distributed import Team
@@ -23,7 +22,7 @@ def test_the_parts_of_a_batch_are_the_batch(size):
 
 
 def test_the_parts_losses_add_up_to_the_whole_batchs_loss(ball_data):
-    task = ImpulseTask(contact_frames(ball_data, "train", Solved()), torch.device("cpu"))
+    task = ImpulseTask(contact_frames(ball_data, "train", Solved()))
 
     def flying(g, mirrored):
         from sdfsim.learned.impulse import Velocities

@@ -53,7 +53,7 @@ def test_training_sees_masses_relative_to_the_scenes_mean(pair, ball_data):
     assert bodies.inverse_mass.tolist() == pytest.approx([0.75, 1.5, 0.75, 1.5, 0.0])
     radii = (torch.diagonal(bodies.inertia, dim1=1, dim2=2)[:4, 0] / bodies.mass[:4]).tolist()
     assert radii == pytest.approx([0.05, 0.1, 0.05, 0.1])
-    task = SurfaceTask(ball_data, "train", SDF_SIM, CPU)
+    task = SurfaceTask(ball_data, "train", SDF_SIM)
     task.trajectories = group
     seen = task.draw(np.random.default_rng(0), 8).graph.nodes["body"][:, 9]
     assert sorted(set(seen.tolist())) == pytest.approx([0.0, 0.75, 1.5])
@@ -67,13 +67,13 @@ def test_bodies_alone_that_never_move_have_no_mean_mass(pair):
 
 
 def test_the_mass_ratio_is_that_within_a_scene(pair, ball_data):
-    task = SurfaceTask(ball_data, "train", SDF_SIM, CPU)
+    task = SurfaceTask(ball_data, "train", SDF_SIM)
     task.trajectories = pair[0]
     assert task.ranges()["mass_ratio"] == [1.0, pytest.approx(2.0)]
 
 
 def test_the_parts_of_a_noisy_batch_are_the_batch(ball_data):
-    task = SurfaceTask(ball_data, "train", SDF_SIM, CPU, noisy=True)
+    task = SurfaceTask(ball_data, "train", SDF_SIM, noisy=True)
 
     def drawn(team: Team):
         batch = task.draw(np.random.default_rng(3), 8, team)
@@ -81,13 +81,13 @@ def test_the_parts_of_a_noisy_batch_are_the_batch(ball_data):
 
     whole, parts = drawn(Team()), [drawn(Team(rank, 3)) for rank in range(3)]
     torch.testing.assert_close(torch.cat(parts), whole, rtol=0, atol=0)
-    exact = SurfaceTask(ball_data, "train", SDF_SIM, CPU).draw(np.random.default_rng(3), 8)
+    exact = SurfaceTask(ball_data, "train", SDF_SIM).draw(np.random.default_rng(3), 8)
     assert not torch.equal(exact.graph.nodes["node"], task.draw(np.random.default_rng(3), 8).graph.nodes["node"])
 
 
 def test_noise_walks_by_the_given_size(ball_data):
     """The last of three poses is off by it, the first by a third of the variance; the recorded target is not."""
-    task = SurfaceTask(ball_data, "train", SDF_SIM, CPU, noisy=True)
+    task = SurfaceTask(ball_data, "train", SDF_SIM, noisy=True)
     picked = [task.trajectories[k % 6] for k in range(2000)]
     noise = task._noise(picked, np.random.default_rng(0), Team())
     assert noise is not None and noise.shape == (3, 2, 4001, 3)
@@ -98,7 +98,7 @@ def test_noise_walks_by_the_given_size(ball_data):
 def test_ranges_are_of_what_moves(pair, ball_data):
     """Scenery is as large as it likes, and does not set the model's unit of length."""
     (one, _), _ = pair
-    task = SurfaceTask(ball_data, "train", SDF_SIM, CPU)
+    task = SurfaceTask(ball_data, "train", SDF_SIM)
     task.trajectories = [one]
     known = task.ranges()
     scenery = {"static": np.array([False, True]), "scale": np.array([1.0, 9.0]), "mass": np.array([2.0, 0.0])}
@@ -111,7 +111,7 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
     for other in ({"dt": 0.01}, {"gravity": np.array([0.0, 0.0, -5.0])}):
         replace(bouncing(3), **other).save(tmp_path / "data" / "train" / "9.npz")
         for read in (
-            lambda data: SurfaceTask(data, "train", SDF_SIM, CPU),
+            lambda data: SurfaceTask(data, "train", SDF_SIM),
             lambda data: contact_frames(data, "train", Solved()),
         ):
             with pytest.raises(SdfsimError, match=r"train: .*\bstep\b.*\bgravity\b"):
@@ -121,11 +121,11 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
 def test_the_floor_of_a_batch_is_the_one_that_dataset_json_tells(tmp_path):
     told = {"engine": "mine", "floor": {"friction": 0.7, "restitution": 0.1}}
     data = slab_data(tmp_path, "train", sliding(0.7), told)
-    task = SurfaceTask(data, "train", SDF_SIM, CPU)
+    task = SurfaceTask(data, "train", SDF_SIM)
     bodies, _, _ = task.scenes(np.random.default_rng(0), 2)
     assert (float(bodies.friction[-1]), float(bodies.restitution[-1])) == (0.7, 0.1)
     assert task.ranges()["friction"] == pytest.approx([0.7, 1.0])
     before = task.digest()
     (data / "dataset.json").write_text('{"engine": "mine"}')
-    other = SurfaceTask(data, "train", SDF_SIM, CPU)
+    other = SurfaceTask(data, "train", SDF_SIM)
     assert float(other.scenes(np.random.default_rng(0), 2)[0].friction[-1]) == 0.3 and other.digest() != before

@@ -44,7 +44,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
         (tmp_path / name).symlink_to(ball_data / name)
     engine = {"engine": "pybullet", "engine_settings": engine_settings(0.02, 5) | {"timeStep": 0.0}} if teacher else {}
     (tmp_path / "dataset.json").write_text(json.dumps(engine))
-    task = ImpulseTask(contact_frames(tmp_path, "train", ONCE), CPU)
+    task = ImpulseTask(contact_frames(tmp_path, "train", ONCE))
     first = Trajectory.load(ball_data / "train" / "0.npz")
     bodies, state = merged([first], [0], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
     options = Options(gravity=torch.tensor(first.gravity), dt=first.dt, record=True)
@@ -70,7 +70,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
 
 
 def test_perfect_predictions_have_no_loss_and_free_flight_has(ball_data):
-    task = ImpulseTask(contact_frames(ball_data, "validation", ONCE), CPU)
+    task = ImpulseTask(contact_frames(ball_data, "validation", ONCE))
     batch = task.draw(np.random.default_rng(0), 8)
     assert float(task.loss(lambda graph, mirrored: batch.truth, batch)) == 0.0
 
@@ -164,7 +164,7 @@ def test_paper_targets_lead_exactly_to_the_recorded_pose(ball_data):
     )
     landed = advance(bodies, state, target_acceleration(bodies, state, *after), t.dt)
     torch.testing.assert_close(landed.position, after[0], rtol=0, atol=1e-12)
-    assert SurfaceTask(ball_data, "train", SDF_SIM, CPU, noisy=True).dt == t.dt
+    assert SurfaceTask(ball_data, "train", SDF_SIM, noisy=True).dt == t.dt
 
 
 def test_an_unreadable_frame_cache_is_named(ball_data):
@@ -181,7 +181,7 @@ def test_joined_frames_are_the_frames_of_both(ball_data):
     one, two = (contact_frames(ball_data, split, ONCE) for split in ("train", "validation"))
     joined = join_frames([one, two])
     assert len(joined) == len(one) + len(two)
-    task, alone = ImpulseTask(joined, CPU), ImpulseTask(two, CPU)
+    task, alone = ImpulseTask(joined), ImpulseTask(two)
     for k in (0, len(two) - 1):
         ours, theirs = task.batch(np.array([len(one) + k])), alone.batch(np.array([k]))
         for name in ("velocity", "gap", "arm_second", "first"):

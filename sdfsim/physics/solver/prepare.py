@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +23,7 @@ from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.physics.validity import NO_LIMITS, Fault, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
-from sdfsim.shape.contact_geometry import NO_SURFACE, ContactSurface
+from sdfsim.shape.contact_geometry import NO_SURFACE, ContactGeometry, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
 
 FORMS = {
@@ -40,12 +41,13 @@ SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the 
 
 
 class Compiled:
-    """One scene, its bodies in model units, as the compiled step wants it."""
+    """One scene, its bodies in model units, as the compiled step wants it. Many scenes of the same shapes can share
+    their compiled `shapes`."""
 
-    def __init__(self, bodies: Bodies, state: State) -> None:
+    def __init__(self, bodies: Bodies, state: State, shapes: kinds.Shapes | None = None) -> None:
         warn_compiling(run_steps, "the contact step", "two minutes")
         self.bodies = bodies
-        self.shapes = compiled_shapes(bodies)
+        self.shapes = shapes or compiled_shapes(bodies.contact)
         self.place(state)
 
     def place(self, state: State) -> None:
@@ -212,15 +214,15 @@ def _manifolds(touch: Touch | None) -> compiled.Manifolds:
     return compiled.Manifolds(touch.pair, touch.count, touch.point)
 
 
-def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
+def compiled_shapes(shapes: Sequence[ContactGeometry]) -> kinds.Shapes:
     """The shapes of a scene, baked where they have no closed form."""
-    table = np.zeros((len(bodies.sdfs), kinds.FIELDS))
+    table = np.zeros((len(shapes), kinds.FIELDS))
     table[:, kinds.CELL], table[:, kinds.PATCH] = 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
     # Where all shapes are convex, or made of convex pieces, none is met as a surface.
-    met = any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in bodies.contact)
-    surfaces = [shape.surface if met else NO_SURFACE for shape in bodies.contact]
-    for row, shape, surface in zip(table, bodies.contact, surfaces, strict=True):
+    met = any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
+    surfaces = [shape.surface if met else NO_SURFACE for shape in shapes]
+    for row, shape, surface in zip(table, shapes, surfaces, strict=True):
         row[kinds.THICKNESS] = shape.thickness
         if surface.label.size:
             row[kinds.PATCH_LOW : kinds.PATCH_LOW + 3], row[kinds.PATCH_CELL] = surface.label_low, surface.label_cell
@@ -238,7 +240,7 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
     arrays = (np.concatenate(parts) for parts in (brick, sample))
-    solids = [shape.solids for shape in bodies.contact]
+    solids = [shape.solids for shape in shapes]
     parts = (table, *arrays, *_joined(surfaces), np.concatenate(label), *_packed(solids))
     return kinds.Shapes(*parts)
 

@@ -1,0 +1,85 @@
+"""The batches of a training run, in the order of its steps: drawn when they are asked for, or ahead by workers."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.training.distributed import Team
+
+AHEAD = 4  # batches that each worker draws ahead
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a step trains on."""
+
+    batch: Any  # the task's
+    mirrored: bool  # whether its mirror image is trained on
+    seconds: float  # s of processor time that drawing took
+
+
+@dataclass(frozen=True)
+class Draws(Dataset):
+    """The batch of every step, which depends on (seed, step) alone."""
+
+    task: Any
+    count: int  # frames in a batch
+    seed: int
+    team: Team
+
+    def __getitem__(self, step: int) -> Drawn:
+        started = time.process_time()
+        rng = np.random.default_rng([self.seed, 0, step])
+        mirrored = bool(rng.integers(2))
+        batch = self.task.draw(rng, self.count, self.team)
+        return Drawn(batch, mirrored, time.process_time() - started)
+
+
+def batches(draws: Draws, first: int, workers: int = 0) -> Iterator[Drawn]:
+    """What the steps from `first` on train on, the same for any number of `workers`: processes that draw ahead. Raises
+    SdfsimError where one of them ended."""
+    steps = range(first, sys.maxsize)
+    if not workers:
+        yield from map(draws.__getitem__, steps)
+        return
+    # Spawned, not forked: nothing of a CUDA context or of running threads is copied.
+    loader = DataLoader(
+        draws, batch_size=None, sampler=steps, collate_fn=_as_it_is, num_workers=workers, prefetch_factor=AHEAD,
+        worker_init_fn=_deaf, multiprocessing_context="spawn",
+    )  # fmt: skip
+    try:
+        yield from loader
+    except RuntimeError as error:
+        if "DataLoader worker" not in str(error).partition("\n")[0]:
+            raise
+        raise SdfsimError("a process that draws batches has ended", "fewer --workers need less memory") from error
+
+
+def moved(value: Any, device: torch.device) -> Any:
+    """A batch, its parts or a tensor on a device."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if isinstance(value, dict):
+        return {name: moved(part, device) for name, part in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value)})
+    return value
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+def _deaf(_: int) -> None:
+    """Ctrl-C is for the process that trains: it ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
