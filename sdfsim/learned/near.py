@@ -109,8 +109,8 @@ def no_pairs(device: torch.device, corners: int) -> Pairs:
 
 
 def near_pairs(
-    bodies: BodyTensors, state: StateTensors, gravity: np.ndarray, reach: float, dt: float, scene: Compiled | None = None, *,
-    faces: bool,
+    bodies: BodyTensors, state: StateTensors, gravity: np.ndarray, reach: float, dt: float,
+    scene: Compiled | None = None, *, faces: bool,
 ) -> Pairs:  # fmt: skip
     """All pairs of nodes, or of `faces`, of different bodies within `reach` (model length) during a step, as
     `find_contacts` has it."""
