@@ -168,7 +168,7 @@ def test_with_everything_active_nothing_is_copied(dropped):
 
 
 def test_learned_free_flight_needs_no_search_with_contact_off(dropped, forbid):
-    forbid(near, "nodes_within")
+    forbid(near, "nodes_near")
     sim = Simulator(replace(dropped, effects=Effects(contact="off")), surface_model(), free_flight="learned")
     rollout = sim.run(steps=3)
     assert rollout.counters["active"][1:].tolist() == [3, 3, 3] and rollout.contact_count.sum() == 0

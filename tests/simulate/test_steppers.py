@@ -191,7 +191,7 @@ def test_a_state_that_cannot_be_amid_a_chunk_ends_it_as_it_ends_single_steps(kin
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_a_state_of_the_caller_that_cannot_be_adds_no_frame_to_a_run(kind, monkeypatch):
+def test_a_state_of_the_caller_that_cannot_be_adds_no_frame_to_a_run(kind):
     sim = busy_simulator(kind)
     whole, frames = [sim.initial_rollout()], sim.frames(10, 3)
     whole += [next(frames), next(frames)]
