@@ -113,7 +113,7 @@ def grown(name: str, scene_file: Path) -> dict[str, float]:
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY << 30, MEMORY << 30))
     scene = load_scene(scene_file)
     settled = Simulator(scene).step(SETTLED)  # a sphere's origin is its centre of mass
-    poses = zip(settled.position.numpy(), settled.orientation.numpy(), strict=True)
+    poses = zip(settled.position, settled.orientation, strict=True)
     bodies = tuple(
         replace(body, position=position, quat_xyzw=turn) if body.motion == "dynamic" else body
         for body, (position, turn) in zip(scene.bodies, poses, strict=True)

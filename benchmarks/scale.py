@@ -90,15 +90,15 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
         frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
         began = time.process_time()
         try:
-            for frame in simulator.frames(steps - 1):
-                frames.append(frame)
+            frames.extend(simulator.frames(steps - 1))
         except SimulationError as error:
             broken = error.message
+            frames.append(error.rollout)
         spent = time.process_time() - began
     rollout = join(frames)
     return {
         "bodies": int(simulator.bodies.moves.sum()),
-        "ms": 1e3 * spent / max(1, len(frames) - 1),
+        "ms": 1e3 * spent / max(1, len(rollout)),
         "contacts": float(rollout.counters["contacts"].mean()),
         "broken": broken,
         "peak_mib": memory["mib"],

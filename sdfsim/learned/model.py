@@ -92,7 +92,7 @@ def model_names() -> list[str]:
 
 
 def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:
-    """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is empty.
+    """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is None.
     Raises SdfsimError for an unknown name, or an unreadable or foreign file."""
     from safetensors import SafetensorError, safe_open
 

@@ -26,7 +26,7 @@ from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
-from sdfsim.simulate.steppers import COUNTS, PHASES, Carry, Frames, FreeFlight, energies_of, stepper_of
+from sdfsim.simulate.steppers import COUNTS, PHASES, Carry, Frames, FreeFlight, energies_of, stacked, stepper_of
 
 if TYPE_CHECKING:
     from sdfsim.scene.builder import SceneBuilder
@@ -155,12 +155,13 @@ class Simulator(LiveScene):
         return self.si_state()
 
     def frames(self, count: int, at_once: int | None = None) -> Iterator[Rollout]:
-        """Advance by `count` steps, yielding all frames since the last time as one rollout; raises as `steps` does.
+        """Advance by `count` steps, yielding all frames since the last time as one rollout; raises as `steps` does, but
+        the `rollout` has the frames since the last time up to the last good state, which may be none.
 
         Steps are made `at_once` in one call of compiled code (None: as many as take about `GLANCE` seconds), which
         changes no result.
         """
-        made, some = 0, at_once or 1
+        made, some = 0, max(1, at_once or 1)
         while made < count:
             some = min(some, count - made)
             started = time.perf_counter()
@@ -309,8 +310,8 @@ class Simulator(LiveScene):
 
     def _advance(self, count: int, *, keep: bool = False) -> None:
         """Make `count` steps, all in one call where the stepper can."""
-        self._accept()
-        after, carry = self.stepper.advance(self._state, self.carry, count, keep=keep)
+        self._accept(keep=keep)
+        after, carry = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep)
         self._state = self._good = after
         self.steps_done += carry.done
         if not keep:
@@ -318,8 +319,9 @@ class Simulator(LiveScene):
         if carry.fault is not None:
             raise self._broke(self._described(carry.fault), carry.frames if keep else None)
 
-    def _accept(self) -> None:
-        """What came from outside is looked at before anything is computed from it, and the stepper is told."""
+    def _accept(self, *, keep: bool = False) -> None:
+        """What came from outside is looked at before anything is computed from it, and the stepper is told. Raises
+        SimulationError where it cannot be, with no frame where somebody does `keep` those before."""
         if not (self._handed or self._changed):
             return
         state, good, changed = self._state, self._good, np.zeros(len(self.bodies), bool)
@@ -335,7 +337,7 @@ class Simulator(LiveScene):
             broken = "time is not finite"
         if broken:
             self._state = good
-            raise self._broke(broken)
+            raise self._broke(broken, stacked(good, [], self.bodies, self._options) if keep else None)
         gravity = self._options.gravity
         self._given += sum(energies_of(self.bodies, state, gravity)) - sum(energies_of(self.bodies, good, gravity))
         self._state = self._good = self.stepper.announce(state, self.carry, changed)

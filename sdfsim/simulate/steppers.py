@@ -162,16 +162,18 @@ class Stepper:
 
     def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
         """Make `n` steps, fewer where the state after one cannot be and the carry is `checked`; `keep` their frames.
-        The counts of the carry are then those of the last one."""
+        The counts of the carry are then those of the last one that is kept."""
         bodies, dt, frames = carry.bodies, carry.options.dt, []
         carry.done, carry.fault, carry.given, carry.frames = 0, None, 0.0, None
         for _ in range(n):
+            known = carry.counts, carry.near
             carry.counts = dict.fromkeys(carry.counts, 0.0)
             after = self._step(driven(bodies, state, dt), carry)
             asleep = np.zeros(len(bodies), bool) if after.touch is None else after.touch.island >= 0
             if carry.checked:
                 carry.fault = first_fault(after, dt, bodies.moves & ~asleep, state)
                 if carry.fault is not None:
+                    carry.counts, carry.near = known
                     break
             carry.counts |= {"asleep": asleep.sum(), "free": carry.moving - asleep.sum() - carry.counts["active"]}
             given = _given(state, after, dt)
@@ -179,7 +181,7 @@ class Stepper:
             if keep:
                 frames.append((after, given, dict(carry.counts), self.touching(after, carry)))
         if keep:
-            carry.frames = _stacked(state, frames, bodies, carry.options)
+            carry.frames = stacked(state, frames, bodies, carry.options)
         return state, carry
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
@@ -220,10 +222,13 @@ class Solver(Stepper):
     def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
         """All steps in one call of compiled code."""
         started = time.perf_counter()
-        made = self._steps(state, carry, n, keep=keep)
+        made = self._steps(state, carry, n, limits(carry.options.dt) if carry.checked else NO_LIMITS, keep=keep)
         spent = 1e3 * (time.perf_counter() - started) / max(n, 1)
         carry.done, carry.fault, carry.given = made.done, made.fault, made.given
         carry.frames = None
+        if made.done:
+            active, asleep = carry.counts["active"], made.counts[3]
+            carry.counts |= {"asleep": asleep, "free": carry.moving - asleep - active, "contact_ms": spent}
         if keep:
             kept = {name: getattr(made.kept, name)[: made.done] for name in made.kept._fields}
             pairs, contacts, active, asleep, touching = kept.pop("count").T
@@ -233,16 +238,16 @@ class Solver(Stepper):
             carry.frames = Frames(**kept, touching=touching, pair=made.pair, point=made.point, counts=counts)
         return made.state, carry
 
-    def _steps(self, state: State, carry: Carry, n: int, *, keep: bool = False) -> Steps:
-        most = limits(carry.options.dt) if carry.checked else NO_LIMITS
+    def _steps(self, state: State, carry: Carry, n: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         made = cast("Compiled", carry.scene).advance(state, carry.options, n, most, keep=keep)
         carry.edges = made.edges
-        carry.counts |= dict(zip(("pairs", "contacts", "active"), made.counts, strict=True))
+        if made.done:
+            carry.counts |= dict(zip(("pairs", "contacts", "active"), made.counts[:3], strict=True))
         return made
 
     def _step(self, state: State, carry: Carry) -> State:
         with carry.timed("contact_ms"):
-            return self._steps(state, carry, 1).state
+            return self._steps(state, carry, 1, NO_LIMITS).state  # `Stepper.advance` looks at what comes of it
 
 
 @dataclass(frozen=True)
@@ -386,7 +391,7 @@ def energies_of(bodies: Bodies, state: State, gravity: np.ndarray) -> tuple[floa
     return energies(bodies.mass, bodies.inertia, gravity, *moved)
 
 
-def _stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: Bodies, options: Options) -> Frames:
+def stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: Bodies, options: Options) -> Frames:
     """The frames of single steps: each the state after it, what pulls gave, counts, and where bodies touch."""
     states = [state for state, *_ in kept]
     arrays = {

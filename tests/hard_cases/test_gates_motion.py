@@ -100,7 +100,7 @@ def test_where_it_happens_does_not_matter(model, distance):
     unit = Simulator(scene, model).units.length
 
     def there(state: State) -> State:
-        return replace(state, position=state.position + torch.as_tensor(shift / unit))
+        return replace(state, position=state.position + shift / unit)
 
     assert apart(model, scene, far, 25, there, lambda p: p - shift) <= 1e-4
 
@@ -177,6 +177,6 @@ def test_a_step_with_two_threads_is_that_with_one(model):
                 simulator.restore(before)
                 after += list(simulator.steps(1))
             two, one = after
-            assert (one.position - two.position).abs().max() <= 1e-6
+            assert np.abs(one.position - two.position).max() <= 1e-6
     finally:
         torch.set_num_threads(usual)

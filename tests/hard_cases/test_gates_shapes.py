@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.learned.near import find_contacts
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
 from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
-from tests.helpers.scenes import random_model, surface_model
+from tests.helpers.scenes import contact_edges, random_model, surface_model
 
 LINE = np.linspace(-0.5, 0.5, 6)[:, None] * [1.0, 0.5, 0.0]
 FLAT = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.5], [0.0]), -1).reshape(-1, 3)
@@ -113,7 +112,7 @@ def test_a_node_where_the_gradient_has_no_direction_of_its_own(kinds, kind, plac
     rest = replace(scene.bodies[0], name="target", shape=1, position=np.zeros(3))
     scene = replace(scene, shapes=(probe, target), bodies=(*scene.bodies, rest))
     sim = Simulator(scene, model)
-    contacts = find_contacts(sim.bodies, sim.state, sim.options.gravity, sim.model.reach, sim.options.dt)
+    _, _, contacts = contact_edges(sim.bodies, sim.state, sim.options.gravity, sim.model.reach, sim.options.dt)
     assert len(contacts)
     torch.testing.assert_close(contacts.normal.norm(dim=-1), torch.ones(len(contacts), dtype=torch.float64))
     assert contacts.distance.isfinite().all() and (contacts.distance.abs() < 2.0).all()

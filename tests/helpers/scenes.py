@@ -11,8 +11,12 @@ import torch
 from sdfsim.learned import inference
 from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.model import Model, new_network
+from sdfsim.learned.near import Contacts, find_contacts
+from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
 from sdfsim.physics import pose
-from sdfsim.physics.bodies import State
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.motion import MOTION
+from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, Edges
 from sdfsim.physics.solver.world import World
 from sdfsim.scene.scene import Body, Scene
@@ -20,7 +24,7 @@ from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 
 kernel = inference.compiled
-POSE = ("position", "orientation", "velocity", "angular_velocity")
+CPU = torch.device("cpu")
 
 
 def make_body(name: str, shape: int, position, mass: float = 1.0, **fields) -> Body:
@@ -52,9 +56,9 @@ def random_model(kind: str, seed: int = 0, push: float = 0.5, **config: int) -> 
     return Model("random", kind, network, dt=0.02, gravity=10.0, length=1.0, reach=0.1)
 
 
-def angle_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle [...] rad of the rotation from `a` to `b`, unit quaternions [..., 4]."""
-    return pose.to_rotvec(pose.multiply(b, pose.conjugate(a))).norm(dim=-1)
+    return np.linalg.norm(pose.to_rotvec(pose.multiply(b, pose.conjugate(a))), axis=-1)
 
 
 @pytest.fixture
@@ -90,7 +94,7 @@ def contact_graph(
     world: World, before: State, solved: State, edges: Edges, terms: kernel.Terms
 ) -> tuple[torch.Tensor, ContactGraph]:
     """The bodies [A] of a step's graph, and the graph, as the compiled network has it but in torch."""
-    start, end = (kernel.Poses(*(getattr(state, name).numpy() for name in POSE)) for state in (before, solved))
+    start, end = (kernel.Poses(*(getattr(state, name) for name in MOTION)) for state in (before, solved))
     given = kernel._graph(world, start, end, edges.pair, edges.value, terms)
     columns = {"normal": AXIS, "arm_first": ARM, "arm_second": OTHER, "impulse": GIVEN}
     twists = {"": kernel.START, "free_": kernel.FREE, "solved_": kernel.END, "mean_": kernel.MEAN}
@@ -112,6 +116,19 @@ def contact_graph(
         restitution=torch.from_numpy(given.product[:, 1]),
         dt=terms.known,
     )
+
+
+def in_torch(bodies: Bodies, state: State) -> tuple[BodyTensors, StateTensors]:
+    """Bodies and state as a network on surface nodes has them."""
+    return body_tensors(bodies, CPU), state_tensors(state, CPU)
+
+
+def contact_edges(
+    bodies: Bodies, state: State, gravity: np.ndarray, reach: float, dt: float
+) -> tuple[BodyTensors, StateTensors, Contacts]:
+    """Bodies, state and contact edges as a network on surface nodes is given them."""
+    tensors = in_torch(bodies, state)
+    return *tensors, find_contacts(*tensors, gravity, reach, dt, Compiled(bodies, state))
 
 
 def in_single(graph: ContactGraph) -> ContactGraph:

@@ -8,21 +8,21 @@ import torch
 
 from sdfsim.learned.families import FAMILIES, vertices
 from sdfsim.learned.near import closest_points, face_pairs, node_pairs
-from sdfsim.learned.surfaces import with_history
-from sdfsim.physics.bodies import Bodies, State, Units, from_scene
+from sdfsim.learned.pose import rotate
+from sdfsim.learned.tensors import BodyTensors, StateTensors
+from sdfsim.physics.bodies import Units, from_scene
+from sdfsim.physics.free_flight import with_history
 from sdfsim.physics.options import Options
-from sdfsim.physics.pose import rotate
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
-from tests.helpers.scenes import make_body
+from tests.helpers.scenes import in_torch, make_body
 
-CPU = torch.device("cpu")
-GRAVITY = torch.tensor([0.0, 0.0, -10.0], dtype=torch.float64)
+GRAVITY = np.array([0.0, 0.0, -10.0])
 FLIP = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
 DT, REACH = 0.02, 0.3
 
 
-def bodies_of(kind: str, seed: int = 0) -> tuple[Bodies, State]:
+def bodies_of(kind: str, seed: int = 0) -> tuple[BodyTensors, StateTensors]:
     """Four tumbling bodies close to each other and to the floor."""
     rng = np.random.default_rng(seed)
     shapes = (
@@ -36,9 +36,9 @@ def bodies_of(kind: str, seed: int = 0) -> tuple[Bodies, State]:
         speeds = {name: rng.normal(size=3) for name in ("velocity", "angular_velocity")}
         bodies.append(make_body(f"{k}", k % 2, place, quat_xyzw=quat / np.linalg.norm(quat), mass=1.0 + k, **speeds))
     worked_on = tuple(FAMILIES[kind].surface(shape, 30) for shape in shapes)
-    scene = Scene(worked_on, tuple(bodies), gravity=GRAVITY.numpy(), duration=1.0)
-    found, state = from_scene(scene, Units(1.0, 1.0, 1.0), CPU)
-    return found, with_history(state, found, Options(gravity=GRAVITY, dt=DT))
+    scene = Scene(worked_on, tuple(bodies), gravity=GRAVITY, duration=1.0)
+    found, state = from_scene(scene, Units(1.0, 1.0, 1.0))
+    return in_torch(found, with_history(state, found, Options(gravity=GRAVITY, dt=DT)))
 
 
 def distances_by_projection(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -81,7 +81,7 @@ def test_pairs_of_nodes_are_all_there_are(seed):
     pairs = node_pairs(bodies, state, GRAVITY, REACH, DT)
     owner = torch.repeat_interleave(torch.arange(len(bodies)), bodies.node_start.diff())
     arm = rotate(state.orientation[owner], bodies.node)
-    place, fall = state.position[owner] + arm, GRAVITY * DT * bodies.moves[:, None]
+    place, fall = state.position[owner] + arm, torch.from_numpy(GRAVITY) * DT * bodies.moves[:, None]
     speed = (state.velocity + fall)[owner] + torch.linalg.cross(state.angular_velocity[owner], arm)
     expected = set()
     for i in range(len(owner)):

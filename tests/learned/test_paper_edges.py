@@ -4,17 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.learned.near import find_contacts
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
-from tests.helpers.scenes import make_body
+from tests.helpers.scenes import contact_edges, make_body
 
-CPU = torch.device("cpu")
 GRAVITY = np.array([0.0, 0.0, -10.0])
 REACH, DT = 0.1, 0.02
 
@@ -70,8 +67,8 @@ def slow_twin(scene: Scene, allowed=lambda one, other: True) -> dict[tuple[int, 
 
 
 def found(scene: Scene):
-    bodies, state = from_scene(scene, Units(1.0, 1.0, 1.0), CPU)
-    return bodies, find_contacts(bodies, state, torch.from_numpy(GRAVITY), REACH, DT)
+    bodies, _, contacts = contact_edges(*from_scene(scene, Units(1.0, 1.0, 1.0)), GRAVITY, REACH, DT)
+    return bodies, contacts
 
 
 def as_edges(bodies, contacts) -> dict[tuple[int, int, int], float]:
@@ -117,4 +114,4 @@ def test_a_moving_body_needs_mass_and_nodes():
     weightless = Scene((analytic_shape("sphere", radius=1.0),), (make_body("b", 0, [0, 0, 0], mass=0.0),), GRAVITY, 1.0)
     for scene in (plane, weightless):
         with pytest.raises(SdfsimError, match="needs a mass"):
-            from_scene(scene, Units(1.0, 1.0, 1.0), CPU)
+            from_scene(scene, Units(1.0, 1.0, 1.0))

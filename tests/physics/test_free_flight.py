@@ -1,7 +1,7 @@
 """Free flight against closed forms and conservation laws."""
 
 import numpy as np
-import torch
+from scipy.spatial.transform import Rotation
 
 from sdfsim.learned import inference
 from sdfsim.physics import pose
@@ -10,14 +10,14 @@ from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import angle_between, make_body, random_model
 
-TOP = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))[None]
+TOP = np.diag([1.0, 2.0, 3.0])[None]
 
 
-def spin_state(angular: list[float]) -> tuple[torch.Tensor, torch.Tensor]:
-    return torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64), torch.tensor([angular], dtype=torch.float64)
+def spin_state(angular: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([[0.0, 0.0, 0.0, 1.0]]), np.array([angular])
 
 
-def momentum_and_energy(q: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def momentum_and_energy(q: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rotation = pose.to_matrix(q)
     momentum = (rotation @ TOP @ rotation.mT @ w[..., None])[..., 0]
     return momentum, 0.5 * (momentum * w).sum(-1)
@@ -37,16 +37,14 @@ def test_ten_seconds_of_projectile_equal_the_closed_form(box_shape):
 
 def test_symmetric_top_precesses_as_in_closed_form():
     """Of an axisymmetric body the symmetry axis turns about the angular momentum at |L| / I1."""
-    inertia = torch.diag(torch.tensor([1.0, 1.0, 2.0], dtype=torch.float64))[None]
+    inertia = np.diag([1.0, 1.0, 2.0])[None]
     q, w = spin_state([0.6, 0.0, 1.5])
-    momentum = torch.tensor([0.6, 0.0, 3.0], dtype=torch.float64)
+    momentum = np.array([0.6, 0.0, 3.0])
     for _ in range(100):
         q, w = torque_free(q, w, inertia, 0.02)
-    about = momentum / momentum.norm()
-    turn = pose.from_rotvec(about * momentum.norm() * 2.0)[None]
-    expected = pose.rotate(turn, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
-    axis = pose.rotate(q, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
-    torch.testing.assert_close(axis, expected, rtol=0, atol=1e-7)
+    turn = Rotation.from_rotvec(momentum * 2.0)  # of |L| / I1, for 2 s
+    axis = Rotation.from_quat(q).apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(axis[0], turn.apply([0.0, 0.0, 1.0]), rtol=0, atol=1e-7)
 
 
 def test_intermediate_axis_flips_and_conserves():
@@ -60,8 +58,8 @@ def test_intermediate_axis_flips_and_conserves():
             flips, side = flips + 1, -side
     after, energy_after = momentum_and_energy(q, w)
     assert flips >= 2
-    torch.testing.assert_close(after, momentum, rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(energy_after, energy, rtol=1e-6, atol=0)
+    np.testing.assert_allclose(after, momentum, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(energy_after, energy, rtol=1e-6, atol=0)
 
 
 def test_a_rotation_in_single_precision_is_one_in_double_after_a_step():
@@ -69,8 +67,8 @@ def test_a_rotation_in_single_precision_is_one_in_double_after_a_step():
     q, w = spin_state([0.3, -1.2, 0.4])
     long = q * (1.0 + 1e-7)
     after, _ = torque_free(long, w, TOP, 0.02)
-    assert abs(float(after.norm()) - 1.0) < 1e-15
-    assert float(angle_between(after, torque_free(q, w, TOP, 0.02)[0])) < 1e-7
+    assert abs(np.linalg.norm(after) - 1.0) < 1e-15
+    assert angle_between(after, torque_free(q, w, TOP, 0.02)[0]).max() < 1e-7
 
 
 def test_a_scene_without_contacts_never_calls_the_network(dropped, monkeypatch):

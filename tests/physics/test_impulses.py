@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from numba import njit
 from scipy.spatial.transform import Rotation
 
@@ -103,9 +102,9 @@ def test_the_compiled_solve_is_the_readable_one(seed):
     """At several moments of a pile that falls together, the velocities changed a little so that it also rebounds."""
     draw = np.random.default_rng(seed)
     scene = pile(draw)
-    bodies, state = from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    bodies, state = from_scene(scene, Units(1.0, 1.0, 1.0))
     inside = Compiled(bodies, state)
-    rules = compiled_rules(Options(torch.from_numpy(scene.gravity), 0.02, **RULES[seed % len(RULES)]))
+    rules = compiled_rules(Options(scene.gravity, 0.02, **RULES[seed % len(RULES)]))
     motion, manifolds = taken_up(state)
     world, work, acting = inside.world, inside.work, 0
     for _ in range(5):

@@ -1,38 +1,77 @@
-"""Quaternions against scipy's rotations, an independent implementation."""
+"""Quaternions against scipy's rotations, an independent implementation: those in NumPy, and those in torch."""
+
+from types import ModuleType
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sdfsim.physics import pose
+from sdfsim.learned import pose as in_torch
+from sdfsim.physics import pose as in_numpy
 
-RNG = np.random.default_rng(0)
 A, B = Rotation.random(50, random_state=1), Rotation.random(50, random_state=2)
 
 
-def quat(rotation: Rotation) -> torch.Tensor:
-    return torch.from_numpy(rotation.as_quat())
+class Functions:
+    """The functions of a module, called with NumPy arrays and answering with them, whatever it works on."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self.module = module
+
+    def __getattr__(self, name: str):
+        function = getattr(self.module, name)
+        if self.module is in_numpy:
+            return function
+        return lambda *arrays: function(*map(torch.tensor, arrays)).numpy()
 
 
-def same(got: torch.Tensor, rotation: Rotation) -> None:
-    angle = (Rotation.from_quat(got.numpy()) * rotation.inv()).magnitude()
+@pytest.fixture(params=[in_numpy, in_torch], ids=["numpy", "torch"])
+def pose(request) -> Functions:
+    return Functions(request.param)
+
+
+def same(got: np.ndarray, rotation: Rotation) -> None:
+    assert got.dtype == np.float64
+    angle = (Rotation.from_quat(got) * rotation.inv()).magnitude()
     assert angle.max() < 1e-12
 
 
-def test_product_inverse_and_matrix():
-    same(pose.multiply(quat(A), quat(B)), A * B)
-    same(pose.conjugate(quat(A)), A.inv())
-    np.testing.assert_allclose(pose.to_matrix(quat(A)).numpy(), A.as_matrix(), atol=1e-14)
+def test_product_inverse_and_matrix(pose):
+    same(pose.multiply(A.as_quat(), B.as_quat()), A * B)
+    same(pose.conjugate(A.as_quat()), A.inv())
+    np.testing.assert_allclose(pose.to_matrix(A.as_quat()), A.as_matrix(), atol=1e-14)
 
 
-def test_rotating_vectors():
-    v = RNG.normal(size=(50, 3))
-    np.testing.assert_allclose(pose.rotate(quat(A), torch.from_numpy(v)).numpy(), A.apply(v), atol=1e-13)
+def test_what_is_long_is_made_a_unit(pose):
+    long = A.as_quat() * np.random.default_rng(1).uniform(0.1, 10.0, (50, 1))
+    np.testing.assert_allclose(pose.normalise(long), A.as_quat(), atol=1e-15)
 
 
-def test_rotation_vectors_round_trip_from_tiny_to_large():
+def test_rotating_vectors(pose):
+    v = np.random.default_rng(0).normal(size=(50, 3))
+    np.testing.assert_allclose(pose.rotate(A.as_quat(), v), A.apply(v), atol=1e-13)
+
+
+def test_rotation_vectors_round_trip_from_tiny_to_large(pose):
+    rng = np.random.default_rng(0)
     for size in (0.0, 1e-14, 1e-8, 1e-3, 1.0, 3.1):
-        vector = RNG.normal(size=(20, 3))
+        vector = rng.normal(size=(20, 3))
         vector *= size / np.linalg.norm(vector, axis=1, keepdims=True)
-        back = pose.to_rotvec(pose.from_rotvec(torch.from_numpy(vector))).numpy()
-        np.testing.assert_allclose(back, vector, rtol=1e-7, atol=1e-20)
+        same(pose.from_rotvec(vector), Rotation.from_rotvec(vector))
+        np.testing.assert_allclose(pose.to_rotvec(pose.from_rotvec(vector)), vector, rtol=1e-7, atol=1e-20)
+        # Of the two quaternions of a rotation either tells the shorter way.
+        np.testing.assert_allclose(pose.to_rotvec(-pose.from_rotvec(vector)), vector, rtol=1e-7, atol=1e-20)
+
+
+def test_leading_dimensions_are_batched_over(pose):
+    """One quaternion turns several vectors, and bodies are turned at several instants."""
+    v = np.random.default_rng(0).normal(size=(4, 5, 3))
+    quats = A.as_quat()[:20].reshape(4, 5, 4)
+    turned = A[:20].apply(v.reshape(-1, 3)).reshape(v.shape)
+    np.testing.assert_allclose(pose.rotate(quats, v), turned, atol=1e-13)
+    np.testing.assert_allclose(pose.to_matrix(quats), A[:20].as_matrix().reshape(4, 5, 3, 3), atol=1e-14)
+    one = np.broadcast_to(A.as_quat()[0], (4, 5, 4)).copy()
+    np.testing.assert_allclose(pose.rotate(one, v), A[0].apply(v.reshape(-1, 3)).reshape(v.shape), atol=1e-13)
+    for some in (quats[:0], quats[:, :0]):
+        assert pose.multiply(some, some).shape == pose.from_rotvec(some[..., :3]).shape == some.shape

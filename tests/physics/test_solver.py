@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from sdfsim import Simulator
 from sdfsim.evaluation import hard_cases
@@ -118,8 +117,9 @@ def test_what_rests_sleeps_and_wakes_when_it_is_hit_or_changed():
     motion = sim.run(2.0)
     assert motion.counters["asleep"][-1] == 3
     assert (motion.position[-1, :3] == motion.position[-10, :3]).all() and not motion.velocity[-1, :3].any()
-    kept = sim.state
-    sim.state = replace(kept, velocity=kept.velocity.clone().index_fill_(0, torch.tensor([1]), 0.5))
+    kept, velocity = sim.state, sim.state.velocity.copy()
+    velocity[1] = 0.5
+    sim.state = replace(kept, velocity=velocity)
     assert sim.run(steps=1).counters["asleep"][-1] == 0
     sim.state = kept
     hit = sim.run(1.5)

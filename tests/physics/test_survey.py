@@ -51,10 +51,10 @@ def test_contacts_are_told_where_the_first_body_has_them(state):
 def test_the_first_body_that_cannot_be_is_found(state, which, value):
     position, orientation, velocity, angular = state
     told = (position, orientation, velocity, angular)
-    seen, most = np.ones(BODIES, bool), np.array([1.0, 50.0, 60.0, 70.0, 1e9])
+    seen, most = np.ones(BODIES, bool), np.array([1e-6, 50.0, 60.0, 70.0, 1e9])
 
     def found():
-        return first_fault(seen, position, orientation, velocity, angular, position, 0.1, 1e-6, most)
+        return first_fault(seen, position, orientation, velocity, angular, position, 0.1, most)
 
     assert found() == (-1, 0)
     told[which][5, 2] = told[which][3, 1] = value
@@ -67,5 +67,5 @@ def test_a_way_that_is_too_long_for_a_step_is_found(state):
     position, orientation, velocity, angular = state
     before = position.copy()
     before[4, 0] += 0.5
-    most, seen = np.array([1.0, 1e9, 1e9, 1e9, 4.9]), np.ones(BODIES, bool)
-    assert first_fault(seen, position, orientation, velocity, angular, before, 0.1, 1e-6, most) == (4, 4)
+    most, seen = np.array([1e-6, 1e9, 1e9, 1e9, 4.9]), np.ones(BODIES, bool)
+    assert first_fault(seen, position, orientation, velocity, angular, before, 0.1, most) == (4, 4)

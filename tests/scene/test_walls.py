@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.scene.scene import Scene
@@ -41,7 +40,7 @@ def test_mass_and_inertia_are_those_of_what_is_left_around_the_hollow(load, name
     (volume, inertia), (hollow, missing) = inside(0.0), inside(0.004)
     scene = scene_of(load, f"{shape}, wall: 0.004", scale)
     assert scene.bodies[0].mass == pytest.approx(500 * (volume - hollow) * scale**3, rel=0.01)
-    bodies, _ = from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    bodies, _ = from_scene(scene, Units(1.0, 1.0, 1.0))
     wanted = 500 * np.diag(inertia - missing) * scale**5
     np.testing.assert_allclose(bodies.inertia[0], wanted, rtol=0.01, atol=1e-3 * wanted.max())
     np.testing.assert_allclose(bodies.com[0], 0, atol=1e-6)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
@@ -237,7 +236,7 @@ def test_convex_pieces_are_the_same_at_every_size(size):
 
 def test_bodies_of_any_scale_share_one_geometry(block):
     bodies = tuple(replace(body(str(k), 0, [k, 0, 0]), scale=scale) for k, scale in enumerate((1.0, 0.3, 7.0)))
-    made = from_scene(Scene((block,), bodies, np.zeros(3), 1.0), Units(0.37, 1.0, 1.0), torch.device("cpu"))[0]
+    made = from_scene(Scene((block,), bodies, np.zeros(3), 1.0), Units(0.37, 1.0, 1.0))[0]
     assert made.contact == (block.contact,)
 
 
@@ -264,7 +263,7 @@ def test_the_compiled_distance_is_that_of_the_shape(kind, block):
         "mesh": lambda: block,
     }[kind]()
     scene = Scene((shape,), (body("a", 0, [0, 0, 0]),), np.zeros(3), 1.0)
-    shapes = compiled_shapes(from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))[0].contact)
+    shapes = compiled_shapes(from_scene(scene, Units(1.0, 1.0, 1.0))[0].contact)
     slack = bake(block.sdf, block.nodes).error if shapes.table[0, 0] == GRID else 1e-12
     points = np.random.default_rng(1).uniform(-1.02, 1.02, (500, 3)) * shape.sdf.bounds[1]
     for p, exact, normal in zip(points, *shape.sdf(points), strict=True):

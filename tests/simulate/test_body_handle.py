@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from sdfsim import SdfsimError, Simulator
 from sdfsim.scene.scene import Effects, Scene, Waypoints
@@ -73,7 +72,7 @@ def test_a_push_gives_its_momentum_and_its_moment():
 def test_a_pull_is_mass_times_acceleration_until_it_ends(contact):
     sim = Simulator(replace(small(), effects=Effects(contact=contact)))
     box, force = sim["box"], np.array([0.3, -0.1, 0.2 * 9.81 + 0.4])  # up, so that nothing is met
-    start, axes = box.centre, [sim.bodies.inertia[0].cpu().numpy() * sim.units.mass * sim.units.length**2]
+    start, axes = box.centre, [sim.bodies.inertia[0] * sim.units.mass * sim.units.length**2]
     box.pull(force, torque=(0, 0, 1e-3))
     sim.step(20)
     time, push = 20 * sim.dt, force / 0.2 + G
@@ -184,7 +183,7 @@ def test_variants_run_on_the_device_of_their_simulator(monkeypatch):
     """A machine without a GPU shows it by what the jobs are told."""
     sim, jobs = Simulator(small()), []
     monkeypatch.setattr(simulator_module, "parallel", lambda function, some: jobs.extend(some) or [(0, [None])])
-    sim.device = torch.device("cuda:0")
+    sim.device = "cuda:0"
     sim.rollouts([{}], steps=1)
     assert jobs[0][2]["device"] == "cuda:0"
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from sdfsim import SdfsimError, Simulator
 from sdfsim.scene.scene import Scene
@@ -62,8 +61,8 @@ def test_a_state_of_the_caller_that_is_no_number_is_refused_in_every_way(free_pa
     if name == "time":
         broken, told = float("nan"), "time is not finite"
     else:
-        broken, told = getattr(good, name).clone(), f"body 'right': {name} is not finite"
-        broken[1, 2] = torch.nan
+        broken, told = getattr(good, name).copy(), f"body 'right': {name} is not finite"
+        broken[1, 2] = np.nan
     simulator.state = replace(good, **{name: broken})
     with pytest.raises(SimulationError, match=f"step 1: {told}"):
         WAYS[way](simulator)

@@ -66,18 +66,18 @@ def test_every_body_is_disturbed_by_a_part_of_the_noise_from_the_least_to_all():
     count, how = 4000, Solved(shift=1.0, speed=10.0, least=0.01)
     shapes = {"ball": analytic_shape("sphere", radius=0.5)}
     start = balls(np.zeros((1, count, 3)) + 3.0 * np.arange(count)[None, :, None])
-    bodies, state = merged([start], [0], shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    bodies, state = merged([start], [0], shapes, Units(1.0, 1.0, 1.0))
     moved = _disturbed(bodies, state, how, np.random.default_rng(0))
     shift = moved.position - state.position
     assert not shift[-1].any() and not moved.velocity[-1].any()  # the floor's
-    draws = torch.cat([shift, (moved.velocity - state.velocity) / 10.0], -1)[:-1]
-    size = draws.square().mean(-1).sqrt().numpy()
+    draws = np.concatenate([shift, (moved.velocity - state.velocity) / 10.0], -1)[:-1]
+    size = np.sqrt(np.square(draws).mean(-1))
     # The logarithm of a part is uniform, so of 4,000 a quarter is in each fourth of its range, but for chi^2 of draws.
     share = np.histogram(np.log(size) / np.log(how.least), bins=[-1.0, 0.25, 0.5, 0.75, 2.0])[0] / count
     np.testing.assert_allclose(share, 0.25, atol=0.05)
     # Turns move the surface, half a metre away, by as much.
     turned = pose.to_rotvec(pose.multiply(moved.orientation, pose.conjugate(state.orientation)))[:-1]
-    assert 0.5 < float((0.5 * turned).abs().median() / shift[:-1].abs().median()) < 1.5
+    assert 0.5 < np.median(np.abs(0.5 * turned)) / np.median(np.abs(shift[:-1])) < 1.5
 
 
 def test_a_folder_with_nothing_but_its_frames_can_be_trained_on(tmp_path):

@@ -17,7 +17,8 @@ from sdfsim.learned.inference import terms_of
 from sdfsim.learned.model import SURFACE, load_model
 from sdfsim.physics.bodies import Units
 from sdfsim.physics.options import Options
-from sdfsim.physics.solver.prepare import Compiled, disturbed, solver_step
+from sdfsim.physics.solver.prepare import Compiled, disturbed
+from sdfsim.physics.validity import NO_LIMITS
 from sdfsim.training import contact_cache
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
@@ -26,7 +27,7 @@ from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
-from tests.helpers.scenes import contact_graph, in_single
+from tests.helpers.scenes import contact_graph, in_single, in_torch
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]
@@ -46,16 +47,16 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
     (tmp_path / "dataset.json").write_text(json.dumps(engine))
     task = ImpulseTask(contact_frames(tmp_path, "train", ONCE))
     first = Trajectory.load(ball_data / "train" / "0.npz")
-    bodies, state = merged([first], [0], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
-    options = Options(gravity=torch.tensor(first.gravity), dt=first.dt, record=True)
+    bodies, state = merged([first], [0], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0))
+    options = Options(gravity=first.gravity, dt=first.dt, record=True)
     if teacher:
         options = replace(options, margin=MARGIN, adds=True, cone=False)
     scene, touch, found = Compiled(bodies, state), None, []
     for frame in range(len(first.position) - 1):
-        _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
-        state = disturbed(replace(state, touch=touch), bodies.moves.numpy())
-        solved, edges, _ = solver_step(scene, state, options)
-        touch = solved.touch
+        _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0))
+        state = disturbed(replace(state, touch=touch), bodies.moves)
+        made = scene.advance(state, options, 1, NO_LIMITS)
+        solved, edges, touch = made.state, made.edges, made.state.touch
         if len(edges.pair):
             terms = terms_of(options, first.dt)
             found.append(in_single(contact_graph(scene.world, state, solved, edges, terms)[1]))
@@ -149,21 +150,22 @@ def test_paper_targets_lead_exactly_to_the_recorded_pose(ball_data):
     from sdfsim.learned.surfaces import advance, target_acceleration
 
     t = Trajectory.load(ball_data / "train" / "0.npz")
-    bodies, state = merged([t], [5], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
+    bodies, state = merged([t], [5], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0))
 
     def pose_at(k):
-        _, s = merged([t], [k], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
+        _, s = merged([t], [k], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0))
         return s.position, s.orientation
 
     before, after = [pose_at(k) for k in (3, 4)], pose_at(6)
     shifted = before[1][0] + 0.01
     state = replace(
         state,
-        earlier_position=torch.stack([before[0][0], shifted]),
-        earlier_orientation=torch.stack([before[0][1], before[1][1]]),
+        earlier_position=np.stack([before[0][0], shifted]),
+        earlier_orientation=np.stack([before[0][1], before[1][1]]),
     )
-    landed = advance(bodies, state, target_acceleration(bodies, state, *after), t.dt)
-    torch.testing.assert_close(landed.position, after[0], rtol=0, atol=1e-12)
+    bodies, state = in_torch(bodies, state)
+    landed = advance(bodies, state, target_acceleration(bodies, state, *map(torch.from_numpy, after)), t.dt)
+    np.testing.assert_allclose(landed.position, after[0], rtol=0, atol=1e-12)
     assert SurfaceTask(ball_data, "train", SDF_SIM, noisy=True).dt == t.dt
 
 

@@ -74,7 +74,8 @@ class Compiled:
             np.empty((n, bodies, 3)), np.empty((n, bodies, 4)), np.empty((n, bodies, 3)), np.empty((n, bodies, 3)),
             np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n),
         )  # fmt: skip
-        known = (self.shapes, self.world, self.work, motion, rules, manifolds, script, most, kept, TOUCHING, steps)
+        # An integer of another kind would be compiled for anew.
+        known = (self.shapes, self.world, self.work, motion, rules, manifolds, script, most, kept, TOUCHING, int(steps))
         return *run_steps(*known), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
@@ -97,7 +98,7 @@ class Compiled:
             found = Motion(motion.position, motion.orientation, motion.velocity, motion.angular)
             fault = fault_of(body, wrong, found, np.array(before), options.dt)
             if not done:
-                return Steps(state, edges, (0, 0, 0), 0, fault, 0.0, kept, pair, point)
+                return Steps(state, edges, (0, 0, 0, 0), 0, fault, 0.0, kept, pair, point)
             # The motion is beyond the last good state, which the same steps but one lead to once more.
             again = self.advance(state, options, done, NO_LIMITS)
             return replace(again, fault=fault, kept=kept, pair=pair, point=point)
@@ -114,7 +115,8 @@ class Compiled:
         arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
         moved = {name: array[rows] for name, array in zip(MOTION, arrays, strict=True)}
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load)
-        return Steps(self._latest, edges, counts, done, fault, given, kept, pair, point)
+        asleep = int((motion.island[rows] >= 0).sum())
+        return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ class Steps:
 
     state: State  # the last good one
     edges: Edges  # what contacts did in the last step, where that is recorded
-    counts: tuple[int, ...]  # of the last step: pairs looked at, contacts, bodies that contacts moved
+    counts: tuple[int, ...]  # of the last step: pairs looked at, contacts, bodies that contacts moved, those asleep
     done: int  # how many steps were made
     fault: Fault | None  # of the state after them, which is not kept
     given: float  # what pulls have given
