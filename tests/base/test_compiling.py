@@ -57,7 +57,7 @@ def test_a_function_is_compiled_where_numba_keeps_it_by_its_own_source(tmp_path,
 
 def test_it_is_said_once_for_all_scenes_of_a_process(monkeypatch, caplog):
     monkeypatch.setattr(compiling, "_said", set())
-    monkeypatch.setattr(solver, "compiled_step", SimpleNamespace(signatures=[]))
+    monkeypatch.setattr(solver, "run_steps", SimpleNamespace(signatures=[]))
     balls = (make_body("ball", 0, [0, 0, 1]), make_body("other", 0, [3, 0, 1]))
     for _ in range(3):
         sim = Simulator(Scene((analytic_shape("sphere", radius=0.5),), balls, np.zeros(3), 1.0))
