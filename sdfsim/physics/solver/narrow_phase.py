@@ -51,6 +51,7 @@ from sdfsim.physics.solver.surface_distance import (
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
+    ONCE,
     add,
     along,
     dot,
@@ -240,7 +241,7 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
     near.count[p, 0] = at - near.start[p, 0]
 
 
-@njit(**FAST)
+@njit(**BARE)
 def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
     """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
 
@@ -249,19 +250,24 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
     if len(near.start) >= MANY:
         _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
     else:
-        for p in range(len(near.start)):
-            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+        _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1))
 
 
 @njit(parallel=True, **FAST)
 def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
     for i in prange(SHARES):
         t, scratch = np.int64(i), scratch_room()
-        for p in range(t, len(near.start), SHARES):
-            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+        _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, t, np.int64(SHARES))
 
 
 @njit(**BARE)
+def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, step):
+    """Every so many pairs, from the first on."""
+    for p in range(first, len(near.start), step):
+        _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+
+
+@njit(**ONCE)
 def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     if near.count[p, 0] + near.count[p, 1] == 0:
@@ -300,7 +306,7 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p)
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p):
     """Where friction acts of points that bound a flat manifold, in parts of the way from its middle to each: the mean
     of what touches on this way. A full face, legs and a rim differ."""
@@ -442,7 +448,7 @@ def _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, cou
     return count
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
     """The manifold of a pair with a sphere or a capsule."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]

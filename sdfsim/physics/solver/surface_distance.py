@@ -20,7 +20,7 @@ from sdfsim.physics.solver.distance import (
     patch_of,
 )
 from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
-from sdfsim.physics.solver.vectors import BARE, add, along, dot, get, norm, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, ONCE, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # patches of a shape at most
 ROUNDS = 12  # of refinement
@@ -64,7 +64,7 @@ def is_round(table, s):
     return table[s, KIND] == SPHERE or table[s, KIND] == CAPSULE
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, scratch, count):
     """Where the surface of one body is near another: from the deepest nodes of its near leaves down the other's
     distance; added to what is found."""
@@ -95,7 +95,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
     return count
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch):
     """The deepest node of each near leaf around which the surface may touch; how many."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
@@ -145,7 +145,7 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
     return kept
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def _chosen(scratch, kept, level):
     """Of candidates that face the same way the deepest, and of those that are about as deep the outermost to all sides:
     the corners of a face, in whatever order its leaves are. How many, to scratch.pick."""
