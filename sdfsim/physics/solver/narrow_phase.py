@@ -87,6 +87,12 @@ class Near(NamedTuple):
     axis: np.ndarray  # [L, 3] the normal of a pair of pieces, from the second to the first; 0 where it is not known
     looked: np.ndarray  # [P] the ways of both bodies when new points were last looked for; -inf for never
     away_all: np.ndarray  # [P] the least of `away`; -inf where it is not known
+    # Of leaves: the node that was deepest when they were last looked into, -1 for never; how far each of their nodes is
+    # at least, likewise; and where the surface led to from there.
+    deepest: np.ndarray  # [L] int32
+    node_away: np.ndarray  # [L * the most nodes of a leaf]
+    placed: np.ndarray  # [L] bool, whether it is known
+    place: np.ndarray  # [L, 3] on the own surface, in its frame
     held: np.ndarray  # [L] bool, whether a pair of pieces has the normal of what supports, see `internal_edges`
     following: np.ndarray  # [2 P] int64 for finding the contacts of a body
 
@@ -143,9 +149,13 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
             elif way == SOLIDS and side == 0:
                 pieces = shapes.piece_start[s + 1] - shapes.piece_start[s]
                 total += pieces * max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
+    wide = 0
+    for leaf in range(len(shapes.leaf_node) - 1):
+        wide = max(wide, shapes.leaf_node[leaf + 1] - shapes.leaf_node[leaf])
     near = Near(
         start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total), np.zeros((total, 3)),
-        np.full(count, -math.inf), np.full(count, -math.inf), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
+        np.full(count, -math.inf), np.full(count, -math.inf), np.empty(total, np.int32), np.empty(total * wide),
+        np.empty(total, np.bool_), np.empty((total, 3)), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
     if count >= MANY:
         _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
@@ -197,7 +207,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
             for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
                 away = beyond(shapes, t, w, c, k, own, i)
                 if away <= most:
-                    near.leaf[at], near.away[at] = i, away
+                    near.leaf[at], near.away[at], near.deepest[at], near.placed[at] = i, away, -1, False
                     at += 1
         near.count[p, side] = at - near.start[p, side]
 
@@ -281,6 +291,7 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     if went - near.looked[p] < rules.still:
         manifolds.count[p] = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
         return
+    since, first = went - near.looked[p], near.looked[p] == -math.inf
     near.looked[p], near.away_all[p] = went, math.inf
     if way == SOLIDS:
         known = manifolds.count[p]
@@ -300,30 +311,36 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
             near.away_all[p] = -math.inf
             return
     for side in range(2):
-        count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, scratch, count)
+        count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, since, scratch, count)
     count = first_to_touch(rules, scratch.found, count)
     manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, False)
-    _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p)
+    _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 
 
 @njit(**ONCE)
-def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p):
+def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, anew):
     """Where friction acts of points that bound a flat manifold, in parts of the way from its middle to each: the mean
-    of what touches on this way. A full face, legs and a rim differ."""
+    of what touches on this way. A full face, legs and a rim differ. Unless `anew`, only of those that are new."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     point, count = manifolds.point[p], manifolds.count[p]
     middle, flat = (0.0, 0.0, 0.0), count >= 3
     for k in range(count):
-        point[k, TORSION] = 1.0
         alike = 0.0
         for x in range(3):
             alike += point[k, NORMAL + x] * point[0, NORMAL + x]
         flat = flat and alike > FLAT and point[k, KEY] == point[0, KEY]
         middle = along(middle, _half_way(motion, matrix, point, a, b, k), 1.0 / count)
-    if not flat:
+    known = flat and not anew
+    for k in range(count):
+        if not flat or anew:
+            point[k, TORSION] = 1.0
+        known = known and point[k, TORSION] < 1.0
+    if not flat or known:
         return
     full = _both_touch(shapes, world, motion, matrix, rules, a, b, middle)
     for k in range(count):
+        if point[k, TORSION] < 1.0:
+            continue
         if full:
             point[k, TORSION] = FACE
             continue
