@@ -282,11 +282,16 @@ def _common(room, round_off, aside):
         low, high = max(low, min(one, two)), min(high, max(one, two))
     elif abs(off) > aside:
         return 0
+    # Across the second edge its surface is level: that is where the first one's places are over it.
+    foot, share = -(px * ex + py * ey) / (other * other), (dx * ex + dy * ey) / (other * other)
+    if share != 0.0:
+        one, two = -foot / share, (1.0 - foot) / share
+        low, high = max(low, min(one, two)), min(high, max(one, two))
     if low >= high:
         return 0
     for i in range(2):
         t = low if i == 0 else high
-        s = (t - start) / (end - start)
+        s = foot + t * share
         for x in range(3):
             room.clipped[i, x] = first[0, x] + t * (first[1, x] - first[0, x])
         room.gap[i] = room.clipped[i, 2] - round_off - (second[0, 2] + s * (second[1, 2] - second[0, 2]))

@@ -38,6 +38,8 @@ TOUCHING = (
     1e-4  # of the thickness: only solids that are farther apart are asked as they lie, else rounding turns normals
 )
 APART = 1e-3  # of the thickness: so far apart overlapping solids are moved
+# Cosine of a normal with that of a face, from which on the two are one, and of the thickness: if they show as much.
+ALONG, AS_MUCH = 1.0 - 1e-9, 1e-9
 EXACT = 1e-14  # squared distances are found to this part
 FEW = 48  # vertices that are looked at in turn; of more, neighbours of neighbours
 STEPS, ROUNDS = 48, 10  # of GJK, and of normals
@@ -174,7 +176,7 @@ def closest(convex, matrix, pair, n, known, enough, room):
     length = norm(v)
     if length > TOUCHING * thick:
         mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
-        n = scale(v, 1.0 / length)
+        n, length = _squared(convex, matrix, pair, scale(v, 1.0 / length), length, thick)
         return length - mine - theirs, n, along(there, n, -mine), along(sub(there, v), n, theirs)
     best = _least_deep(convex, matrix, pair, _along_face(convex, matrix, pair, between), thick, enough, room)
     for way in range(7):
@@ -214,7 +216,26 @@ def _least_deep(convex, matrix, pair, n, thick, enough, room):
             n, s = m, found
         if found <= was + 1e-9 * thick:
             break
+    n, s = _squared(convex, matrix, pair, n, s, thick)
     return s - mine - theirs, n, along(own, n, -mine), along(his, n, theirs)
+
+
+@njit(**BARE)
+def _squared(convex, matrix, pair, n, s, thick):
+    """A normal along which two cores are s apart, and s; or that of a face of a box or drum that rounding parts from
+    it."""
+    for side in range(2):
+        p, body = (pair.first, pair.a) if side == 0 else (pair.second, pair.b)
+        kind = convex.table[p, KIND]
+        if kind == BLOCK or kind == DRUM:
+            x, y, z = turn_back(matrix, body, n)
+            flat = abs(z) > ALONG or (kind == BLOCK and (abs(x) > ALONG or abs(y) > ALONG))
+            if flat:
+                m = turn(matrix, body, (float(round(x)), float(round(y)), float(round(z))))
+                found = separation(convex, matrix, pair, m)
+                if found >= s - AS_MUCH * thick:
+                    return m, found
+    return n, s
 
 
 @njit(**BARE)

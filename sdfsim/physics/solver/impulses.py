@@ -62,10 +62,10 @@ def solve_contacts(world, work, motion, rules, manifolds):
     system = _equations(world, work, motion, rules, manifolds)
     islands = len(system.start) - 1
     if islands >= MANY:
-        _solve_many(world, rules, system, change, shift)
+        _solve_many(world.inverse_mass, rules, system, change, shift)
     else:
         for i in range(islands):
-            _solve(world, rules, system, change, shift, i)
+            _solve(world.inverse_mass, rules, system, change, shift, i)
     for c in range(len(system.where)):
         point = manifolds.point[system.where[c, 0], system.where[c, 1]]
         point[NORMAL_IMPULSE] = system.row[c, 0, IMPULSE]
@@ -240,18 +240,18 @@ def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
 
 
 @njit(parallel=True, **FAST)
-def _solve_many(world, rules, system, change, shift):
+def _solve_many(mass, rules, system, change, shift):
     for i in prange(len(system.start) - 1):
-        _solve(world, rules, system, change, shift, np.int64(i))
+        _solve(mass, rules, system, change, shift, np.int64(i))
 
 
 @njit(**BARE)
-def _solve(world, rules, system, change, shift, island):
+def _solve(mass, rules, system, change, shift, island):
     """One island; where it would gain energy from nothing, again with half of what rebounds and pushes, then without.
 
     Contacts that contradict each other, as of bodies that are wedged into one another, would else throw them apart.
     """
-    where, row, mass, order = system.where, system.row, world.inverse_mass, system.order
+    where, row, order = system.where, system.row, system.order
     lively = deep = False
     for o in range(system.start[island], system.start[island + 1]):
         c = order[o]

@@ -38,9 +38,10 @@ class Scratch(NamedTuple):
 
     found: np.ndarray  # [FOUND, COLUMNS] new points
     every: np.ndarray  # [FOUND + POINTS, COLUMNS] with those that were known
-    # depth, node, key, normal, place, used: [CANDIDATES] and [CANDIDATES, 3] of nodes that may become points
+    # depth, node, leaf, key, normal, place, used: [CANDIDATES] and [CANDIDATES, 3] of nodes that may become points
     depth: np.ndarray
     node: np.ndarray
+    leaf: np.ndarray
     key: np.ndarray
     normal: np.ndarray
     place: np.ndarray
@@ -58,8 +59,9 @@ def scratch_room():
     most = FOUND + POINTS
     return Scratch(
         np.empty((FOUND, COLUMNS)), np.empty((most, COLUMNS)), np.empty(CANDIDATES), np.empty(CANDIDATES, np.int64),
-        np.empty(CANDIDATES, np.int64), np.empty((CANDIDATES, 3)), np.empty((CANDIDATES, 3)),
-        np.empty(CANDIDATES, np.int64), np.empty(SIDE, np.int64), np.empty(most), np.empty(most, np.int64),
+        np.empty(CANDIDATES, np.int64), np.empty(CANDIDATES, np.int64), np.empty((CANDIDATES, 3)),
+        np.empty((CANDIDATES, 3)), np.empty(CANDIDATES, np.int64), np.empty(SIDE, np.int64), np.empty(most),
+        np.empty(most, np.int64),
         simplex_room(), polygons_room(),
     )  # fmt: skip
 
@@ -163,6 +165,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
         elif every[twin, NORMAL_IMPULSE] == 0.0:
             for x in range(NORMAL_IMPULSE, KEY):
                 every[twin, x] = point[p, k, x]
+            every[twin, TORSION] = point[p, k, TORSION]
     # The deepest first, then always the one that is farthest from those chosen.
     chosen, lowest = -1, 1e300
     for e in range(total):

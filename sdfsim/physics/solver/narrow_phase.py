@@ -51,6 +51,7 @@ from sdfsim.physics.solver.surface_distance import (
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
+    ONCE,
     add,
     along,
     dot,
@@ -86,6 +87,12 @@ class Near(NamedTuple):
     axis: np.ndarray  # [L, 3] the normal of a pair of pieces, from the second to the first; 0 where it is not known
     looked: np.ndarray  # [P] the ways of both bodies when new points were last looked for; -inf for never
     away_all: np.ndarray  # [P] the least of `away`; -inf where it is not known
+    # Of leaves: the node that was deepest when they were last looked into, -1 for never; how far each of their nodes is
+    # at least, likewise; and where the surface led to from there.
+    deepest: np.ndarray  # [L] int32
+    node_away: np.ndarray  # [L * the most nodes of a leaf]
+    placed: np.ndarray  # [L] bool, whether it is known
+    place: np.ndarray  # [L, 3] on the own surface, in its frame
     held: np.ndarray  # [L] bool, whether a pair of pieces has the normal of what supports, see `internal_edges`
     following: np.ndarray  # [2 P] int64 for finding the contacts of a body
 
@@ -142,9 +149,13 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
             elif way == SOLIDS and side == 0:
                 pieces = shapes.piece_start[s + 1] - shapes.piece_start[s]
                 total += pieces * max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
+    wide = 0
+    for leaf in range(len(shapes.leaf_node) - 1):
+        wide = max(wide, shapes.leaf_node[leaf + 1] - shapes.leaf_node[leaf])
     near = Near(
         start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total), np.zeros((total, 3)),
-        np.full(count, -math.inf), np.full(count, -math.inf), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
+        np.full(count, -math.inf), np.full(count, -math.inf), np.empty(total, np.int32), np.empty(total * wide),
+        np.empty(total, np.bool_), np.empty((total, 3)), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
     if count >= MANY:
         _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
@@ -196,7 +207,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
             for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
                 away = beyond(shapes, t, w, c, k, own, i)
                 if away <= most:
-                    near.leaf[at], near.away[at] = i, away
+                    near.leaf[at], near.away[at], near.deepest[at], near.placed[at] = i, away, -1, False
                     at += 1
         near.count[p, side] = at - near.start[p, side]
 
@@ -240,7 +251,7 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
     near.count[p, 0] = at - near.start[p, 0]
 
 
-@njit(**FAST)
+@njit(**BARE)
 def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
     """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
 
@@ -249,19 +260,24 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
     if len(near.start) >= MANY:
         _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
     else:
-        for p in range(len(near.start)):
-            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+        _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1))
 
 
 @njit(parallel=True, **FAST)
 def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
     for i in prange(SHARES):
         t, scratch = np.int64(i), scratch_room()
-        for p in range(t, len(near.start), SHARES):
-            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+        _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, t, np.int64(SHARES))
 
 
 @njit(**BARE)
+def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, step):
+    """Every so many pairs, from the first on."""
+    for p in range(first, len(near.start), step):
+        _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+
+
+@njit(**ONCE)
 def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     if near.count[p, 0] + near.count[p, 1] == 0:
@@ -275,6 +291,7 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     if went - near.looked[p] < rules.still:
         manifolds.count[p] = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
         return
+    since, first = went - near.looked[p], near.looked[p] == -math.inf
     near.looked[p], near.away_all[p] = went, math.inf
     if way == SOLIDS:
         known = manifolds.count[p]
@@ -294,30 +311,36 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
             near.away_all[p] = -math.inf
             return
     for side in range(2):
-        count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, scratch, count)
+        count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, since, scratch, count)
     count = first_to_touch(rules, scratch.found, count)
     manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, False)
-    _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p)
+    _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 
 
-@njit(**BARE)
-def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p):
+@njit(**ONCE)
+def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, anew):
     """Where friction acts of points that bound a flat manifold, in parts of the way from its middle to each: the mean
-    of what touches on this way. A full face, legs and a rim differ."""
+    of what touches on this way. A full face, legs and a rim differ. Unless `anew`, only of those that are new."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     point, count = manifolds.point[p], manifolds.count[p]
     middle, flat = (0.0, 0.0, 0.0), count >= 3
     for k in range(count):
-        point[k, TORSION] = 1.0
         alike = 0.0
         for x in range(3):
             alike += point[k, NORMAL + x] * point[0, NORMAL + x]
         flat = flat and alike > FLAT and point[k, KEY] == point[0, KEY]
         middle = along(middle, _half_way(motion, matrix, point, a, b, k), 1.0 / count)
-    if not flat:
+    known = flat and not anew
+    for k in range(count):
+        if not flat or anew:
+            point[k, TORSION] = 1.0
+        known = known and point[k, TORSION] < 1.0
+    if not flat or known:
         return
     full = _both_touch(shapes, world, motion, matrix, rules, a, b, middle)
     for k in range(count):
+        if point[k, TORSION] < 1.0:
+            continue
         if full:
             point[k, TORSION] = FACE
             continue
@@ -442,7 +465,7 @@ def _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, cou
     return count
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
     """The manifold of a pair with a sphere or a capsule."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]

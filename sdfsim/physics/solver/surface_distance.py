@@ -20,7 +20,7 @@ from sdfsim.physics.solver.distance import (
     patch_of,
 )
 from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
-from sdfsim.physics.solver.vectors import BARE, add, along, dot, get, norm, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, ONCE, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # patches of a shape at most
 ROUNDS = 12  # of refinement
@@ -29,6 +29,7 @@ FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
 ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they must lead, in strides
 WAYS = 8  # in which the outermost nodes of a face are looked for
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
+SHORTEST, AHEAD = 2.5, 4.0  # the first one again: of the last, and of the way since, at least
 
 
 @njit(**BARE)
@@ -64,27 +65,39 @@ def is_round(table, s):
     return table[s, KIND] == SPHERE or table[s, KIND] == CAPSULE
 
 
-@njit(**BARE)
-def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, scratch, count):
+@njit(**ONCE)
+def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, way, scratch, count):
     """Where the surface of one body is near another: from the deepest nodes of its near leaves down the other's
-    distance; added to what is found."""
+    distance; added to what is found. `way` is by how much the two have moved since they were last looked at."""
     if near.count[pair, side] == 0:
         return count
     one, other = (a, b) if side == 0 else (b, a)
     r, s = world.shape[one], world.shape[other]
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
-    stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
+    size = shapes.clump_ball[shapes.clump_start[r], 3]
     kept = _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch)
     chosen = _chosen(scratch, kept, look)
     for e in range(chosen):
         if count == FOUND:
             break
-        u, key = scratch.node[scratch.pick[e]], scratch.key[scratch.pick[e]]
+        i, stride = scratch.pick[e], STRIDE * size
+        key, at, node = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
+        p, d, n = node, scratch.depth[i] / k, get(scratch.normal, i)
+        if near.placed[at]:
+            # From where the way led the last time, with shorter steps, unless the node is deeper by now.
+            q, short = get(near.place, at), min(stride, max(SHORTEST * FINEST * size, AHEAD * way / own))
+            if q[0] == p[0] and q[1] == p[1] and q[2] == p[2]:
+                stride = short
+            else:
+                there, normal = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, q))
+                if there < d:
+                    p, d, n, stride = q, there, normal, short
         p, d, n = _refined(
-            shapes.table, shapes.brick, shapes.sample, stride, r, s, w, c, k, own, get(shapes.node, u),
-            get(shapes.inward, u),
-        )  # fmt: skip
+            shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
+        )
+        near.placed[at] = True
+        put(near.place, at, p)
         if d > look:
             continue
         # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
@@ -95,36 +108,59 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
     return count
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch):
-    """The deepest node of each near leaf around which the surface may touch; how many."""
+    """The deepest node of each near leaf around which the surface may touch; how many.
+
+    How far a leaf and each of its nodes were at least is known until bodies are looked for again: what cannot be near
+    or deepest by now, as far as bodies have moved since, is not asked again.
+    """
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     flat = table[s, KIND] == PLANE  # whose distance has one normal: no look from within
     kept, most = 0, NEAR * table[s, CELL] * k / own if table[s, KIND] == GRID else math.inf
+    wide = len(near.node_away) // max(1, len(near.away))
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
-        i = near.leaf[at]
-        if near.away[at] - went <= look:
+        i, best = near.leaf[at], near.deepest[at]
+        if near.away[at] - went <= look and best < 0:
             near.away[at] = beyond(shapes, s, w, c, k, own, i) + went
-        near.away_all[pair] = min(near.away_all[pair], near.away[at])
         if near.away[at] - went > look:
+            near.away_all[pair] = min(near.away_all[pair], near.away[at])
             continue
-        deepest, chosen, lowest = 0.0, -1, 1e300
+        first, last = shapes.leaf_node[i], shapes.leaf_node[i + 1]
+        outward = OUTWARD * own * (norm(get(shapes.leaf_ball, i)) + shapes.leaf_ball[i, 3])
+        deepest, chosen, lowest, closest = 0.0, -1, math.inf, math.inf
         facing, d, bound, there = (0.0, 0.0, 0.0), 0.0, -math.inf, (0.0, 0.0, 0.0)
-        for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
-            p, around = get(shapes.node, u), own * shapes.cover[u]
+        # The one that was deepest comes first: few others can then be deeper.
+        for e in range(first - 1 if best >= 0 else first, last):
+            if e == best:
+                continue
+            u = best if e < first else e
+            around, known = own * shapes.cover[u], at * wide + u - first
+            low = near.node_away[known] - went if best >= 0 else -math.inf
+            if low - around > look or low - outward > lowest:
+                closest = min(closest, low - around)
+                continue
+            p = get(shapes.node, u)
             if flat:
                 d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
+                low = d
             else:
                 within, back = _within_wall(get(shapes.inward, u), most)
                 q = add(p, within)
-                if bound - own * (norm(sub(q, there)) + back) > look + around:
-                    continue  # too near to one that is far
+                low = max(low, bound - own * (norm(sub(q, there)) + back))  # near to one that is far
+                if low - around > look or low - outward > lowest:
+                    near.node_away[known], closest = low + went, min(closest, low - around)
+                    continue
                 d, n = distance(table, brick, sample, s, mapped(w, c, q))
                 bound, there = k * at_least(table, s, d), q
+                low = bound - own * back
                 d = k * d - k * _along_normal(w, within, n)
+            near.node_away[known], closest = low + went, min(closest, low - around)
             score = d - OUTWARD * own * norm(p)
-            if d - around <= look and score < lowest:
+            if d - around <= look and (score < lowest or (score == lowest and u < chosen)):
                 deepest, chosen, lowest, facing = d, u, score, n
+        near.away[at], near.deepest[at] = closest + went, chosen if chosen >= 0 else first
+        near.away_all[pair] = min(near.away_all[pair], near.away[at])
         if chosen < 0:
             continue
         if kept == CANDIDATES:
@@ -138,14 +174,14 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
             kept += 1
         place = mapped(w, c, get(shapes.node, chosen))
         patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, place)
-        scratch.depth[worst], scratch.node[worst] = deepest, chosen
+        scratch.depth[worst], scratch.node[worst], scratch.leaf[worst] = deepest, chosen, at
         scratch.key[worst] = patch * KEYS + there if side == 0 else there * KEYS + patch
         put(scratch.normal, worst, facing)
         put(scratch.place, worst, scale(place, k))
     return kept
 
 
-@njit(**BARE)
+@njit(**ONCE)
 def _chosen(scratch, kept, level):
     """Of candidates that face the same way the deepest, and of those that are about as deep the outermost to all sides:
     the corners of a face, in whatever order its leaves are. How many, to scratch.pick."""
@@ -206,13 +242,10 @@ def _along_normal(w, within, n):
 
 
 @njit(**BARE)
-def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
-    """From node p of shape s down the distance of t along the surface of s: place, distance, normal in t's axes."""
+def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
+    """From a place p on shape s, at the distance d of t with the normal n in t's axes, down the distance along the
+    surface of s, in steps of `stride` at first and `least` at last: place, distance at the scale of t, and normal."""
     ratio = k / own
-    within, _ = _within_wall(inward, NEAR * table[t, CELL] * ratio if table[t, KIND] == GRID else math.inf)
-    d, n = distance(table, brick, sample, t, mapped(w, c, add(p, within)))
-    d -= _along_normal(w, within, n)
-    least = stride * (FINEST / STRIDE)
     _, m = distance(table, brick, sample, s, p)
     way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and how steep the distance was along it
     for _ in range(ROUNDS):
@@ -232,21 +265,25 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
             stride = min(stride * slope / change, 3.0 * stride) if change > 0.0 else 3.0 * stride
         way, was, better = scale(g, -1.0 / slope), slope, False
         while stride > least:
-            q = along(p, way, stride)
+            q, share = along(p, way, stride), 0.4
             # Back onto the own surface; beyond an edge one step does not lead there, and a place beside it is none.
             own_d, across_own = distance(table, brick, sample, s, q)
             for _ in range(ONTO):
-                q = along(q, across_own, -own_d)
-                own_d, across_own = distance(table, brick, sample, s, q)
                 if abs(own_d) <= BESIDE * stride:
                     break
+                q = along(q, across_own, -own_d)
+                own_d, across_own = distance(table, brick, sample, s, q)
             if abs(own_d) <= BESIDE * stride:
+                q = along(q, across_own, -own_d)
                 there, normal = distance(table, brick, sample, t, mapped(w, c, q))
                 if there < d - 1e-9:
                     better = True
                     p, d, n, m = q, there, normal, across_own
                     break
-            stride *= 0.4
+                # The lowest place of the parabola that has the slope here and the distance there.
+                fall = slope * stride / ratio
+                share = min(0.4, max(0.1, 0.5 * fall / (there - d + fall)))
+            stride *= share
         if not better:
             break
     return p, k * d, n

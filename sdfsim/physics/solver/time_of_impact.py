@@ -15,7 +15,7 @@ from sdfsim.physics.solver.vectors import BARE, FAST, along, get, norm, put, sca
 THIN = 0.4  # of a wall: who goes farther in an inner step is watched on its way
 
 
-@njit(**FAST)
+@njit(**BARE)
 def time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch):
     """How much of the inner step each body may move, so that none passes through what is thinner than its way."""
     free, change, part = work.free, work.change, work.part

@@ -9,10 +9,12 @@ from numba import njit
 # Of functions that Python calls.
 ENTRY = {"cache": True, "fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy"}
 # Of functions that only compiled code calls: a way in from Python takes as long to compile as most of them.
-FAST = {**ENTRY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+FAST = {**ENTRY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": True}
 # Likewise, of functions that make no arrays: without this each counts the references of all arrays that it is given,
 # which takes longer than what most of them do.
 BARE = {**FAST, "_nrt": False}
+# Likewise, of functions that one place calls, again and again: all numbers of all arrays are copied for a call.
+ONCE = {**BARE, "forceinline": True}
 
 
 @njit(**BARE)
