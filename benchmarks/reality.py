@@ -82,7 +82,7 @@ def load_tosses(folder: Path) -> list[Toss]:
     file = folder / "cube.npz"
     found = read_arrays(file, "recorded tosses", "give the folder that holds cube.npz")
     if missing := {"start", "dt", "position", "quat_xyzw"} - set(found):
-        raise SdfsimError(f"{file}: there is no array {min(missing)!r}", f"it has {', '.join(sorted(found))}")
+        raise SdfsimError(f"{file}: the array {min(missing)!r} is missing", f"it has {', '.join(sorted(found))}")
     rows = [slice(a, b) for a, b in zip(found["start"][:-1], found["start"][1:], strict=True)]
     dt, position, turn = float(found["dt"]), *(found[name].astype(np.float64) for name in ("position", "quat_xyzw"))
     return [Toss(dt, position[k], turn[k]) for k in rows]
@@ -151,7 +151,7 @@ def split(tosses: Sequence[Toss]) -> tuple[list[Toss], list[Toss]]:
 
 
 def recorded(tosses: Sequence[Toss]) -> Poses:
-    """What is compared of recordings."""
+    """The frames of recordings that are compared."""
     frames = slice(1, FRAMES + 1)
     return Poses(*(np.array([getattr(toss, name)[frames] for toss in tosses]) for name in Poses._fields))
 

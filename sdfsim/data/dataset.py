@@ -134,7 +134,7 @@ def check_names(where: str, names: Iterable[str]) -> None:
     """Raises SdfsimError where one of the names cannot be that of a Shape folder of a dataset."""
     for name in names:
         if not _NAME.fullmatch(name):
-            raise SdfsimError(f"{where}: {name!r} is no name of a Shape folder", "letters, digits, spaces, . _ - only")
+            raise SdfsimError(f"{where}: {name!r} cannot name a Shape folder", "use letters, digits, spaces, . _ -")
 
 
 def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:

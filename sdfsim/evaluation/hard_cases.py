@@ -1,4 +1,4 @@
-"""The hard cases: their scenes, what is measured on the motions, and what is wanted.
+"""The hard cases: their scenes, what is measured on the motions, and the limits.
 
 Scenes are of metre-sized boxes and balls on a floor, in the teacher's gravity. Coefficients of the bodies and the floor
 are such that their products lie within what models are trained on, unless a case is about them.
@@ -56,7 +56,7 @@ RUNAWAY = 10.0  # times the energy at the start, and no motion is worth measurin
 
 @dataclass(frozen=True)
 class Trial:
-    """One motion of one scene: of its bodies but for planes, up to the last good state."""
+    """One motion of one scene: of all bodies but planes, up to the last good state."""
 
     scene: Scene
     motion: Trajectory
@@ -84,7 +84,7 @@ class Figure:
     name: str
     unit: str
     digits: int = 2  # shown after the point; differences that are not shown do not count
-    limit: float | None = None  # what is wanted is at most this; None where only the teacher says how good one can be
+    limit: float | None = None  # largest value that is wanted; None where only the teacher gives a standard
     largest: bool = False  # of several repetitions the largest counts, not the mean
     judged: bool = True  # lower is better; other figures inform, such as the height of a rebound
     longer: bool = False  # higher is better instead
@@ -105,7 +105,7 @@ class Case:
     cuda: bool = False  # the scenes are simulated a second time there, behind the first
     engines: bool = True  # whether engines can take part
     x: float | None = None  # where it stands in its group's plot of the first figure; None where it is not in a row
-    # figures of a model by scenes of its own, of which `scenes` then gives none
+    # figures of a model from scenes that this function makes; `scenes` then gives none
     own: Callable[[Model], dict[str, float]] | None = None
 
 
@@ -209,9 +209,9 @@ def overlapping(first: Shape, second: Shape, apart: float) -> Scene:
 
 
 def thrown_at_plate(speed: float, repeat: int) -> Scene:
-    """Eight boxes and eight balls of 20 cm, anyhow turned, flying at `speed` m/s down to a plate of 1 cm.
+    """Eight boxes and eight balls of 20 cm in random orientations that fly down to a plate of 1 cm at `speed` m/s.
 
-    There is no floor below: what passes the plate falls on.
+    There is no floor: bodies that pass the plate fall on.
     """
     rng = np.random.default_rng(repeat)
     thrown = []

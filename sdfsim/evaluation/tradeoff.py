@@ -1,4 +1,4 @@
-"""How much error for how many milliseconds: our models and their knobs, beside other engines."""
+"""Error against time: our models with their settings, and other engines."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from sdfsim.shape.surface_nodes import hull_nodes
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.simulate.steppers import stepper_of
 
-VERSION = 2  # counts up when what is measured changes, so that kept results are measured again
+VERSION = 2  # counts up when the measurements change, so that kept results are measured again
 REPEATS = 7
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, STEPS_QUICK = 100, 50
@@ -73,7 +73,7 @@ Rows = list[tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Cases:
-    """What every contender simulates."""
+    """What every model and engine simulates."""
 
     recorded: list[Trajectory]  # as the teacher moved the bodies, from their first frames on
     starts: list[Trajectory]  # with velocities at the instants of the positions: what ours start from
@@ -179,7 +179,7 @@ class Variant:
 
     @property
     def label(self) -> str:
-        """The model and all that is not the default."""
+        """The model, and every setting that is not the default."""
         if not self.contact:
             return "ballistic"
         usual, path = Variant(self.model), Path(self.model)
@@ -188,7 +188,7 @@ class Variant:
 
     @property
     def family(self) -> str:
-        """Settings that differ in one knob alone."""
+        """The name that variants share which differ in one setting alone."""
         if not self.contact:
             return "all contact ignored"
         usual, name = Variant(self.model), self.label.partition(",")[0]
@@ -197,7 +197,7 @@ class Variant:
 
 
 def variants(models: Sequence[str], *, quick: bool) -> list[Variant]:
-    """Each model with each of its knobs alone, and two useful combinations."""
+    """Each model with each of its settings changed alone, and two useful combinations."""
     chosen = []
     for name in models:
         knobs: list[dict[str, Any]] = [{}]
@@ -265,7 +265,7 @@ def _time_simulator(variant: Variant, model: Model, shapes: dict[str, Shape], ca
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
-    """Errors and times of an engine with so many of its steps in a recorded one, starts `off` m/s off."""
+    """Errors and times of an engine with `substeps` steps in a recorded one; starts differ by `off` m/s."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
     run = RUNS[name]
@@ -303,10 +303,10 @@ def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[st
 
 
 def _times(run: Callable[[], Timing], cases: Cases) -> dict[str, Any]:
-    """What a run takes over what our default takes, in turn with it, and the default's milliseconds per simulated
-    second: what a shared machine does to the one it does to the other.
+    """The time of a run relative to our default's, measured in turn with it, and the default's milliseconds per
+    simulated second. A shared machine slows both alike.
 
-    All work in one thread, and are timed by the processor's clock: on a shared core the wall shows what others do.
+    All run in one thread and count processor time: wall time on a shared core depends on other processes.
     """
     model = load_model(SOLVER)
     repeats, usual = zip(

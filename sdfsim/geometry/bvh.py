@@ -79,8 +79,8 @@ class Crossings:
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
         self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
         vertices = np.ascontiguousarray(mesh.vertices - self._centre, dtype=np.float32)
-        # Open3D reports one of two hits at the same distance, unless they are of different geometries: so that faces
-        # which lie on each other are both seen, they are dealt out to many.
+        # Open3D reports one of two hits at the same distance, unless these are on different geometries. So faces are
+        # spread over many geometries, and faces that lie on each other are both hit.
         order = np.random.default_rng(0).permutation(len(mesh.faces))
         groups = np.array_split(order, min(GEOMETRIES, len(order)))
         for group in groups:

@@ -1,5 +1,5 @@
-"""glTF 2.0, by hand. What trimesh writes has textures in JPEG of quality 75, and no motion; it reads normalised and
-sparse numbers, instances and fans as if they were something else.
+"""glTF 2.0, written and read without trimesh, whose files have textures in JPEG of quality 75 and no motion. Its reader
+misreads normalised and sparse numbers, instances and fans.
 
 glTF has y up and we have z up. A file that we write has one node above all others that turns it, so that its meshes
 and motions hold our own numbers; what we read is turned back (a file of ours comes out as it was).
@@ -256,7 +256,7 @@ class _GltfReader:
         while todo:
             number, above = todo.pop()
             if number in seen:
-                raise ValueError(f"node {number} hangs in two places")
+                raise ValueError(f"node {number} has two parents")
             seen.add(number)
             node = nodes[number]
             matrix = above @ _matrix(node)
@@ -293,7 +293,7 @@ class _GltfReader:
             corners = np.arange(len(vertices))
         if mode == TRIANGLES:
             if len(corners) % 3:
-                raise ValueError(f"{len(corners)} corners make no triangles")
+                raise ValueError(f"{len(corners)} corners do not make triangles")
             faces = corners.reshape(-1, 3)
         elif mode == TRIANGLE_STRIP:
             faces = strip(corners)
@@ -339,7 +339,7 @@ class _GltfReader:
 def _index(number: int) -> int:
     """A place in one of the header's lists; below 0 Python would count from their ends."""
     if not isinstance(number, int) or number < 0:
-        raise ValueError(f"{number!r} is no place in a list")
+        raise ValueError(f"{number!r} is not an index")
     return number
 
 

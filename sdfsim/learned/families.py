@@ -76,7 +76,7 @@ def _endless(shape: Shape) -> bool:
 
 @dataclass(frozen=True)
 class Family:
-    """What is a network's own beside its weights."""
+    """Everything but weights that is specific to one network."""
 
     layout: Layout  # of its graphs
     # a shape, with the nodes (at most so many, None for all) that the network works on

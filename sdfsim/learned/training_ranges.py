@@ -54,7 +54,7 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
 
 
 def _values(scene: Scene, units: Units) -> dict[str, list[float]]:
-    """What a scene has of each quantity of `LABELS`; nothing where nothing moves by itself."""
+    """The values of each quantity of `LABELS` in a scene; none where no body is dynamic."""
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     if not moving:
         return {}
