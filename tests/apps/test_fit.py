@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from joblib import parallel_config
 from typer.testing import CliRunner
 
 import cli
@@ -133,7 +134,8 @@ def where(number: int) -> tuple[int, int, int]:
 def test_work_is_spread_over_processes_of_one_thread() -> None:
     import os
 
-    found = dict(parallel(where, [(n,) for n in range(6)]))
+    with parallel_config(backend="loky"):
+        found = dict(parallel(where, [(n,) for n in range(6)]))
     assert [found[n][0] for n in range(6)] == [n * n for n in range(6)]
     assert all(pid != os.getpid() and threads == 1 for _, pid, threads in found.values())
     assert list(parallel(where, [])) == []
