@@ -41,7 +41,7 @@ FLIGHT = 6  # frames at least, to fit a start to
 INNER = 5  # inner steps of every engine in a frame
 IMPRATIO = 14.0  # MuJoCo: how much stiffer friction is than the normal
 FAR = 30.0  # % and degrees: errors of a toss that are larger count as this in the search for parameters
-CROWD, ROUNDS = 25, 12  # of that search: points (rounded up to a power of two), and how often each is tried anew
+CROWD, ROUNDS = 25, 12  # of that search: points (rounded up to a power of two), and rounds
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def mujoco(starts: Sequence[FittedStart], dt: float, gravity: float, values: dic
 
 
 def bullet(starts: Sequence[FittedStart], dt: float, gravity: float, values: dict[str, float]) -> Poses:
-    """PyBullet as it is without settings."""
+    """PyBullet with its default settings."""
     engine = import_pybullet()
     client, step = engine.connect(engine.DIRECT), dt / INNER
     try:

@@ -512,7 +512,7 @@ def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) ->
     MuJoCo has no restitution. A spring that only pushes, its damping relative to the critical one z, gives back
     exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed; also above 1, where arccos and root are imaginary.
     """
-    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to where MuJoCo takes it as it is
+    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to where MuJoCo does not change it
     turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
     back = np.exp(-damping * np.abs(turned))
     found = np.interp(-restitution, -back, damping)

@@ -27,7 +27,7 @@ SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
 LONGEST_STEP = 10.0  # s, between recorded frames
 LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
-EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
+EXACTLY = 1e-3  # of what gravity adds in a step: tolerance of a free flight
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
 _AXES = {  # T frames, N bodies
     "position": ("T", "N", 3), "quat_xyzw": ("T", "N", 4), "velocity": ("T", "N", 3), "angular_velocity": ("T", "N", 3),

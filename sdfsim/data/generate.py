@@ -40,8 +40,8 @@ def make_dataset(
     split depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
     (see `split_of`), so that those of validation and test are never trained on.
 
-    Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; so many
-    `random_solids` of PyBullet go beside them. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
+    Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; `random_solids`
+    of PyBullet are added. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
     `RATES`. Raises SdfsimError for an option that the recipe does not take, no usable shapes or none to be fetched,
     PyBullet absent, another dataset in `out`, or another run writing to it.
     """

@@ -185,7 +185,7 @@ def mujoco(
     It takes the larger of two coefficients of friction where the teacher multiplies. So geoms that meet the floor carry
     the product with the floor's, and those that meet other bodies carry their square. Those of static bodies take
     priority, and carry the product with the median body's: exact where all bodies that move are of one material. Its
-    contacts are soft: the restitution wanted is that of a damped spring.
+    contacts are soft: a damped spring gives the wanted restitution.
 
     Raises:
         SdfsimError: MuJoCo is not installed, a shape's engine file cannot be read, or the motion is unstable.
@@ -342,7 +342,7 @@ def dataset_urdf(data: Path, shape: str) -> Path:
 
 
 def form_of(urdf: Path) -> tuple[str, np.ndarray]:
-    """What a URDF of ours collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or "capsule", its
+    """What a URDF of `shape_urdf` collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or "capsule", its
     radius and the length of its straight side, or "mesh", its pieces."""
     found = re.search(r"<(sphere|box|cylinder|capsule) ([^>]*)/>", urdf.read_text(encoding="utf-8"))
     if found is None:

@@ -203,7 +203,9 @@ def teacher_again(data: Path, trajectories: Motions, steps: int, seed: int = 0) 
     info = read_info(home)
     floor, settings = floor_of(info, home), info.get("engine_settings")
     if info.get("engine") != "pybullet" or not isinstance(settings, dict):
-        raise SdfsimError(f"recorded by {info.get('engine') or 'an unnamed engine'}, not by PyBullet as it is set here")
+        raise SdfsimError(
+            f"recorded by {info.get('engine') or 'an unnamed engine'}, not by PyBullet with the teacher's settings"
+        )
     ours = engine_settings(trajectories[0].dt, substeps_of(trajectories[0].dt))
     if other := [name for name, value in ours.items() if settings.get(name) != value]:
         raise SdfsimError(f"recorded with other engine settings ({', '.join(other)})")

@@ -288,7 +288,7 @@ class Ran:
 def run(
     at: Setting, bodies: Sequence[Put], seconds: float, *, gravity: float = G, tilt: float = 0.0, sleep: bool = False
 ) -> Ran:
-    """A scene for so many seconds (as at 10 cm); gravity leans by `tilt` degrees to +x."""
+    """Run a scene for `seconds` (as at 10 cm); gravity leans by `tilt` degrees to +x."""
     shapes: list[Shape] = []
     made, yaw = [], about("z", at.yaw)
     for put in bodies:
@@ -860,7 +860,7 @@ ROWS: dict[str, Callable[[Setting], Iterator[Check]]] = {
 
 
 def checks(row: str, at: Setting) -> Iterator[tuple[str, Check]]:
-    """Every check of a row with its full name, by which lists know it."""
+    """Every check of a row with its full name, as lists have it."""
     for check in ROWS[row](at):
         yield f"{row}: {check.name} [{at}]", check
 
@@ -872,7 +872,7 @@ def failures(row: str, settings: Sequence[Setting]) -> dict[str, float]:
 
 
 def changed(found: Sequence[tuple[str, Check]], listed: Sequence[str]) -> list[str]:
-    """What differs between checks that were run and the names of those that hold, as far as it is clear, in lines."""
+    """The clear differences between checks that were run and the listed names of checks that hold, a line each."""
     lines = []
     for name, check in found:
         if check.close or check.holds == (name in listed):
@@ -887,7 +887,7 @@ def changed(found: Sequence[tuple[str, Check]], listed: Sequence[str]) -> list[s
 
 
 def update(file: Path, found: Sequence[tuple[str, Check]]) -> None:
-    """Bring the list of what holds up to date with checks that were run; others stay as they are."""
+    """Update the list of checks that hold with those that were run; others stay."""
     listed = set(file.read_text(encoding="utf-8").splitlines()) if file.exists() else set()
     settings = {name.split(":")[0] + name[name.rindex(" [") :] for name, _ in found}
     listed = {name for name in listed if name.split(":")[0] + name[name.rindex(" [") :] not in settings}

@@ -97,7 +97,7 @@ class Case:
     name: str
     group: str
     title: str
-    scenes: Callable[[int], list[Scene]]  # of one repetition, given its number; 0 is the case as it is meant
+    scenes: Callable[[int], list[Scene]]  # of one repetition, given its number; 0 is the exact case
     measure: Measure  # of the motions of these scenes, in their order; gives `figures`
     figures: tuple[Figure, ...]
     seconds: float = 3.0
@@ -225,7 +225,7 @@ def thrown_at_plate(speed: float, repeat: int) -> Scene:
 
 
 def resting(shape: Shape, *, sleep: bool) -> Scene:
-    """One body at rest on the floor: on that of its steady faces which already looks down most, else as it is."""
+    """One body at rest on the floor, on its steady face that points down most; without such a face as it is."""
     vertices = shape.mesh.vertices - shape.com
     faces = steady_faces(vertices)
     turn = Rotation.identity()
@@ -467,7 +467,7 @@ def slipped(trials: Sequence[Trial], *, friction: float, offsets: Sequence[float
 
 
 def slide(friction: float, degrees: float, seconds: float, gravity: float) -> float:
-    """m that a body at rest slides on a slope in so many seconds, by Coulomb's law."""
+    """m that a body slides from rest on a slope in `seconds`, by Coulomb's law."""
     angle = np.radians(degrees)
     return 0.5 * gravity * max(0.0, float(np.sin(angle) - friction * np.cos(angle))) * seconds**2
 

@@ -53,7 +53,7 @@ class Study:
         models: their names.
         engines: their names; the teacher where PyBullet is installed.
         results: (case, who) -> figures (name -> a value a repetition), broke, outside and laws (lines; the last are
-            those that a motion of ours breaks, by instruments that know no contacts) and recording (a path in the
+            laws that a motion of ours breaks, by instruments that do not use the solve) and recording (a path in the
             folder, or None); nothing for a case that one cannot take part in.
         quick: whether it is the short form.
     """

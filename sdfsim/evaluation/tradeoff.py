@@ -49,7 +49,7 @@ REPEATS = 7
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, STEPS_QUICK = 100, 50
 TIMED = 80  # steps, at most
-EXPLODED = 1.0  # an energy gain of so many times the energy at the start is a motion that blew up
+EXPLODED = 1.0  # energy gain over the energy at the start, beyond which a motion blew up
 OFF = 1e-3  # m/s, by which the starts of the chaos floor differ from the recorded ones
 HORIZON = 50  # steps of the errors that are drawn
 RUNS: dict[str, Engine] = {
@@ -78,7 +78,7 @@ class Cases:
     recorded: list[Trajectory]  # as the teacher moved the bodies, from their first frames on
     starts: list[Trajectory]  # with velocities at the instants of the positions: what ours start from
     shapes: dict[str, Shape]  # of every name in use, their origins at the centres of mass
-    urdfs: dict[str, Path]  # the engines' files, by name; those that are not at hand are absent
+    urdfs: dict[str, Path]  # the engines' files, by name; missing ones are left out
     solids: dict[str, ExactSolid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
@@ -168,7 +168,7 @@ class Variant:
     """One way to simulate. The defaults are those of `sdfsim evaluate`."""
 
     model: str  # name or path
-    # "own", the shapes' own; "thin K", K of them, outermost first; "grid N", sampled anew from N^3 points
+    # "own": the shapes' own; "thin K": K of them, outermost first; "grid N": new samples from N^3 points
     nodes: str = "own"
     # "own", convex pieces where the shape has some; "mlp", its network alone; "grid N", samples of the exact distance,
     # N along each side; "mesh", the distance to the mesh that is shown
@@ -270,7 +270,7 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
         raise SdfsimError(f"recorded with another step than {DT} s")
     run = RUNS[name]
     if lacking := sorted({str(n) for t in cases.recorded for n in t.shape} - set(cases.urdfs)):
-        raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
+        raise SdfsimError(f"no engine file of {', '.join(lacking)}")
     meshes = {name: centred_mesh(shape) for name, shape in cases.shapes.items()}
     recorded = cases.recorded if name == "PyBullet" else cases.starts
     starts = [
@@ -347,7 +347,7 @@ def tradeoff(
         what was measured, or why it `failed`; and `front`, the labels of ours that no other of ours beats, by time.
 
     Raises:
-        SdfsimError: bad input, nothing of ours could be measured, or another study that writes to the same folder.
+        SdfsimError: bad input, none of our variants could be measured, or another study writes to the same folder.
     """
     if source and not source.exists():
         raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
@@ -384,7 +384,7 @@ def tradeoff(
         fine = [p for p in points if "failed" not in p]
         ours = [p for p in fine if p["kind"] == "ours"]
         if not ours:
-            raise SdfsimError(f"nothing of ours could be measured: {points[0]['failed']}")
+            raise SdfsimError(f"none of our variants could be measured: {points[0]['failed']}")
         best = [ours[k] for k in front([p["ms"] for p in ours], [p["translation_rmse"][steps] for p in ours])]
         report = {
             "source": str(source or "a random scene"),

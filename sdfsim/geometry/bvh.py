@@ -130,7 +130,7 @@ class Caster:
         return self.scene.compute_signed_distance(self.tensor(points.astype(np.float32))).numpy()
 
     def anything(self, rays: np.ndarray, most: float = np.inf) -> np.ndarray:
-        """[R] whether anything is hit, within so many lengths of the directions."""
+        """[R] whether anything is hit within `most` lengths of the directions."""
         return self.scene.test_occlusions(self.tensor(rays), tnear=0.0, tfar=most).numpy()
 
     def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -35,12 +35,12 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
 MOST = 500_000_000  # vertices and corners
 WHITE = [1.0, 1.0, 1.0]
-SPARSE = 2**24  # rows of an accessor of which only some are in the file
+SPARSE = 2**24  # most rows of an accessor that has no values but sparse ones
 _OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
 
 
 class GltfWriter:
-    """A file in the making: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
+    """A file to be written: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
     that turns z up to glTF's y up."""
 
     def __init__(self) -> None:

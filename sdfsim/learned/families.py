@@ -79,7 +79,7 @@ class Family:
     """Everything but weights that is specific to one network."""
 
     layout: Layout  # of its graphs
-    # a shape, with the nodes (at most so many, None for all) that the network works on
+    # the shape with the nodes that the network works on (at most a number of them, None for all)
     surface: Callable[[Shape, int | None], Shape]
     # what of the bodies is near what, for bodies, state, gravity, reach, time step and the compiled scene of a run
     near: Callable[[Bodies, State, Tensor, float, float, Compiled | None], Contacts | Pairs]

@@ -95,7 +95,7 @@ class Pairs:
 
     @property
     def node(self) -> Tensor:
-        """[E] int64, the node of the first body that stands for the pair in recordings."""
+        """[E] int64, the node of the first body that represents the pair in recordings."""
         return self.first[:, 0]
 
     def renumbered(self, body: Tensor, node: Tensor) -> Pairs:
@@ -169,7 +169,7 @@ def _centre(place: Tensor, arm: Tensor, part: Tensor) -> Tensor:
 
 
 def _speed_at(bodies: Bodies, state: State, velocity: Tensor, body: Tensor, arm: Tensor) -> Tensor:
-    """[E, 3] velocity of bodies [E] at `arm` [E, 3]; the speed of a plane is that of all of it."""
+    """[E, 3] velocity of bodies [E] at `arm` [E, 3]; a plane moves as a whole."""
     turning = torch.linalg.cross(state.angular_velocity[body], arm)
     return velocity[body] + torch.where(bodies.size[body].isfinite()[:, None], turning, 0.0)
 

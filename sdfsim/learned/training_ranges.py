@@ -20,7 +20,7 @@ LABELS = {
     "friction": "friction of two bodies, multiplied",
     "restitution": "restitution of two bodies, multiplied",
 }
-# Part of its largest side by which bodies start inside one another in the training data at most.
+# Deepest start of one body in another in the training data, over its largest side.
 DEEPEST = 0.16
 SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
 
@@ -84,7 +84,7 @@ def _products(scene: Scene, name: str) -> list[float]:
 
 def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
     """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
-    Bodies have `names` [N]; a model unit is so many `metres`."""
+    Bodies have `names` [N]; a model unit is `metres` m."""
     from sdfsim.learned.near import find_contacts  # numba takes its time to load
 
     nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)
