@@ -58,8 +58,9 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, ExactSolid]:
 
 
 def deepest(motion: Trajectory, solids: dict[str, ExactSolid], every: int = EVERY) -> np.ndarray:
-    """[F] m, signed distance of the deepest node of any body in another, or in the floor z = 0, of every
-    `every`-th frame. Negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not count."""
+    """[F] m, signed distance of the deepest node of any body in another, or in the floor z = 0, of every `every`-th
+    frame: negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not
+    count."""
     kept = slice(every, None, every)
     position = motion.position[kept]
     frames, bodies = position.shape[:2]
