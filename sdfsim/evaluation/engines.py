@@ -342,8 +342,8 @@ def dataset_urdf(data: Path, shape: str) -> Path:
 
 
 def form_of(urdf: Path) -> tuple[str, np.ndarray]:
-    """What a URDF of `shape_urdf` collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or "capsule"
-    and its radius and the length of its straight side, or "mesh", its pieces."""
+    """What a URDF of `shape_urdf` collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or
+    "capsule" and its radius and the length of its straight side, or "mesh", its pieces."""
     found = re.search(r"<(sphere|box|cylinder|capsule) ([^>]*)/>", urdf.read_text(encoding="utf-8"))
     if found is None:
         return "mesh", np.zeros(0)
