@@ -1,4 +1,4 @@
-"""What a step of the contact solve costs, beside PyBullet's on the same scenes, and how it grows.
+"""The time of a step of the contact solve and of PyBullet on the same scenes, and how it grows.
 
     python -m benchmarks.contact_step DATA [--repeats 5]
     python -m benchmarks.contact_step --check

@@ -1,4 +1,4 @@
-"""What each effect costs when it is on and off: RESULTS.md.
+"""The time of a step with each effect on and off: RESULTS.md.
 
     python benchmarks/effects.py
 

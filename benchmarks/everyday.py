@@ -131,7 +131,7 @@ def in_parts(scene: Scene, folder: Path) -> Scene:
 
 
 def still(scene: Scene, seconds: float) -> Rollout:
-    """The start of a scene, and the same after so many seconds: what checks read where there is no motion."""
+    """The start of a scene, and the same state after `seconds`: checks read this where there is no motion."""
     first = Simulator(scene, SOLVER).initial_rollout()
     return join([first, replace(first, time=first.time + seconds)])
 

@@ -1,4 +1,4 @@
-"""All that docs/stability.md shows of the models, and the ratchet that later models are held to.
+"""The table and pictures of docs/stability.md, and the ratchet for later models.
 
     python benchmarks/hard_cases.py -o DIR [--quick]
 
@@ -35,7 +35,7 @@ from sdfsim.evaluation.stress import (
 ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
 DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
-SPREADS = 3.0  # so many standard deviations are noise
+SPREADS = 3.0  # standard deviations that count as noise
 SHARE = 0.05  # of a figure: what another machine's rounding may change where repetitions agree
 PICTURES = {"stack": "stability_stacks.png", "bounce": "stability_bounces.png", "slope": "stability_slopes.png"}
 
@@ -79,7 +79,7 @@ def main(*, out: Path, quick: bool = False) -> None:
     pictures = "\n".join(f"![{GROUPS[group].title}](images/{name})" for group, name in PICTURES.items())
     write_section("hard cases", command, f"{table(study)}\n{pictures}", DOCUMENT)
     write_section("hard cases", command, "\n".join(f"- {line}" for line in loss_lines(study)))
-    # Beside engines that know no restitution nothing else could be seen.
+    # Engines without restitution would set the scale of the plots.
     others = replace(study, engines=list(USUAL))
     for group, name in PICTURES.items():
         draw_group(others, group, ROOT / "docs" / "images" / name)

@@ -1,4 +1,4 @@
-"""What a network is worth on top of the contact solve: docs/simulator.md.
+"""The gain of a network on top of the contact solve: docs/simulator.md.
 
     python benchmarks/network.py DATA [MORE ...] -o DIR [--seeds 3] [--steps N]
 
@@ -44,7 +44,7 @@ TIMED, STEPS_TIMED = 5, 100  # scenes, and steps of each
 
 @dataclass(frozen=True)
 class Method:
-    """A preset, or the solver (None), with so many inner steps of the solve in a recorded step."""
+    """A preset, or the solver (None), with a number of inner steps of the solve in a recorded step."""
 
     preset: str | None
     substeps: int | None = None

@@ -145,7 +145,7 @@ def judged(model: Path, data: Path, split: str, free_flight: str) -> dict[str, A
 
 
 def unsigned(data: Path, home: Path) -> Path:
-    """The dataset with unsigned distances: its shapes as grids of |d|, which know no inside."""
+    """The dataset with unsigned distances: its shapes as grids of |d|, which have no inside."""
     (home / "shapes").mkdir(parents=True, exist_ok=True)
     for there in data.iterdir():
         if there.name != "shapes" and not (home / there.name).exists():
@@ -239,7 +239,7 @@ def _case(name: str, minutes: float) -> str:
 
 
 def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
-    """Errors of the solver on validation data whose shapes are networks of so many hidden units, refitted where they
+    """Errors of the solver on validation data whose shapes are networks of `width` hidden units, refitted where they
     are not 64 wide and kept in `home`; on the convex pieces themselves for None."""
     torch.set_num_threads(1)
     recorded, shapes = load_recorded(data, "validation")
@@ -257,7 +257,7 @@ def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
 
 
 def refitted(shape: Shape, width: int, folder: Path) -> Shape:
-    """The shape known by a network of so many hidden units alone, with its own nodes, fitted for a minute."""
+    """The shape with a network of `width` hidden units alone and its own nodes, fitted for a minute."""
     usual = RECIPES["default"]
     if width == usual.width:
         return replace(shape, pieces=())

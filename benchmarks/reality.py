@@ -41,7 +41,7 @@ FLIGHT = 6  # frames at least, to fit a start to
 INNER = 5  # inner steps of every engine in a frame
 IMPRATIO = 14.0  # MuJoCo: how much stiffer friction is than the normal
 FAR = 30.0  # % and degrees: errors of a toss that are larger count as this in the search for parameters
-CROWD, ROUNDS = 25, 12  # of that search: points (rounded up to a power of two), and how often each is tried anew
+CROWD, ROUNDS = 25, 12  # of that search: points (rounded up to a power of two), and rounds
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def load_tosses(folder: Path) -> list[Toss]:
     file = folder / "cube.npz"
     found = read_arrays(file, "recorded tosses", "give the folder that holds cube.npz")
     if missing := {"start", "dt", "position", "quat_xyzw"} - set(found):
-        raise SdfsimError(f"{file}: there is no array {min(missing)!r}", f"it has {', '.join(sorted(found))}")
+        raise SdfsimError(f"{file}: the array {min(missing)!r} is missing", f"it has {', '.join(sorted(found))}")
     rows = [slice(a, b) for a, b in zip(found["start"][:-1], found["start"][1:], strict=True)]
     dt, position, turn = float(found["dt"]), *(found[name].astype(np.float64) for name in ("position", "quat_xyzw"))
     return [Toss(dt, position[k], turn[k]) for k in rows]
@@ -151,7 +151,7 @@ def split(tosses: Sequence[Toss]) -> tuple[list[Toss], list[Toss]]:
 
 
 def recorded(tosses: Sequence[Toss]) -> Poses:
-    """What is compared of recordings."""
+    """The frames of recordings that are compared."""
     frames = slice(1, FRAMES + 1)
     return Poses(*(np.array([getattr(toss, name)[frames] for toss in tosses]) for name in Poses._fields))
 
@@ -222,7 +222,7 @@ def mujoco(starts: Sequence[FittedStart], dt: float, gravity: float, values: dic
 
 
 def bullet(starts: Sequence[FittedStart], dt: float, gravity: float, values: dict[str, float]) -> Poses:
-    """PyBullet as it is without settings."""
+    """PyBullet with its default settings."""
     engine = import_pybullet()
     client, step = engine.connect(engine.DIRECT), dt / INNER
     try:

@@ -83,7 +83,7 @@ def to_truth(folder: Path, points: np.ndarray, move: Similarity) -> np.ndarray:
 
 
 def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str, Any]]:
-    """Measured errors, mm, beside the uncertainty that the run says of the same places.
+    """Measured errors, mm, and the uncertainty that the run gives for the same places.
 
     Each vertex of what is displayed counts by its area: the scenery as shown, and the closed bodies. First those of
     which the photos show something, in quarters from the surest on, and the least sure twentieth; then what is guessed

@@ -1,4 +1,4 @@
-"""Our solver and what people would take instead, on shapes that are hard for them: RESULTS.md.
+"""Our solver and other engines on shapes that are hard for these: RESULTS.md.
 
     python benchmarks/rivals.py shapes DATA -o DIR
     python benchmarks/rivals.py turns DATA -o DIR
@@ -307,7 +307,7 @@ def why_not(result: dict[str, Any]) -> str:
 
 
 def shapes(data: Path, *, out: Path) -> None:
-    """Hard shapes: a row a case and engine, by the usual inner step, and what equal depth costs."""
+    """Hard shapes: a row for each case and engine at the usual inner step, with the time that equal depth takes."""
     rows: list[tuple[str, ...]] = [(
         "case", "engine", "ms per s at 4 ms", "depth, %", "away from itself at 1 ms, %", "lost",
         f"ms per s where depth is at most {100 * DEEP:g} %", "prepared in, s", "MiB",
@@ -328,7 +328,7 @@ def shapes(data: Path, *, out: Path) -> None:
 
 @one_thread()
 def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
-    """The fast engines in turn, again and again: what a shared machine does to one of them it does to all."""
+    """The fast engines in turn: a shared machine slows all of them alike."""
     rows: list[tuple[str, ...]] = [("case, ms per s at 4 ms", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
     for k, case in enumerate(SHAPES):
         scenes = scenes_of(case, data, out / "scenes")
@@ -343,7 +343,7 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
 
 
 def large(*, out: Path) -> None:
-    """Large scenes: a row a case, with time, memory and depth by engine."""
+    """Large scenes: a row for each case, with time, memory and depth by engine."""
     rows: dict[str, list[str]] = {case: [case] for case in LARGE}
     for (case, _), result in compared(LARGE, None, out).items():
         if usual := result.get("inner", {}).get(str(USUAL)):

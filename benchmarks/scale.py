@@ -1,4 +1,4 @@
-"""What large scenes cost, and many scenes at once: RESULTS.md.
+"""Time and memory of large scenes, and of many scenes at once: RESULTS.md.
 
     python benchmarks/scale.py growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
         bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, beside networks and two engines
@@ -81,7 +81,7 @@ def with_nodes_cut(scene: Scene, keep: float) -> Scene:
 
 @one_thread()
 def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
-    """What a scene (its file, or so many boxes `apart`) costs with a model, and how deep bodies are in each other."""
+    """Time and memory of a scene (its file, or a number of boxes `apart`) with a model, and how deep bodies overlap."""
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:

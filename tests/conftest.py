@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from joblib import parallel_config
+
+
+@pytest.fixture(scope="session", autouse=True)
+def in_this_process() -> Iterator[None]:
+    """`parallel` works in the test's own process: jobs are small, and every other process loads everything anew."""
+    with parallel_config(backend="sequential"):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -91,7 +91,7 @@ def export(
     (see `FORMATS`); `scene_file` is of a run, None for the one that it was made from.
 
     Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, a
-    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be builder.
+    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
     """
     source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
     kind = out.suffix.lower()
@@ -125,7 +125,7 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:
-        raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
+        raise SdfsimError(f"{source}: --scene belongs to a run", "leave out --scene")
     elif (source / RECORD_FILE).is_file():
         shape = load_shape(source)
         moves = "dynamic" if shape.volume > 0 else "static"
@@ -154,7 +154,7 @@ def _plain_names(names: list[str]) -> list[str]:
     for name in names:
         stem = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
         stem = f"_{stem}" if stem[0].isdigit() else stem
-        # Files of one name but for their case would be one file on some systems.
+        # Names that differ in case alone are one file on some systems.
         choice = next(c for k in range(len(used) + 1) if (c := f"{stem}_{k}" if k else stem).lower() not in used)
         used.add(choice.lower())
         plain.append(choice)
@@ -277,7 +277,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
     write_bytes(out, file.to_bytes())
-    return [out], ["masses, friction and all else that is not seen", *_missing(take, motion=True, textures=True)]
+    return [out], ["masses, friction and all else that is not visible", *_missing(take, motion=True, textures=True)]
 
 
 # --- USD ---
@@ -447,7 +447,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         name = file.stem + ("" if scale == 1.0 else f"-x{scale:.9g}")
         if name not in meshes:
             meshes.add(name)
-            # "convex" and "shell" ask for no volume inside, which what is only shown need not have.
+            # "convex" and "shell" need no enclosed volume, which meshes that are only shown may lack.
             inertia = "convex" if "-" in file.stem else "shell"
             _add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
         return name
@@ -512,7 +512,7 @@ def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) ->
     MuJoCo has no restitution. A spring that only pushes, its damping relative to the critical one z, gives back
     exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed; also above 1, where arccos and root are imaginary.
     """
-    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to where MuJoCo takes it as it is
+    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to where MuJoCo does not change it
     turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
     back = np.exp(-damping * np.abs(turned))
     found = np.interp(-restitution, -back, damping)

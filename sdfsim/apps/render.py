@@ -43,7 +43,7 @@ def render(
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.
 
     Camera and what it looks at, [3] m each, are as in `eye_of`. Raises SdfsimError for another ending, a time outside
-    of the run, a camera where it looks at, or a file that cannot be builder.
+    of the run, a camera where it looks at, or a file that cannot be written.
     """
     out, scene = Path(out), scene if isinstance(scene, Scene) else scene.load()
     check_format(out)
@@ -70,15 +70,16 @@ def render(
 def eye_of(
     scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
 ) -> Eye:
-    """From where a scene is looked at; of the eye and what it looks at, [3] m each, what is not given is chosen so that
-    all of the scene is in sight. Raises SdfsimError where the eye is where it looks at, or not at a finite place."""
+    """The camera of a scene. Where its position or target, [3] m each, is not given, one is chosen that has the whole
+    scene in sight. Raises SdfsimError where the two are one point, or not finite."""
     centre, radius = framed(scene, motion)
     given = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
     eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))
     sight = eye.target - eye.position
     if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
         raise SdfsimError("--camera and --look-at: must be two different points")
-    if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):  # straight down, up has no place there
+    # Straight down, the direction up is undefined.
+    if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):
         aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
         eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
     return eye
@@ -207,7 +208,7 @@ class Studio:
         to_sun = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1, dtype=np.float32)
         dark = (toward <= 0.0) | cast.caster.anything(to_sun)
         light = _SHADE + 0.1 * (facing @ self._eye.up.astype(np.float32)) + np.where(dark, 0.0, (1.0 - _SHADE) * toward)
-        # Far away the floor goes over into the sky.
+        # Far away the floor fades into the sky.
         clear = 2.0 * (self._radius + float(np.linalg.norm(self._eye.target - self._eye.position)))
         fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
         pixels, label = np.tile(_SKY, (len(rays), 1)), np.full(len(rays), -1)

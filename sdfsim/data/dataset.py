@@ -27,7 +27,7 @@ SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
 LONGEST_STEP = 10.0  # s, between recorded frames
 LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
-EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
+EXACTLY = 1e-3  # of what gravity adds in a step: tolerance of a free flight
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
 _AXES = {  # T frames, N bodies
     "position": ("T", "N", 3), "quat_xyzw": ("T", "N", 4), "velocity": ("T", "N", 3), "angular_velocity": ("T", "N", 3),
@@ -134,7 +134,7 @@ def check_names(where: str, names: Iterable[str]) -> None:
     """Raises SdfsimError where one of the names cannot be that of a Shape folder of a dataset."""
     for name in names:
         if not _NAME.fullmatch(name):
-            raise SdfsimError(f"{where}: {name!r} is no name of a Shape folder", "letters, digits, spaces, . _ - only")
+            raise SdfsimError(f"{where}: {name!r} cannot name a Shape folder", "use letters, digits, spaces, . _ -")
 
 
 def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:

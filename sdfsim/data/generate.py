@@ -40,9 +40,9 @@ def make_dataset(
     split depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
     (see `split_of`), so that those of validation and test are never trained on.
 
-    Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; so many
-    `random_solids` of PyBullet go beside them. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
-    `RATES`. Raises SdfsimError for an option that the recipe has no use for, no usable shapes or none to be fetched,
+    Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; `random_solids`
+    of PyBullet are added. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
+    `RATES`. Raises SdfsimError for an option that the recipe does not take, no usable shapes or none to be fetched,
     PyBullet absent, another dataset in `out`, or another run writing to it.
     """
     plan = RECIPES[recipe]
@@ -145,7 +145,7 @@ def _origins(
     }
     for option, given in unused.items():
         if given:
-            raise SdfsimError(f"{recipe} has no use for {option}")
+            raise SdfsimError(f"{recipe} does not take {option}")
     if plan.given and shapes is None and not random_solids:
         raise SdfsimError(f"{recipe} needs shapes", "give --shapes a folder, or kubasic or ycb")
     folder = shapes and public_folder(shapes, on_progress)
@@ -156,7 +156,7 @@ def _origins(
 
 
 def _check_same(out: Path, info: dict) -> None:
-    """Raises SdfsimError when the folder holds a dataset of which anything in `info` is not true."""
+    """Raises SdfsimError when the folder holds a dataset that differs from `info`."""
     there = read_info(out) if (out / INFO).exists() else info
     if other := [key for key, value in info.items() if there.get(key) != value]:
         raise SdfsimError(f"{out} holds a dataset with another {other[0]}", "choose another -o")

@@ -58,7 +58,7 @@ def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
 
 
 def _url(file: str) -> str:
-    """Where a file of a set is: in Kubric's archive of its folder's name, or by itself."""
+    """The address of a file of a set: Kubric's archive of its folder's name, or the file alone."""
     if folder := Path(file).parent.name:
         return f"{KUBRIC}/{folder}{ARCHIVE}"
     return f"{YCB}/{Path(file).stem.title().replace('_', '')}/textured_simple_reoriented.obj"

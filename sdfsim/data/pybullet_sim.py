@@ -75,7 +75,7 @@ def engine_settings(step: float, substeps: int) -> dict:
 
 
 def set_as_teacher(info: dict) -> bool:
-    """Whether a `dataset.json` names this engine with the settings that the teacher has, at whatever inner step: its
+    """Whether a `dataset.json` names this engine with the settings that the teacher has, with any inner step: its
     recordings then have the teacher's habits, bodies larger by `MARGIN` and pushes that add to rebounds."""
     settings, ours = info.get("engine_settings"), engine_settings(DT, SUBSTEPS)
     if info.get("engine") != "pybullet" or not isinstance(settings, dict):
@@ -120,7 +120,7 @@ class Teacher:
 
     def add(self, body: TeacherBody, position: Vector = FAR, quat: Vector = UNTURNED) -> int:
         """Add a body with its centre of mass at `position` [3] m, orientation `quat` [4] xyzw; returns its index."""
-        # Far away first and moved then: the engine's order of pairs depends on it.
+        # Added far away and then moved: the engine's order of pairs depends on it.
         given = {"basePosition": FAR, "globalScaling": body.scale, "useFixedBase": int(body.mass == 0)}
         # Cylinders are round, and not prisms of 32 sides.
         handle = self._call("loadURDF", str(body.urdf), flags=self.pb.URDF_USE_IMPLICIT_CYLINDER, **given, **MAXIMAL)

@@ -22,7 +22,7 @@ REGION = ((-5.0, -5.0, 1.0), (5.0, 5.0, 5.0))  # m, holds every tossed body's bo
 COUNT = (3, 10)
 SIZES = (0.7, 1.4)
 MATERIALS = {"metal": (2.7, 0.4, 0.3), "rubber": (1.1, 0.8, 0.7)}  # density, friction, restitution
-# MOVi-C: largest extent in m; Kubric's coefficients. Meshes at hand have no true size, so none has a mass of its own:
+# MOVi-C: largest extent in m; Kubric's coefficients. Our meshes have no true size, so none has a mass of its own:
 # all have rubber's density.
 EXTENTS_C = (0.75, 3.0)
 PLAIN = (1.1, 0.5, 0.5)  # density, friction, restitution

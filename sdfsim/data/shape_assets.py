@@ -116,7 +116,7 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
     """Engine files of all shapes, about their centres of mass; files that are there already are kept.
 
     Returns the usable shapes in the order of `found`; and the others, name -> why. Raises SdfsimError where a shape
-    that is to be taken as it is cannot be used.
+    taken `as_is` cannot be used.
     """
     engine.mkdir(parents=True, exist_ok=True)
     records: dict[int, dict[str, Any]] = {}

@@ -82,7 +82,7 @@ def timed(advance: Callable[[int], object], steps: int) -> Timing:
 
 
 def start_of_scene(scene: Scene, folder: Path, units: Units = SI) -> Start:
-    """A scene whose only plane, if any, is a level floor; shapes are called by their index in it.
+    """A scene whose only plane, if any, is a level floor; shapes are named by their index in it.
 
     The engine's files are written to `folder` where they are not there yet. Raises SdfsimError for bodies on a path, or
     planes other than one level floor.
@@ -107,7 +107,7 @@ def centred_mesh(shape: Shape) -> Mesh:
 
 
 def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
-    """The start of a scene's bodies but for planes as a recording of one frame, shapes called by their index."""
+    """The start of all bodies but planes as a recording of one frame; shapes are named by their index."""
     bodies, state = from_scene(scene, units)
     solid = solid_bodies(scene)
 
@@ -132,14 +132,14 @@ def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
 
 
 def rollout_motion(scene: Scene, rollout: Rollout) -> Trajectory:
-    """Our motion of a scene as `start_motion` has its start."""
+    """Our motion of a scene as a recording of the bodies of `start_motion`."""
     frames = (rollout.position, rollout.orientation, rollout.velocity, rollout.angular_velocity)
     found = {name: values[:, solid_bodies(scene)] for name, values in zip(MOTION, frames, strict=True)}
     return replace(start_motion(scene), **found, dt=float(rollout.meta["dt"]))
 
 
 def solid_bodies(scene: Scene) -> np.ndarray:
-    """[N] bool: which bodies are no planes."""
+    """[N] bool: bodies that are not planes."""
     return np.array([not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies])
 
 
@@ -150,14 +150,14 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
     """PyBullet's motion of `steps` recorded steps, by default in the teacher's own inner steps.
 
     Raises:
-        SdfsimError: PyBullet is not installed, a step that the teacher does not make, or another inertia than recorded.
+        SdfsimError: PyBullet is not installed, the teacher makes no such step, or an inertia differs from the recorded.
     """
     t, parts = start.motion, []
     with Teacher(t.gravity, start.floor, step=t.dt, substeps=substeps or substeps_of(t.dt)) as teacher:
         for i, name in enumerate(t.shape):
             urdf = start.urdfs[str(name)]
             mass = 0.0 if t.static[i] else float(t.mass[i])
-            # Far away first and moved then, as when it was recorded: the engine's order of pairs depends on it.
+            # Added far away and then moved, as when it was recorded: the engine's order of pairs depends on it.
             teacher.add(TeacherBody(urdf, float(t.scale[i]), mass, float(t.friction[i]), float(t.restitution[i])))
             teacher.place(i, t.position[0, i], t.quat_xyzw[0, i])
             if t.static[i]:
@@ -166,7 +166,7 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
             if start.own_inertia:
                 teacher.set_inertia(i, t.inertia[i])
             elif not np.allclose(teacher.inertia(i), t.inertia[i], rtol=SAME_INERTIA):
-                raise SdfsimError(f"{urdf}: the engine's inertia is not the recorded one")
+                raise SdfsimError(f"{urdf}: the engine's inertia differs from the recorded one")
         timing = timed(lambda count: parts.append(teacher.run(count)), steps)
     first, rest = parts
     return replace(t, **{name: np.concatenate([first[name][:1], rest[name]]) for name in MOTION}), timing
@@ -182,9 +182,9 @@ def mujoco(
     its usual pyramid of friction, or with a cone.
 
     It takes the larger of two coefficients of friction where the teacher multiplies. So geoms that meet the floor carry
-    the product with the floor's, and those that meet other bodies carry their square. Those of static bodies have the
-    say, and carry the product with the median body's: all exact where all bodies that move are of one material. Its
-    contacts are soft: the restitution wanted is that of a damped spring.
+    the product with the floor's, and those that meet other bodies carry their square. Those of static bodies take
+    priority, and carry the product with the median body's: exact where all bodies that move are of one material. Its
+    contacts are soft: a damped spring gives the wanted restitution.
 
     Raises:
         SdfsimError: MuJoCo is not installed, a shape's engine file cannot be read, or the motion is unstable.
@@ -241,14 +241,14 @@ def mujoco(
         quat = np.roll(place[:, 3:], -1, axis=-1)
         return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
 
-    engine.set_mju_user_warning(lambda message: None)  # it would write them to a file where it runs
+    engine.set_mju_user_warning(lambda message: None)  # by default it writes them to a file in the working directory
     kinds = engine.mjtWarning
     unstable = [data.warning[int(kind)] for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
 
     def advance() -> None:
         engine.mj_step(model, data, substeps)
         if any(warning.number for warning in unstable):
-            raise SdfsimError("MuJoCo found the motion unstable, and put it back to its start")
+            raise SdfsimError("MuJoCo found the motion unstable and reset it")
 
     return engine_motion(t, steps, advance, state)
 
@@ -341,8 +341,8 @@ def dataset_urdf(data: Path, shape: str) -> Path:
 
 
 def form_of(urdf: Path) -> tuple[str, np.ndarray]:
-    """What a URDF of ours collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or "capsule", its
-    radius and the length of its straight side, or "mesh", its pieces."""
+    """What a URDF of `shape_urdf` collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or
+    "capsule" and its radius and the length of its straight side, or "mesh", its pieces."""
     found = re.search(r"<(sphere|box|cylinder|capsule) ([^>]*)/>", urdf.read_text(encoding="utf-8"))
     if found is None:
         return "mesh", np.zeros(0)

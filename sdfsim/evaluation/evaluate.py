@@ -59,7 +59,7 @@ def evaluate(
     errors_only: bool = False,
     on_progress: Progress = silent,
 ) -> dict:
-    """Roll a model out from the first frame of every trajectory and compare, beside the ballistic baseline.
+    """Roll a model out from the first frame of every trajectory and compare, with the ballistic baseline.
 
     Args:
         model: bundled name, path or `Model`.
@@ -74,7 +74,7 @@ def evaluate(
         A report:
         "model", "ballistic": errors as `errors` gives them.
         "chaos_floor": "perturbations" -> name -> errors; "median_farthest_unperturbed_m".
-        "outside_training": what of the scenes the model has not seen, one line each.
+        "outside_training": in what the scenes leave the model's training, one line each.
         "median_survival_s": of all of them, by limit in m: until half of the bodies are farther from the recording.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
         "engine_substep": s, the recording engine's inner step; 0 where no dataset.json has it.
@@ -202,7 +202,9 @@ def teacher_again(data: Path, trajectories: Motions, steps: int, seed: int = 0) 
     info = read_info(home)
     floor, settings = floor_of(info, home), info.get("engine_settings")
     if info.get("engine") != "pybullet" or not isinstance(settings, dict):
-        raise SdfsimError(f"recorded by {info.get('engine') or 'an unnamed engine'}, not by PyBullet as it is set here")
+        raise SdfsimError(
+            f"recorded by {info.get('engine') or 'an unnamed engine'}, not by PyBullet with the teacher's settings"
+        )
     ours = engine_settings(trajectories[0].dt, substeps_of(trajectories[0].dt))
     if other := [name for name, value in ours.items() if settings.get(name) != value]:
         raise SdfsimError(f"recorded with other engine settings ({', '.join(other)})")
@@ -259,7 +261,7 @@ def error_rows(report: dict[str, Any], *, name: str) -> Rows:
 
 
 def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
-    """Penetration, energy, rest and survival, with the teacher's recording beside the model."""
+    """Penetration, energy, rest and survival of the model and of the teacher's recording."""
     head = ("", "penetration 95 %", "worst", "energy gain", "worst", "resting speed", f"within {SURVIVED} m for")
     length = max(found["seconds"] for found in report["model"].values())
 
@@ -286,7 +288,7 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 
 
 def notes(report: dict[str, Any]) -> list[str]:
-    """What has to be known beside the tables, a line each."""
+    """Notes on the tables, one line each."""
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
     ground, source = report["floor"], "from dataset.json" if report["floor"]["told"] else "that of our recipes"
     how = f"The solve has the teacher's habits: bodies larger by {MARGIN:g} m, pushes that add to rebounds."

@@ -1,4 +1,4 @@
-"""Everyday scenes: what any rigid-body simulator has to get right, each with a closed form for what is wanted.
+"""Everyday scenes that any rigid-body simulator has to get right, each with a closed form of the right answer.
 
     python -m sdfsim.evaluation.everyday [ROW ...] [--size 0.1] [--yaw 0] [--kind analytic] [--full]
 
@@ -103,7 +103,7 @@ class Check:
 
 
 def near(name: str, measured: float, wanted: float, part: float, unit: str = "", slack: float = 0.0) -> Check:
-    """Within a part of what is wanted, and some slack."""
+    """A check within a `part` of the wanted value, plus `slack`."""
     off = abs(wanted) * part + slack
     return Check(name, float(measured), wanted - off, wanted + off, unit)
 
@@ -265,7 +265,7 @@ class Ran:
         return self.time / self.at.time
 
     def when(self, seconds: float) -> int:
-        """The frame at a time as at 10 cm."""
+        """The frame at a time (as at 10 cm)."""
         return int(np.abs(self.seconds - seconds).argmin())
 
     @cached_property
@@ -288,7 +288,7 @@ class Ran:
 def run(
     at: Setting, bodies: Sequence[Put], seconds: float, *, gravity: float = G, tilt: float = 0.0, sleep: bool = False
 ) -> Ran:
-    """A scene for so many seconds (as at 10 cm); gravity leans by `tilt` degrees to +x."""
+    """Run a scene for `seconds` (as at 10 cm); gravity leans by `tilt` degrees to +x."""
     shapes: list[Shape] = []
     made, yaw = [], about("z", at.yaw)
     for put in bodies:
@@ -320,7 +320,7 @@ def run(
 
 
 def laws(ran: Ran, name: str, *, deep: float = DEEP) -> Iterator[Check]:
-    """What holds of every scene; bodies may be in each other by a `deep` of the smaller thickness."""
+    """Laws of every scene; bodies may overlap by a part `deep` of the smaller thickness."""
     verdict = ran.verdict
     yield most(f"{name}: overlap", 100 * verdict.overlap.part if verdict.overlap else 0.0, 100 * deep, "% of thickness")
     yield most(f"{name}: floating", 100 * verdict.floating.part if verdict.floating else 0.0, 0.0, "% of thickness")
@@ -409,7 +409,7 @@ def heaps(at: Setting) -> Iterator[Check]:
 
 
 def seams(at: Setting) -> Iterator[Check]:
-    """What slides over flush tiles knows nothing of their seams; only gravity acts at a step down."""
+    """Seams between flush tiles do not disturb a sliding body; only gravity acts at a step down."""
     forms = {
         "cube": (solid(at.kind, "box", 1, 1, 1), 0.5),
         "slab": (solid(at.kind, "box", 2, 2, 0.5), 0.25),
@@ -457,7 +457,7 @@ def thin_floors(at: Setting) -> Iterator[Check]:
     cube = solid(at.kind, "box", 1, 1, 1)
     sheets = {"1000 x 1000 x 1": (1000, 1000, 1), "10 x 10 x 0.02": (10, 10, 0.02)}
     for name, size in sheets.items():
-        # Half a millimetre of wood at 10 m is no mesh that a grid could hold.
+        # No grid resolves a sheet of half a millimetre that is 10 m wide.
         sheet = solid("analytic" if at.kind == "grid" else at.kind, "box", *size)
         ground = fixed("ground", sheet, [0, 0, -size[2] / 2])
         deep = DEEP / size[2]  # a hundredth of the cube
@@ -476,7 +476,7 @@ def thin_floors(at: Setting) -> Iterator[Check]:
 
 
 def rolling(at: Setting) -> Iterator[Check]:
-    """What is round rolls on, and down a slope with g sin a / (1 + k^2): a cylinder has k^2 = 1/2, a tube
+    """Round bodies keep rolling, and go down a slope with g sin a / (1 + k^2): a cylinder has k^2 = 1/2, a tube
     (1 + (inner / outer)^2) / 2."""
     lie = about("x", 90)
     tube_k = (1 + (0.45 / 0.5) ** 2) / 2
@@ -609,7 +609,7 @@ def round_on_meshes(at: Setting) -> Iterator[Check]:
 
 
 def flat_drops(at: Setting) -> Iterator[Check]:
-    """What is dropped flat comes down flat."""
+    """Bodies that are dropped flat land flat."""
     forms = {"brick": (2, 1.5, 0.3), "plate": (3, 3, 0.1), "cube": (1, 1, 1)}
     grounds = {
         "plane": floor(),
@@ -632,7 +632,7 @@ def flat_drops(at: Setting) -> Iterator[Check]:
 
 
 def slabs(at: Setting) -> Iterator[Check]:
-    """A slab that slides does not turn: friction's pressure centre lies ahead, on the line of motion."""
+    """A sliding slab does not turn: the centre of pressure lies ahead, on the line of motion."""
     forms = {"2:1:0.3": (2, 1, 0.3), "1:1:0.1": (1, 1, 0.1), "4:1:0.2": (4, 1, 0.2)}
     grounds = {"plane": floor(), "box": fixed("box", solid(at.kind, "box", 40, 20, 1), [10, 0, -0.5])}
     for name, size in forms.items():
@@ -838,8 +838,8 @@ def before_touch(at: Setting) -> Iterator[Check]:
     small, large = of_mesh(kind, "ball", 1.0, 4), solid("analytic", "ball", 2.1)
     bodies = [fixed("small", small, [0, 0, 0]), Put("large", large, [-3.6, 0, 0], v=[0.2, 0, 0], mu=0.0)]
     ran = run(at, bodies, 0.6, gravity=0.0)
-    # A frictionless ball without restitution that hits a fixed one centrally stops, but for what the nearest corner of
-    # the mesh, up to 0.05 rad aside, lets pass: 0.01 m/s, and as much again where it then meets the next.
+    # A frictionless ball without restitution stops when it hits a fixed one centrally. The nearest corner of the mesh
+    # is up to 0.05 rad aside, which leaves 0.01 m/s, and as much again at the next corner.
     yield most("ball on a mesh ball: speed after", float(np.linalg.norm(ran.v("large")[-1])), 0.015, "m/s")
     yield from laws(ran, "ball on a mesh ball")
     ring = of_mesh(kind, "torus", 0.5, 0.1)  # a hole of radius 0.4
@@ -860,7 +860,7 @@ ROWS: dict[str, Callable[[Setting], Iterator[Check]]] = {
 
 
 def checks(row: str, at: Setting) -> Iterator[tuple[str, Check]]:
-    """Every check of a row with its full name, by which lists know it."""
+    """Every check of a row with its full name, as lists have it."""
     for check in ROWS[row](at):
         yield f"{row}: {check.name} [{at}]", check
 
@@ -872,7 +872,7 @@ def failures(row: str, settings: Sequence[Setting]) -> dict[str, float]:
 
 
 def changed(found: Sequence[tuple[str, Check]], listed: Sequence[str]) -> list[str]:
-    """What differs between checks that were run and the names of those that hold, as far as it is clear, in lines."""
+    """The clear differences between checks that were run and the listed names of checks that hold, a line each."""
     lines = []
     for name, check in found:
         if check.close or check.holds == (name in listed):
@@ -887,7 +887,7 @@ def changed(found: Sequence[tuple[str, Check]], listed: Sequence[str]) -> list[s
 
 
 def update(file: Path, found: Sequence[tuple[str, Check]]) -> None:
-    """Bring the list of what holds up to date with checks that were run; others stay as they are."""
+    """Update the list of checks that hold with those that were run; others stay."""
     listed = set(file.read_text(encoding="utf-8").splitlines()) if file.exists() else set()
     settings = {name.split(":")[0] + name[name.rindex(" [") :] for name, _ in found}
     listed = {name for name in listed if name.split(":")[0] + name[name.rindex(" [") :] not in settings}

@@ -1,4 +1,4 @@
-"""The hard cases: their scenes, what is measured on the motions, and what is wanted.
+"""The hard cases: their scenes, what is measured on the motions, and the limits.
 
 Scenes are of metre-sized boxes and balls on a floor, in the teacher's gravity. Coefficients of the bodies and the floor
 are such that their products lie within what models are trained on, unless a case is about them.
@@ -56,7 +56,7 @@ RUNAWAY = 10.0  # times the energy at the start, and no motion is worth measurin
 
 @dataclass(frozen=True)
 class Trial:
-    """One motion of one scene: of its bodies but for planes, up to the last good state."""
+    """One motion of one scene: of all bodies but planes, up to the last good state."""
 
     scene: Scene
     motion: Trajectory
@@ -84,7 +84,7 @@ class Figure:
     name: str
     unit: str
     digits: int = 2  # shown after the point; differences that are not shown do not count
-    limit: float | None = None  # what is wanted is at most this; None where only the teacher says how good one can be
+    limit: float | None = None  # largest value that is wanted; None where only the teacher gives a standard
     largest: bool = False  # of several repetitions the largest counts, not the mean
     judged: bool = True  # lower is better; other figures inform, such as the height of a rebound
     longer: bool = False  # higher is better instead
@@ -97,7 +97,7 @@ class Case:
     name: str
     group: str
     title: str
-    scenes: Callable[[int], list[Scene]]  # of one repetition, given its number; 0 is the case as it is meant
+    scenes: Callable[[int], list[Scene]]  # of one repetition, given its number; 0 is the exact case
     measure: Measure  # of the motions of these scenes, in their order; gives `figures`
     figures: tuple[Figure, ...]
     seconds: float = 3.0
@@ -105,7 +105,7 @@ class Case:
     cuda: bool = False  # the scenes are simulated a second time there, behind the first
     engines: bool = True  # whether engines can take part
     x: float | None = None  # where it stands in its group's plot of the first figure; None where it is not in a row
-    # figures of a model by scenes of its own, of which `scenes` then gives none
+    # figures of a model from scenes that this function makes; `scenes` then gives none
     own: Callable[[Model], dict[str, float]] | None = None
 
 
@@ -209,9 +209,9 @@ def overlapping(first: Shape, second: Shape, apart: float) -> Scene:
 
 
 def thrown_at_plate(speed: float, repeat: int) -> Scene:
-    """Eight boxes and eight balls of 20 cm, anyhow turned, flying at `speed` m/s down to a plate of 1 cm.
+    """Eight boxes and eight balls of 20 cm in random orientations that fly down to a plate of 1 cm at `speed` m/s.
 
-    There is no floor below: what passes the plate falls on.
+    There is no floor: bodies that pass the plate fall on.
     """
     rng = np.random.default_rng(repeat)
     thrown = []
@@ -225,7 +225,7 @@ def thrown_at_plate(speed: float, repeat: int) -> Scene:
 
 
 def resting(shape: Shape, *, sleep: bool) -> Scene:
-    """One body at rest on the floor: on that of its steady faces which already looks down most, else as it is."""
+    """One body at rest on the floor, on its steady face that points down most; without such a face as it is."""
     vertices = shape.mesh.vertices - shape.com
     faces = steady_faces(vertices)
     turn = Rotation.identity()
@@ -467,7 +467,7 @@ def slipped(trials: Sequence[Trial], *, friction: float, offsets: Sequence[float
 
 
 def slide(friction: float, degrees: float, seconds: float, gravity: float) -> float:
-    """m that a body at rest slides on a slope in so many seconds, by Coulomb's law."""
+    """m that a body slides from rest on a slope in `seconds`, by Coulomb's law."""
     angle = np.radians(degrees)
     return 0.5 * gravity * max(0.0, float(np.sin(angle) - friction * np.cos(angle))) * seconds**2
 

@@ -95,7 +95,7 @@ def _run(job: Job, file: Path, mark: str) -> dict[str, Any]:
 
 
 def _kept(file: Path, mark: str) -> dict[str, Any]:
-    """The result in a file; empty where there is none of this content."""
+    """The result in a file; empty where its content does not match."""
     try:
         content = read_json(file)
     except SdfsimError:
@@ -104,7 +104,7 @@ def _kept(file: Path, mark: str) -> dict[str, Any]:
 
 
 def machine() -> str:
-    """What timings depend on besides the code: the machine's name and the number of torch's threads."""
+    """What timings depend on apart from the code: the machine's name and the number of torch's threads."""
     return f"{platform.node()}, {torch.get_num_threads()} threads"
 
 
@@ -116,20 +116,20 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """So many significant digits; a dash for what is not known."""
+    """A number with `digits` significant digits; a dash where it is unknown."""
     if value is None or not np.isfinite(value):
         return "-"
     return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
 
 
 def cells(found: dict[str, Any], columns: Iterable[str]) -> tuple[str, ...]:
-    """Cells of a table: these figures of a result, and last what went wrong with it."""
+    """Cells of a table: these figures of a result; the last cell says why it failed."""
     why = next((found[key] for key in ("failed", "broken") if found.get(key)), "")
     return (*(number(found.get(key)) for key in columns), why)
 
 
 def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
-    """Indices, by time, of points that no other beats: none is at most as slow and as wrong, and one of both less."""
+    """Indices of the Pareto front, by time: no other point is at least as good in time and error, and better in one."""
     kept: list[int] = []
     for k in sorted(range(len(time)), key=lambda k: (time[k], error[k])):
         if not kept or error[k] < error[kept[-1]] or (time[k], error[k]) == (time[kept[-1]], error[kept[-1]]):

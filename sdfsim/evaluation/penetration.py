@@ -34,7 +34,7 @@ class ExactSolid:
     bounds: np.ndarray  # [2, 3] m, box of the solid (infinite for a plane)
     distance: Callable[[np.ndarray], np.ndarray]  # [P, 3] m -> [P] m, negative inside
     # "pieces" (the convex pieces that an engine collides), "mesh" (the shape's), "shown mesh" (the same, where the
-    # engine collides pieces that are not at hand) or "closed form"
+    # engine collides pieces that are missing) or "closed form"
     kind: str
 
 
@@ -58,8 +58,9 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, ExactSolid]:
 
 
 def deepest(motion: Trajectory, solids: dict[str, ExactSolid], every: int = EVERY) -> np.ndarray:
-    """[F] m, signed distance of the deepest node of any body in any other, or in the floor z = 0, every so many frames.
-    Negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not count."""
+    """[F] m, signed distance of the deepest node of any body in another, or in the floor z = 0, of every `every`-th
+    frame: negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not
+    count."""
     kept = slice(every, None, every)
     position = motion.position[kept]
     frames, bodies = position.shape[:2]
@@ -99,7 +100,7 @@ def penetration(motions: list[Trajectory], solids: dict[str, ExactSolid]) -> dic
 
 
 def depths(scene: Scene, motion: Trajectory, every: int = 5) -> np.ndarray:
-    """[F] m, depth of the deepest node in those of every so many frames (see `rollout_motion`) in which bodies touch.
+    """[F] m, depth of the deepest node, in every `every`-th frame (see `rollout_motion`) in which bodies touch.
     The only plane of the scene, if any, is the floor z = 0."""
     solids = {}
     for name in set(motion.shape.tolist()):
@@ -126,7 +127,7 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
 
 
 def _exact(shape: Shape, com: np.ndarray | float = 0.0) -> ExactSolid:
-    """The geometry that a shape's distances stand for, seen from `com` [3] m."""
+    """The geometry behind a shape's distances, with the origin at `com` [3] m."""
     sdf = with_sdf(shape, "mesh").sdf if isinstance(shape.sdf, MlpSdf | GridSdf) else shape.sdf
     kind = "mesh" if isinstance(sdf, MeshSdf) else "closed form"
     return ExactSolid(shape.nodes, np.asarray(sdf.bounds) - com, lambda points: np.asarray(sdf(points + com)[0]), kind)

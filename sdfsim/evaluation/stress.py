@@ -1,4 +1,4 @@
-"""Runs the hard cases with models, the teacher and other engines; their table, plots and report."""
+"""The hard cases run with models, the teacher and other engines; their table, plots and report."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sdfsim.sdf.closed_forms import PlaneSdf
 from sdfsim.simulate.simulator import SimulationError, Simulator
 from sdfsim.simulate.steppers import stepper_of
 
-VERSION = 5  # counts up when what is measured changes, so that kept results are measured again
+VERSION = 5  # counts up when the measurements change, so that kept results are measured again
 TEACHER = "teacher"
 USUAL = {TEACHER: bullet}
 OUTSIDE = "†"
@@ -53,7 +53,7 @@ class Study:
         models: their names.
         engines: their names; the teacher where PyBullet is installed.
         results: (case, who) -> figures (name -> a value a repetition), broke, outside and laws (lines; the last are
-            those that a motion of ours breaks, by instruments that know no contacts) and recording (a path in the
+            laws that a motion of ours breaks, by instruments that do not use the solve) and recording (a path in the
             folder, or None); nothing for a case that one cannot take part in.
         quick: whether it is the short form.
     """
@@ -106,7 +106,7 @@ def stress(
     scenes = {case.name: [case.scenes(repeat) for repeat in range(case.repeats)] for case in found}
 
     def work(case: Case) -> float:
-        """About how long a model takes, in no unit; a step has its price without bodies too."""
+        """About how long a model takes, without a unit; a step costs time without bodies too."""
         if case.own:
             return OWN
         return case.seconds * sum(10 + len(scene.bodies) for repeat in scenes[case.name] for scene in repeat)
@@ -236,7 +236,7 @@ def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
 
 
 def rows(study: Study, marks: dict[str, str]) -> list[tuple[str, ...]]:
-    """The table, its head first, a row a figure; `marks` (state -> text) stand around what is missed or behind."""
+    """The table, its head first, with a row for each figure; `marks` (state -> text) surround missed or behind ones."""
     table: list[tuple[str, ...]] = [("case", "figure", "wanted", *study.who)]
     for case in study.cases:
         for k, figure in enumerate(case.figures):
@@ -277,7 +277,7 @@ def table(study: Study) -> str:
 
 
 def draw_group(study: Study, name: str, path: Path) -> bool:
-    """Write a plot of one group's first figure along its cases; False where they are no row."""
+    """Write a plot of one group's first figure along its cases; False where these have no common axis."""
     group, along = GROUPS[name], [case for case in study.cases if case.group == name and case.x is not None]
     if len(along) < 2:
         return False

@@ -1,4 +1,4 @@
-"""How much error for how many milliseconds: our models and their knobs, beside other engines."""
+"""Error against time: our models with their settings, and other engines."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ from sdfsim.shape.surface_nodes import hull_nodes
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.simulate.steppers import stepper_of
 
-VERSION = 2  # counts up when what is measured changes, so that kept results are measured again
+VERSION = 2  # counts up when the measurements change, so that kept results are measured again
 REPEATS = 7
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, STEPS_QUICK = 100, 50
 TIMED = 80  # steps, at most
-EXPLODED = 1.0  # an energy gain of so many times the energy at the start is a motion that blew up
+EXPLODED = 1.0  # energy gain over the energy at the start, beyond which a motion blew up
 OFF = 1e-3  # m/s, by which the starts of the chaos floor differ from the recorded ones
 HORIZON = 50  # steps of the errors that are drawn
 RUNS: dict[str, Engine] = {
@@ -71,12 +71,12 @@ Rows = list[tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Cases:
-    """What every contender simulates."""
+    """What every model and engine simulates."""
 
     recorded: list[Trajectory]  # as the teacher moved the bodies, from their first frames on
     starts: list[Trajectory]  # with velocities at the instants of the positions: what ours start from
     shapes: dict[str, Shape]  # of every name in use, their origins at the centres of mass
-    urdfs: dict[str, Path]  # the engines' files, by name; those that are not at hand are absent
+    urdfs: dict[str, Path]  # the engines' files, by name; missing ones are left out
     solids: dict[str, ExactSolid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
@@ -166,7 +166,7 @@ class Variant:
     """One way to simulate. The defaults are those of `sdfsim evaluate`."""
 
     model: str  # name or path
-    # "own", the shapes' own; "thin K", K of them, outermost first; "grid N", sampled anew from N^3 points
+    # "own": the shapes' own; "thin K": K of them, outermost first; "grid N": new samples from N^3 points
     nodes: str = "own"
     # "own", convex pieces where the shape has some; "mlp", its network alone; "grid N", samples of the exact distance,
     # N along each side; "mesh", the distance to the mesh that is shown
@@ -177,7 +177,7 @@ class Variant:
 
     @property
     def label(self) -> str:
-        """The model and all that is not the default."""
+        """The model, and every setting that is not the default."""
         if not self.contact:
             return "ballistic"
         usual, path = Variant(self.model), Path(self.model)
@@ -186,7 +186,7 @@ class Variant:
 
     @property
     def family(self) -> str:
-        """Settings that differ in one knob alone."""
+        """The name that variants share which differ in one setting alone."""
         if not self.contact:
             return "all contact ignored"
         usual, name = Variant(self.model), self.label.partition(",")[0]
@@ -195,7 +195,7 @@ class Variant:
 
 
 def variants(models: Sequence[str], *, quick: bool) -> list[Variant]:
-    """Each model with each of its knobs alone, and two useful combinations."""
+    """Each model with each of its settings changed alone, and two useful combinations."""
     chosen = []
     for name in models:
         knobs: list[dict[str, Any]] = [{}]
@@ -263,12 +263,12 @@ def _time_simulator(variant: Variant, model: Model, shapes: dict[str, Shape], ca
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
-    """Errors and times of an engine with so many of its steps in a recorded one, starts `off` m/s off."""
+    """Errors and times of an engine with `substeps` steps in a recorded one; starts differ by `off` m/s."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
     run = RUNS[name]
     if lacking := sorted({str(n) for t in cases.recorded for n in t.shape} - set(cases.urdfs)):
-        raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
+        raise SdfsimError(f"no engine file of {', '.join(lacking)}")
     meshes = {name: centred_mesh(shape) for name, shape in cases.shapes.items()}
     recorded = cases.recorded if name == "PyBullet" else cases.starts
     starts = [
@@ -301,10 +301,10 @@ def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[st
 
 
 def _times(run: Callable[[], Timing], cases: Cases) -> dict[str, Any]:
-    """What a run takes over what our default takes, in turn with it, and the default's milliseconds per simulated
-    second: what a shared machine does to the one it does to the other.
+    """The time of a run relative to our default's, measured in turn with it, and the default's milliseconds per
+    simulated second. A shared machine slows both alike.
 
-    All work in one thread, and are timed by the processor's clock: on a shared core the wall shows what others do.
+    All run in one thread and count processor time: wall time on a shared core depends on other processes.
     """
     model = load_model(SOLVER)
     repeats, usual = zip(
@@ -345,7 +345,7 @@ def tradeoff(
         what was measured, or why it `failed`; and `front`, the labels of ours that no other of ours beats, by time.
 
     Raises:
-        SdfsimError: bad input, nothing of ours could be measured, or another study that writes to the same folder.
+        SdfsimError: bad input, none of our variants could be measured, or another study writes to the same folder.
     """
     if source and not source.exists():
         raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
@@ -382,7 +382,7 @@ def tradeoff(
         fine = [p for p in points if "failed" not in p]
         ours = [p for p in fine if p["kind"] == "ours"]
         if not ours:
-            raise SdfsimError(f"nothing of ours could be measured: {points[0]['failed']}")
+            raise SdfsimError(f"none of our variants could be measured: {points[0]['failed']}")
         best = [ours[k] for k in front([p["ms"] for p in ours], [p["translation_rmse"][steps] for p in ours])]
         report = {
             "source": str(source or "a random scene"),

@@ -79,8 +79,8 @@ class Crossings:
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
         self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
         vertices = np.ascontiguousarray(mesh.vertices - self._centre, dtype=np.float32)
-        # Open3D reports one of two hits at the same distance, unless they are of different geometries: so that faces
-        # which lie on each other are both seen, they are dealt out to many.
+        # Open3D reports one of two hits at the same distance, unless these are on different geometries. So faces are
+        # spread over many geometries, and faces that lie on each other are both hit.
         order = np.random.default_rng(0).permutation(len(mesh.faces))
         groups = np.array_split(order, min(GEOMETRIES, len(order)))
         for group in groups:
@@ -130,7 +130,7 @@ class Caster:
         return self.scene.compute_signed_distance(self.tensor(points.astype(np.float32))).numpy()
 
     def anything(self, rays: np.ndarray, most: float = np.inf) -> np.ndarray:
-        """[R] whether anything is hit, within so many lengths of the directions."""
+        """[R] whether anything is hit within `most` lengths of the directions."""
         return self.scene.test_occlusions(self.tensor(rays), tnear=0.0, tfar=most).numpy()
 
     def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:

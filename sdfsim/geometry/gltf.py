@@ -1,5 +1,5 @@
-"""glTF 2.0, by hand. What trimesh writes has textures in JPEG of quality 75, and no motion; it reads normalised and
-sparse numbers, instances and fans as if they were something else.
+"""glTF 2.0, written and read without trimesh, whose files have textures in JPEG of quality 75 and no motion. Its reader
+misreads normalised and sparse numbers, instances and fans.
 
 glTF has y up and we have z up. A file that we write has one node above all others that turns it, so that its meshes
 and motions hold our own numbers; what we read is turned back (a file of ours comes out as it was).
@@ -34,12 +34,12 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
 MOST = 500_000_000  # vertices and corners
 WHITE = [1.0, 1.0, 1.0]
-SPARSE = 2**24  # rows of an accessor of which only some are in the file
+SPARSE = 2**24  # most rows of an accessor that has no values but sparse ones
 _OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
 
 
 class GltfWriter:
-    """A file in the making: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
+    """A file to be written: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
     that turns z up to glTF's y up."""
 
     def __init__(self) -> None:
@@ -255,7 +255,7 @@ class _GltfReader:
         while todo:
             number, above = todo.pop()
             if number in seen:
-                raise ValueError(f"node {number} hangs in two places")
+                raise ValueError(f"node {number} has two parents")
             seen.add(number)
             node = nodes[number]
             matrix = above @ _matrix(node)
@@ -292,7 +292,7 @@ class _GltfReader:
             corners = np.arange(len(vertices))
         if mode == TRIANGLES:
             if len(corners) % 3:
-                raise ValueError(f"{len(corners)} corners make no triangles")
+                raise ValueError(f"{len(corners)} corners do not make triangles")
             faces = corners.reshape(-1, 3)
         elif mode == TRIANGLE_STRIP:
             faces = strip(corners)
@@ -338,7 +338,7 @@ class _GltfReader:
 def _index(number: int) -> int:
     """A place in one of the header's lists; below 0 Python would count from their ends."""
     if not isinstance(number, int) or number < 0:
-        raise ValueError(f"{number!r} is no place in a list")
+        raise ValueError(f"{number!r} is not an index")
     return number
 
 

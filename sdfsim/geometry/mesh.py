@@ -76,8 +76,8 @@ def require_whole(mesh: Mesh) -> None:
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     """Merge equal vertices, drop degenerate and doubled faces and unused vertices, turn a closed mesh right side out.
 
-    Of two faces back to back none stays where the rest is closed without them (a wall between touching cells). Raises
-    SdfsimError where there are no faces, vertices that are not finite or absurdly far, or indices out of range.
+    Two faces back to back both go where the rest is closed without them (a wall between touching cells). Raises
+    SdfsimError for no faces, vertices that are not finite or too far away, or indices out of range.
     """
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) == 0:
@@ -166,7 +166,7 @@ def signed_volume(mesh: Mesh) -> float:
 
 
 def components(faces: np.ndarray) -> np.ndarray:
-    """[F] labels: faces that share an edge, with whatever others, are of one component."""
+    """[F] labels: faces that share an edge belong to one component."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

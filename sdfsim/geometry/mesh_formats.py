@@ -2,7 +2,7 @@
 
 trimesh refuses a binary PLY whose faces differ in their number of corners, and an OFF with its counts on the first
 line; Open3D, which reads both, gives up a whole file for one polygon with three corners in a line. So these two are
-read here. Everything raises ValueError for a file that is not what it should be, or cut short.
+read here. All readers raise ValueError for a file that is damaged or cut short.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
     line = re.escape(first[1]) if first else b""
     end = re.search(line + rb"end_header[ \t]*(?:" + line + rb"|\Z)", content)
     if first is None or end is None:
-        raise ValueError("its header is no PLY header, or cut short")
+        raise ValueError("it has no complete PLY header")
     order, texture = "", ""
     counts: dict[str, int] = {}
     columns: dict[str, list[tuple[str, str, str]]] = {}  # name, kind of the list's length or nothing, kind
@@ -86,7 +86,7 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
         try:
             body = np.array(body.split(), dtype="S").astype("<f8").tobytes() if body.strip() else b""
         except ValueError as error:
-            raise ValueError("its rows hold something that is no number") from error
+            raise ValueError("its rows hold something that is not a number") from error
     found: dict[str, Element] = {}
     start = 0
     for name, rows in counts.items():
@@ -254,7 +254,7 @@ def looked_up(image: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def read_image(content: bytes) -> np.ndarray | None:
-    """[H, W, 3] uint8, or None where it is no image of one of `TEXTURES`."""
+    """[H, W, 3] uint8, or None where it is not an image of one of `TEXTURES`."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -276,7 +276,7 @@ def side_file(path: Path, name: str) -> bytes:
 def whole(values: np.ndarray) -> np.ndarray:
     """Indices as int64. Raises ValueError for fractions, and for what is not finite."""
     if values.dtype.kind == "f" and not (np.isfinite(values) & (np.round(values) == values)).all():
-        raise ValueError("indices that are no whole numbers")
+        raise ValueError("indices that are not whole numbers")
     return values.astype(np.int64)
 
 
@@ -284,8 +284,8 @@ def triangles(length: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> 
     """Polygons of `length` [P] corners each, one after the other in `corners` [sum], as triangles [F, 3] of places in
     `corners`. Raises ValueError for corners that are no vertices [V, 3].
 
-    Each becomes a fan around the first of its corners from which none lies outside of it; where there is none, its
-    ears are cut off one after the other.
+    Each becomes a fan around the first corner from which no triangle lies outside the polygon; where there is no such
+    corner, its ears are cut off one by one.
     """
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(vertices)):
         raise ValueError(f"face indices out of range (0 to {len(vertices) - 1} allowed)")
@@ -465,7 +465,7 @@ def plain_stl(content: bytes) -> bytes:
             raise ValueError("cut short: it has no endsolid")
         return content
     if len(content) < 84:
-        raise ValueError("it is no STL file, or cut short")
+        raise ValueError("it is not an STL file, or cut short")
     # The last triangle's last two bytes are an attribute, which some programs leave out.
     if len(content) < needed - 2:
         raise ValueError(f"cut short: {(len(content) - 84) // FACET} of {count} faces")

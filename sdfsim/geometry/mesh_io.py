@@ -27,7 +27,7 @@ from sdfsim.geometry.mesh_formats import (
     side_file,
 )
 
-# trimesh logs what it passes over, some of it with tracebacks. Whoever wants to see that can still listen.
+# trimesh logs what it skips, sometimes with tracebacks. Callers may add a handler to see that.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
@@ -36,8 +36,8 @@ GLTF = (".glb", ".gltf")
 
 def load_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
-    Raises SdfsimError where it is missing, cut short, no mesh, needs what is not read, or has no faces, vertices that
-    are not finite, or indices out of range."""
+    Raises SdfsimError for a file that is missing, cut short or not a mesh, that needs an unsupported extension, or that
+    has no faces, vertices that are not finite or indices out of range."""
     path = Path(path)
     if not path.is_file():
         raise SdfsimError(f"{path}: no such mesh file")
@@ -46,7 +46,7 @@ def load_mesh(path: str | Path) -> Mesh:
         raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
     try:
         mesh = _read(path, suffix)
-    except Exception as error:  # the readers raise whatever their format made them stumble over
+    except Exception as error:  # readers raise errors of many types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise SdfsimError(f"{path}: not a readable mesh ({reason})") from error
     return clean(mesh, name=str(path))
@@ -201,7 +201,7 @@ def wavefront(pieces: list[Mesh]) -> str:
 
 @contextmanager
 def _reading(path: Path, fault: str = "damaged or cut short") -> Iterator[None]:
-    """Turn whatever a reader stumbles over into an SdfsimError."""
+    """Turn any error of a reader into an SdfsimError."""
     try:
         yield
     except Exception as error:

@@ -154,7 +154,7 @@ def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
 def _revolve(profile: np.ndarray, segments: int) -> Mesh:
     """The solid of a profile [K, 2] of (radius, z), both ends on the axis, turned about z."""
     rings = np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
-    # On the axis all turns of a point are one vertex and half of each quad vanishes: `clean` sees to both.
+    # On the axis all turns of a point are one vertex and half of each quad vanishes; `clean` handles both.
     return _tube(rings, len(profile) - 1)
 
 

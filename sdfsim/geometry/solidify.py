@@ -165,7 +165,7 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.
         faces, volume = faces[:, ::-1], -volume
     inverted = (volume < 0)[label]
     if inverted.any() and not inverted.all():
-        # At most some points of each: a body that reaches out of all others is no cavity.
+        # At most 16 points of each: a body that reaches out of all others is not a cavity.
         chosen = np.flatnonzero(inverted)
         chosen = chosen[np.argsort(label[chosen], kind="stable")]
         chosen = chosen[np.arange(len(chosen)) - np.searchsorted(label[chosen], label[chosen]) < 16]

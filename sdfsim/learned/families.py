@@ -76,10 +76,10 @@ def _endless(shape: Shape) -> bool:
 
 @dataclass(frozen=True)
 class Family:
-    """What is a network's own beside its weights."""
+    """Everything but weights that is specific to one network."""
 
     layout: Layout  # of its graphs
-    # a shape, with the nodes (at most so many, None for all) that the network works on
+    # the shape with the nodes that the network works on (at most a number of them, None for all)
     surface: Callable[[Shape, int | None], Shape]
     # what of the bodies is near what, for bodies, state, gravity, reach, time step and the compiled scene of a run
     near: Callable[[BodyTensors, StateTensors, np.ndarray, float, float, Compiled | None], Contacts | Pairs]

@@ -133,7 +133,7 @@ class ImpulseNetwork(nn.Module):
             change = layer.impulse(hidden, friction) * weight[..., None]
             added = added + change * (frames.speed * frames.mass[:, : added.shape[1]])[..., None]
             twist = pushed(graph, frames, added, start)
-            if number < len(self.rounds):  # nobody reads what comes after the last round
+            if number < len(self.rounds):  # the last round's latents are not read
                 edge, body = layer.update(edge, body, hidden, weight, graph)
         if not alone:
             twist = pushed(graph, frames, bounded(graph, frames, added, start, trust), start)

@@ -43,7 +43,7 @@ def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:
     impulse = layer([r.normal_impulse for r in rounds])
     if friction:
         both = layer([r.normal_impulse for r in rounds], [r.tangent_impulse for r in rounds])
-        order = [0, 1, 2, 4, 3, 5]  # the tangential ones have both axes beside each other, here each has (end, mean)
+        order = [0, 1, 2, 4, 3, 5]  # tangential columns have both axes together, here each axis has (end, mean)
         impulse = compiled.Layer(*(np.ascontiguousarray(values[..., order]) for values in both))
     return compiled.Weights(
         encode=linear([network.encode]),  # type: ignore[arg-type]
@@ -86,7 +86,7 @@ def _blas() -> ThreadpoolController:
 
 
 def terms_of(options: Options, known: float, trust: float = 1.0) -> compiled.Terms:
-    """What is in play, for a network that knows steps of `known`, and that is trusted by 0 to 1 in what it adds."""
+    """The terms of a step for a network that was trained on steps of `known`; `trust` (0 to 1) scales what it adds."""
     return compiled.Terms(
         gravity=options.gravity, dt=options.dt, known=known, friction=options.friction,
         restitution=options.restitution, rotation=options.rotation, trust=trust, rest=REST_SPEED, calm=CALM,

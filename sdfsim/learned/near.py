@@ -91,7 +91,7 @@ class Pairs:
 
     @property
     def node(self) -> Tensor:
-        """[E] int64, the node of the first body that stands for the pair in recordings."""
+        """[E] int64, the node of the first body that represents the pair in recordings."""
         return self.first[:, 0]
 
     def renumbered(self, body: Tensor, node: Tensor) -> Pairs:
@@ -142,7 +142,7 @@ def near_pairs(
     on_second = torch.where(endless[:, None], on_first - below[:, None] * up, on_second)
     way = on_second - on_first
     distance = torch.where(endless, below, way.norm(dim=-1))
-    # Where surfaces cross there is no way between them; whatever moves there is near enough.
+    # Where surfaces cross, the distance is 0 and the direction is 0: these pairs are near at any speed.
     along = torch.where(endless[:, None], -up, way / distance.abs().clamp_min(1e-12)[:, None])
     approach = _speed_at(bodies, state, velocity, owner[a[:, 0]], on_first - _centre(place, arm, a))
     approach = approach - _speed_at(bodies, state, velocity, owner[b[:, 0]], on_second - _centre(place, arm, b))
@@ -166,7 +166,7 @@ def _centre(place: Tensor, arm: Tensor, part: Tensor) -> Tensor:
 
 
 def _speed_at(bodies: BodyTensors, state: StateTensors, velocity: Tensor, body: Tensor, arm: Tensor) -> Tensor:
-    """[E, 3] velocity of bodies [E] at `arm` [E, 3]; the speed of a plane is that of all of it."""
+    """[E, 3] velocity of bodies [E] at `arm` [E, 3]; a plane moves as a whole."""
     turning = torch.linalg.cross(state.angular_velocity[body], arm)
     return velocity[body] + torch.where(bodies.size[body].isfinite()[:, None], turning, 0.0)
 
@@ -198,7 +198,7 @@ def _near(bodies: BodyTensors, part: Tensor, owner: Tensor, place: Tensor, margi
     one, other = torch.where(endless[one], other, one), torch.where(endless[one], one, other)
     meet = ((lowest[one] <= highest[other]) & (highest[one] >= lowest[other])).all(-1) & bodies.may_meet(one, other)
     one, other = one[meet], other[meet]
-    # Of each body only what is in the box of the other; then all of these against all of those.
+    # Of each body the parts in the box of the other; then all pairs of these.
     pair, first = _inside(start, one, low, high, lowest[other], highest[other])
     number, second = _inside(start, other, low, high, lowest[one], highest[one])
     begins = torch.searchsorted(number, torch.arange(len(one) + 1, device=number.device))

@@ -18,7 +18,7 @@ LABELS = {
     "friction": "friction of two bodies, multiplied",
     "restitution": "restitution of two bodies, multiplied",
 }
-# Part of its largest side by which bodies start inside one another in the training data at most.
+# Deepest start of one body in another in the training data, over its largest side.
 DEEPEST = 0.16
 SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
 
@@ -52,7 +52,7 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
 
 
 def _values(scene: Scene, units: Units) -> dict[str, list[float]]:
-    """What a scene has of each quantity of `LABELS`; nothing where nothing moves by itself."""
+    """The values of each quantity of `LABELS` in a scene; none where no body is dynamic."""
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     if not moving:
         return {}
@@ -82,7 +82,7 @@ def _products(scene: Scene, name: str) -> list[float]:
 
 def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
     """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
-    Bodies have `names` [N]; a model unit is so many `metres`."""
+    Bodies have `names` [N]; a model unit is `metres` m."""
     from sdfsim.physics.solver.prepare import Compiled, nodes_near  # numba takes its time to load
 
     index, value = nodes_near(Compiled(bodies, state), state, np.zeros(3), reach=0.0, dt=0.0)

@@ -2,7 +2,7 @@
 
 The solve follows a recording step by step, every step from where the recording has the bodies. So training needs
 neither signed distances nor the solve itself, only torch and numpy. Disturbed starts are solved as well: in a rollout a
-network meets states that are a little beside what is recorded.
+network meets states that differ a little from recorded ones.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class ContactFrames:
         return cls(**arrays)
 
     def digest(self) -> str:
-        """Changes with what is trained on."""
+        """Changes with the training data."""
         digest = hashlib.sha256(f"{self.dt}".encode())
         for field in fields(self):
             if field.name not in ("dt", "trajectories"):

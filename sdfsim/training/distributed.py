@@ -25,7 +25,7 @@ class Team:
 
     @contextmanager
     def in_turn(self) -> Iterator[None]:
-        """The first goes first, the others together after it."""
+        """The first process runs the block alone, then the others run it together."""
         if not self.leads:
             self.wait()
         yield
@@ -33,11 +33,11 @@ class Team:
             self.wait()
 
     def share(self, count: int) -> slice:
-        """This one's part of a batch of `count`."""
+        """This process's part of a batch of `count`."""
         return slice(self.rank * count // self.size, (self.rank + 1) * count // self.size)
 
     def total(self, value: float, device: torch.device) -> float:
-        """The sum of everybody's `value`."""
+        """The sum of `value` over all processes."""
         if self.size == 1:
             return value
         whole = torch.tensor([value], dtype=torch.float64, device=device)
@@ -45,7 +45,7 @@ class Team:
         return float(whole)
 
     def add_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Replace everybody's gradients by their sum."""
+        """Replace the gradients of every process by their sum."""
         if self.size == 1:
             return
         gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
@@ -54,7 +54,7 @@ class Team:
         nn.utils.vector_to_parameters(flat, gradients)
 
     def wait(self) -> None:
-        """Until everybody has got here."""
+        """Wait for all processes."""
         if self.size > 1:
             torch.distributed.barrier()
 

@@ -15,7 +15,7 @@ class Preset:
     batch: int  # contact frames (impulse) or recorded steps (others) a step
     rate: float  # peak learning rate of Adam; it falls to a hundredth along a cosine
     reach: float = 0.1  # m, contact radius D
-    # surface nodes a body of networks on surface nodes (meshes: about so many vertices); None for all
+    # surface nodes of a body (of meshes: about this number of vertices); None for all
     nodes: int | None = None
     noise: float | None = None  # m, standard deviation of their pose noise (None: none); *impulse* has its own
     # peak learning rate of Muon, which then trains the hidden matrices; None leaves all to Adam, as published

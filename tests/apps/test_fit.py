@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from joblib import parallel_config
 from typer.testing import CliRunner
 
 import cli
@@ -18,7 +19,7 @@ from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.sdf.baked_grid import baked
-from sdfsim.shape.make import mesh_shape, shape_from_mesh
+from sdfsim.shape.make import mesh_shape, remarks, shape_from_mesh
 from sdfsim.shape.shape import load_shape
 
 
@@ -74,13 +75,12 @@ def test_units_are_those_of_a_scene_file_and_odd_sizes_are_told(tmp_path: Path) 
         told = CliRunner().invoke(cli.app, options).stdout
         assert ((out / "shape.json").stat().st_mtime_ns == before) == same
     assert "it is 40 m wide in metres; if its unit is millimetres, give --units mm" in told
-    for size, units, note in ((4.9, [], ""), (5.1, [], "it is 5.1 m wide"), (80.0, ["m"], ""), (5.1, ["mm"], "")):
-        file.write_bytes(write_ply(primitives.box((size, 1.0, 1.0))))
-        told = CliRunner().invoke(cli.app, [*arguments[:-2], *(["--units", *units] if units else [])]).stdout
+    for size, metres, given, note in (
+        (4.9, 1.0, False, ""), (5.1, 1.0, False, "it is 5.1 m wide"), (80.0, 1.0, True, ""), (5.1, 0.001, True, ""),
+        (400.0, 1.0, True, "it is 400 m wide; if that is wrong, give the file's unit with --units"),
+    ):  # fmt: skip
+        told = "\n".join(remarks(file, primitives.box((size, 1.0, 1.0)), metres, given=given))
         assert ("--units" in told) == bool(note) and note in told
-    file.write_bytes(write_ply(primitives.box((200.0, 300.0, 400.0))))
-    said = CliRunner().invoke(cli.app, [*arguments[:-2], "--units", "m"]).stdout
-    assert "it is 400 m wide; if that is wrong, give the file's unit with --units" in said
 
 
 def test_an_error_names_the_mesh_and_not_the_folder(tmp_path: Path) -> None:
@@ -133,7 +133,8 @@ def where(number: int) -> tuple[int, int, int]:
 def test_work_is_spread_over_processes_of_one_thread() -> None:
     import os
 
-    found = dict(parallel(where, [(n,) for n in range(6)]))
+    with parallel_config(backend="loky"):
+        found = dict(parallel(where, [(n,) for n in range(6)]))
     assert [found[n][0] for n in range(6)] == [n * n for n in range(6)]
     assert all(pid != os.getpid() and threads == 1 for _, pid, threads in found.values())
     assert list(parallel(where, [])) == []
