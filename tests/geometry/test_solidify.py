@@ -292,7 +292,7 @@ def prism_of(sides: int, across: float = 1.0) -> Mesh:
     )
 
 
-@pytest.mark.parametrize("sides", [255, 719])
+@pytest.mark.parametrize("sides", [255, pytest.param(719, marks=pytest.mark.slow)])
 def test_long_thin_triangles_take_no_time(sides: int) -> None:
     mesh = prism_of(sides)
     assert len(mesh.faces) in (1020, 2876)
