@@ -26,7 +26,7 @@ from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, Trained, Trainer, camera_rays, load_rays, save_field, train
 from sdfsim.base.errors import SdfsimError
-from tests.helpers.fields import SMALL, UNIT, one_thread, posed_noise, toy_rays  # noqa: F401  a fixture
+from tests.helpers.fields import SMALL, UNIT, posed_noise, toy_rays
 from tests.helpers.sparse import NOTHING
 
 
