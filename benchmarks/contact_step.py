@@ -15,8 +15,10 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 if __name__ == "__main__":
@@ -25,7 +27,7 @@ if __name__ == "__main__":
 import numpy as np
 
 from benchmarks.results import in_turn, script, write_section
-from benchmarks.scale import FAR, apart, with_far, with_nodes_cut
+from benchmarks.scale import apart, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json
@@ -33,7 +35,7 @@ from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
-from sdfsim.evaluation.harness import markdown, number
+from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
@@ -45,6 +47,16 @@ SLACK = 0.35  # of a ratio: what machines and their load make of it
 TRAJECTORIES, STEPS = 10, 100
 BALLS, FALL = (16, 512), 200
 GROWN = (256, 512)  # bodies far apart
+SLIDE = 100  # steps of a body beside static ones
+FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static bodies, and where
+
+
+def with_far(count: int) -> Scene:
+    """One box that slides on the floor, and static ones far away."""
+    scene = apart(count + 1)
+    mover, *others, floor = scene.bodies
+    still = [replace(b, motion="static", mass=0.0, position=b.position + FAR_OFF) for b in others]
+    return replace(scene, bodies=(replace(mover, velocity=np.array([-1.0, 0.0, 0.0])), *still, floor))
 
 
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
@@ -77,6 +89,21 @@ def bowl(count: int, folder: Path) -> tuple[float, float]:
     return bullet(start, FALL)[1].wall_ms, solved(scene, FALL)
 
 
+@one_thread()
+def user_steps(model: str) -> tuple[float, float]:
+    """Milliseconds a step of `Simulator`, whose Python looks at all bodies, beside few and many static bodies."""
+    taken = []
+    for count in FAR:
+        simulator = Simulator(with_far(count), model)
+        simulator.options = replace(simulator.options, sleep=False)
+        simulator.step(2)  # not timed: it loads what is compiled
+        simulator.reset()
+        began = time.process_time()
+        deque(simulator.steps(SLIDE), maxlen=0)
+        taken.append(1e3 * (time.process_time() - began) / SLIDE)
+    return taken[0], taken[1]
+
+
 def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable[[], tuple[float, float]]]]:
     """What is compared, by name: what the two are called, and a call that gives the milliseconds a step of both."""
     found: dict[str, tuple[str, str, Callable[[], tuple[float, float]]]] = {}
@@ -92,6 +119,9 @@ def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable
     both("64 knots", ("half of the nodes", with_nodes_cut(heap, 0.5)), ("all", heap), 60)
     both("boxes far apart", *((str(n), apart(n)) for n in GROWN), 50)
     both("static boxes far away", *((str(n), with_far(n)) for n in FAR), 500)
+    for model in ("solver", "small"):
+        few, many = (str(n) for n in FAR)
+        found[f"the same with all of `Simulator`, {model}"] = (few, many, partial(user_steps, model))
     return found
 
 

@@ -6,8 +6,6 @@
         heaps, shoes and knots to the end on all cores, each with a movie
     python benchmarks/scale.py many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
-    python benchmarks/scale.py scenery [--repeats 7]
-        one body that moves beside static ones far away, with all that a user's step does
 
 Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
 holds is not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
@@ -22,7 +20,6 @@ import sys
 import time
 from collections import deque
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.engines import in_metres
-from benchmarks.results import in_turn, progress, script, spread, write_section
+from benchmarks.results import progress, script, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
@@ -53,8 +50,6 @@ BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
 PARTS = (16, 4, 1)  # of the nodes of a knot
 DISTINCT, CHUNK, STEPS = 100, 10, 96  # scenes that differ, scenes of a job, steps of a scene
-FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static bodies, and where
-SLIDE = 100  # steps of what slides past them
 COLUMNS = {"ms": "ms a step", "peak_mib": "MiB", "contacts": "contacts", "depth_95": "deepest 95 %, mm", "lost": "lost"}
 
 
@@ -63,14 +58,6 @@ def apart(count: int) -> Scene:
     side = int(np.ceil(count**0.5))
     places = [[3.0 * (k % side), 3.0 * (k // side), 0.5] for k in range(count)]
     return on_floor([box(1.0)], [body(f"b{k}", 0, place) for k, place in enumerate(places)])
-
-
-def with_far(count: int) -> Scene:
-    """One box that slides on the floor, and static ones far away."""
-    scene = apart(count + 1)
-    mover, *others, floor = scene.bodies
-    still = [replace(b, motion="static", mass=0.0, position=b.position + FAR_OFF) for b in others]
-    return replace(scene, bodies=(replace(mover, velocity=np.array([-1.0, 0.0, 0.0])), *still, floor))
 
 
 def with_nodes_cut(scene: Scene, keep: float) -> Scene:
@@ -228,26 +215,5 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {scenes}", markdown(rows))
 
 
-@one_thread()
-def scenery(*, repeats: int = 7) -> None:
-    """Write the section: milliseconds of a step through `Simulator.steps` beside few and many static bodies."""
-    rows = [("a step of", *(f"ms beside {count:,}" for count in FAR), "times as long")]
-    for model in ("solver", "small"):
-        simulators = [Simulator(with_far(count), model) for count in FAR]
-        for simulator in simulators:
-            simulator.options = replace(simulator.options, sleep=False)
-        times = in_turn([partial(slid, simulator) for simulator in simulators], repeats)
-        rows.append((f"`{model}`", *map(number, np.median(times, axis=0)), spread(times[:, 1] / times[:, 0])))
-    write_section("scenery", "python benchmarks/scale.py scenery", markdown(rows))
-
-
-def slid(simulator: Simulator) -> float:
-    """Milliseconds a step of the processor, from the start of the scene."""
-    simulator.reset()
-    began = time.process_time()
-    deque(simulator.steps(SLIDE), maxlen=0)
-    return 1e3 * (time.process_time() - began) / SLIDE
-
-
 if __name__ == "__main__":
-    script(__doc__, growth, large, many, scenery)
+    script(__doc__, growth, large, many)

@@ -403,7 +403,7 @@ def run(*arguments: object):
     return CliRunner().invoke(cli.app, ["export", *map(str, arguments)])
 
 
-def test_the_command_tells_what_it_wrote_and_what_it_left_out(dropped, tmp_path):
+def test_the_command_reports_what_it_wrote_and_what_it_left_out(dropped, tmp_path):
     done = run(dropped.folder, "-o", tmp_path / "new" / "run.urdf", "--allow-outside", "--json")
     assert done.exit_code == 0, done.stderr
     report = json.loads(done.stdout)

@@ -61,7 +61,7 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
     assert report["shapes"]["box"]["error_in_box"] == load_shape(out / "box").certificate["error_in_box"]
 
 
-def test_units_are_those_of_a_scene_file_and_odd_sizes_are_told(tmp_path: Path) -> None:
+def test_units_are_those_of_a_scene_file_and_odd_sizes_are_reported(tmp_path: Path) -> None:
     size, file, out = np.array([20.0, 30.0, 40.0]), tmp_path / "box.ply", tmp_path / "box"
     file.write_bytes(write_ply(primitives.box((20.0, 30.0, 40.0))))
     arguments = ["fit", str(file), "-o", str(out), "--budget", "0.1s", "--device", "cpu", "--units", "cm"]
@@ -95,7 +95,7 @@ def test_an_error_names_the_mesh_and_not_the_folder(tmp_path: Path) -> None:
             shape_from_mesh(tmp_path / "holed.ply", tmp_path / "cache", sdf=kind)
 
 
-def test_a_turned_gltf_is_told(tmp_path: Path) -> None:
+def test_a_turned_gltf_is_reported(tmp_path: Path) -> None:
     mesh_shape(primitives.box((0.3, 0.2, 0.1)), name="box", kind="mesh").save(tmp_path / "box")
     done = CliRunner().invoke(cli.app, ["export", str(tmp_path / "box"), "-o", str(tmp_path / "box.glb")])
     assert "z up is turned to glTF's y up" in done.stdout

@@ -82,7 +82,7 @@ def test_what_a_motion_does_not_show_is_not_made_up(recorded, tmp_path):
     assert found["own_friction"]["box"]["value"] == pytest.approx(BOX["friction"], abs=0.01)
 
 
-def test_a_body_that_only_falls_tells_nothing(recorded, tmp_path):
+def test_a_body_that_only_falls_shows_nothing(recorded, tmp_path):
     scene = load_scene(recorded / "known.yaml")
     up = np.array([0.0, 0.0, 50.0])
     high = tuple(replace(b, position=b.position + up, velocity=up) for b in scene.bodies[1:])

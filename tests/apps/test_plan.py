@@ -45,7 +45,7 @@ def told(scene: Path, model: str) -> dict:
     return describe(scene, model=model, device="cpu", on_progress=lambda *_: None)
 
 
-def test_plan_tells_all_there_is_to_know(scene, model):
+def test_a_plan_reports_effects_pairs_and_costs(scene, model):
     report = told(scene, model)
     assert [name for name, e in report["effects"].items() if not e["on"]] == ["restitution"]
     assert (report["static"], report["kinematic"]) == (["floor"], ["lift"]) and len(report["dynamic"]) == 3

@@ -108,7 +108,7 @@ def test_a_movie_has_its_frames_and_ends_as_the_picture_of_the_end(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["fall.mp4", "fall.png"]
 
 
-def test_the_end_of_a_run_tells_who_rests_who_moves_and_who_is_gone():
+def test_the_end_of_a_run_reports_who_rests_who_moves_and_who_is_gone():
     scene = sdfsim.Scene(duration=2.5).add("slope", plane={"normal": (0.1, 0, 1)}, friction=1.0)
     scene.add("block", box={"size": (0.1, 0.1, 0.05)}, position=(0, 0, 0.03), friction=0.8, restitution=0.0)
     scene.add("ball", sphere={"radius": 0.05}, position=(0, 0.4, 0.06), friction=0.8, restitution=0.0)

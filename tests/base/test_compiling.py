@@ -80,7 +80,7 @@ def test_a_run_says_nothing_of_threading_layers():
     assert "TBB" not in ended.stderr and "something else" in ended.stderr
 
 
-def test_what_is_compiled_already_is_not_told(caplog):
+def test_what_is_compiled_already_is_not_reported(caplog):
     assert pytest.importorskip("numba")
     sim = Simulator(Scene((analytic_shape("sphere", radius=0.5),), (make_body("a", 0, [0, 0, 1]),), np.zeros(3), 1.0))
     sim.step(1)

@@ -161,7 +161,7 @@ def test_a_report_that_cannot_be_written_is_one_line():
     [("--model", "gigantic"), ("--device", "cuda"), ("--viewer", "native")],
     ids=lambda option: option[0],
 )
-def test_what_is_wrong_from_the_start_is_told_before_work_and_deletes_nothing(
+def test_what_is_wrong_from_the_start_is_reported_before_work_and_deletes_nothing(
     scene, model, tmp_path, monkeypatch, wrong
 ):
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -72,7 +72,7 @@ def test_the_floor_is_what_the_dataset_says_else_the_recipes():
             floor_of({"floor": told}, Path("data"))
 
 
-def test_a_split_is_recorded_as_its_dataset_tells(tmp_path):
+def test_a_split_is_recorded_as_its_dataset_says(tmp_path):
     (tmp_path / "test").mkdir()
     assert conditions_of(tmp_path / "test") == Conditions(*FLOOR, floor_given=False, by_teacher=False)
     told = {"engine": "pybullet", "engine_settings": engine_settings(1 / 240, 1)}

@@ -75,7 +75,7 @@ def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
     np.testing.assert_allclose(motion.velocity[-1, high, 2], fallen, atol=1e-6)
 
 
-def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_tells_it(tmp_path):
+def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_has_it(tmp_path):
     start = start_of_scene(hard_cases.tower(2), tmp_path)
     bullet(replace(start, own_inertia=False), 2)
     doubled = replace(start.motion, inertia=2 * start.motion.inertia)

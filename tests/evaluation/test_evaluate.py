@@ -131,7 +131,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize(("friction", "other"), [(0.05, 0.3), (0.15, 0.05), (0.0, 0.3)])
-def test_the_floor_is_the_one_that_dataset_json_tells(tmp_path, friction, other):
+def test_the_floor_is_that_of_dataset_json(tmp_path, friction, other):
     told = {"engine": "mine", "floor": {"friction": friction, "restitution": 0.0}}
     data = slab_data(tmp_path, "test", sliding(friction), told)
     report = evaluate(data, errors_only=True)

@@ -120,7 +120,7 @@ def test_a_convex_mesh_is_its_own_piece(tmp_path):
     assert np.linalg.norm(piece, axis=1) == pytest.approx(0.5, abs=1e-3)
 
 
-def test_a_motion_that_mujoco_gives_up_is_told(tmp_path, monkeypatch):
+def test_a_motion_that_mujoco_gives_up_is_reported(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     start = engines.start_of_scene(scene_of(Put("it", CUBE, [0, 0, 2]), floor()), tmp_path / "files")
     start.motion.velocity[:] = 1e12  # m/s
@@ -199,7 +199,7 @@ def test_drake_knows_no_restitution_and_one_friction_of_all_that_move():
     assert unknown_to("PyBullet", scene_of(a, replace(b, mu=0.4, e=0.3), floor())) == ""
 
 
-def test_the_table_has_our_losses_first_and_tells_what_is_absent():
+def test_the_table_has_our_losses_first_and_names_what_is_absent():
     def found(held: list[str], missed: list[str], **not_run: int) -> dict:
         return {"held": held, "missed": missed, "not_run": not_run, "s": 1.0}
 

@@ -86,7 +86,7 @@ def test_penetration_is_the_overlap_of_two_cubes_and_of_one_with_the_floor():
     assert (depths(apart, motion(apart, 5).motion, every=5) == 0).all()
 
 
-def test_separation_tells_the_fastest_speed_and_what_is_left():
+def test_separation_gives_the_fastest_speed_and_what_is_left():
     scene = hard_cases.overlapping(hard_cases.box(1.0), hard_cases.box(1.0), 0.5)
     speed = {1: np.stack([[3.0 * np.sin(k / 50 * np.pi), 0, 0] for k in range(51)])}
     found = hard_cases.separated([motion(scene, 50, {1: line(50, x=0.3)}, speed)])

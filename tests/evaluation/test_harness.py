@@ -51,7 +51,7 @@ def test_results_are_made_again_when_the_compiled_step_is_another_one(tmp_path, 
         assert ran.read_text().count("ran") == expected
 
 
-def test_failures_are_told_and_tried_again(tmp_path):
+def test_failures_are_reported_and_tried_again(tmp_path):
     ran, seen = tmp_path / "ran", []
     jobs = [Job("case", name, [], noted, (ran, value)) for name, value in (("good", 1.0), ("bad", -1.0))]
     for _ in range(2):

@@ -68,7 +68,7 @@ def test_a_springs_push_is_the_gain_and_scenery_has_no_part_in_it():
     assert energy_gain([replace(still, position=0.0 * still.position)]) == {"mean": None, "worst": None}
 
 
-def test_what_rests_is_told_by_displacement_in_the_last_steps():
+def test_what_rests_is_reported_by_displacement_in_the_last_steps():
     """Ball 0 creeps at 0.02 m/s, 1 stops only in the end, 2 is scenery; recorded velocities say nothing of it."""
     step = np.zeros((30, 3, 3))
     step[:, 0, 0] = 0.02 * 0.02

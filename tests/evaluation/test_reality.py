@@ -146,7 +146,7 @@ def test_a_toss_that_ends_on_another_face_counts_as_far():
     assert cost(Poses(truth.position, turned), truth) == pytest.approx(10.0)
 
 
-def test_no_recordings_are_told(tmp_path):
+def test_no_recordings_are_reported(tmp_path):
     with pytest.raises(SdfsimError, match=r"cube\.npz: cannot be read"):
         load_tosses(tmp_path)
     np.savez(tmp_path / "cube.npz", start=[0, 3], dt=DT, position=np.zeros((3, 3)))

@@ -23,7 +23,7 @@ def test_no_ratio_of_timings_slips_back():
     assert ended.returncode == 0, ended.stderr
 
 
-def test_a_ratio_that_grew_by_half_is_told():
+def test_a_ratio_that_grew_by_half_is_reported():
     kept = read_json(RATCHET)
     slower = {name: 1.5 * ratio for name, ratio in kept.items()}
     assert slipped_back(kept, kept) == [] and len(slipped_back(slower, kept)) == len(kept) >= 5

@@ -449,7 +449,7 @@ def test_what_a_gltf_needs_and_is_not_read_is_named(tmp_path: Path, name: str) -
     check_block(load_mesh(file.write(tmp_path / "a.gltf")))
 
 
-def test_a_buffer_that_only_an_extension_fills_is_told(tmp_path: Path) -> None:
+def test_a_buffer_that_only_an_extension_fills_is_reported(tmp_path: Path) -> None:
     file = block(extensionsUsed=["EXT_meshopt_compression"])
     file.header["bufferViews"][0] |= {"buffer": 1, "extensions": {"EXT_meshopt_compression": {"buffer": 0}}}
     path = file.write(tmp_path / "a.gltf")

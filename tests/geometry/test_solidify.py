@@ -292,7 +292,7 @@ def prism_of(sides: int, across: float = 1.0) -> Mesh:
     )
 
 
-@pytest.mark.parametrize("sides", [255, 719])
+@pytest.mark.parametrize("sides", [255, pytest.param(719, marks=pytest.mark.slow)])
 def test_long_thin_triangles_take_no_time(sides: int) -> None:
     mesh = prism_of(sides)
     assert len(mesh.faces) in (1020, 2876)
@@ -329,7 +329,7 @@ def test_cutting_keeps_area_and_edges_that_match() -> None:
         assert is_closed(Mesh(pieces.reshape(-1, 3), label.reshape(-1, 3)))
 
 
-def test_rays_tell_how_often_a_surface_goes_around_a_point() -> None:
+def test_rays_count_how_often_a_surface_goes_around_a_point() -> None:
     inner = primitives.box((0.4, 0.4, 0.4))
     nested = both(CUBE, inner, moved(prism_of(100), 0.6, 0.0, 0.0))
     points = query()

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from pipeline.cameras import PosedPhotos, Similarity, Sparse, View
@@ -34,14 +33,6 @@ def toy_rays(count: int = 2000) -> Rays:
         torch.tensor([[60.0, 20, 20, 0]] * 2), torch.tensor(np.stack([np.eye(3), turn]), dtype=torch.float32),
         torch.tensor([[0.0, 0, -3], [0, 0, 3]]), torch.tensor([[40, 40]] * 2),
     )  # fmt: skip
-
-
-@pytest.fixture
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def posed_noise(folder: Path) -> PosedPhotos:

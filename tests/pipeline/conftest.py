@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from pipeline import stages
 from tests.helpers.photos import RESULTS, noise
@@ -45,3 +46,11 @@ def calls(act) -> list[str]:
     for name in stages.STAGES:
         act(name, action(name))
     return done
+
+
+@pytest.fixture
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

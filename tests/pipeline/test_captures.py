@@ -204,7 +204,7 @@ def test_scale_and_gravity_come_from_the_capture():
     assert isinstance(placement.to_metres, Similarity)
 
 
-def test_what_is_no_capture_is_told(tmp_path):
+def test_what_is_no_capture_is_reported(tmp_path):
     broken = tmp_path / "a.r3d"
     broken.write_text("no zip")
     out = tmp_path / "out"

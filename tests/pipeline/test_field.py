@@ -140,7 +140,7 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
 
 
 @pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "no numbers", "a tensor less", "another field"])
-def test_a_checkpoint_that_cannot_be_read_is_told_and_leaves_nothing_behind(tmp_path, damage, one_thread):
+def test_a_checkpoint_that_cannot_be_read_is_reported_and_leaves_nothing_behind(tmp_path, damage, one_thread):
     path, before, run, untouched = tmp_path / "c.safetensors", trainer(), trainer(), trainer()
     before.step()
     before.save(path)

@@ -148,7 +148,7 @@ def test_cropping_leaves_the_frame_and_what_is_within(mesh):
         mesh(crop=[5.0, 5, 5, 6, 6, 6])
 
 
-def test_lengths_are_told_to_six_digits_of_the_largest():
+def test_lengths_are_reported_to_six_digits_of_the_largest():
     np.testing.assert_array_equal(rounded([1234567.8, -3.24, 0.0]), [1234570.0, 0.0, 0.0])
     np.testing.assert_array_equal(rounded([2 / 3, -1e-17, 1e-4 / 3]), [0.666667, 0.0, 3.3e-05])
     assert rounded(2e-6 / 3) == 6.66667e-07 and rounded(0.0) == 0.0 and rounded(100.0) == 100.0
@@ -219,7 +219,7 @@ def test_photos_that_something_unknown_stands_before_do_not_count():
         ("hard equations", "not solved in 1 steps"),
     ],
 )
-def test_a_body_that_cannot_be_moved_stays_and_it_is_told_why(case, words, monkeypatch):
+def test_a_body_that_cannot_be_moved_stays_and_it_is_reported_why(case, words, monkeypatch):
     body, pictures = ball_and_photos()
     if case == "two photos":
         pictures = pictures[:2]

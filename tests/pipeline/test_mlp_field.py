@@ -12,7 +12,7 @@ from pipeline.field.mlp_field import MlpField, MlpSize, encoded
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, MlpTrainer, Trained, Trainer, load_field, save_field
-from tests.helpers.fields import UNIT, one_thread, toy_rays  # noqa: F401  a fixture
+from tests.helpers.fields import UNIT, toy_rays
 from tests.helpers.sparse import NOTHING
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
@@ -94,7 +94,7 @@ def test_beta_is_learned():
     assert run.beta != before and run.beta > 0
 
 
-def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):  # noqa: F811
+def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
     whole, first, second = trainer(), trainer(), trainer()
     for _ in range(6):
         whole.step()

@@ -351,7 +351,7 @@ def test_deep_photos_of_one_set_keep_their_brightness_beside_each_other(tmp_path
     assert np.abs(found[0] - EIGHT).mean() < 2 and np.abs(found[1] - 0.24 * EIGHT).mean() < 2
 
 
-def test_dark_photos_are_told_apart_from_blurred_ones(tmp_path):
+def test_dark_photos_are_reported_apart_from_blurred_ones(tmp_path):
     fill(tmp_path / "in")
     for name, factor in (("dark", 0.05), ("dim", 0.4)):
         Image.fromarray((factor * np.asarray(picture())).astype(np.uint8)).save(tmp_path / "in" / f"{name}.png")

@@ -136,7 +136,7 @@ def test_what_is_wrong_with_the_photos(found, words):
     ("first", "words"),
     [({**result(10, 0), "turn_only": 0.8}, "from one spot"), (result(10, 0, still=0.9), "turntable")],
 )
-def test_how_the_camera_moved_is_told_by_the_ordinary_matches(first, words):
+def test_how_the_camera_moved_is_reported_by_the_ordinary_matches(first, words):
     verdict = check(result(10, 3), PHOTOS, first)
     assert words in verdict["causes"][0]
     assert words not in check(result(10, 3), PHOTOS)["causes"][0]
@@ -424,7 +424,7 @@ def test_photos_without_a_pose_are_left_unexplained():
     assert contradicting(seven) == 0 and views[7]["name"] not in excess_of_photos(seven)
 
 
-def test_zooms_are_told_apart_by_the_focal_lengths_of_each_photo_alone():
+def test_zooms_are_reported_apart_by_the_focal_lengths_of_each_photo_alone():
     from pipeline.sfm.worker import zooms_of
 
     focals = {"a": 700.0, "b": 1030.0, "c": 680.0, "d": 1060.0, "e": 735.0}
@@ -432,7 +432,7 @@ def test_zooms_are_told_apart_by_the_focal_lengths_of_each_photo_alone():
     assert zooms_of([*"ace"], focals) == [["c", "a", "e"]] and zooms_of(["f"], focals) == [["f"]]
 
 
-def test_turning_on_the_spot_is_told_from_walking():
+def test_turning_on_the_spot_is_reported_from_walking():
     from pipeline.sfm.worker import turn_only
 
     rng = np.random.default_rng(0)

@@ -68,7 +68,7 @@ def test_a_run_that_stopped_says_where_and_why(photos, tmp_path, act):
         (Options(preset="standard", budget=60.0), "a larger --budget"),
     ],
 )
-def test_nobody_is_told_to_do_what_they_did(options, said, photos, tmp_path, act):
+def test_nobody_is_reported_to_do_what_they_did(options, said, photos, tmp_path, act):
     (line,) = improvements({"poses": {}, "stages": {}, "photos": [], "psnr": 12.0, "failed_checks": []}, options)
     assert said in line and f"--preset {options.preset}" not in line
 

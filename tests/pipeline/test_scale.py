@@ -104,7 +104,7 @@ def test_a_pixel_is_followed_through_the_lens(views, photos):
     assert scale[0] == pytest.approx(METRES, rel=1e-3)
 
 
-def test_photos_of_the_same_name_have_to_be_told_apart(views, photos):
+def test_photos_of_the_same_name_have_to_be_reported_apart(views, photos):
     photos = [replace(photo, source=f"cam{k}/1.jpg") for k, photo in enumerate(photos)]
     apart = float(np.linalg.norm(views[0].center - views[2].center))
     known = ["cam0/1.jpg", "cam2/1.jpg", METRES * apart]

@@ -286,7 +286,7 @@ def test_a_few_pictures_in_a_folder_images_do_not_take_the_place_of_the_photos(t
     assert names_of(tmp_path) == names
 
 
-def test_it_is_told_where_photos_are_if_they_lie_deeper(tmp_path):
+def test_it_is_reported_where_photos_are_if_they_lie_deeper(tmp_path):
     noise(tmp_path / "card" / "DCIM" / "100", NAMES)
     noise(tmp_path / "card" / "DCIM" / "101" / "images", [*NAMES, "d.jpg"])
     with pytest.raises(SdfsimError, match=r"card: .*\b0\b.*3 in .*DCIM/100, 4 in .*DCIM/101$"):

@@ -176,7 +176,7 @@ def test_a_cup_and_the_vase_that_it_touches_come_apart_by_their_masks(pair, tmp_
     pair.check(found, {"cup": "cup", "vase": "vase"}, 0.5 * CELL, 0.02)
 
 
-def test_masks_of_one_of_two_leave_the_other_a_number_and_masks_of_nothing_are_told(pair, tmp_path):
+def test_masks_of_one_of_two_leave_the_other_a_number_and_masks_of_nothing_are_reported(pair, tmp_path):
     found = pair.split(tmp_path / "p", ("cup", "spoon"))
     assert list(found.bodies) == ["object1", "cup"] and found.missing == ["spoon"]
     pair.check(found, {"cup": "cup", "object1": "vase"}, 0.5 * CELL, 0.02)

@@ -71,7 +71,7 @@ def test_what_is_behind_something_is_guessed():
     assert sum(told["seen_by"]) == pytest.approx(1, abs=1e-3)
 
 
-def test_the_guessed_part_of_a_body_is_told():
+def test_the_guessed_part_of_a_body_is_reported():
     block = cube(0.4, (0, 0, 0.2))
     views = [look_at(np.array([2 * np.cos(a), 2 * np.sin(a), 1.2])) for a in np.arange(8) * np.pi / 4]
     found = evidence_of(Visibility(block, 1e-3, Caster(joined([block, plate(4)]))), views)

@@ -217,6 +217,6 @@ def test_bodies_by_how_they_move(scene):
         (PATH.replace("time: 2", "time: 0"), "bodies[1].path[1]: must be later than the pose before it"),
     ],
 )
-def test_faulty_paths_are_told(scene, fields, told):
+def test_faulty_paths_are_reported(scene, fields, told):
     with pytest.raises(SceneError, match=re.escape(told)):
         scene(fields)

@@ -65,7 +65,7 @@ def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit
         np.testing.assert_allclose(heights(scene), expected, atol=0.02, err_msg=key)
 
 
-def test_an_asset_keeps_its_own_sdf_unless_told_and_cannot_grow_a_network(load, tmp_path):
+def test_an_asset_keeps_its_own_sdf_unless_reported_and_cannot_grow_a_network(load, tmp_path):
     with_sdf(analytic_shape("box", size=(0.4, 0.4, 0.4)), "mesh").save(tmp_path / "crate")
     assert isinstance(load(falling_ball("{asset: crate}")).shapes[1].sdf, MeshSdf)
     (fault,) = problems_of(load, falling_ball("{asset: crate, sdf: mlp}"))

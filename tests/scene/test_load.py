@@ -37,7 +37,7 @@ BODY = [
 
 
 @pytest.mark.parametrize(("fields", "fault"), BODY)
-def test_a_wrong_body_is_told_with_its_line(load, fields, fault):
+def test_a_wrong_body_is_reported_with_its_line(load, fields, fault):
     text = f"{HEAD}  - {{name: a, shape: ball, {fields}}}\n  - {{name: floor, motion: static, plane: {{}}}}\n"
     found = problems_of(load, text)
     if fault is not None:
@@ -58,7 +58,7 @@ FILES = [
 
 
 @pytest.mark.parametrize(("text", "faults"), FILES)
-def test_a_wrong_file_is_told_with_its_line(load, text, faults):
+def test_a_wrong_file_is_reported_with_its_line(load, text, faults):
     found = problems_of(load, text)
     for fault in faults:
         assert any(line.startswith(fault) for line in found), found
@@ -81,14 +81,14 @@ TOP = [
 
 
 @pytest.mark.parametrize(("line", "fault"), TOP)
-def test_a_wrong_top_level_is_told_with_its_line(load, tmp_path, line, fault):
+def test_a_wrong_top_level_is_reported_with_its_line(load, tmp_path, line, fault):
     version = "" if line.startswith("version") else "version: 1\n"
     found = problems_of(load, f"# comment\n{version}{line}\nbodies:\n  - {{name: floor, plane: {{}}}}\n")
     where = "scene.yaml:2: " if not version else "scene.yaml:3: "
     assert any(f.startswith(where + fault.replace("FOLDER", str(tmp_path))) for f in found), found
 
 
-def test_every_fault_is_told_at_once_in_file_order(load):
+def test_every_fault_is_reported_at_once_in_file_order(load):
     found = problems_of(
         load,
         "version: 3\nduration: -1\nshapes:\n  ball: {sphere: {radius: 0.1}}\nbodies:\n"
@@ -117,14 +117,14 @@ def test_missing_files(tmp_path):
         load_scene(tmp_path / "scene.yaml")
 
 
-def test_a_broken_asset_is_told_at_its_line(load, tmp_path):
+def test_a_broken_asset_is_reported_at_its_line(load, tmp_path):
     (tmp_path / "cup").mkdir()
     found = problems_of(load, "version: 1\nshapes:\n  c: {asset: cup}\nbodies:\n  - {name: a, shape: c, mass: 1}\n")
     assert len(found) == 1 and found[0].startswith("scene.yaml:3: shapes.c.asset: ")
 
 
 @pytest.mark.parametrize("change", [{"volume": 0.0}, {"volume": -1.0}, {"nodes": np.zeros((0, 3))}])
-def test_a_shape_that_cannot_move_is_told_where_it_should(load, tmp_path, change):
+def test_a_shape_that_cannot_move_is_reported_where_it_should(load, tmp_path, change):
     replace(analytic_shape("box", size=(1, 1, 1)), **change).save(tmp_path / "cup")
     text = "version: 1\nshapes:\n  c: {asset: cup}\nbodies:\n  - {name: a, shape: c, mass: 1MOTION}\n"
     found = problems_of(load, text.replace("MOTION", ""))

@@ -41,14 +41,14 @@ def test_a_simulator_takes_it():
     assert rollout.position[-1, 1, 2] == pytest.approx(fall, abs=1e-9)
 
 
-def test_unknown_keys_are_told_at_once():
+def test_unknown_keys_are_reported_at_once():
     with pytest.raises(SceneError, match=r"body 'a': unknown key 'sphre' \(did you mean 'sphere'\?\)"):
         sdfsim.Scene().add("a", sphre={"radius": 1})
     with pytest.raises(SceneError, match=r"a scene: unknown key 'gravitiy' \(did you mean 'gravity'\?\)"):
         sdfsim.Scene(gravitiy=(0, 0, 0))
 
 
-def test_wrong_values_are_told_together_with_the_lines_that_print_shows():
+def test_wrong_values_are_reported_together_with_the_lines_that_print_shows():
     scene = sdfsim.Scene(duration=-1).add("a", sphere={"radius": "x"}, mass=float("nan")).add("b", shape="c")
     with pytest.raises(SceneError) as caught:
         scene.load()

@@ -62,7 +62,7 @@ def two_halves() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(("wall", "told"), [(0.002, True), (0.03, False)])
-def test_walls_that_no_grid_sees_are_told(wall, told, caplog):
+def test_walls_that_no_grid_sees_are_reported(wall, told, caplog):
     rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
     assert ContactGeometry(rod.sdf, rod.nodes, (), NOTHING).grid is not None
     assert ("things may pass through" in caplog.text) is told and "--thicken" not in caplog.text
@@ -100,7 +100,7 @@ def test_edges_are_thin():
 
 
 @pytest.mark.parametrize("wall", [0.001, 0.003])
-def test_a_hollow_solid_with_thin_walls_is_told_of(wall):
+def test_a_hollow_solid_with_thin_walls_is_reported_of(wall):
     outer = analytic_shape("box", size=(1.0, 0.8, 0.6)).mesh
     inner = analytic_shape("box", size=(1.0 - 2 * wall, 0.8 - 2 * wall, 0.6 - 2 * wall)).mesh
     faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)])

@@ -145,7 +145,7 @@ def test_a_ball_that_is_too_small_is_off_by_as_much_all_around() -> None:
     assert got["projected_from_0.1"] == pytest.approx(0.003, abs=1e-4)
 
 
-def test_slopes_and_the_far_field_are_told(cube: MeshDistance) -> None:
+def test_slopes_and_the_far_field_are_reported(cube: MeshDistance) -> None:
     got = certify(scaled_up(CUBE, 1.2), cube, points=2000)
     assert got["far_field_ratio"] == pytest.approx(1.2, abs=1e-5)
     assert got["gradient_within_0.1"] < 1e-6

@@ -118,7 +118,7 @@ def test_scaling_scales_everything() -> None:
 
 
 @pytest.mark.parametrize("layers", [0, -1, 1, 2, 4, 10**30, "3.5", None, [3], True])
-def test_layers_that_are_not_there_are_told(tmp_path: Path, layers) -> None:
+def test_layers_that_are_not_there_are_reported(tmp_path: Path, layers) -> None:
     folder = fitted().save(tmp_path / "shape")
     record = json.loads((folder / "shape.json").read_text())
     record["sdf"]["layers"] = layers
@@ -129,7 +129,7 @@ def test_layers_that_are_not_there_are_told(tmp_path: Path, layers) -> None:
 
 @pytest.mark.parametrize("key", ["name", "sdf", "volume", "com", "inertia", "certificate", "source", "pieces"])
 @pytest.mark.parametrize("value", [None, [], {}, 0, -1, "x", [[]], {"kind": []}, True])
-def test_whatever_a_record_holds_is_read_or_told(tmp_path: Path, key: str, value) -> None:
+def test_whatever_a_record_holds_is_read_or_reported(tmp_path: Path, key: str, value) -> None:
     folder = fitted().save(tmp_path / "shape")
     record = json.loads((folder / "shape.json").read_text()) | {key: value}
     (folder / "shape.json").write_text(json.dumps(record))

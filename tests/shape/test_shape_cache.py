@@ -74,7 +74,7 @@ def test_what_the_cache_knows_a_mesh_by_is_all_that_it_describes(tmp_path: Path,
     assert len(digests) == 3
 
 
-def test_a_fit_that_nobody_sees_is_told_once(tmp_path: Path, quick: None, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_fit_that_nobody_sees_is_reported_once(tmp_path: Path, quick: None, caplog: pytest.LogCaptureFixture) -> None:
     told = "making the shape cup, once for this mesh"
     (tmp_path / "cup.ply").write_bytes(write_ply(primitives.cone(segments=12)))
     text = "version: 1\nshapes: {cup: {mesh: cup.ply}}\nbodies: [{name: a, shape: cup, mass: 1}]\n"

@@ -108,7 +108,7 @@ def test_errors_at_a_frame_are_those_of_that_frame_alone():
 
 
 @pytest.mark.parametrize("floor", [(0.05, 0.2), (0.2, 0.7)])
-def test_frames_and_ranges_are_those_of_the_floor_that_dataset_json_tells(tmp_path, floor):
+def test_frames_and_ranges_are_those_of_the_floor_of_dataset_json(tmp_path, floor):
     told = {"engine": "mine", "floor": {"friction": floor[0], "restitution": floor[1]}}
     frames = contact_frames(slab_data(tmp_path, "train", sliding(floor[0]), told), "train", ONCE)
     assert len(frames) == 39

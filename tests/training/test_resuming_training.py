@@ -53,7 +53,7 @@ def test_what_the_card_needs_is_missed_before_training(frames_only, presets, tmp
     assert not (tmp_path / "run").exists()
 
 
-def test_frames_of_another_version_are_refused_where_nothing_else_tells_it(frames_only):
+def test_frames_of_another_version_are_refused_where_nothing_else_shows_it(frames_only):
     def change(arrays):
         arrays["version"] = np.array(contact_cache.FRAMES_VERSION - 1)
 

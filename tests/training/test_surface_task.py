@@ -118,7 +118,7 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
                 read(tmp_path / "data")
 
 
-def test_the_floor_of_a_batch_is_the_one_that_dataset_json_tells(tmp_path):
+def test_the_floor_of_a_batch_is_that_of_dataset_json(tmp_path):
     told = {"engine": "mine", "floor": {"friction": 0.7, "restitution": 0.1}}
     data = slab_data(tmp_path, "train", sliding(0.7), told)
     task = SurfaceTask(data, "train", SDF_SIM)
