@@ -41,9 +41,13 @@ bodies:
   - {name: gem, shape: gem, position: [-2.0, 0.01, 0.29], velocity: [0, 0, -2], mass: 1}
   - {name: cross, shape: cross, position: [-2.33, 0.02, 0.15], velocity: [0.5, 0, -1], mass: 1}
 """
+# The solve ends where impulses change little, and rounding would decide in which round: here it makes all of them.
 RUN = """
 import json, sys
 import sdfsim
+from sdfsim.physics.solver import prepare
+rules = prepare.compiled_rules
+prepare.compiled_rules = lambda options: rules(options)._replace(exact=0.0)
 simulator = sdfsim.Simulator(sdfsim.load_scene(sys.argv[1], allow_outside=True))
 state = simulator.step(int(sys.argv[2]))
 touching = sorted({name for point in simulator.contact_points() for name in (point.first, point.second)})
@@ -79,6 +83,5 @@ def test_uncompiled_kernels_stay_within_their_arrays_and_come_to_the_same(tmp_pa
     assert {"ring", "bowl", "slider", "drum", "gem", "cross", "left", "right"} <= set(compiled[2]) and plain[
         2
     ] == compiled[2]
-    # The solve ends where impulses change little: rounding decides in which round.
     np.testing.assert_allclose(plain[0], compiled[0], atol=1e-5)
     np.testing.assert_allclose(plain[1], compiled[1], atol=1e-4)

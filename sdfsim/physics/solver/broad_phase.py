@@ -97,7 +97,8 @@ def near_pairs(world, motion, low, high):
             if _overlap(low, high, a, world.low, world.high, k) and _may_meet(world, a, world.still[k]):
                 found, pairs = _append(found, pairs, a, world.still[k])
     found = found[:pairs]
-    return found[np.argsort(found[:, 0] * len(world.shape) + found[:, 1], kind="mergesort")]
+    # Floats, for which sorting is compiled already.
+    return found[np.argsort((found[:, 0] * len(world.shape) + found[:, 1]) * 1.0, kind="mergesort")]
 
 
 @njit(**FAST)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 from sdfsim.physics.solver.islands import islands_of
-from sdfsim.physics.solver.vectors import BARE, FAST, add, along, cross, dot, get, norm, scale, sub, turn, vector
+from sdfsim.physics.solver.vectors import BARE, FAST, ONCE, add, along, cross, dot, get, norm, scale, sub, turn, vector
 from sdfsim.physics.solver.world import (
     FIRST,
     GAP,
@@ -60,12 +60,7 @@ def solve_contacts(world, work, motion, rules, manifolds):
     """
     change, shift = work.change, work.shift
     system = _equations(world, work, motion, rules, manifolds)
-    islands = len(system.start) - 1
-    if islands >= MANY:
-        _solve_many(world.inverse_mass, rules, system, change, shift)
-    else:
-        for i in range(islands):
-            _solve(world.inverse_mass, rules, system, change, shift, i)
+    _solve_all(world.inverse_mass, rules, system, change, shift, world.threads)
     for c in range(len(system.where)):
         point = manifolds.point[system.where[c, 0], system.where[c, 1]]
         point[NORMAL_IMPULSE] = system.row[c, 0, IMPULSE]
@@ -82,7 +77,7 @@ def _equations(world, work, motion, rules, manifolds):
     where = np.empty((most, 4), np.int64)
     row = np.zeros((most, 3, WIDTH))
     mu, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
-    count = 0
+    count = np.int64(0)  # a literal would be a type of its own, for which all is compiled once more
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         if motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b]):
@@ -237,6 +232,17 @@ def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
         row[c, e, AXIS + x], row[c, e, ARM + x], row[c, e, OTHER + x] = axis[x], lever[x], counter[x]
         row[c, e, SPIN + x], row[c, e, COUNTER + x] = spin[x], back[x]
     row[c, e, MASS] = 1.0 / (inverse_mass[a] + inverse_mass[b] + dot(lever, spin) + dot(counter, back))
+
+
+@njit(**ONCE)
+def _solve_all(mass, rules, system, change, shift, threads):
+    islands = len(system.start) - 1
+    if len(threads) > 0:  # known when it is compiled
+        if islands >= MANY:
+            _solve_many(mass, rules, system, change, shift)
+            return
+    for i in range(islands):
+        _solve(mass, rules, system, change, shift, i)
 
 
 @njit(parallel=True, **FAST)

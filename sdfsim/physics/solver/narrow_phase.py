@@ -157,12 +157,18 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
         np.full(count, -math.inf), np.full(count, -math.inf), np.empty(total, np.int32), np.empty(total * wide),
         np.empty(total, np.bool_), np.empty((total, 3)), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
-    if count >= MANY:
-        _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
-    else:
-        for p in range(count):
-            _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
+    _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, world.threads)
     return near
+
+
+@njit(**ONCE)
+def _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, threads):
+    if len(threads) > 0:  # known when it is compiled
+        if len(pairs) >= MANY:
+            _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
+            return
+    for p in range(len(pairs)):
+        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
 
 
 @njit(parallel=True, **FAST)
@@ -257,10 +263,16 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
 
     `gone` [N] is how far any point of a body may have moved since `near` was made.
     """
-    if len(near.start) >= MANY:
-        _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
-    else:
-        _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1))
+    _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, world.threads)
+
+
+@njit(**ONCE)
+def _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, threads):
+    if len(threads) > 0:  # known when it is compiled
+        if len(near.start) >= MANY:
+            _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
+            return
+    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1))
 
 
 @njit(parallel=True, **FAST)
@@ -304,16 +316,18 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
         return
     known = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
     manifolds.count[p] = known
-    count, look = 0, rules.search_margin + 2.0 * rules.margin + _approach_margin(world, motion, rules, a, b)
+    # Numbers of one type, or all would be compiled once more.
+    none, one = np.int64(0), np.int64(1)
+    count, look = none, rules.search_margin + 2.0 * rules.margin + _approach_margin(world, motion, rules, a, b)
     for side in range(2):
         if swallowed(shapes, world, motion, matrix, a, b, side, scratch.found):
-            manifolds.count[p] = merged(rules, manifolds.point, p, 0, scratch, 1, False)
+            manifolds.count[p] = merged(rules, manifolds.point, p, none, scratch, one, none > one)
             near.away_all[p] = -math.inf
             return
     for side in range(2):
         count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, since, scratch, count)
     count = first_to_touch(rules, scratch.found, count)
-    manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, False)
+    manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, none > one)
     _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 
 
@@ -484,7 +498,7 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
         known = 0
     known = moved(shapes, world, motion, matrix, rules, manifolds, p, known)
     if count + known > 0:
-        known = merged(rules, point, p, known, scratch, count, True)
+        known = merged(rules, point, p, known, scratch, count, one or other)
     manifolds.count[p] = known
 
 

@@ -34,6 +34,7 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 # Penetration that is left as it is, so that what rests has contacts that do not come and go: model lengths, and less in
 # inner steps below the usual 4 ms, which scenes of slender bodies have.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
+CROWD = 64  # bodies that move, from which on pairs may be looked at in threads
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
 NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 6)))
@@ -333,4 +334,5 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         group=array["group"], allowed=array["allowed"], world=array["world"],
         going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
+        threads=(0,) if np.count_nonzero(moves) >= CROWD else (),
     )  # fmt: skip
