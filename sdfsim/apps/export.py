@@ -22,7 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.identify import COLUMNS
+from sdfsim.apps.observed import COLUMNS
 from sdfsim.apps.recording import body_colors, framed, shown, with_normals
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError

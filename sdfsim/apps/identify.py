@@ -1,318 +1,674 @@
-"""Friction, restitution and mass ratios from a recorded motion: what `sdfsim identify` does.
+"""Coefficients, sizes, masses and the lie of the ground from recorded motions: what `sdfsim identify` does.
 
-The recording is cut into short windows. The contact solve runs all of them side by side, each from where the recording
-has the bodies, and a least-squares fit moves the coefficients until the windows end as recorded. Windows are short, so
-that chaos has no time to grow, and long enough to tell a rebound from a slide.
+Recordings are cut into windows, short ones from all over them and long ones from their starts. The contact solve runs
+all of them side by side, each from where the recording has the bodies, and a fit moves the parameters until the windows
+go as recorded. Whole motions that the fit has not seen then tell how good that is.
 """
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
+import yaml
 
-from sdfsim.apps.run import read_run
+from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.parallel import Progress, silent
+from sdfsim.base.files import write_text
+from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
+from sdfsim.physics.bodies import Bodies, State
 from sdfsim.physics.options import STEP, SUBSTEPS, Options
 from sdfsim.physics.units import scene_units
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.load import read_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.batch import placed, side_by_side
 from sdfsim.simulate.steppers import Frames, stepper_of
 
-if TYPE_CHECKING:
-    from sdfsim.physics.solver.prepare import Compiled
-
-WINDOW, EVERY = 0.15, 0.06  # model units of time, about seconds for bodies of a metre: length and spacing of windows
-SMOOTH = 4.0  # times gravity: a recording of poses tells no velocity where it accelerates more than that
-START = 0.5  # of every coefficient
-WEAK = 1e-3  # how strongly coefficients that nothing shows are held to it
+# Model units of time, about seconds for bodies of a metre: length and spacing of short windows, length of long ones.
+WINDOW, EVERY, LONG = 0.15, 0.06, (0.5, 1.5)
+MOST = 250  # short windows; of more every so many are taken
+WHOLE = 8  # long windows at least, for these to have the last word: few that are chaotic tell less than many short ones
 OUTLIER = 2e-3  # model lengths: errors of windows that count less than squared, beyond
-NUDGE = 0.02  # of a coefficient, for differences: contacts come and go, so that smaller ones tell nothing
+FAR = 0.3  # of a body's size: a motion that is farther off counts as so far, by however much it is
+WEAK = 1e-3  # how strongly parameters that nothing shows are held to the scene's
+NUDGE = 0.02  # of a parameter's width, for differences: contacts come and go, so that smaller ones tell nothing
 SURE = 1.96  # standard deviations in an interval of 95 %
+SHOWN = 0.7  # of its width: how well the windows have to tell a parameter, noise being `OUTLIER`
 HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are looked for
-RATIO = 7.0  # the largest logarithm of a mass ratio
-COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
+HELD = 6  # every so many-th recording is kept out of the fit, where there are at least `ENOUGH`
+ENOUGH = 4
+TRIES = 25, 12, 12  # of the fit to short windows, and to long ones
+# How far parameters are looked for from the scene's: logarithms of factors, model lengths, rad.
+WIDTH = {
+    "friction": 1.0, "restitution": 1.0, "mass": 3.0, "inertia": 0.5, "size": 0.1, "height": 0.05, "tilt": 0.05,
+}  # fmt: skip
+FARTHEST = {"mass": 7.0, "inertia": 0.7, "size": 0.15, "height": 0.15, "tilt": 0.15}
+FACTORS = ("mass", "inertia", "size")
 
 
 @dataclass(frozen=True)
-class Recording:
-    """T poses of D bodies, evenly spaced in time."""
+class Parameter:
+    """One number that is looked for: of one body, or of all copies of one."""
 
-    dt: float  # s
-    position: np.ndarray  # [T, D, 3] m, of the centres of mass
-    orientation: np.ndarray  # [T, D, 4] xyzw
-    # velocity, angular_velocity: [T, D, 3] m/s and rad/s
-    velocity: np.ndarray
-    angular_velocity: np.ndarray
-    known: np.ndarray  # [T] bool, whether the velocities are to be trusted
+    kind: str  # of `WIDTH`
+    bodies: tuple[int, ...]  # among those that move, static ones behind them
+    name: str
+    start: float = 0.0  # as the scene has it; factors by their logarithms
+    low: float = -math.inf
+    high: float = math.inf
+    axis: int = 0  # of a tilt
 
-
-def load_recording(
-    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
-) -> tuple[Recording, Scene]:
-    """A recording of the bodies of a scene that move, and the scene: of a run folder or a `rollout.npz`, whose scene is
-    known; or a CSV of poses (`COLUMNS`), whose positions are those of the shapes' own origins, as in a scene file.
-    Raises SdfsimError for no scene, unreadable files, or a recording that is not of this scene."""
-    if path.suffix == ".csv":
-        if scene_file is None:
-            raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
-        scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
-        return _from_poses(path, scene), scene
-    scene, rollout = read_run(path, scene_file, allow_outside=allow_outside, on_progress=on_progress)
-    rows = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]
-    moving = ("position", "orientation", "velocity", "angular_velocity")
-    dt = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0
-    motion = {name: getattr(rollout, name)[:, rows] for name in moving}
-    return Recording(dt, **motion, known=np.ones(len(rollout.time), dtype=bool)), scene
+    @property
+    def width(self) -> float:
+        return WIDTH[self.kind]
 
 
-def _read_csv(path: Path, moving: list[str]) -> tuple[float, np.ndarray]:
-    """Spacing s and poses [T, D, 7] of the bodies, positions [m] before quaternions."""
-    rows: dict[float, dict[str, list[float]]] = {}
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            if tuple(reader.fieldnames or ()) != COLUMNS:
-                raise SdfsimError(f"{path}:1: columns must be {','.join(COLUMNS)}")
-            for row in reader:
-                if row["body"] in moving:
-                    time, *values = (float(row[c] or "") for c in ("time", *COLUMNS[2:]))
-                    if not np.isfinite([time, *values]).all() or not any(values[3:]):
-                        raise ValueError("must be finite, with a quaternion that is not 0")
-                    rows.setdefault(time, {})[row["body"]] = values
-    except ValueError as error:
-        raise SdfsimError(f"{path}:{reader.line_num}: {error}") from error
-    except (OSError, csv.Error) as error:
-        raise SdfsimError(f"{path}: not a CSV of poses ({error})") from error
-    times = np.array(sorted(rows))
-    if len(times) < 4:
-        raise SdfsimError(f"{path}: {len(times)} times of {moving} (at least 4)")
-    gaps = np.diff(times)
-    if np.ptp(gaps) > 0.02 * gaps.mean():
-        told = f"they are {gaps.min():.4g} to {gaps.max():.4g} s apart"
-        raise SdfsimError(f"{path}: times must be evenly spaced ({told})")
-    for time in times:
-        if missing := set(moving) - set(rows[time]):
-            raise SdfsimError(f"{path}: no pose of body {min(missing)!r} at time {time:g}")
-    return float(gaps.mean()), np.array([[rows[time][name] for name in moving] for time in times])
+@dataclass(frozen=True)
+class Ground:
+    """Where a static body is touched, model units."""
+
+    centre: np.ndarray  # [3]
+    axes: np.ndarray  # [3, 3] rows: two tangents, which it is tilted about, and the normal, along which it is moved
 
 
-def _from_poses(path: Path, scene: Scene) -> Recording:
-    """Velocities by central differences, which are exact in free flight, where no impact is near."""
-    bodies = [b for b in scene.bodies if b.motion == "dynamic"]
-    dt, poses = _read_csv(path, [b.name for b in bodies])
-    turn = pose.normalise(poses[..., 3:])
-    com = np.array([scene.shapes[b.shape].com * b.scale for b in bodies])
-    position = poses[..., :3] + pose.rotate(turn, com)
-    velocity, angular = np.zeros_like(position), np.zeros_like(position)
-    velocity[1:-1] = (position[2:] - position[:-2]) / (2.0 * dt)
-    angular[1:-1] = pose.to_rotvec(pose.multiply(turn[2:], pose.conjugate(turn[:-2]))) / (2.0 * dt)
-    bend = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
-    smooth = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
-    return Recording(dt, position, turn, velocity, angular, np.pad(smooth, 1))
+@dataclass(frozen=True)
+class Estimate:
+    """What the recordings say of one quantity."""
+
+    kind: str
+    name: str
+    unit: str
+    value: float | None  # None where they do not show it
+    interval: tuple[float, float] | None
 
 
-def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> dict[str, Any]:
-    """Find the coefficients and masses with which the contact solve repeats a recording; those of bodies that do not
-    move are taken from the scene.
+@dataclass(frozen=True)
+class Identified:
+    """What `identify` found. `scene_values`: body -> key of the scene file -> its value."""
 
-    Returns `value` and `interval` (of 95 %; both None where the motion does not show it) of: `friction` and
-    `restitution`, by "BODY / BODY", the product of both bodies' coefficients; `own_friction` and `own_restitution`, by
-    body, where the scene gives that of what it touched; `mass` in kg, relative to the first body that another one
-    touched. And `error_m`, the root mean square error of the `windows` that are left. Raises SdfsimError for bodies on
-    paths, a recording too short, or one in which nothing touches.
-    """
-    from scipy.optimize import least_squares
+    estimates: list[Estimate]
+    windows: int
+    error_m: float  # root mean square over short windows
+    held_out: dict[str, Any]  # errors of whole motions that the fit has not seen; of all, where `recordings` is 0
+    notes: list[str]
+    scene_values: dict[str, dict[str, Any]] = field(default_factory=dict)
 
-    if any(b.motion == "kinematic" for b in scene.bodies):
-        raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
-    windows = Windows(recording, scene)
-    # A sweep over all coefficients alike finds the valley; the fit goes down in it.
-    tried = [windows.start(f, e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95)]
-    costs = []
-    for k, trial in enumerate(tried):
-        costs.append(float(np.minimum(np.abs(windows.errors(trial)), 10.0).sum()))
-        on_progress(0.3 * k / len(tried), "a first sweep over friction and restitution")
-    start, count = windows.start(START, START), [0]
-
-    def errors(parameters: np.ndarray) -> np.ndarray:
-        count[0] += 1
-        on_progress(min(0.95, 0.3 + 0.005 * count[0]), f"fit, run {count[0]} of all windows")
-        return np.concatenate([windows.errors(parameters), WEAK * (parameters - start)])
-
-    slope: Any = lambda parameters: windows.jacobian(parameters, errors)  # noqa: E731
-    best = tried[int(np.argmin(costs))]
-    found = least_squares(errors, best, slope, windows.bounds, x_scale=0.1, loss="soft_l1", max_nfev=25)
-    return windows.report(found.x, windows.jacobian(found.x, errors), errors(found.x))
+    def report(self) -> dict[str, Any]:
+        """By kind and name."""
+        kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(WIDTH)[2:])
+        told: dict[str, Any] = {kind: {} for kind in kinds}
+        for e in self.estimates:
+            told[e.kind][e.name] = {"value": e.value, "interval": e.interval}
+        return told | {
+            "windows": self.windows, "error_m": self.error_m, "held_out": self.held_out, "notes": self.notes,
+            "scene": self.scene_values,
+        }  # fmt: skip
 
 
-def report_lines(report: dict[str, Any]) -> list[str]:
-    """`identify`'s report for people."""
-    heads = {"friction": "friction, product", "restitution": "restitution, product"}
-    heads |= {"own_friction": "friction of the body's own", "own_restitution": "restitution of the body's own"}
+HEADS = {
+    "friction": "friction, product", "restitution": "restitution, product", "own_friction": "friction of its own",
+    "own_restitution": "restitution of its own", "mass": "mass", "inertia": "inertia, factor", "size": "size, factor",
+    "height": "moved along its normal", "tilt": "tilted",
+}  # fmt: skip
+UNITS = {"mass": " kg", "height": " m", "tilt": " degrees"}
+
+
+def report_lines(found: Identified) -> list[str]:
+    """What was found, for people."""
     lines = []
-    for kind, head in (heads | {"mass": "mass, kg"}).items():
-        for name, told in report[kind].items():
-            seen = "not shown by this motion"
-            if told["interval"]:
-                seen = "{:.3f} ({:.3f} to {:.3f})".format(told["value"], *told["interval"])
-            lines.append(f"{head}: {name}: {seen}")
-    return [*lines, f"{report['windows']} windows, repeated with an error of {report['error_m']:.2g} m"]
+    for e in found.estimates:
+        digits = 5 if e.kind == "height" else 3
+        seen = "not shown by these recordings"
+        if e.interval:
+            low, high = e.interval
+            seen = f"{e.value:.{digits}f}{e.unit} ({low:.{digits}f} to {high:.{digits}f})"
+        lines.append(f"{HEADS[e.kind]}: {e.name}: {seen}")
+    lines.append(f"{found.windows} windows, repeated with an error of {found.error_m:.2g} m")
+    h = found.held_out
+    who = f"{h['recordings']} whole motions that the fit has not seen" if h["recordings"] else "the same motions, whole"
+    lines.append(
+        "{}: {:.2g} % of the size and {:.2g} degrees off; as the scene was, {:.2g} % and {:.2g}".format(
+            who, *h["after"], *h["before"]
+        )
+    )
+    return [*lines, *found.notes]
+
+
+# --- the model ---
+
+
+class Problem:
+    """A scene with its parameters: those of the bodies that touch something in recordings."""
+
+    def __init__(self, recordings: Sequence[Recording], scene: Scene) -> None:
+        self.scene, self.recordings = scene, list(recordings)
+        self.moving, self.fixed = movers(scene), [b for b in scene.bodies if b.motion == "static"]
+        self.bodies, self.units = [*self.moving, *self.fixed], scene_units(scene)
+        self.parameters: list[Parameter] = []
+        self.ground: dict[int, Ground] = {}
+        if any(r.dt == 0.0 for r in recordings):
+            raise SdfsimError("a recording is a single frame")
+
+    def windows(self, length: float, begin: Sequence[tuple[int, int]]) -> Windows:
+        """Windows of `length` model times, which begin in these recordings at these frames."""
+        return Windows(self, length, begin)
+
+    def short(self, chosen: Sequence[int]) -> Windows:
+        """The short windows of these recordings in which something touches; the parameters are those of their pairs."""
+        begin = []
+        for k in chosen:
+            r = self.recordings[k]
+            every = max(1, round(EVERY * self.units.time / r.dt))
+            last = len(r.known) - max(3, round(WINDOW * self.units.time / r.dt))
+            near = np.flatnonzero(r.known[: max(0, last)])
+            begin += [(k, int(rows[0])) for rows in _groups(near, every)]
+        if not begin:
+            told = "give longer ones, of more frames a second"
+            raise SdfsimError("the recordings are too short, or nowhere smooth", told)
+        windows = self.windows(WINDOW, begin[:: -(-len(begin) // (2 * MOST))])
+        touched = windows.touched()
+        if not touched:
+            raise SdfsimError("nothing touches in the recordings", "friction and restitution show in contacts only")
+        self._choose(touched)
+        rows = sorted({w for w, *_ in touched})
+        return self.windows(WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
+
+    def whole(self, chosen: Sequence[int], length: float) -> Windows:
+        """Long windows that follow each other through these recordings, from the first frame at which velocities are
+        known on; a last one is at least half as long."""
+        begin = []
+        for k in chosen:
+            r, t = self.recordings[k], 0
+            frames = length * self.units.time / r.dt
+            while t == 0 or len(r.known) - t > 0.5 * frames:
+                t += int(r.known[t:].argmax())
+                if not r.known[t] or len(r.known) - t < 4:
+                    break
+                begin.append((k, t))
+                t += max(4, round(frames))
+        return self.windows(length, begin)
+
+    def _choose(self, touched: list[tuple[int, int, int, np.ndarray]]) -> None:
+        many = len(self.moving)
+        self.pairs = sorted({(a, b) for _, a, b, _ in touched})
+        groups: dict[str, list[int]] = {}
+        for k, body in enumerate(self.bodies):
+            groups.setdefault(re.sub(r"\[\d+\]$", "", body.name), []).append(k)
+        seen = {name: rows for name, rows in groups.items() if any(k in pair for k in rows for pair in self.pairs)}
+        static = {name: rows for name, rows in seen.items() if rows[0] >= many}
+        count = {name: sum(b in rows for _, _, b, _ in touched) for name, rows in static.items()}
+        reference = max(count, key=lambda name: count[name], default=None)
+        beside = [name for name, rows in seen.items() if any(set(p) & set(rows) and max(p) < many for p in self.pairs)]
+        for kind, high in HIGH.items():
+            for name, rows in seen.items():
+                if name != reference:
+                    start = getattr(self.bodies[rows[0]], kind)
+                    self._add(kind, name, rows, start, 0.0, max(start, self._most(kind, high, rows, static, reference)))
+        for name in beside[1:]:
+            self._add("mass", name, seen[name])
+        for kind in ("inertia", "size"):
+            for name, rows in seen.items():
+                if rows[0] < many:
+                    self._add(kind, name, rows)
+        for name, rows in static.items():
+            if len(rows) == 1:  # copies lie on a grid
+                points = np.concatenate([p for _, _, b, p in touched if b == rows[0]])
+                self.ground[rows[0]] = self._touched_at(rows[0], points)
+                self._add("height", name, rows)
+                for axis, way in enumerate(self.ground[rows[0]].axes[:2]):
+                    self._add("tilt", f"{name} about {'xyz'[np.abs(way).argmax()]}", rows, axis=axis)
+
+    def _add(
+        self, kind: str, name: str, rows: list[int], start: float = 0.0, low: float | None = None,
+        high: float | None = None, axis: int = 0,
+    ) -> None:  # fmt: skip
+        most = FARTHEST.get(kind, 0.0)
+        low, high = -most if low is None else low, most if high is None else high
+        self.parameters.append(Parameter(kind, tuple(rows), name, start, low, high, axis))
+
+    def _most(
+        self, kind: str, high: float, rows: list[int], static: dict[str, list[int]], reference: str | None
+    ) -> float:
+        """What coefficients may be at most: those of bodies on the reference such that its own is the scene's."""
+        if rows[0] >= len(self.moving) or reference is None:
+            return high
+        known = getattr(self.bodies[static[reference][0]], kind)
+        if kind == "restitution" and any(max(pair) < len(self.moving) for pair in self.pairs):
+            return 1.0  # what bodies do to each other fixes what is whose, and a scene has none above 1
+        return high / known if known > 0.0 else high
+
+    def _touched_at(self, body: int, points: np.ndarray) -> Ground:
+        """Of points [P, 3] in model units."""
+        b, length = self.bodies[body], self.units.length
+        points = points[:: -(-len(points) // 500)]
+        own = pose.rotate(pose.conjugate(b.quat_xyzw), points * length - b.position) / b.scale
+        slope = self.scene.shapes[b.shape].sdf(own)[1]
+        normal = pose.rotate(b.quat_xyzw, np.asarray(slope, np.float64).mean(0))
+        length_of = float(np.linalg.norm(normal))
+        normal = normal / length_of if length_of > 0.1 else np.array([0.0, 0.0, 1.0])
+        along = np.eye(3)[0] if abs(normal[0]) < 0.9 else np.eye(3)[1]
+        first = along - normal * (normal @ along)
+        first /= np.linalg.norm(first)
+        return Ground(points.mean(0), np.stack([first, np.cross(normal, first), normal]))
+
+    @cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([p.low for p in self.parameters]), np.array([p.high for p in self.parameters])
+
+    @cached_property
+    def width(self) -> np.ndarray:
+        return np.array([p.width for p in self.parameters])
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The parameters as the scene has them."""
+        return np.clip([p.start for p in self.parameters], *self.bounds)
+
+    def lie(self, values: np.ndarray, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """By how much a static body is turned (a quaternion) about its ground's centre, and shifted, model units."""
+        turn, shift = np.zeros(3), np.zeros(3)
+        for p, value in zip(self.parameters, values, strict=True):
+            if p.bodies == (body,) and p.kind in ("height", "tilt"):
+                axis = self.ground[body].axes[2 if p.kind == "height" else p.axis]
+                if p.kind == "height":
+                    shift = value * axis
+                else:
+                    turn = turn + value * axis
+        return pose.from_rotvec(turn), shift
+
+    def applied(self, values: np.ndarray, bodies: Bodies, state: State, count: int) -> tuple[Bodies, State]:
+        """`count` copies of the moving bodies, and the static ones behind them, with these parameters."""
+        many = len(self.moving)
+        total = many * count
+        names = (*HIGH, "scale", "com", "inertia", "mass", "inverse_mass", "bounds", "size", "radius")
+        new = {name: getattr(bodies, name).copy() for name in names}
+        position, orientation = state.position.copy(), state.orientation.copy()
+        for p, value in zip(self.parameters, values, strict=True):
+            for k in p.bodies:
+                rows: Any = slice(k, total, many) if k < many else total + k - many
+                if p.kind in HIGH:
+                    new[p.kind][rows] = value
+                elif p.kind == "inertia":
+                    new["inertia"][rows] *= math.exp(value)
+                elif p.kind == "mass":
+                    for name, power in (("mass", 1), ("inverse_mass", -1), ("inertia", 1)):
+                        new[name][rows] *= math.exp(power * value)
+                elif p.kind == "size":
+                    for name in ("scale", "com", "bounds", "size", "radius"):
+                        new[name][rows] *= math.exp(value)
+                    new["inertia"][rows] *= math.exp(2.0 * value)
+        for body, ground in self.ground.items():
+            row, (turn, shift) = total + body - many, self.lie(values, body)
+            position[row] = ground.centre + pose.rotate(turn, position[row] - ground.centre) + shift
+            orientation[row] = pose.multiply(turn, orientation[row])
+        return replace(bodies, **new), replace(state, position=position, orientation=orientation)
+
+
+def _groups(frames: np.ndarray, every: int) -> list[np.ndarray]:
+    """Frames by `every` so many."""
+    return [rows for rows in np.split(frames, np.flatnonzero(np.diff(frames // every)) + 1) if len(rows)]
 
 
 class Windows:
-    """All windows of a recording as one set of bodies, each window a world of its own. Parameters are friction and
-    restitution of every body that touches another, then the logarithms of mass ratios."""
+    """Windows of recordings, side by side as a few sets of bodies, one a core; each window is a world of its own."""
 
-    def __init__(self, recording: Recording, scene: Scene) -> None:
-        self.scene, self.recording = scene, recording
-        self.units, self.solver = scene_units(scene), stepper_of(load_model())
-        self.moving = [b for b in scene.bodies if b.motion == "dynamic"]
-        self.fixed = [b for b in scene.bodies if b.motion != "dynamic"]
-        if recording.dt == 0.0:
-            raise SdfsimError("the recording is a single frame")
-        self.length = max(3, round(WINDOW * self.units.time / recording.dt))
-        every = max(1, round(EVERY * self.units.time / recording.dt))
-        begin = np.arange(0, len(recording.position) - self.length, every)
-        begin = begin[recording.known[begin]]
-        if not len(begin):
-            told = f"give at least {self.length + 1} frames"
-            raise SdfsimError("the recording is too short, or nowhere smooth", told)
-        dt = recording.dt / self.units.time
-        inner = max(1, int(np.ceil(dt / (STEP / SUBSTEPS) - 0.01)))
-        gravity = np.asarray(scene.gravity) / self.units.acceleration
-        self.options = Options(gravity, dt, inner)
-        self._build(begin)
-        touched = self._touched()
-        if not touched:
-            raise SdfsimError("nothing touches in the recording", "friction and restitution show in contacts only")
-        self._build(begin[sorted({w for w, _, _ in touched})])
-        self.pairs = sorted({(a, b) for _, a, b in touched})
-        many = len(self.moving)
-        self.seen = sorted({k for pair in self.pairs for k in pair if k < many})
-        beside = [pair for pair in self.pairs if pair[1] < many]
-        self.weighed = sorted({k for pair in beside for k in pair})[1:]
-        ratios = np.full(len(self.weighed), RATIO)
-        high = [self._most(name, k) for name in HIGH for k in self.seen]
-        self.bounds = np.concatenate([np.zeros(len(high)), -ratios]), np.concatenate([high, ratios])
+    def __init__(self, problem: Problem, length: float, begin: Sequence[tuple[int, int]]) -> None:
+        self.problem, parts = problem, []
+        spacing = {k: problem.recordings[k].dt for k, _ in begin}
+        begin = sorted(begin, key=lambda window: spacing[window[0]])
+        cuts = [i + 1 for i, (a, b) in enumerate(pairwise(begin)) if spacing[b[0]] > 1.0001 * spacing[a[0]]]
+        cores = os.cpu_count() or 1
+        for a, b in pairwise([0, *cuts, len(begin)]):
+            size = max(1, -(-(b - a) // cores))
+            parts += [begin[c : min(c + size, b)] for c in range(a, b, size)]
+        self.begin = begin
+        self.parts = [_Part(problem, length, part) for part in parts if part]
+        self.recording = np.array([k for k, _ in begin])
 
-    def _build(self, begin: np.ndarray) -> None:
-        """Bodies and start states of the windows that begin at frames `begin`."""
-        whole = replace(self.scene, bodies=tuple(self.moving * len(begin) + self.fixed))
-        world = [*np.repeat(np.arange(len(begin)), len(self.moving)), *[-1] * len(self.fixed)]
-        r, u = self.recording, self.units
-        given = (r.position / u.length, r.orientation, r.velocity / u.velocity, r.angular_velocity * u.time)
+    def run(self, values: np.ndarray) -> list[np.ndarray]:
+        """Of every part [L, W, D, 6] the differences from the recording, model lengths: of positions, and of turns at
+        half of a body's size; NaN where there is no pose to compare with."""
+        jobs = [(part, values) for part in self.parts]
+        done = dict(threads(_Part.errors, jobs)) if len(jobs) > 1 else {0: self.parts[0].errors(values)}
+        return [done[k] for k in range(len(jobs))]
+
+    def errors(self, values: np.ndarray) -> np.ndarray:
+        """[R] differences for a fit, in units of `OUTLIER`; 0 where there is nothing to compare with."""
+        found = []
+        for part, off in zip(self.parts, self.run(values), strict=True):
+            most = FAR * part.size[None, None, :, None]
+            off = np.clip(off, -1e3, 1e3)
+            way = np.square(off).sum(-1, keepdims=True) / most**2
+            found.append(np.nan_to_num(off / np.sqrt(1.0 + way), nan=0.0).ravel())
+        return np.concatenate(found) / OUTLIER
+
+    @cached_property
+    def group(self) -> np.ndarray:
+        """[R] which recording an error is of; which window, where recordings are few."""
+        few, at, found = len(set(self.recording.tolist())) < 8, 0, []
+        for part in self.parts:
+            count = len(part.begin)
+            own = np.arange(at, at + count) if few else self.recording[at : at + count]
+            found.append(np.broadcast_to(own[None, :, None, None], part.shape).ravel())
+            at += count
+        return np.concatenate(found)
+
+    def off(self, values: np.ndarray) -> np.ndarray:
+        """[W, 2] of each window: root mean square distance in % of the size, and mean turn in degrees."""
+        found = []
+        for part, off in zip(self.parts, self.run(values), strict=True):
+            way = np.linalg.norm(off[..., :3], axis=-1) / part.size
+            turn = np.linalg.norm(off[..., 3:], axis=-1) / (0.5 * part.size)
+            found.append(
+                np.stack([100.0 * np.sqrt(np.nanmean(way**2, (0, 2))), np.degrees(np.nanmean(turn, (0, 2)))], 1)
+            )
+        return np.concatenate(found)
+
+    def touched(self) -> list[tuple[int, int, int, np.ndarray]]:
+        """Window, pair of bodies and points [P, 3] of all contacts; static bodies count on from those that move."""
+        found, at = [], 0
+        for part in self.parts:
+            found += [(at + w, a, b, points) for w, a, b, points in part.touched()]
+            at += len(part.begin)
+        return found
+
+
+class _Part:
+    """Windows of one frame spacing as one set of bodies."""
+
+    def __init__(self, problem: Problem, length: float, begin: Sequence[tuple[int, int]]) -> None:
+        self.problem, self.begin, u = problem, begin, problem.units
+        some = [problem.recordings[k] for k, _ in begin]
+        dt = some[0].dt / u.time
+        self.length = max(3, round(length / dt))
+        ends = [min(self.length, len(r.known) - 1 - t) for r, (_, t) in zip(some, begin, strict=True)]
+        self.length = max(ends)
+        many, count = len(problem.moving), len(begin)
+        whole = replace(problem.scene, bodies=tuple([*problem.moving] * count + problem.fixed))
+        world = [*np.repeat(np.arange(count), many), *[-1] * len(problem.fixed)]
         self.bodies, start = side_by_side(whole, world, u)
-        self.start_state = placed(start, *(values[begin].reshape(-1, values.shape[-1]) for values in given))
-        frames = begin[None] + 1 + np.arange(self.length)[:, None]
-        self.goal = r.position[frames] / u.length, r.orientation[frames]
-        self.carry, self.count = self.solver.init(self.bodies, self.start_state, self.options), len(begin)
-        self.world = cast("Compiled", self.carry.scene).world
-        self.given = {name: getattr(self.world, name).copy() for name in ("inverse_mass", "inertia", "inverse_inertia")}
+        first = [
+            np.concatenate([getattr(r, name)[t] for r, (_, t) in zip(some, begin, strict=True)])
+            for name in ("position", "orientation", "velocity", "angular_velocity")
+        ]
+        self.start = placed(start, first[0] / u.length, first[1], first[2] / u.velocity, first[3] * u.time)
+        inner = max(1, math.ceil(dt / (STEP / SUBSTEPS) - 0.01))
+        self.options = Options(np.asarray(problem.scene.gravity) / u.acceleration, dt, inner)
+        self.goal = np.full((self.length, count, many, 7), np.nan)
+        for w, (r, (_, t), n) in enumerate(zip(some, begin, ends, strict=True)):
+            rows = slice(t + 1, t + 1 + n)
+            both = np.concatenate([r.goal[0][rows] / u.length, r.goal[1][rows]], -1)
+            self.goal[:n, w] = np.where(r.seen[rows][..., None], both, np.nan)
+        self.shape = (self.length, count, many, 6)
+        self.size = self.bodies.size[:many].copy()
+        self.solver = stepper_of(load_model())
+        self.carry = self.solver.init(self.bodies, self.start, self.options)
 
-    def _run(self) -> Frames:
-        _, carry = self.solver.advance(self.start_state, self.carry, self.length, keep=True)
+    def frames(self, values: np.ndarray) -> Frames:
+        compiled = cast("Any", self.carry.scene)
+        compiled.bodies, start = self.problem.applied(values, self.bodies, self.start, len(self.begin))
+        compiled.place(start)
+        _, carry = self.solver.advance(start, self.carry, self.length, keep=True)
         return cast("Frames", carry.frames)
 
-    def _touched(self) -> set[tuple[int, int, int]]:
-        """Window and pair of bodies of every contact; static ones count on from those that move."""
-        many = len(self.moving)
-        total, found = many * self.count, set()
-        state = self.start_state
-        for _ in range(self.length):
-            state, _ = self.solver.advance(state, self.carry)
-            assert state.touch is not None
-            for a, b in state.touch.pair[state.touch.count > 0].tolist():
+    def errors(self, values: np.ndarray) -> np.ndarray:
+        frames = self.frames(values)
+        total = self.shape[1] * self.shape[2]
+        place = frames.position[:, :total].reshape(*self.shape[:3], 3)
+        turn = frames.orientation[:, :total].reshape(*self.shape[:3], 4)
+        away = pose.to_rotvec(pose.multiply(turn, pose.conjugate(self.goal[..., 3:])))
+        off = np.concatenate([place - self.goal[..., :3], 0.5 * self.size[:, None] * away], -1)
+        return np.where(np.isnan(self.goal[..., :1]), np.nan, np.nan_to_num(off, nan=1e3))
+
+    def touched(self) -> list[tuple[int, int, int, np.ndarray]]:
+        frames = self.frames(np.zeros(0))
+        many, total = self.shape[2], self.shape[1] * self.shape[2]
+        frame = np.repeat(np.arange(self.length), frames.touching)
+        there = ~np.isnan(self.goal[..., 0]).all(-1)
+        found: dict[tuple[int, int, int], list[np.ndarray]] = {}
+        for t, (a, b), point in zip(frame.tolist(), frames.pair.tolist(), frames.point, strict=True):
+            a, b = (a, b) if a < total else (b, a)
+            if there[t:, a // many].any():
                 other = b % many if b < total else many + b - total
-                found.add((a // many, *sorted((a % many, other))))
-        return found
+                found.setdefault((a // many, *sorted((a % many, other))), []).append(point)
+        return [(*key, np.stack(points)) for key, points in sorted(found.items())]
 
-    def _most(self, name: str, body: int) -> float:
-        """What a body's own coefficient may be at most, given those of the static bodies that it touched."""
-        many = len(self.moving)
-        others = [getattr(self.fixed[b - many], name) for a, b in self.pairs if a == body and b >= many]
-        return HIGH[name] / max([v for v in others if v > 0.0], default=1.0)
 
-    def start(self, friction: float, restitution: float) -> np.ndarray:
-        """Parameters with one coefficient for all, and the masses of the scene."""
-        count = len(self.seen)
-        return np.concatenate([np.full(count, friction), np.full(count, restitution), np.zeros(len(self.weighed))])
+# --- the fit ---
 
-    def errors(self, parameters: np.ndarray) -> np.ndarray:
-        """Differences of all windows from the recording, in units of `OUTLIER`; turns at half of a body's size."""
-        count, many = len(self.seen), len(self.moving)
-        total = self.count * many
-        for k, friction, restitution in zip(self.seen, parameters[:count], parameters[count : 2 * count], strict=True):
-            self.world.friction[k:total:many] = friction
-            self.world.restitution[k:total:many] = restitution
-        for k, ratio in zip(self.weighed, np.exp(parameters[2 * count :]), strict=True):
-            for name, power in (("inverse_mass", -1), ("inertia", 1), ("inverse_inertia", -1)):
-                getattr(self.world, name)[k:total:many] = self.given[name][k:total:many] * ratio**power
-        size = self.bodies.size[:total, None]
-        frames = self._run()
-        place, turn = (values.reshape(self.length, total, -1) for values in self.goal)
-        away = pose.multiply(frames.orientation[:, :total], pose.conjugate(turn))
-        errors = np.stack([frames.position[:, :total] - place, 0.5 * size * pose.to_rotvec(away)], 1)
-        return np.nan_to_num(errors.ravel(), nan=1e3) / OUTLIER
 
-    def jacobian(self, parameters: np.ndarray, errors: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Progress = silent) -> Identified:
+    """Find the parameters with which the contact solve repeats recordings, and by how much they may be otherwise.
+
+    Those of the static body that is touched most count as the scene has them, as contacts show products only. Raises
+    SdfsimError for recordings that are too short, or in which nothing touches.
+    """
+    from scipy.optimize import least_squares
+
+    problem = Problem(recordings, scene)
+    every = range(len(recordings))
+    held = [k for k in every if k % HELD == HELD - 1] if len(recordings) >= HELD else [*every][-1:]
+    held = held if len(recordings) >= ENOUGH else []
+    fit = [k for k in every if k not in held]
+    short = problem.short(fit)
+    start, width = problem.start, problem.width
+    low, high = problem.bounds
+
+    def alike(**given: float) -> np.ndarray:
+        """All coefficients of moving bodies of these products, the others as the scene has them."""
+        return np.clip([given.get(p.kind, s) for p, s in zip(problem.parameters, start, strict=True)], low, high)
+
+    # A sweep over all coefficients alike finds the valley; the fit goes down in it.
+    tried = [start, *(alike(friction=f, restitution=e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95))]
+    costs = []
+    for k, trial in enumerate(tried):
+        costs.append(float(np.minimum(np.abs(short.errors(trial)), 10.0).sum()))
+        on_progress(0.2 * k / len(tried), "a first sweep over friction and restitution")
+    count = [0]
+
+    def errors_of(windows: Windows, values: np.ndarray) -> np.ndarray:
+        count[0] += 1
+        on_progress(min(0.95, 0.2 + 0.002 * count[0]), f"fit, run {count[0]} of all windows")
+        return np.concatenate([windows.errors(values), WEAK * (values - start) / width])
+
+    def slope(windows: Windows, values: np.ndarray) -> np.ndarray:
         """[R, P] by central differences of `NUDGE`, one-sided at the bounds."""
-        low, high = self.bounds
         columns = []
-        for k in range(len(parameters)):
-            one, other = parameters.copy(), parameters.copy()
-            one[k], other[k] = min(one[k] + NUDGE, high[k]), max(other[k] - NUDGE, low[k])
-            columns.append((errors(one) - errors(other)) / (one[k] - other[k]))
+        for k, step in enumerate(NUDGE * width):
+            one, other = values.copy(), values.copy()
+            one[k], other[k] = min(one[k] + step, high[k]), max(other[k] - step, low[k])
+            columns.append((errors_of(windows, one) - errors_of(windows, other)) / (one[k] - other[k]))
         return np.stack(columns, 1)
 
-    def report(self, parameters: np.ndarray, jacobian: np.ndarray, errors: np.ndarray) -> dict[str, Any]:
-        """What `identify` returns. Intervals are from the curvature of the robust cost, and how windows pull apart (a
-        sandwich)."""
-        data, slope = errors[: -len(parameters)], jacobian[: -len(parameters)]
-        weight = (1.0 + data**2) ** -0.5  # of the soft L1 loss
-        curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(parameters))
-        # Errors within a window go together: windows, not single poses, are what is independent.
-        window = np.tile(np.repeat(np.arange(self.count), 3 * len(self.moving)), 2 * self.length)
-        pull = np.zeros((self.count, len(parameters)))
-        np.add.at(pull, window, (weight * data)[:, None] * slope)
-        inverse = np.linalg.inv(curvature)
-        spread = max(1.0, self.count / max(1, self.count - len(parameters)))
-        covariance = spread * inverse @ (pull.T @ pull) @ inverse
-        shown = np.square(slope).sum(0) > 1.0
+    def settled(windows: Windows, values: np.ndarray, most: int) -> np.ndarray:
+        inside = np.clip(values, low + 1e-9, high - 1e-9)
+        of: Any = lambda v: errors_of(windows, v)  # noqa: E731
+        by: Any = lambda v: slope(windows, v)  # noqa: E731
+        return least_squares(of, inside, by, (low, high), x_scale=width, loss="soft_l1", max_nfev=most).x
 
-        def estimate(value: float, gradient: dict[int, float]) -> dict[str, Any]:
-            """Of a value with these derivatives by parameters; the fit left one that is not shown where it began."""
-            which, by = list(gradient), np.array(list(gradient.values()))
-            if not shown[which][by != 0.0].all():
-                return {"value": None, "interval": None}
-            half = SURE * float(np.sqrt(by @ covariance[np.ix_(which, which)] @ by))
-            return {"value": float(value), "interval": (max(0.0, float(value) - half), float(value) + half)}
+    best = settled(short, tried[int(np.argmin(costs))], TRIES[0])
+    last = short
+    for length, most in zip(LONG, TRIES[1:], strict=True):
+        longer = problem.whole(fit, length)
+        if len(longer.begin) >= WHOLE:
+            last, best = longer, settled(longer, best, most)
+    whole = problem.whole(held or fit, LONG[-1])
+    before, after = (whole.off(values) for values in (start, best))
+    change = after - before
+    sure = SURE * change.std(0, ddof=1) / math.sqrt(len(change)) if len(change) > 2 else np.full(2, np.nan)
+    confirmed: dict[str, Any] = {
+        "recordings": len(held), "before": before.mean(0).tolist(), "after": after.mean(0).tolist(),
+        "change": change.mean(0).tolist(), "change_95": sure.tolist() if np.isfinite(sure).all() else None,
+    }  # fmt: skip
+    error = float(np.sqrt(np.nanmean(np.concatenate([e[..., :3].ravel() for e in short.run(best)]) ** 2)))
+    return Identified(
+        _estimates(problem, best, last.group, slope(last, best), errors_of(last, best)), len(short.begin),
+        error * math.sqrt(3.0) * problem.units.length, confirmed, _notes(recordings), _scene_values(problem, best),
+    )  # fmt: skip
 
-        many, bodies = len(self.moving), [*self.moving, *self.fixed]
-        rms = float(np.sqrt(np.mean((data * OUTLIER) ** 2))) * self.units.length
-        found: dict[str, Any] = {"error_m": rms, "windows": self.count}
-        for offset, kind in ((0, "friction"), (len(self.seen), "restitution")):
-            found[kind], found[f"own_{kind}"] = {}, {}
-            for a, b in self.pairs:
-                i, name = offset + self.seen.index(a), f"{bodies[a].name} / {bodies[b].name}"
-                if b < many:
-                    j = offset + self.seen.index(b)
-                    gradient = {i: parameters[j], j: parameters[i]}
-                    found[kind][name] = estimate(parameters[i] * parameters[j], gradient)
-                else:
-                    other = getattr(bodies[b], kind)
-                    found[kind][name] = estimate(parameters[i] * other, {i: other})
-                    found[f"own_{kind}"][bodies[a].name] = estimate(parameters[i], {i: 1.0})
-        found["mass"] = {}
-        for i, k in enumerate(self.weighed, 2 * len(self.seen)):
-            value = self.moving[k].mass * float(np.exp(parameters[i]))
-            found["mass"][self.moving[k].name] = estimate(value, {i: value})
-        return found
+
+def _estimates(
+    problem: Problem, values: np.ndarray, group: np.ndarray, slope: np.ndarray, errors: np.ndarray
+) -> list[Estimate]:
+    """Values with their intervals, from the curvature of the robust cost and how recordings (few: windows) pull apart
+    (a sandwich); none where an error of `OUTLIER` a number would leave one of them unknown."""
+    parameters, width = problem.parameters, problem.width
+    data, slope = errors[: -len(values)], slope[: -len(values)] * width
+    weight = (1.0 + data**2) ** -0.5  # of the soft L1 loss
+    curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(values))
+    # Errors within a group go together: groups, not single poses, are what is independent.
+    which, group = np.unique(group, return_inverse=True)
+    pull = np.zeros((len(which), len(values)))
+    np.add.at(pull, group, (weight * data)[:, None] * slope)
+    inverse = np.linalg.inv(curvature)
+    spread = max(1.0, len(which) / max(1, len(which) - len(values)))
+    covariance = spread * inverse @ (pull.T @ pull) @ inverse
+    noise = max(1.0, float(np.mean(weight * data**2)))
+    told = np.linalg.inv((slope.T @ slope) / noise + np.eye(len(values)))
+    shown = np.sqrt(np.diag(told)) < SHOWN
+
+    def estimate(kind: str, name: str, value: float, gradient: dict[int, float]) -> Estimate:
+        """Of a value with these derivatives by parameters."""
+        at, by = list(gradient), np.array(list(gradient.values())) * width[list(gradient)]
+        unit = UNITS.get(kind, "")
+        if not shown[at][by != 0.0].all():
+            return Estimate(kind, name, unit, None, None)
+        half = SURE * float(np.sqrt(by @ covariance[np.ix_(at, at)] @ by))
+        least = -math.inf if kind in ("height", "tilt") else 0.0
+        return Estimate(kind, name, unit, float(value), (max(least, float(value) - half), float(value) + half))
+
+    found, own = [], {(p.kind, k): i for i, p in enumerate(parameters) for k in p.bodies}
+    for kind in HIGH:
+        for a, b in problem.pairs:
+            gradient, product = {}, 1.0
+            for one, other in ((a, b), (b, a)):
+                of = values[own[kind, other]] if (kind, other) in own else getattr(problem.bodies[other], kind)
+                product *= of
+                if (i := own.get((kind, one))) is not None:
+                    gradient[i] = gradient.get(i, 0.0) + of
+            found.append(estimate(kind, f"{problem.bodies[a].name} / {problem.bodies[b].name}", product, gradient))
+    for i, (p, value) in enumerate(zip(parameters, values, strict=True)):
+        if p.kind in HIGH:
+            found.append(estimate(f"own_{p.kind}", p.name, value, {i: 1.0}))
+        elif p.kind in FACTORS:
+            factor = math.exp(value) * (problem.bodies[p.bodies[0]].mass if p.kind == "mass" else 1.0)
+            found.append(estimate(p.kind, p.name, factor, {i: factor}))
+        else:
+            unit = problem.units.length if p.kind == "height" else math.degrees(1.0)
+            found.append(estimate(p.kind, p.name, unit * value, {i: unit}))
+    return found
+
+
+def _notes(recordings: Sequence[Recording]) -> list[str]:
+    """What trackers did, and what recordings lack."""
+    lost, jumps = sum(r.lost for r in recordings), sum(r.jumps for r in recordings)
+    notes = []
+    if lost or jumps:
+        worst = max(recordings, key=lambda r: r.lost + r.jumps)
+        notes.append(f"left out: {lost} poses that are missing or no numbers, {jumps} jumps (most in {worst.name})")
+    if noise := [r.noise for r in recordings if r.noise[0] > 0.0]:
+        place, turn = np.median(noise, axis=0)
+        notes.append(f"noise of the poses: {1e3 * place:.2g} mm and {math.degrees(turn):.2g} degrees")
+    if still := [r.name for r in recordings if not r.known.any()]:
+        notes.append(f"not used, as nowhere smooth: {', '.join(still[:3])}" + (" ..." if still[3:] else ""))
+    if len(recordings) < ENOUGH:
+        notes.append(f"with {ENOUGH} recordings or more some are kept to confirm what the others show")
+    return notes
+
+
+# --- the scene ---
+
+
+def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, Any]]:
+    """Body (of copies: their common name) -> key of the scene file -> value; of all parameters of the fit, as those
+    that are not shown one by one may be together."""
+    found: dict[str, dict[str, Any]] = {}
+    many = len(problem.moving)
+    for p, value in zip(problem.parameters, values, strict=True):
+        b = problem.bodies[p.bodies[0]]
+        name = re.sub(r"\[\d+\]$", "", b.name)
+        entry = found.setdefault(name, {})
+        if p.kind in HIGH:
+            entry[p.kind] = float(value)
+        elif p.kind == "mass":
+            entry["mass"] = b.mass * math.exp(value)
+        elif p.kind == "size":
+            entry["scale"] = b.scale * math.exp(value)
+        elif p.kind == "inertia":
+            shape = problem.scene.shapes[b.shape]
+            own = b.mass / shape.volume * shape.inertia * b.scale**2
+            given = 1.0 if b.inertia is None else np.trace(b.inertia) / np.trace(own)
+            entry["inertia_factor"] = float(given * math.exp(value))
+        if p.bodies[0] < many:
+            entry.setdefault("mass", b.mass)  # a density would make another mass of another size
+    for body, ground in problem.ground.items():
+        b, (turn, shift) = problem.bodies[body], problem.lie(values, body)
+        centre, length = ground.centre * problem.units.length, problem.units.length
+        position = centre + pose.rotate(turn, b.position - centre) + shift * length
+        found.setdefault(b.name, {}).update(
+            position=position.tolist(), quat_xyzw=pose.normalise(pose.multiply(turn, b.quat_xyzw)).tolist()
+        )
+    # A scene has no restitution above 1; contacts show products, so that what stands still can have more of it.
+    moving = {re.sub(r"\[\d+\]$", "", b.name) for b in problem.moving}
+    most = max((entry.get("restitution", 0.0) for name, entry in found.items() if name in moving), default=0.0)
+    if most > 1.0:
+        for b in problem.fixed:
+            found.setdefault(re.sub(r"\[\d+\]$", "", b.name), {}).setdefault("restitution", b.restitution)
+        for name, entry in found.items():
+            if "restitution" in entry:
+                entry["restitution"] = min(1.0, entry["restitution"] * (1.0 / most if name in moving else most))
+    return found
+
+
+INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
+
+
+def write_scene(found: Identified, scene_file: Path, out: Path) -> list[str]:
+    """A copy of a scene file with what was found; all else is as the file has it, but for comments. Returns notes."""
+    root, notes = cast("Any", yaml.compose(scene_file.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)), []
+    for entry in _value(root, "bodies").value:
+        values = dict(found.scene_values.get(_value(entry, "name").value, {}))
+        if (plane := _value(entry, "plane")) is not None and "position" in values:
+            place, turn = np.array(values.pop("position")), np.array(values.pop("quat_xyzw"))
+            normal = pose.rotate(turn, np.array([0.0, 0.0, 1.0]))
+            _set(plane, "normal", normal.tolist())
+            _set(plane, "offset", float(normal @ place))
+        for key, value in values.items():
+            entry.value = [(k, v) for k, v in entry.value if k.value not in INSTEAD.get(key, ())]
+            _set(entry, key, value)
+    if out.resolve().parent != scene_file.resolve().parent:
+        shapes = _value(root, "shapes")
+        named = [(_value(s, k)) for _, s in (shapes.value if shapes is not None else ()) for k in ("mesh", "asset")]
+        model = _value(root, "model")
+        named += [model] if model is not None and model.value.endswith(".safetensors") else []
+        for node in (node for node in named if node is not None):
+            node.value = os.path.relpath(scene_file.resolve().parent / node.value, out.resolve().parent)
+            notes = [f"{out} names files outside its folder: simulate it with --allow-outside, or write it beside them"]
+    text = yaml.serialize(root, Dumper=yaml.SafeDumper, width=120)
+    read_scene(out, allow_outside=True, text=text)
+    write_text(out, text)
+    return notes
+
+
+def _value(mapping: Any, key: str) -> Any:
+    return next((value for k, value in mapping.value if k.value == key), None)
+
+
+def _set(mapping: Any, key: str, value: Any) -> None:
+    node = yaml.compose(yaml.safe_dump(_rounded(value), default_flow_style=True), Loader=yaml.SafeLoader)
+    at = next((i for i, (k, _) in enumerate(mapping.value) if k.value == key), len(mapping.value))
+    mapping.value[at : at + 1] = [(yaml.ScalarNode("tag:yaml.org,2002:str", key), node)]
+
+
+def _rounded(value: Any) -> Any:
+    return [_rounded(v) for v in value] if isinstance(value, list) else float(f"{value:.9g}")

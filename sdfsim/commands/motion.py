@@ -173,19 +173,33 @@ def export(
 @command
 def identify(
     session: Session,
-    recording: Annotated[
-        Path, typer.Argument(help="Run folder, rollout.npz or CSV of poses (docs/identify.md).", show_default=False)
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Run folders, rollout.npz, CSV or npz files of poses, folders of these (docs/identify.md).",
+            show_default=False,
+        ),
     ],
     scene: OfRun = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE", help="Write the scene with what was found.")
+    ] = None,
     allow_outside: Outside = False,
 ) -> None:
-    """Motion -> friction, restitution and mass ratios."""
+    """Recorded motions -> friction, restitution, sizes, masses, the lie of the ground."""
     from sdfsim.apps import identify as room
+    from sdfsim.apps.observed import load_recordings
+    from sdfsim.base.files import check_writable
 
+    if out is not None:
+        check_writable(out.parent)
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
-    motion, known = room.load_recording(recording, scene, allow_outside=allow_outside, on_progress=shapes)
-    report = room.identify(motion, known, on_progress=fit)
-    session.report(report, room.report_lines(report))
+    motions, known = load_recordings(recordings, scene, allow_outside=allow_outside, on_progress=shapes)
+    found = room.identify(motions, known, on_progress=fit)
+    lines = room.report_lines(found)
+    if out is not None and known.path is not None:
+        lines += [*room.write_scene(found, known.path, out), f"wrote {out}"]
+    session.report(found.report() | ({"wrote": out} if out else {}), lines)
 
 
 @command

@@ -54,6 +54,10 @@ def load_scene(
         made = _body(entry, order[entry.shape], table.motion_of(entry), groups)
         if made.motion == "dynamic":
             made = replace(made, mass=_mass(entry, shapes[entry.shape], partial(document.wrong, ("bodies", i, "name"))))
+            if entry.inertia_factor != 1.0 and made.mass > 0.0:
+                shape = shapes[entry.shape]
+                own = made.mass / shape.volume * shape.inertia * entry.scale**2
+                made = replace(made, inertia=entry.inertia_factor * own)
         for name, offset in zip(entry.names(), entry.offsets(), strict=True):
             way = made.path and replace(made.path, position=made.path.position + offset)
             bodies.append(replace(made, name=name, position=made.position + offset, path=way))

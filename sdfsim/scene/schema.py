@@ -361,7 +361,7 @@ class Arrange(Table):
     spacing: Number = key("from one to the next", unit="m", gt=0)
 
 
-_NOT_WITH_PATH = ("position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density")
+_NOT_WITH_PATH = ("position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density", "inertia_factor")
 _NOT_WITH_PLANE = ("shape", "scale", *_NOT_WITH_PATH, "count", "arrange")
 _ORIGIN = (0.0, 0.0, 0.0)
 
@@ -382,6 +382,7 @@ class BodyTable(Turned):
     angular_velocity: Vector = key("in world axes", _ORIGIN, "rad/s")
     mass: Number | None = key("without it the density counts", None, "kg", gt=0)
     density: Number = key("not together with mass", 1000.0, "kg/m^3", gt=0)
+    inertia_factor: Number = key("on the inertia that this mass has, spread evenly in the shape", 1.0, gt=0, le=100)
     friction: Number = key("Coulomb coefficient; two bodies' product counts", 0.5, ge=0, le=1000)
     restitution: Number = key("two bodies' product counts", 0.5, ge=0, le=1)
     collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(

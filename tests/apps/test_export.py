@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import cli
 from sdfsim import Rollout, Simulator, load_scene
 from sdfsim.apps.export import export
-from sdfsim.apps.identify import load_recording
+from sdfsim.apps.observed import load_recordings
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape, mesh_shape
@@ -390,10 +390,10 @@ def test_a_shape_becomes_one_urdf(tmp_path):
 
 
 def test_identify_reads_the_poses_of_a_run(dropped):
-    found, scene = load_recording(dropped.export("run.csv"), dropped.file, allow_outside=True)
+    (found,), scene = load_recordings([dropped.export("run.csv")], dropped.file, allow_outside=True)
     rows = [dropped.index(body.name) for body in scene.bodies if body.motion == "dynamic"]
-    np.testing.assert_allclose(found.position, dropped.rollout.position[:, rows], atol=1e-9)
-    assert np.abs((found.orientation * dropped.rollout.orientation[:, rows]).sum(-1)).min() > 1 - 1e-9
+    np.testing.assert_allclose(found.goal[0], dropped.rollout.position[:, rows], atol=1e-9)
+    assert np.abs((found.goal[1] * dropped.rollout.orientation[:, rows]).sum(-1)).min() > 1 - 1e-9
 
 
 # --- the command, and what goes wrong ---

@@ -1,0 +1,416 @@
+"""Recorded motions of a scene as trackers and runs give them: read, cleaned of what trackers do, and the velocities
+that fits through smooth stretches tell."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.apps.run import read_run
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, visible
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.physics import pose
+from sdfsim.physics.bodies import from_scene, largest_extent
+from sdfsim.physics.free_flight import torque_free
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import Body, Scene
+
+COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
+ARRAYS = ("position", "quat_xyzw")  # of an npz of poses, besides `dt` or `time`, and `names` and `start`
+EVEN = 0.1  # of the spacing: how far a time may be off an even grid
+NEAR, LEAST = 3, 5  # frames on either side that tell whether one is in smooth motion; frames of the shortest flight
+BEYOND = 5.0  # deviations of the noise that are no noise
+ROUGH = 3e-3  # of a body's size (and rad): what trackers that smooth are off in a flight, more than from frame to frame
+FINEST = 1e-5  # of a body's size (and rad): poses are not expected to be more exact
+WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
+ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
+LOST = 3  # frames: the longest excursion of a tracker that is told from an impact
+
+
+@dataclass(frozen=True)
+class Recording:
+    """T poses of the D bodies that move, evenly spaced in time, and the velocities that were found."""
+
+    name: str
+    dt: float  # s
+    position: np.ndarray  # [T, D, 3] m, of the centres of mass; that of the fit where there is one
+    orientation: np.ndarray  # [T, D, 4] xyzw, likewise
+    # velocity, angular_velocity: [T, D, 3] m/s and rad/s
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+    known: np.ndarray  # [T] bool, whether the velocities of all bodies are to be trusted
+    flying: np.ndarray  # [T, D] bool, whether a body is in free flight
+    seen: np.ndarray  # [T, D] bool, whether there is a pose at all
+    goal: tuple[np.ndarray, np.ndarray]  # the poses as recorded, [T, D, 3] and [T, D, 4]
+    noise: tuple[float, float] = (0.0, 0.0)  # m and rad, standard deviations of poses about smooth motion
+    lost: int = 0  # poses that were missing or not a number
+    jumps: int = 0  # poses that were left out because no motion leads there and back
+
+
+def movers(scene: Scene) -> list[Body]:
+    """The bodies that a recording tells of. Raises SdfsimError where one is on a path, or none moves."""
+    if any(b.motion == "kinematic" for b in scene.bodies):
+        raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
+    found = [b for b in scene.bodies if b.motion == "dynamic"]
+    if not found:
+        raise SdfsimError(f"{scene.path}: bodies: none moves")
+    return found
+
+
+def load_recordings(
+    paths: Sequence[Path],
+    scene_file: Path | None = None,
+    *,
+    allow_outside: bool = False,
+    on_progress: Progress = silent,
+) -> tuple[list[Recording], Scene]:
+    """Recordings of one scene, and the scene: of run folders and `rollout.npz`, whose scene is known; of CSVs and
+    `npz` files of poses, whose positions are those of the shapes' own origins, as in a scene file; and of folders of
+    these. Raises SdfsimError for no scene, unreadable files, or a recording that is not of this scene."""
+    files = [file for path in paths for file in _files(path)]
+    scene, found = None, []
+    if scene_file is not None:
+        scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
+    for file in files:
+        poses = file.suffix == ".csv" or (file.suffix == ".npz" and "meta" not in read_arrays(file, "a recording"))
+        if not poses:
+            own, rollout = read_run(
+                file, scene.path if scene else None, allow_outside=allow_outside, on_progress=on_progress
+            )
+            scene = scene or own
+            rows = [k for k, b in enumerate(own.bodies) if b in movers(own)]
+            arrays = [getattr(rollout, n)[:, rows] for n in ("position", "orientation", "velocity", "angular_velocity")]
+            dt, sure = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0, np.ones(arrays[0].shape[:2], bool)
+            found.append(Recording(str(file), dt, *arrays, sure.all(1), ~sure, sure, (arrays[0], arrays[1])))
+        elif scene is None:
+            raise SdfsimError(f"{file}: a recording without its scene", "give it: --scene scene.yaml")
+        else:
+            names = [body.name for body in movers(scene)]
+            read = _csv(file, names) if file.suffix == ".csv" else _npz(file, names)
+            found += [cleaned(name, dt, poses, scene) for name, dt, poses in read]
+    if scene is None:
+        raise SdfsimError("no recordings", "give run folders, or CSV or npz files of poses")
+    return with_velocities(found, scene), scene
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.is_dir() or (path / "rollout.npz").exists():
+        return [path]
+    found = [f for f in visible(path) if f.suffix in (".csv", ".npz") or (f / "rollout.npz").exists()]
+    if not found:
+        raise SdfsimError(f"{path}: no recordings in this folder", "it may hold CSVs, npz files and run folders")
+    return found
+
+
+def _csv(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
+    """Spacing s and poses [T, D, 7] of the bodies, positions [m] before quaternions; NaN where there is none."""
+    rows: dict[tuple[float, str], list[float]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != COLUMNS:
+                raise SdfsimError(f"{path}:1: columns must be {','.join(COLUMNS)}")
+            for row in reader:
+                if row["body"] in moving:
+                    where, numbers = f"{path}:{reader.line_num}: ", []
+                    for name in ("time", *COLUMNS[2:]):
+                        try:
+                            numbers.append(float(row[name] or ("" if name == "time" else "nan")))
+                        except ValueError:
+                            raise SdfsimError(f"{where}{name}: must be a number (got {row[name]!r})") from None
+                    if not np.isfinite(numbers[0]):
+                        raise SdfsimError(f"{where}time: must be finite (got {row['time']!r})")
+                    if (numbers[0], row["body"]) in rows:
+                        raise SdfsimError(f"{where}body: {row['body']!r} has two poses at time {numbers[0]:g}")
+                    rows[numbers[0], row["body"]] = numbers[1:]
+    except (OSError, csv.Error, UnicodeDecodeError) as error:
+        raise SdfsimError(f"{path}: not a CSV of poses ({error})") from error
+    if missing := set(moving) - {name for _, name in rows}:
+        raise SdfsimError(f"{path}: body: no pose of {min(missing)!r}, which the scene has")
+    times = np.unique([time for time, _ in rows])
+    poses = np.full((len(times), len(moving), 7), np.nan)
+    for (time, name), values in rows.items():
+        poses[np.searchsorted(times, time), moving.index(name)] = values
+    return [(str(path), *_on_grid(path, times, poses))]
+
+
+def _npz(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
+    """As `_csv`; of many recordings end to end where there is a `start` [K+1]."""
+    data = read_arrays(path, "a recording")
+
+    def wrong(name: str, what: str) -> SdfsimError:
+        return SdfsimError(f"{path}: {name}: {what}")
+
+    if missing := [name for name in ARRAYS if name not in data]:
+        raise wrong(missing[0], f"there is no such array (it has {', '.join(sorted(data))})")
+    arrays = []
+    for name, width in zip(ARRAYS, (3, 4), strict=True):
+        values = np.asarray(data[name])
+        values = values[:, None] if values.ndim == 2 else values
+        if values.dtype.kind not in "fiu" or values.ndim != 3 or values.shape[2] != width:
+            raise wrong(name, f"must be numbers [T, bodies, {width}] (got {data[name].dtype} {data[name].shape})")
+        arrays.append(values.astype(np.float64))
+    names = [str(name) for name in data["names"]] if "names" in data else moving
+    if len({len(names), *(array.shape[1] for array in arrays)}) > 1 or len(arrays[0]) != len(arrays[1]):
+        raise wrong(ARRAYS[1], f"must be of as many poses as position, and of {len(names)} bodies")
+    if missing := set(moving) - set(names):
+        raise wrong("names", f"no body {min(missing)!r}, which the scene has")
+    poses = np.concatenate(arrays, -1)[:, [names.index(name) for name in moving]]
+    ends = np.asarray(data.get("start", [0, len(poses)]))
+    if ends.dtype.kind not in "iu" or ends.ndim != 1 or len(ends) < 2 or ends[0] != 0 or ends[-1] != len(poses):
+        raise wrong("start", f"must be whole numbers from 0 to {len(poses)}")
+    if (np.diff(ends) <= 0).any():
+        raise wrong("start", "must increase")
+    if "time" in data:
+        times = np.asarray(data["time"], dtype=np.float64)
+        if times.shape != (len(poses),) or not np.isfinite(times).all():
+            raise wrong("time", f"must be {len(poses)} finite numbers")
+    elif np.size(data.get("dt", ())) == 1 and 0.0 < float(data["dt"]) < np.inf:
+        times = float(data["dt"]) * np.arange(len(poses))
+    else:
+        raise wrong("dt", "must be one number of s above 0, where there is no time")
+    cuts = [slice(a, b) for a, b in pairwise(ends)]
+    names = [f"{path}[{k}]" if len(cuts) > 1 else str(path) for k in range(len(cuts))]
+    return [(name, *_on_grid(name, times[cut], poses[cut])) for name, cut in zip(names, cuts, strict=True)]
+
+
+def _on_grid(path: Path | str, times: np.ndarray, poses: np.ndarray) -> tuple[float, np.ndarray]:
+    """Spacing s, and poses at even times, NaN at those that are missing."""
+    if len(times) < LEAST:
+        raise SdfsimError(f"{path}: time: {len(times)} times (at least {LEAST})")
+    gaps = np.diff(times)
+    if (gaps <= 0.0).any():
+        raise SdfsimError(f"{path}: time: must increase (frame {int((gaps <= 0.0).argmax()) + 1})")
+    dt = float(np.median(gaps))
+    dt = float(np.ptp(times)) / max(1, round(np.ptp(times) / dt))
+    frame = np.round((times - times[0]) / dt).astype(int)
+    off = np.abs((times - times[0]) / dt - frame)
+    if off.max() > EVEN or (np.diff(frame) < 1).any():
+        told = f"they are {gaps.min():.4g} to {gaps.max():.4g} s apart"
+        raise SdfsimError(f"{path}: time: must be evenly spaced, but for frames that are missing ({told})")
+    if frame[-1] + 1 > 100 * len(times):
+        raise SdfsimError(f"{path}: time: {frame[-1] + 1 - len(times)} of {frame[-1] + 1} frames are missing")
+    whole = np.full((frame[-1] + 1, *poses.shape[1:]), np.nan)
+    whole[frame] = poses
+    return dt, whole
+
+
+def cleaned(name: str, dt: float, poses: np.ndarray, scene: Scene) -> Recording:
+    """A recording of poses [T, D, 7] without what trackers do: rows without numbers, signs of quaternions that flip,
+    and excursions of up to `LOST` frames. Its velocities are still to be found."""
+    bodies = movers(scene)
+    length = np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
+    seen = np.isfinite(poses).all(-1) & (length[..., 0] > 0.0) & np.isfinite(length[..., 0])
+    turn = np.where(seen[..., None], poses[..., 3:] / np.where(seen[..., None], length, 1.0), [0.0, 0.0, 0.0, 1.0])
+    com = np.array([scene.shapes[b.shape].com * b.scale for b in bodies])
+    position = np.where(seen[..., None], poses[..., :3], 0.0) + pose.rotate(turn, com)
+    size = np.array([largest_extent(scene.shapes[b.shape]) * b.scale for b in bodies])
+    lost, before = int((~seen).sum()), int(seen.sum())
+    for d in range(len(bodies)):
+        rows = np.flatnonzero(seen[:, d])
+        if len(rows) < LEAST:
+            raise SdfsimError(f"{name}: body {bodies[d].name!r}: {len(rows)} poses (at least {LEAST})")
+        turn[rows, d] = _same_sign(turn[rows, d])
+        away = _excursions(np.concatenate([position[rows, d] / size[d], turn[rows, d]], 1))
+        seen[rows[away], d] = False
+        rows = rows[~away]
+        turn[rows, d] = _same_sign(turn[rows, d])
+    none = np.zeros(position.shape)
+    return Recording(
+        name, dt, position, turn, none, none, np.zeros(len(poses), bool), ~seen & False, seen, (position, turn),
+        lost=lost, jumps=before - int(seen.sum()),
+    )  # fmt: skip
+
+
+def _same_sign(turn: np.ndarray) -> np.ndarray:
+    """Quaternions [T, 4], each with the sign that is nearer to the one before."""
+    signs = np.where((turn[1:] * turn[:-1]).sum(1) < 0.0, -1.0, 1.0)
+    return turn * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
+
+
+def _excursions(x: np.ndarray) -> np.ndarray:
+    """[T] bool: poses x [T, 7] that are farther from the line between those before and after an excursion than any
+    motion with the speeds there leads: an impact changes a velocity and not a place."""
+    away, floor = np.zeros(len(x), bool), 20.0 * FINEST
+    for part in (x[:, :3], x[:, 3:]):
+        step = np.linalg.norm(np.diff(part, axis=0), axis=1)
+        usual = float(np.median(step)) + floor
+        for count in range(1, LOST + 1):
+            for t in range(1, len(x) - count):
+                if away[t : t + count].any():
+                    continue
+                # Ends have a neighbour on one side only, and a neighbour that is away itself tells nothing.
+                ahead = step[t - 2] if t > 1 and not away[t - 2] else usual
+                behind = step[t + count] if t + count < len(step) and not away[t + count + 1] else usual
+                bound = 2.0 * (ahead + behind + usual) * 0.5 * (count + 1)
+                first, last = part[t - 1], part[t + count]
+                share = np.arange(1, count + 1)[:, None] / (count + 1)
+                off = np.linalg.norm(part[t : t + count] - (first + share * (last - first)), axis=1)
+                if (off > bound).all() and np.linalg.norm(last - first) < bound * (count + 1):
+                    away[t : t + count] = True
+    return away
+
+
+# --- velocities ---
+
+
+def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording]:
+    """The recordings with the velocities of their smooth stretches: of flights by a parabola and a torque-free rotation
+    through all of a flight, elsewhere (a slide, a roll, rest) by a polynomial through the frames nearby. Those of a run
+    are known."""
+    bodies = movers(scene)
+    inertia = from_scene(replace(scene, bodies=tuple(bodies)), scene_units(scene))[0].inertia
+    size = [largest_extent(scene.shapes[b.shape]) * b.scale for b in bodies]
+    gravity, done, flights = np.asarray(scene.gravity), [], []
+    for r in recordings:
+        if r.known.any():
+            done.append(r)
+            continue
+        arrays = [a.copy() for a in (r.position, r.orientation, r.velocity, r.angular_velocity)]
+        smooth, flying, noise = np.zeros(r.seen.shape, bool), np.zeros(r.seen.shape, bool), []
+        for d in range(len(bodies)):
+            p, q = r.position[:, d], r.orientation[:, d]
+            sigma = _noise(p, r.seen[:, d], FINEST * size[d]), _noise(q, r.seen[:, d], 0.5 * FINEST) * 2.0
+            noise.append(sigma)
+            fitted, fits, flies = _nearby(p, q, r.seen[:, d], r.dt, gravity, sigma)
+            smooth[:, d] = fits
+            for whole, values in zip(arrays, fitted, strict=True):
+                whole[fits, d] = values[fits]
+            for a, b in _flights(flies, r.seen[:, d], p, r.dt, gravity, max(BEYOND * sigma[0], ROUGH * size[d])):
+                rows = np.arange(a, b)[r.seen[a:b, d]]
+                (arrays[0][a:b, d], arrays[2][a:b, d]), _ = _parabola(rows, p[rows], r.dt, gravity, np.arange(a, b))
+                flying[a:b, d] = True
+                flights.append((len(done), d, a, b, rows, arrays[3][a, d].copy()))
+        spread = np.sqrt(np.mean(np.square(noise), axis=0))
+        done.append(
+            replace(
+                r, position=arrays[0], orientation=arrays[1], velocity=arrays[2], angular_velocity=arrays[3],
+                known=(smooth | flying).all(1), flying=flying, noise=(float(spread[0]), float(spread[1])),
+            )
+        )  # fmt: skip
+    _rotations(done, flights, inertia)
+    return done
+
+
+def _noise(x: np.ndarray, seen: np.ndarray, least: float) -> float:
+    """Standard deviation of a coordinate about smooth motion, of x [T, C]: by third differences, of which few are of
+    impacts."""
+    rows = np.flatnonzero(seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3])
+    third = x[rows + 3] - 3.0 * x[rows + 2] + 3.0 * x[rows + 1] - x[rows]
+    return max(least, 1.48 * float(np.median(np.abs(third))) / np.sqrt(20.0)) if len(rows) else least
+
+
+def _nearby(
+    p: np.ndarray, q: np.ndarray, seen: np.ndarray, dt: float, gravity: np.ndarray, sigma: tuple[float, float]
+) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """Pose and velocities of every frame by parabolas through the `NEAR` frames on either side (one-sided at ends and
+    impacts), whether these fit [T], and whether the frame may be in free flight [T]."""
+    count, rows = len(p), np.flatnonzero(seen)
+    out = p.copy(), q.copy(), np.zeros((count, 3)), np.zeros((count, 3))
+    fits, flies = np.zeros(count, bool), np.zeros(count, bool)
+    base = q[rows[np.clip(np.searchsorted(rows, np.arange(count)), 0, len(rows) - 1)]]
+    strength = float(np.linalg.norm(gravity))
+    for shift in (0, -NEAR, NEAR):  # symmetric first, then what lies before, and what comes after
+        offset = np.arange(shift - NEAR, shift + NEAR + 1)
+        frame = np.arange(count)[:, None] + offset
+        there = (frame >= 0) & (frame < count)
+        frame = np.clip(frame, 0, count - 1)
+        there &= seen[frame]
+        time = dt * offset
+        powers = np.stack([np.ones_like(time), time, 0.5 * time**2], 1)
+        enough = (there.sum(1) >= LEAST) & there[:, offset <= 0].any(1) & there[:, offset >= 0].any(1) & ~fits
+        if not enough.any():
+            continue
+        t, weight = np.flatnonzero(enough), there[enough].astype(float)
+        turn = pose.to_rotvec(pose.multiply(q[frame[t]], pose.conjugate(base[t])[:, None]))
+        both = np.concatenate([p[frame[t]], turn], -1)
+        inverse = np.linalg.inv(np.einsum("ki,tk,kj->tij", powers, weight, powers))
+        fit = inverse @ np.einsum("ki,tk,tkc->tic", powers, weight, both)
+        off = np.square(both - powers @ fit) * weight[..., None]
+        off = np.sqrt(off.sum(1) / weight.sum(1)[:, None])
+        good = (off[:, :3].max(1) < BEYOND * sigma[0]) & (off[:, 3:].max(1) < BEYOND * sigma[1])
+        unsure = BEYOND * sigma[0] * np.sqrt(inverse[:, 2, 2])
+        pull = np.linalg.norm(fit[:, 2, :3] - gravity, axis=1)
+        fits[t[good]], t, fit = True, t[good], fit[good]
+        flies[t] = (pull[good] < np.maximum(unsure[good], WEIGHTLESS * strength)) & (pull[good] < 0.5 * strength)
+        out[0][t], out[2][t], out[3][t] = fit[:, 0, :3], fit[:, 1, :3], fit[:, 1, 3:]
+        out[1][t] = pose.multiply(pose.from_rotvec(fit[:, 0, 3:]), base[t])
+    return out, fits, flies
+
+
+def _flights(
+    flies: np.ndarray, seen: np.ndarray, p: np.ndarray, dt: float, gravity: np.ndarray, most: float
+) -> list[tuple[int, int]]:
+    """First and last (exclusive) frames of the longest stretches that a parabola each fits by `most` everywhere."""
+    found, a, rows = [], 0, np.flatnonzero(flies & seen)
+    while a + LEAST <= len(rows):
+        b = a + LEAST
+        while b <= len(rows) and (b == a + LEAST or rows[b - 1] - rows[b - 2] <= NEAR):
+            some = rows[a:b]
+            if _parabola(some, p[some], dt, gravity, some)[1] > most:
+                break
+            b += 1
+        if b - 1 - a >= LEAST and rows[b - 2] - rows[a] < 2 * (b - 1 - a):
+            found.append((int(rows[a]), int(rows[b - 2]) + 1))
+            a = b - 1
+        else:
+            a += 1
+    return found
+
+
+def _parabola(
+    rows: np.ndarray, p: np.ndarray, dt: float, gravity: np.ndarray, at: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], float]:
+    """Positions and velocities at frames `at` of a flight through p [K, 3] at frames `rows`, and how far the farthest
+    is off it."""
+    time, later = (dt * (f - at[0])[:, None] for f in (rows, at))
+    even = np.concatenate([np.ones_like(time), time], 1)
+    level = p - 0.5 * time**2 * gravity
+    fit = np.linalg.lstsq(even, level, rcond=None)[0]
+    off = float(np.linalg.norm(level - even @ fit, axis=1).max())
+    return (fit[0] + later * fit[1] + 0.5 * later**2 * gravity, fit[1] + later * gravity), off
+
+
+def _rotations(done: list[Recording], flights: list[tuple], inertia: np.ndarray) -> None:
+    """Write the torque-free rotations that fit flights best, by Gauss and Newton, all at once."""
+    if not flights:
+        return
+    longest = max(b - a for _, _, a, b, *_ in flights)
+    own = np.repeat(inertia[[d for _, d, *_ in flights]], 7, axis=0)
+    steps = np.array([done[k].dt for k, *_ in flights])
+    start = np.array([done[k].orientation[a, d] for k, d, a, *_ in flights])
+    rate = np.array([w for *_, w in flights])
+    nudge = np.zeros((7, 6))
+    nudge[1:, :] = 1e-4 * np.eye(6)
+    for turn in range(ROUNDS + 1):
+        scale = np.concatenate([np.ones((len(steps), 3)), np.repeat(1.0 / (longest * steps)[:, None], 3, 1)], 1)
+        moved = nudge[None] * scale[:, None]
+        q = pose.multiply(pose.from_rotvec(moved[..., :3]), start[:, None]).reshape(-1, 4)
+        w = (rate[:, None] + moved[..., 3:]).reshape(-1, 3)
+        paths = [(q, w)]
+        for _ in range(longest - 1):  # one step of each flight's own length: inertia and time scale together
+            q, spin = torque_free(q, w * np.repeat(steps, 7)[:, None], own, 1.0)
+            w = spin / np.repeat(steps, 7)[:, None]
+            paths.append((q, w))
+        at, speed = (np.stack([p[i] for p in paths]).reshape(longest, len(steps), 7, -1) for i in range(2))
+        for f, (k, d, a, b, rows, _) in enumerate(flights):
+            if turn == ROUNDS:
+                off = pose.to_rotvec(pose.multiply(done[k].goal[1][rows, d], pose.conjugate(at[rows - a, f, 0])))
+                if np.linalg.norm(off, axis=1).max() > max(BEYOND * done[k].noise[1], 2.0 * ROUGH):
+                    done[k].known[a:b] = done[k].flying[a:b, d] = False  # something turned it
+                    continue
+                done[k].orientation[a:b, d], done[k].angular_velocity[a:b, d] = at[: b - a, f, 0], speed[: b - a, f, 0]
+                continue
+            seen = done[k].goal[1][rows, d]
+            off = pose.to_rotvec(pose.multiply(seen[:, None], pose.conjugate(at[rows - a, f]))).swapaxes(1, 2)
+            slope = (off[..., 1:] - off[..., :1]) / 1e-4
+            change = np.linalg.lstsq(slope.reshape(-1, 6), -off[..., 0].reshape(-1), rcond=None)[0]
+            start[f] = pose.multiply(pose.from_rotvec(change[:3]), start[f])
+            rate[f] = rate[f] + change[3:] * scale[f, 3:]
