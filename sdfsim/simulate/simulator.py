@@ -425,11 +425,14 @@ def run_all(
     **options: Any,
 ) -> list[Rollout]:  # fmt: skip
     """`run` of a `Simulator` of every scene, made with these options, on all cores: in threads where the steps are
-    compiled code that needs nothing of Python, else in processes. Raises as these do."""
+    compiled code that needs nothing of Python and has no threads of its own, else in processes. Raises as these do."""
+    from sdfsim.physics.solver.prepare import CROWD  # numba takes its time to load
+
     model = model or load_model()
+    few = all(sum(b.motion == "dynamic" for b in scene.bodies) < CROWD for scene in scenes)
     pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
     jobs = [([scenes[k] for k in piece], model, options, seconds, steps) for piece in pieces]
-    found = dict((threads if model.kind == SOLVER else parallel)(_run_each, jobs))
+    found = dict((threads if few and model.kind == SOLVER else parallel)(_run_each, jobs))
     return [rollout for k in range(len(jobs)) for rollout in found[k]]
 
 
