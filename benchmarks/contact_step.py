@@ -5,9 +5,9 @@
 
 Writes its section of RESULTS.md, and the ratios into contact_step_ratchet.json. A slow test holds later steps to these:
 it asks for --check, which fails where a ratio has slipped back. DATA is a MOVi-B dataset; without one its row is left
-out. One thread; PyBullet and the solve take turns, and every figure is the median of the repeats. PyBullet collides
-convex pieces (a bowl of 144), the solve baked distances; both make five inner steps a step. Loading, and what a
-simulator keeps for its recording, is left out.
+out. One thread but for many scenes in a call. PyBullet and the solve take turns, each through its own API; every
+figure is the median of the repeats. PyBullet collides convex pieces (a bowl of 144), the solve those or baked distances;
+both make five inner steps a step. Loading, and what a simulator keeps for its recording, is left out.
 """
 
 from __future__ import annotations
@@ -36,18 +36,19 @@ from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.harness import markdown, number, one_thread
-from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.simulate.simulator import Simulator
+from sdfsim.simulate.simulator import Simulator, run_all
 
 RATCHET = Path(__file__).with_name("contact_step_ratchet.json")
 SLACK = 0.35  # of a ratio: what machines and their load make of it
 TRAJECTORIES, STEPS = 10, 100
 BALLS, FALL = (16, 512), 200
 GROWN = (256, 512)  # bodies far apart
-SLIDE = 100  # steps of a body beside static ones
+SLIDE = 100  # steps of a body beside static ones, and of what rests
+REST = 60  # steps in which it falls asleep
+WORLDS = 200
 FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static bodies, and where
 
 
@@ -60,16 +61,42 @@ def with_far(count: int) -> Scene:
 
 
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
-    """Milliseconds a step of the compiled solve."""
+    """Milliseconds a step of `Simulator.step`."""
     simulator = Simulator(scene, "solver")
     options = replace(simulator.options, sleep=False)
-    rules = compiled_rules(replace(options, dt=dt / simulator.units.time) if dt else options)
-    inside = Compiled(simulator.bodies, simulator.state)
-    motion, manifolds = taken_up(simulator.state)
+    simulator.options = replace(options, dt=dt / simulator.units.time) if dt else options
     began = time.perf_counter()
-    for _ in range(steps):
-        manifolds, *_ = inside.run(motion, manifolds, rules)
+    simulator.step(steps)
     return 1e3 * (time.perf_counter() - began) / steps
+
+
+def asleep(scene: Scene) -> tuple[float, float]:
+    """Milliseconds a step of what rests: awake, and asleep."""
+    taken = []
+    for sleep in (False, True):
+        simulator = Simulator(scene, "solver")
+        simulator.options = replace(simulator.options, sleep=sleep)
+        simulator.step(REST)
+        began = time.perf_counter()
+        simulator.step(SLIDE)
+        taken.append(1e3 * (time.perf_counter() - began) / SLIDE)
+    return taken[0], taken[1]
+
+
+def worlds(data: Path) -> tuple[float, float]:
+    """Milliseconds a step of MOVi-B scenes that are simulated one after the other, and many in one call on all cores,
+    their recordings included."""
+    recorded, shapes = load_recorded(data, "test", most=TRAJECTORIES, as_recorded=True)
+    floor = conditions_of(data).floor
+    scenes = [scene_of([t], [0], shapes, floor)[0] for t in recorded]
+    began = time.perf_counter()
+    for scene in scenes:
+        Simulator(scene, "solver").run(steps=STEPS)
+    alone = (time.perf_counter() - began) / len(scenes)
+    many = scenes * (WORLDS // len(scenes))
+    began = time.perf_counter()
+    run_all(many, steps=STEPS)
+    return 1e3 * alone / STEPS, 1e3 * (time.perf_counter() - began) / len(many) / STEPS
 
 
 def movi_b(data: Path) -> tuple[float, float]:
@@ -109,6 +136,7 @@ def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable
     found: dict[str, tuple[str, str, Callable[[], tuple[float, float]]]] = {}
     if data:
         found["a MOVi-B step"] = ("PyBullet", "sdfsim", lambda: movi_b(data))
+        found["MOVi-B scenes, all cores"] = ("one by one", f"{WORLDS} in a call", lambda: worlds(data))
     for n in BALLS:
         found[f"{n} spheres in a bowl"] = ("PyBullet", "sdfsim", lambda n=n: bowl(n, folder))
 
@@ -119,6 +147,7 @@ def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable
     both("64 knots", ("half of the nodes", with_nodes_cut(heap, 0.5)), ("all", heap), 60)
     both("boxes far apart", *((str(n), apart(n)) for n in GROWN), 50)
     both("static boxes far away", *((str(n), with_far(n)) for n in FAR), 500)
+    found["64 boxes at rest"] = ("awake", "asleep", lambda: asleep(apart(64)))
     for model in ("solver", "small"):
         few, many = (str(n) for n in FAR)
         found[f"the same with all of `Simulator`, {model}"] = (few, many, partial(user_steps, model))
