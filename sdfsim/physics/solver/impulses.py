@@ -237,7 +237,7 @@ def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
 @njit(**ONCE)
 def _solve_all(mass, rules, system, change, shift, threads):
     islands = len(system.start) - 1
-    if len(threads) > 0:  # known when it is compiled
+    if threads.ndim > 1:  # known when it is compiled
         if islands >= MANY:
             _solve_many(mass, rules, system, change, shift)
             return

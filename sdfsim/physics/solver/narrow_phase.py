@@ -163,7 +163,7 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
 
 @njit(**ONCE)
 def _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, threads):
-    if len(threads) > 0:  # known when it is compiled
+    if threads.ndim > 1:  # known when it is compiled
         if len(pairs) >= MANY:
             _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
             return
@@ -268,7 +268,7 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
 
 @njit(**ONCE)
 def _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, threads):
-    if len(threads) > 0:  # known when it is compiled
+    if threads.ndim > 1:  # known when it is compiled
         if len(near.start) >= MANY:
             _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
             return
