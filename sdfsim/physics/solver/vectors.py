@@ -13,8 +13,8 @@ FAST = {**ENTRY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": T
 # Likewise, of functions that make no arrays: without this each counts the references of all arrays that it is given,
 # which takes longer than what most of them do.
 BARE = {**FAST, "_nrt": False}
-# Likewise, of functions that one place calls, again and again: all numbers of all arrays are copied for a call.
-ONCE = {**BARE, "forceinline": True}
+# Likewise, of functions that few places call, again and again: all numbers of all arrays are copied for a call.
+INLINED = {**BARE, "forceinline": True}
 
 
 @njit(**BARE)
