@@ -19,7 +19,7 @@ from sdfsim.physics.solver.convex import (
     outermost,
     rounding,
 )
-from sdfsim.physics.solver.vectors import BARE, FAST, add, along, cross, dot, get, put, scale, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, FAST, INLINED, add, along, cross, dot, get, put, scale, turn, turn_back
 
 RIM = 24  # points of the true circle that bound the contact of a drum's end
 MOST = 160  # corners of a clipped face
@@ -124,7 +124,7 @@ def across(n):
     return u, cross(n, u)
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, room):
     """The points at which two pieces touch or may soon, of which up to CHOSEN bound the contact; to room.clipped (its
     places are on the first, world axes from the second's origin) and room.gap.

@@ -16,6 +16,7 @@ from numba import njit
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
+    INLINED,
     add,
     along,
     cross,
@@ -82,7 +83,7 @@ def rounding(convex, p):
     return convex.table[p, SIZE] if convex.table[p, KIND] <= SEGMENT else 0.0
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def outermost(convex, p, d):
     """The vertex of a hull that is farthest along d: of the best of a few, always the neighbour that is farther."""
     first, last = convex.vertex_start[p], convex.vertex_start[p + 1]
@@ -113,7 +114,7 @@ def outside(convex, p, place):
     return most
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def core(convex, p, d):
     """The point of the core of piece p, in its own frame, that is farthest along d."""
     kind = convex.table[p, KIND]
@@ -132,7 +133,7 @@ def core(convex, p, d):
     return a * d[0] / r, a * d[1] / r, math.copysign(b, d[2])
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def farthest(convex, p, size, matrix, body, d):
     """The point of the core of a body's piece that is farthest along d; both along world axes, from its origin."""
     return turn(matrix, body, scale(core(convex, p, turn_back(matrix, body, d)), size))
@@ -275,7 +276,7 @@ def _gjk(convex, matrix, pair, offset, v, room):
     return scale(best, max(surely, 0.0) / norm(best)), there
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def _nearest_part(corner, own, weight, trial, count):
     """Leave of a simplex the corners between which the place nearest to the origin lies, with their weights; how many
     these are. None where the origin is inside."""

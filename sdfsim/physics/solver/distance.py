@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.convex import Convex
-from sdfsim.physics.solver.vectors import BARE, ENTRY, along, dot, get, norm, put, scale
+from sdfsim.physics.solver.vectors import BARE, ENTRY, INLINED, along, dot, get, norm, put, scale
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
 TINY = 1e-12
@@ -157,7 +157,7 @@ def _cylinder(p, radius, half):
     return z, (0.0, 0.0, sz)
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def _grid(table, brick, sample, s, p):
     """Trilinear in the brick around p, or between the corners of bricks; the distance to the box adds beyond it."""
     corners, part, beyond = _around(table, brick, sample, s, p)
@@ -183,7 +183,7 @@ def _grid_alone(table, brick, sample, s, p):
     return d if far == 0.0 else math.sqrt(far + max(d, 0.0) ** 2)
 
 
-@njit(forceinline=True, **BARE)
+@njit(**INLINED)
 def _around(table, brick, sample, s, p):
     """The eight samples around p, or around the nearest place of the grid; where between them; and how far beyond."""
     cell = table[s, CELL]
@@ -211,7 +211,7 @@ def _around(table, brick, sample, s, p):
     return corners, (u - i, v - j, w - k), beyond
 
 
-@njit(forceinline=True, **BARE)
+@njit(**INLINED)
 def _trilinear(corners, part):
     """The interpolant between eight corners and its slope a cell."""
     a000, a001, a010, a011, a100, a101, a110, a111 = corners

@@ -9,7 +9,21 @@ import numpy as np
 from numba import njit, prange
 
 from sdfsim.physics.solver.islands import islands_of
-from sdfsim.physics.solver.vectors import BARE, FAST, ONCE, add, along, cross, dot, get, norm, scale, sub, turn, vector
+from sdfsim.physics.solver.vectors import (
+    BARE,
+    FAST,
+    INLINED,
+    add,
+    along,
+    cross,
+    dot,
+    get,
+    norm,
+    scale,
+    sub,
+    turn,
+    vector,
+)
 from sdfsim.physics.solver.world import (
     FIRST,
     GAP,
@@ -234,10 +248,10 @@ def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
     row[c, e, MASS] = 1.0 / (inverse_mass[a] + inverse_mass[b] + dot(lever, spin) + dot(counter, back))
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _solve_all(mass, rules, system, change, shift, threads):
     islands = len(system.start) - 1
-    if len(threads) > 0:  # known when it is compiled
+    if threads.ndim > 1:  # known when it is compiled
         if islands >= MANY:
             _solve_many(mass, rules, system, change, shift)
             return
@@ -343,7 +357,7 @@ def _balance(mass, rules, system, change, island):
             break
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def _relax(where, row, mass, change, c, first, last, least, most):
     """Bring rows of a contact to their wanted velocities, as far as limits allow; returns by how much that changed."""
     a, b = where[c, 2], where[c, 3]
@@ -367,7 +381,7 @@ def _relax(where, row, mass, change, c, first, last, least, most):
     return worst
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def _relax_friction(where, row, mass, change, c, most):
     """Bring both tangential rows of a contact to rest, as far as the cone of friction allows; returns by how much that
     changed."""

@@ -15,7 +15,7 @@ from sdfsim.physics.solver.distance import CELL, GRID, KIND, PLANE, distance_alo
 from sdfsim.physics.solver.manifold import renewed
 from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, pair_kind
 from sdfsim.physics.solver.surface_distance import KEYS
-from sdfsim.physics.solver.vectors import BARE, ONCE, add, dot, get, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, INLINED, add, dot, get, put, scale, sub, turn, turn_back
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two are one
@@ -49,7 +49,7 @@ def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
             _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p)
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]

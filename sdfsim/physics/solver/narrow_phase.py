@@ -51,7 +51,7 @@ from sdfsim.physics.solver.surface_distance import (
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
-    ONCE,
+    INLINED,
     add,
     along,
     dot,
@@ -161,9 +161,9 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
     return near
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, threads):
-    if len(threads) > 0:  # known when it is compiled
+    if threads.ndim > 1:  # known when it is compiled
         if len(pairs) >= MANY:
             _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
             return
@@ -266,9 +266,9 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
     _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, world.threads)
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, threads):
-    if len(threads) > 0:  # known when it is compiled
+    if threads.ndim > 1:  # known when it is compiled
         if len(near.start) >= MANY:
             _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
             return
@@ -289,7 +289,7 @@ def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, s
         _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     if near.count[p, 0] + near.count[p, 1] == 0:
@@ -331,7 +331,7 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, anew):
     """Where friction acts of points that bound a flat manifold, in parts of the way from its middle to each: the mean
     of what touches on this way. A full face, legs and a rim differ. Unless `anew`, only of those that are new."""
@@ -479,7 +479,7 @@ def _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, cou
     return count
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
     """The manifold of a pair with a sphere or a capsule."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]

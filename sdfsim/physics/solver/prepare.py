@@ -334,5 +334,5 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         group=array["group"], allowed=array["allowed"], world=array["world"],
         going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
-        threads=(0,) if np.count_nonzero(moves) >= CROWD else (),
+        threads=np.zeros((0, 0) if np.count_nonzero(moves) >= CROWD else 0),
     )  # fmt: skip

@@ -20,7 +20,7 @@ from sdfsim.physics.solver.distance import (
     patch_of,
 )
 from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
-from sdfsim.physics.solver.vectors import BARE, ONCE, add, along, dot, get, norm, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # patches of a shape at most
 ROUNDS = 12  # of refinement
@@ -65,7 +65,7 @@ def is_round(table, s):
     return table[s, KIND] == SPHERE or table[s, KIND] == CAPSULE
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, way, scratch, count):
     """Where the surface of one body is near another: from the deepest nodes of its near leaves down the other's
     distance; added to what is found. `way` is by how much the two have moved since they were last looked at."""
@@ -108,7 +108,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
     return count
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch):
     """The deepest node of each near leaf around which the surface may touch; how many.
 
@@ -181,7 +181,7 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
     return kept
 
 
-@njit(**ONCE)
+@njit(**INLINED)
 def _chosen(scratch, kept, level):
     """Of candidates that face the same way the deepest, and of those that are about as deep the outermost to all sides:
     the corners of a face, in whatever order its leaves are. How many, to scratch.pick."""
@@ -241,7 +241,7 @@ def _along_normal(w, within, n):
     return dot((dot(w[0], within), dot(w[1], within), dot(w[2], within)), n)
 
 
-@njit(**BARE)
+@njit(**INLINED)
 def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
     """From a place p on shape s, at the distance d of t with the normal n in t's axes, down the distance along the
     surface of s, in steps of `stride` at first and `least` at last: place, distance at the scale of t, and normal."""

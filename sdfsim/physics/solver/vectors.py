@@ -6,15 +6,15 @@ import math
 
 from numba import njit
 
-# Of functions that Python calls.
-ENTRY = {"cache": True, "fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy"}
+# Of functions that Python calls. What is not said here would be taken from who calls a function first.
+ENTRY = {"cache": True, "fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy", "forceinline": False}
 # Of functions that only compiled code calls: a way in from Python takes as long to compile as most of them.
 FAST = {**ENTRY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": True}
 # Likewise, of functions that make no arrays: without this each counts the references of all arrays that it is given,
 # which takes longer than what most of them do.
 BARE = {**FAST, "_nrt": False}
-# Likewise, of functions that one place calls, again and again: all numbers of all arrays are copied for a call.
-ONCE = {**BARE, "forceinline": True}
+# Likewise, of functions that few places call, again and again: all numbers of all arrays are copied for a call.
+INLINED = {**BARE, "forceinline": True}
 
 
 @njit(**BARE)

@@ -57,9 +57,9 @@ class World(NamedTuple):
     high: np.ndarray
     reach: np.ndarray  # [M] the highest end so far along `axis`
     axis: int  # 0, 1 or 2
-    # One number where there may be so many pairs that threads are worth their while, else none: loops on all cores take
-    # a quarter of the time in which all is compiled, and are compiled for worlds of another type only.
-    threads: tuple[int, ...] = ()
+    # [0, 0] where there may be so many pairs that threads are worth their while, else [0]: loops on all cores take a
+    # quarter of the time in which all is compiled, and are compiled for worlds of another type only.
+    threads: np.ndarray = np.zeros(0)
 
 
 class Work(NamedTuple):
