@@ -46,7 +46,7 @@ WEAK = 1e-3  # how strongly parameters that nothing shows are held to the scene'
 # ones tell nothing.
 NUDGE = {"friction": 0.02, "restitution": 0.02, "mass": 0.02, "inertia": 0.1, "size": 0.2, "height": 0.2, "tilt": 0.1}
 SURE = 1.96  # standard deviations in an interval of 95 %
-SHOWN = 0.1  # of its width: how well the windows have to tell a parameter, noise being `OUTLIER`
+SHOWN = 0.25  # of its width: how well the windows have to tell a parameter, noise being `OUTLIER`
 IMPACT = 3.0  # times what gravity makes in a frame: changes of a velocity that weight and friction do not make
 HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are looked for
 HELD = 6  # every so many-th recording is kept out of the fit, where there are at least `ENOUGH`

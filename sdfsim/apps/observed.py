@@ -27,8 +27,10 @@ ARRAYS = ("position", "quat_xyzw")  # of an npz of poses, besides `dt` or `time`
 EVEN = 0.1  # of the spacing: how far a time may be off an even grid
 NEAR, LEAST = 3, 5  # frames on either side that tell whether one is in smooth motion; frames of the shortest flight
 BEYOND = 5.0  # deviations of the noise that are no noise
-ROUGH = 3e-3  # of a body's size (and rad): what trackers that smooth are off in a flight, more than from frame to frame
-FINEST = 1e-5  # of a body's size (and rad): poses are not expected to be more exact
+# Trackers that smooth are off more in a flight than from frame to frame: by so much of a size (and rad) at most, and
+# so many deviations of that.
+ROUGH, SMOOTHED = 3e-3, 30.0
+FINEST = 2e-6  # of a body's size (and rad): poses are not expected to be more exact
 WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
 ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
 LOST = 3  # frames: the longest excursion of a tracker that is told from an impact
@@ -281,7 +283,8 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
             smooth[:, d] = fits
             for whole, values in zip(arrays, fitted, strict=True):
                 whole[fits, d] = values[fits]
-            for a, b in _flights(flies, r.seen[:, d], p, r.dt, gravity, max(BEYOND * sigma[0], ROUGH * size[d])):
+            most = max(BEYOND * sigma[0], min(ROUGH * size[d], SMOOTHED * sigma[0]))
+            for a, b in _flights(flies, r.seen[:, d], p, r.dt, gravity, most):
                 rows = np.arange(a, b)[r.seen[a:b, d]]
                 (arrays[0][a:b, d], arrays[2][a:b, d]), _ = _parabola(rows, p[rows], r.dt, gravity, np.arange(a, b))
                 flying[a:b, d] = True
