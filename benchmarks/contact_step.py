@@ -6,8 +6,8 @@
 Writes its section of RESULTS.md, and the ratios into contact_step_ratchet.json. A slow test holds later steps to these:
 it asks for --check, which fails where a ratio has slipped back. DATA is a MOVi-B dataset; without one its row is left
 out. One thread but for many scenes in a call. PyBullet and the solve take turns, each through its own API; every
-figure is the median of the repeats. PyBullet collides convex pieces (a bowl of 144), the solve those or baked distances;
-both make five inner steps a step. Loading, and what a simulator keeps for its recording, is left out.
+figure is the median of the repeats. PyBullet collides convex pieces (a bowl of 144), the solve those or baked
+distances; both make five inner steps a step. Loading, and what a simulator keeps for its recording, is left out.
 """
 
 from __future__ import annotations
@@ -145,11 +145,13 @@ def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable
 
     heap = load_scene(write_scene("knots", folder / "knots", 64))
     both("64 knots", ("half of the nodes", with_nodes_cut(heap, 0.5)), ("all", heap), 60)
-    both("boxes far apart", *((str(n), apart(n)) for n in GROWN), 50)
-    both("static boxes far away", *((str(n), with_far(n)) for n in FAR), 500)
+    few, many = GROWN
+    both("boxes far apart", (str(few), apart(few)), (str(many), apart(many)), 50)
+    few, many = FAR
+    both("static boxes far away", (str(few), with_far(few)), (str(many), with_far(many)), 500)
     found["64 boxes at rest"] = ("awake", "asleep", lambda: asleep(apart(64)))
     for model in ("solver", "small"):
-        few, many = (str(n) for n in FAR)
+        few, many = map(str, FAR)
         found[f"the same with all of `Simulator`, {model}"] = (few, many, partial(user_steps, model))
     return found
 

@@ -28,6 +28,7 @@ from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
 from sdfsim.physics.options import STEP, SUBSTEPS, Options
+from sdfsim.physics.solver.world import FIRST
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import read_scene
 from sdfsim.scene.scene import Scene
@@ -35,24 +36,30 @@ from sdfsim.simulate.batch import placed, side_by_side
 from sdfsim.simulate.steppers import Frames, stepper_of
 
 # Model units of time, about seconds for bodies of a metre: length and spacing of short windows, length of long ones.
-WINDOW, EVERY, LONG = 0.15, 0.06, (0.5, 1.5)
+WINDOW, EVERY, LONG = 0.15, 0.06, 1.85
 MOST = 250  # short windows; of more every so many are taken
 WHOLE = 8  # long windows at least, for these to have the last word: few that are chaotic tell less than many short ones
 OUTLIER = 2e-3  # model lengths: errors of windows that count less than squared, beyond
 FAR = 0.3  # of a body's size: a motion that is farther off counts as so far, by however much it is
 WEAK = 1e-3  # how strongly parameters that nothing shows are held to the scene's
-NUDGE = 0.02  # of a parameter's width, for differences: contacts come and go, so that smaller ones tell nothing
+# Of a parameter's width, for differences: contacts come and go, and impacts are found to an inner step, so that smaller
+# ones tell nothing.
+NUDGE = {"friction": 0.02, "restitution": 0.02, "mass": 0.02, "inertia": 0.1, "size": 0.2, "height": 0.2, "tilt": 0.1}
 SURE = 1.96  # standard deviations in an interval of 95 %
-SHOWN = 0.7  # of its width: how well the windows have to tell a parameter, noise being `OUTLIER`
+SHOWN = 0.25  # of its width: how well the windows have to tell a parameter, noise being `OUTLIER`
+IMPACT = 3.0  # times what gravity makes in a frame: changes of a velocity that weight and friction do not make
 HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are looked for
 HELD = 6  # every so many-th recording is kept out of the fit, where there are at least `ENOUGH`
 ENOUGH = 4
-TRIES = 25, 12, 12  # of the fit to short windows, and to long ones
+TRIES = 15, 15, 8  # of the fits to short windows, and to long ones
+DRAWS = 400  # of recordings, for intervals
+CROWD, ROUNDS, AROUND = 24, 14, 0.15  # of the search between them: points, rounds, and how far about, in widths
 # How far parameters are looked for from the scene's: logarithms of factors, model lengths, rad.
 WIDTH = {
     "friction": 1.0, "restitution": 1.0, "mass": 3.0, "inertia": 0.5, "size": 0.1, "height": 0.05, "tilt": 0.05,
 }  # fmt: skip
-FARTHEST = {"mass": 7.0, "inertia": 0.7, "size": 0.15, "height": 0.15, "tilt": 0.15}
+# A factor of inertia of exp(0.5) is nearly that of a hollow shell: with all of its mass inside, no body has more.
+FARTHEST = {"mass": 7.0, "inertia": 0.5, "size": 0.15, "height": 0.15, "tilt": 0.15}
 FACTORS = ("mass", "inertia", "size")
 
 
@@ -156,6 +163,8 @@ class Problem:
         self.bodies, self.units = [*self.moving, *self.fixed], scene_units(scene)
         self.parameters: list[Parameter] = []
         self.ground: dict[int, Ground] = {}
+        if any(b.motion == "kinematic" for b in scene.bodies):
+            raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
         if any(r.dt == 0.0 for r in recordings):
             raise SdfsimError("a recording is a single frame")
 
@@ -183,30 +192,31 @@ class Problem:
         rows = sorted({w for w, *_ in touched})
         return self.windows(WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
 
-    def whole(self, chosen: Sequence[int], length: float) -> Windows:
+    def whole(self, chosen: Sequence[int]) -> Windows:
         """Long windows that follow each other through these recordings, from the first frame at which velocities are
         known on; a last one is at least half as long."""
         begin = []
         for k in chosen:
             r, t = self.recordings[k], 0
-            frames = length * self.units.time / r.dt
+            frames = LONG * self.units.time / r.dt
             while t == 0 or len(r.known) - t > 0.5 * frames:
                 t += int(r.known[t:].argmax())
                 if not r.known[t] or len(r.known) - t < 4:
                     break
                 begin.append((k, t))
                 t += max(4, round(frames))
-        return self.windows(length, begin)
+        return self.windows(LONG, begin)
 
-    def _choose(self, touched: list[tuple[int, int, int, np.ndarray]]) -> None:
+    def _choose(self, touched: list[tuple[int, int, int, np.ndarray, bool]]) -> None:
         many = len(self.moving)
-        self.pairs = sorted({(a, b) for _, a, b, _ in touched})
+        self.pairs = sorted({(a, b) for _, a, b, *_ in touched})
+        self.hit = {k for _, *pair, _, impact in touched for k in pair if impact}
         groups: dict[str, list[int]] = {}
         for k, body in enumerate(self.bodies):
             groups.setdefault(re.sub(r"\[\d+\]$", "", body.name), []).append(k)
         seen = {name: rows for name, rows in groups.items() if any(k in pair for k in rows for pair in self.pairs)}
         static = {name: rows for name, rows in seen.items() if rows[0] >= many}
-        count = {name: sum(b in rows for _, _, b, _ in touched) for name, rows in static.items()}
+        count = {name: sum(b in rows for _, _, b, *_ in touched) for name, rows in static.items()}
         reference = max(count, key=lambda name: count[name], default=None)
         beside = [name for name, rows in seen.items() if any(set(p) & set(rows) and max(p) < many for p in self.pairs)]
         for kind, high in HIGH.items():
@@ -222,7 +232,7 @@ class Problem:
                     self._add(kind, name, rows)
         for name, rows in static.items():
             if len(rows) == 1:  # copies lie on a grid
-                points = np.concatenate([p for _, _, b, p in touched if b == rows[0]])
+                points = np.concatenate([p for _, _, b, p, _ in touched if b == rows[0]])
                 self.ground[rows[0]] = self._touched_at(rows[0], points)
                 self._add("height", name, rows)
                 for axis, way in enumerate(self.ground[rows[0]].axes[:2]):
@@ -374,11 +384,12 @@ class Windows:
             )
         return np.concatenate(found)
 
-    def touched(self) -> list[tuple[int, int, int, np.ndarray]]:
-        """Window, pair of bodies and points [P, 3] of all contacts; static bodies count on from those that move."""
+    def touched(self) -> list[tuple[int, int, int, np.ndarray, bool]]:
+        """Window, pair of bodies and points [P, 3] of all contacts, and whether one was an impact; static bodies count
+        on from those that move."""
         found, at = [], 0
         for part in self.parts:
-            found += [(at + w, a, b, points) for w, a, b, points in part.touched()]
+            found += [(at + w, *rest) for w, *rest in part.touched()]
             at += len(part.begin)
         return found
 
@@ -430,18 +441,30 @@ class _Part:
         off = np.concatenate([place - self.goal[..., :3], 0.5 * self.size[:, None] * away], -1)
         return np.where(np.isnan(self.goal[..., :1]), np.nan, np.nan_to_num(off, nan=1e3))
 
-    def touched(self) -> list[tuple[int, int, int, np.ndarray]]:
-        frames = self.frames(np.zeros(0))
-        many, total = self.shape[2], self.shape[1] * self.shape[2]
-        frame = np.repeat(np.arange(self.length), frames.touching)
+    def touched(self) -> list[tuple[int, int, int, np.ndarray, bool]]:
+        """See `Windows.touched`. Inner steps one by one: what rebounds is away again at the end of a frame."""
+        many, total, inner = self.shape[2], self.shape[1] * self.shape[2], self.options.substeps
         there = ~np.isnan(self.goal[..., 0]).all(-1)
+        fine = replace(self.options, dt=self.options.dt / inner, substeps=1)
+        state, carry = self.start, self.solver.init(self.bodies, self.start, fine)
+        pull = self.options.dt * self.options.gravity
         found: dict[tuple[int, int, int], list[np.ndarray]] = {}
-        for t, (a, b), point in zip(frame.tolist(), frames.pair.tolist(), frames.point, strict=True):
-            a, b = (a, b) if a < total else (b, a)
-            if there[t:, a // many].any():
-                other = b % many if b < total else many + b - total
-                found.setdefault((a // many, *sorted((a % many, other))), []).append(point)
-        return [(*key, np.stack(points)) for key, points in sorted(found.items())]
+        impacts = set()
+        for t in range(self.length):
+            before, now = state.velocity, set()
+            for _ in range(inner):
+                state, _ = self.solver.advance(state, carry)
+                touch = cast("Any", state.touch)
+                for (a, b), count, points in zip(touch.pair.tolist(), touch.count.tolist(), touch.point, strict=True):
+                    if count and there[t:, a // many].any():
+                        low, high = sorted((a % many, b % many if b < total else many + b - total))
+                        at = pose.rotate(state.orientation[a], points[:count, FIRST : FIRST + 3]) + state.position[a]
+                        found.setdefault((a // many, low, high), []).append(at)
+                        now.add((a, (a // many, low, high)))
+            # A change in the first frame may be of a start that is a little wrong.
+            change = np.linalg.norm(state.velocity - before - pull, axis=-1) > IMPACT * np.linalg.norm(pull)
+            impacts |= {key for a, key in now if t and change[a]}
+        return [(*key, np.concatenate(points), key in impacts) for key, points in sorted(found.items())]
 
 
 # --- the fit ---
@@ -456,10 +479,8 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
     from scipy.optimize import least_squares
 
     problem = Problem(recordings, scene)
-    every = range(len(recordings))
-    held = [k for k in every if k % HELD == HELD - 1] if len(recordings) >= HELD else [*every][-1:]
-    held = held if len(recordings) >= ENOUGH else []
-    fit = [k for k in every if k not in held]
+    held = [k for k in range(len(recordings)) if k % HELD == HELD - 1 or HELD > len(recordings) == k + 1 >= ENOUGH]
+    fit = [k for k in range(len(recordings)) if k not in held]
     short = problem.short(fit)
     start, width = problem.start, problem.width
     low, high = problem.bounds
@@ -481,28 +502,41 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
         on_progress(min(0.95, 0.2 + 0.002 * count[0]), f"fit, run {count[0]} of all windows")
         return np.concatenate([windows.errors(values), WEAK * (values - start) / width])
 
-    def slope(windows: Windows, values: np.ndarray) -> np.ndarray:
-        """[R, P] by central differences of `NUDGE`, one-sided at the bounds."""
+    nudge = width * [NUDGE[p.kind] for p in problem.parameters]
+
+    def slope(windows: Windows, values: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """[R, F] by central differences of `NUDGE`, one-sided at the bounds."""
         columns = []
-        for k, step in enumerate(NUDGE * width):
+        for k in free:
             one, other = values.copy(), values.copy()
-            one[k], other[k] = min(one[k] + step, high[k]), max(other[k] - step, low[k])
+            one[k], other[k] = min(one[k] + nudge[k], high[k]), max(other[k] - nudge[k], low[k])
             columns.append((errors_of(windows, one) - errors_of(windows, other)) / (one[k] - other[k]))
         return np.stack(columns, 1)
 
-    def settled(windows: Windows, values: np.ndarray, most: int) -> np.ndarray:
-        inside = np.clip(values, low + 1e-9, high - 1e-9)
-        of: Any = lambda v: errors_of(windows, v)  # noqa: E731
-        by: Any = lambda v: slope(windows, v)  # noqa: E731
-        return least_squares(of, inside, by, (low, high), x_scale=width, loss="soft_l1", max_nfev=most).x
+    def settled(windows: Windows, values: np.ndarray, free: np.ndarray, most: int) -> np.ndarray:
+        values = np.clip(values, low + 1e-9, high - 1e-9)
 
-    best = settled(short, tried[int(np.argmin(costs))], TRIES[0])
-    last = short
-    for length, most in zip(LONG, TRIES[1:], strict=True):
-        longer = problem.whole(fit, length)
-        if len(longer.begin) >= WHOLE:
-            last, best = longer, settled(longer, best, most)
-    whole = problem.whole(held or fit, LONG[-1])
+        def whole(some: np.ndarray) -> np.ndarray:
+            made = values.copy()
+            made[free] = some
+            return made
+
+        of: Any = lambda some: errors_of(windows, whole(some))  # noqa: E731
+        by: Any = lambda some: slope(windows, whole(some), free)  # noqa: E731
+        limits = low[free], high[free]
+        found = least_squares(of, values[free], by, limits, x_scale=width[free], loss="soft_l1", max_nfev=most)
+        return whole(found.x)
+
+    # First what contacts do, with the bodies and the ground as the scene has them; then all.
+    every = np.arange(len(width))
+    usual = np.flatnonzero([p.kind in (*HIGH, "mass") for p in problem.parameters])
+    best = settled(short, tried[int(np.argmin(costs))], usual, TRIES[0])
+    best = settled(short, best, every, TRIES[1])
+    last, longer, scatter = short, problem.whole(fit), np.zeros((len(best), len(best)))
+    if len(longer.begin) >= WHOLE:
+        near, scatter = _searched(longer, best, (low, high), width)
+        last, best = longer, settled(longer, near, every, TRIES[2])
+    whole = problem.whole(held or fit)
     before, after = (whole.off(values) for values in (start, best))
     change = after - before
     sure = SURE * change.std(0, ddof=1) / math.sqrt(len(change)) if len(change) > 2 else np.full(2, np.nan)
@@ -511,14 +545,55 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
         "change": change.mean(0).tolist(), "change_95": sure.tolist() if np.isfinite(sure).all() else None,
     }  # fmt: skip
     error = float(np.sqrt(np.nanmean(np.concatenate([e[..., :3].ravel() for e in short.run(best)]) ** 2)))
+    found = _estimates(problem, best, last.group, slope(last, best, every), errors_of(last, best), scatter)
     return Identified(
-        _estimates(problem, best, last.group, slope(last, best), errors_of(last, best)), len(short.begin),
+        found, len(short.begin),
         error * math.sqrt(3.0) * problem.units.length, confirmed, _notes(recordings), _scene_values(problem, best),
     )  # fmt: skip
 
 
+def repeated(recordings: Sequence[Recording], scene: Scene, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """How the solve moves a scene from where recordings begin: positions [K, T, D, 3] m of the centres of mass, and
+    orientations [K, T, D, 4], in the `frames` T that follow the first of each."""
+    problem = Problem(recordings, scene)
+    windows = problem.windows(frames * recordings[0].dt / problem.units.time, [(k, 0) for k in range(len(recordings))])
+    found = []
+    for part in windows.parts:
+        _, count, many, _ = part.shape
+        kept = part.frames(np.zeros(0))
+        both = (kept.position, kept.orientation)
+        found.append([poses[:, : count * many].reshape(-1, count, many, poses.shape[-1]) for poses in both])
+    place, turn = (np.concatenate(parts, 1).swapaxes(0, 1) for parts in zip(*found, strict=True))
+    return place * problem.units.length, turn
+
+
+def _searched(
+    windows: Windows, best: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The parameters about `best` of the least cost (long motions have so many dips that slopes lead into the next),
+    and the covariance of the best tries for other draws of the same recordings, in widths."""
+    from scipy.optimize import differential_evolution
+
+    tries, costs = [], []
+
+    def cost(values: np.ndarray) -> float:
+        tries.append(values.copy())
+        costs.append(np.bincount(windows.group, np.sqrt(1.0 + windows.errors(values) ** 2) - 1.0))
+        return float(costs[-1].sum())
+
+    rng = np.random.default_rng(0)
+    crowd = best + AROUND * width * rng.standard_normal((CROWD, len(best)))
+    crowd[0] = best
+    limits, crowd = list(zip(*bounds, strict=True)), np.clip(crowd, *bounds)
+    found = differential_evolution(cost, limits, init=crowd, maxiter=ROUNDS, tol=0.0, polish=False, rng=0).x
+    costs = np.array(costs)[:, np.unique(windows.group)]
+    drawn = rng.multinomial(costs.shape[1], np.full(costs.shape[1], 1.0 / costs.shape[1]), DRAWS)
+    best_of = np.array(tries)[np.argmin(costs @ drawn.T, axis=0)] / width
+    return found, np.cov(best_of.T).reshape(len(best), len(best))
+
+
 def _estimates(
-    problem: Problem, values: np.ndarray, group: np.ndarray, slope: np.ndarray, errors: np.ndarray
+    problem: Problem, values: np.ndarray, group: np.ndarray, slope: np.ndarray, errors: np.ndarray, scatter: np.ndarray
 ) -> list[Estimate]:
     """Values with their intervals, from the curvature of the robust cost and how recordings (few: windows) pull apart
     (a sandwich); none where an error of `OUTLIER` a number would leave one of them unknown."""
@@ -532,10 +607,11 @@ def _estimates(
     np.add.at(pull, group, (weight * data)[:, None] * slope)
     inverse = np.linalg.inv(curvature)
     spread = max(1.0, len(which) / max(1, len(which) - len(values)))
-    covariance = spread * inverse @ (pull.T @ pull) @ inverse
-    noise = max(1.0, float(np.mean(weight * data**2)))
-    told = np.linalg.inv((slope.T @ slope) / noise + np.eye(len(values)))
+    covariance = spread * inverse @ (pull.T @ pull) @ inverse + scatter
+    noise = max(1.0, float(np.mean(np.abs(data))) ** 2)
+    told = np.linalg.inv((slope.T @ slope) * len(which) / len(group) / noise + np.eye(len(values)))
     shown = np.sqrt(np.diag(told)) < SHOWN
+    shown &= [p.kind != "restitution" or bool(problem.hit & set(p.bodies)) for p in parameters]
 
     def estimate(kind: str, name: str, value: float, gradient: dict[int, float]) -> Estimate:
         """Of a value with these derivatives by parameters."""

@@ -27,8 +27,10 @@ ARRAYS = ("position", "quat_xyzw")  # of an npz of poses, besides `dt` or `time`
 EVEN = 0.1  # of the spacing: how far a time may be off an even grid
 NEAR, LEAST = 3, 5  # frames on either side that tell whether one is in smooth motion; frames of the shortest flight
 BEYOND = 5.0  # deviations of the noise that are no noise
-ROUGH = 3e-3  # of a body's size (and rad): what trackers that smooth are off in a flight, more than from frame to frame
-FINEST = 1e-5  # of a body's size (and rad): poses are not expected to be more exact
+# Trackers that smooth are off more in a flight than from frame to frame: by so much of a size (and rad) at most, and
+# so many deviations of that.
+ROUGH, SMOOTHED = 3e-3, 30.0
+FINEST = 2e-6  # of a body's size (and rad): poses are not expected to be more exact
 WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
 ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
 LOST = 3  # frames: the longest excursion of a tracker that is told from an impact
@@ -55,9 +57,7 @@ class Recording:
 
 
 def movers(scene: Scene) -> list[Body]:
-    """The bodies that a recording tells of. Raises SdfsimError where one is on a path, or none moves."""
-    if any(b.motion == "kinematic" for b in scene.bodies):
-        raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
+    """The bodies that a recording tells of. Raises SdfsimError where none moves."""
     found = [b for b in scene.bodies if b.motion == "dynamic"]
     if not found:
         raise SdfsimError(f"{scene.path}: bodies: none moves")
@@ -283,11 +283,12 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
             smooth[:, d] = fits
             for whole, values in zip(arrays, fitted, strict=True):
                 whole[fits, d] = values[fits]
-            for a, b in _flights(flies, r.seen[:, d], p, r.dt, gravity, max(BEYOND * sigma[0], ROUGH * size[d])):
+            most = max(BEYOND * sigma[0], min(ROUGH * size[d], SMOOTHED * sigma[0]))
+            for a, b in _flights(flies, r.seen[:, d], p, r.dt, gravity, most):
                 rows = np.arange(a, b)[r.seen[a:b, d]]
                 (arrays[0][a:b, d], arrays[2][a:b, d]), _ = _parabola(rows, p[rows], r.dt, gravity, np.arange(a, b))
                 flying[a:b, d] = True
-                flights.append((len(done), d, a, b, rows, arrays[3][a, d].copy()))
+                flights.append((len(done), d, a, b, rows, fitted[3][a]))
         spread = np.sqrt(np.mean(np.square(noise), axis=0))
         done.append(
             replace(
@@ -310,15 +311,18 @@ def _noise(x: np.ndarray, seen: np.ndarray, least: float) -> float:
 def _nearby(
     p: np.ndarray, q: np.ndarray, seen: np.ndarray, dt: float, gravity: np.ndarray, sigma: tuple[float, float]
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Pose and velocities of every frame by parabolas through the `NEAR` frames on either side (one-sided at ends and
-    impacts), whether these fit [T], and whether the frame may be in free flight [T]."""
+    """Pose and velocities of every frame by parabolas through `NEAR` frames on either side (more where they are noisy;
+    one-sided at ends and impacts), whether these fit [T], and whether the frame may be in free flight [T]."""
     count, rows = len(p), np.flatnonzero(seen)
     out = p.copy(), q.copy(), np.zeros((count, 3)), np.zeros((count, 3))
     fits, flies = np.zeros(count, bool), np.zeros(count, bool)
     base = q[rows[np.clip(np.searchsorted(rows, np.arange(count)), 0, len(rows) - 1)]]
     strength = float(np.linalg.norm(gravity))
-    for shift in (0, -NEAR, NEAR):  # symmetric first, then what lies before, and what comes after
-        offset = np.arange(shift - NEAR, shift + NEAR + 1)
+    # So many that their noise leaves the acceleration sure to a sixteenth of gravity.
+    wanted = (430.0 * sigma[0] / (dt**2 * strength)) ** 0.4 if strength else 0.0
+    near = int(np.clip(wanted / 2.0, NEAR, 5 * NEAR))
+    for shift in (0, -near, near):  # symmetric first, then what lies before, and what comes after
+        offset = np.arange(shift - near, shift + near + 1)
         frame = np.arange(count)[:, None] + offset
         there = (frame >= 0) & (frame < count)
         frame = np.clip(frame, 0, count - 1)
@@ -335,10 +339,11 @@ def _nearby(
         fit = inverse @ np.einsum("ki,tk,tkc->tic", powers, weight, both)
         off = np.square(both - powers @ fit) * weight[..., None]
         off = np.sqrt(off.sum(1) / weight.sum(1)[:, None])
-        good = (off[:, :3].max(1) < BEYOND * sigma[0]) & (off[:, 3:].max(1) < BEYOND * sigma[1])
+        good = off[:, :3].max(1) < BEYOND * sigma[0]
+        turns = good & (off[:, 3:].max(1) < BEYOND * sigma[1])
         unsure = BEYOND * sigma[0] * np.sqrt(inverse[:, 2, 2])
         pull = np.linalg.norm(fit[:, 2, :3] - gravity, axis=1)
-        fits[t[good]], t, fit = True, t[good], fit[good]
+        fits[t[turns]], t, fit = True, t[good], fit[good]
         flies[t] = (pull[good] < np.maximum(unsure[good], WEIGHTLESS * strength)) & (pull[good] < 0.5 * strength)
         out[0][t], out[2][t], out[3][t] = fit[:, 0, :3], fit[:, 1, :3], fit[:, 1, 3:]
         out[1][t] = pose.multiply(pose.from_rotvec(fit[:, 0, 3:]), base[t])
