@@ -61,7 +61,7 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
     with tempfile.TemporaryDirectory() as scratch:  # files are read when the simulator is made
         for i, name in enumerate(map(str, t.shape)):
             kind, sizes = form_of(start.urdfs[name])
-            place = lib.RigidTransform(lib.Quaternion(np.roll(t.quat_xyzw[0, i], 1)), t.position[0, i])
+            place = lib.RigidTransform(lib.Quaternion(np.roll(t.orientation[0, i], 1)), t.position[0, i])
             scale, moves = float(t.scale[i]), not t.static[i]
             if kind == "mesh":
                 file, mesh = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj"), start.meshes[name]

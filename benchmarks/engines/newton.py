@@ -35,7 +35,7 @@ def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
     meshes, moving = {}, []
     for i, name in enumerate(map(str, t.shape)):
         kind, sizes = form_of(start.urdfs[name])
-        scale, body, place = float(t.scale[i]), -1, warp.transform(t.position[0, i], t.quat_xyzw[0, i])
+        scale, body, place = float(t.scale[i]), -1, warp.transform(t.position[0, i], t.orientation[0, i])
         if not t.static[i]:
             inertia = warp.mat33(np.diag(t.inertia[i]))
             body = builder.add_body(xform=place, mass=float(t.mass[i]), inertia=inertia, lock_inertia=True)

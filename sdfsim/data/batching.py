@@ -23,7 +23,6 @@ from sdfsim.simulate.steppers import Frames, FreeFlight, Stepper, stepper_of
 
 BATCH = 50  # trajectories simulated side by side
 PLANE = analytic_shape("plane")
-RECORDED = ("position", "quat_xyzw", "velocity", "angular_velocity")  # what a trajectory has of every frame
 
 
 def merged(
@@ -64,7 +63,7 @@ def scene_of(
                 motion="static" if t.static[i] else "dynamic",
                 scale=float(t.scale[i]),
                 position=t.position[frame, i],
-                quat_xyzw=t.quat_xyzw[frame, i],
+                quat_xyzw=t.orientation[frame, i],
                 velocity=t.velocity[frame, i],
                 angular_velocity=t.angular_velocity[frame, i],
                 mass=float(t.mass[i]),
@@ -89,7 +88,7 @@ def centred(shape: Shape) -> Shape:
 def state_at(trajectories: list[Trajectory], frames: list[int], like: State) -> State:
     """The state of all trajectories, each at its frame; the floor, which is last, as in `like`."""
 
-    each = [[getattr(t, name)[k] for t, k in zip(trajectories, frames, strict=True)] for name in RECORDED]
+    each = [[getattr(t, name)[k] for t, k in zip(trajectories, frames, strict=True)] for name in MOTION]
     return placed(like, *map(np.concatenate, each))
 
 
@@ -151,7 +150,7 @@ def _rolled(
         replace(
             t,
             position=position[:, mine] * units.length,
-            quat_xyzw=quat[:, mine],
+            orientation=quat[:, mine],
             velocity=velocity[:, mine] * units.velocity,
             angular_velocity=angular[:, mine] / units.time,
         )
@@ -169,12 +168,12 @@ def batches(trajectories: list[Trajectory]) -> list[list[Trajectory]]:
 
 def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
     """The first `count` frames."""
-    return replace(trajectory, **{name: getattr(trajectory, name)[:count] for name in RECORDED})
+    return replace(trajectory, **{name: getattr(trajectory, name)[:count] for name in MOTION})
 
 
 def every(trajectory: Trajectory, stride: int) -> Trajectory:
     """Every `stride`-th frame, as a trajectory with longer steps."""
-    frames = {name: getattr(trajectory, name)[::stride] for name in RECORDED}
+    frames = {name: getattr(trajectory, name)[::stride] for name in MOTION}
     return replace(trajectory, dt=trajectory.dt * stride, **frames)
 
 

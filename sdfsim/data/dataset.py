@@ -17,6 +17,7 @@ import numpy as np
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, read_json, write_arrays
 from sdfsim.data.pybullet_sim import TEACHER_VERSION, set_as_teacher
+from sdfsim.physics.motion import Motion
 
 if TYPE_CHECKING:
     from sdfsim.shape.shape import Shape
@@ -29,6 +30,7 @@ LONGEST_STEP = 10.0  # s, between recorded frames
 LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
 EXACTLY = 1e-3  # of what gravity adds in a step: tolerance of a free flight
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
+IN_FILE = {"orientation": "quat_xyzw"}  # names of arrays that differ there
 _AXES = {  # T frames, N bodies
     "position": ("T", "N", 3), "quat_xyzw": ("T", "N", 4), "velocity": ("T", "N", 3), "angular_velocity": ("T", "N", 3),
     "shape": ("N",), "scale": ("N",), "mass": ("N",), "inertia": ("N", 3), "friction": ("N",), "restitution": ("N",),
@@ -37,13 +39,10 @@ _AXES = {  # T frames, N bodies
 
 
 @dataclass(frozen=True)
-class Trajectory:
-    """T recorded frames of N bodies above the static floor z = 0 (which is not among the N)."""
+class Trajectory(Motion):
+    """T recorded frames of N bodies above the static floor z = 0 (which is not among the N), SI units; the origin of a
+    body is its centre of mass."""
 
-    position: np.ndarray  # [T, N, 3] m, body-frame origin = centre of mass
-    quat_xyzw: np.ndarray  # [T, N, 4]
-    velocity: np.ndarray  # [T, N, 3] m/s, world, at the end of the step
-    angular_velocity: np.ndarray  # [T, N, 3] rad/s, world, at the end of the step
     shape: np.ndarray  # [N] names of the Shape folders
     scale: np.ndarray  # [N] uniform size factors
     mass: np.ndarray  # [N] kg
@@ -56,14 +55,16 @@ class Trajectory:
 
     def save(self, path: Path) -> None:
         """Write the file; its velocities are to be those that the engine recorded."""
-        write_arrays(path, {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        write_arrays(path, {IN_FILE.get(name, name): array for name, array in arrays.items()})
 
     @classmethod
     def load(cls, path: Path, *, as_recorded: bool = False) -> Trajectory:
         """Read and check one file. The `dataset.json` beside it, or in the folder above, has the engine's inner step;
         `as_recorded` leaves velocities as the engine recorded them, from which it goes on when it is started again.
         Raises SdfsimError with the file and the field that is wrong."""
-        recorded = cls(**_checked(path, read_arrays(path, "a trajectory")))
+        found = _checked(path, read_arrays(path, "a trajectory"))
+        recorded = cls(**{name: found.pop(IN_FILE[name]) for name in IN_FILE}, **found)
         return recorded if as_recorded else at_instants(recorded, engine_substep(path.parent))
 
 

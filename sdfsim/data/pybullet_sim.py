@@ -159,7 +159,7 @@ class Teacher:
         self._call("resetBaseVelocity", self.bodies[index], list(velocity), list(angular_velocity))
 
     def run(self, steps: int) -> dict[str, np.ndarray]:
-        """Simulate `steps` recorded steps: position [steps+1, N, 3] m, quat_xyzw [steps+1, N, 4], velocity and
+        """Simulate `steps` recorded steps: position [steps+1, N, 3] m, orientation [steps+1, N, 4], velocity and
         angular_velocity [steps+1, N, 3] in m/s and rad/s; entry 0 is the state at the call."""
         if not self._settled:
             self._settle()
@@ -169,7 +169,7 @@ class Teacher:
                 self._call("stepSimulation")
             frames.append(self._state())
         position, quat, velocity, angular = (np.array(a) for a in zip(*frames, strict=True))
-        return {"position": position, "quat_xyzw": quat, "velocity": velocity, "angular_velocity": angular}
+        return {"position": position, "orientation": quat, "velocity": velocity, "angular_velocity": angular}
 
     def _state(self) -> tuple[list, list, list, list]:
         poses = [self._call("getBasePositionAndOrientation", b) for b in self.bodies]

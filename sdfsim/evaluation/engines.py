@@ -19,13 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
-from sdfsim.data.batching import MOTION
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_urdf
 from sdfsim.data.shape_assets import decompose
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
 from sdfsim.physics.bodies import Units, from_scene
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
@@ -116,7 +116,7 @@ def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
 
     return Trajectory(
         position=of(state.position)[None],
-        quat_xyzw=of(state.orientation)[None],
+        orientation=of(state.orientation)[None],
         velocity=of(state.velocity)[None],
         angular_velocity=of(state.angular_velocity)[None],
         shape=np.array([str(b.shape) for b in scene.bodies])[solid],
@@ -159,7 +159,7 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
             mass = 0.0 if t.static[i] else float(t.mass[i])
             # Added far away and then moved, as when it was recorded: the engine's order of pairs depends on it.
             teacher.add(TeacherBody(urdf, float(t.scale[i]), mass, float(t.friction[i]), float(t.restitution[i])))
-            teacher.place(i, t.position[0, i], t.quat_xyzw[0, i])
+            teacher.place(i, t.position[0, i], t.orientation[0, i])
             if t.static[i]:
                 continue
             teacher.push(i, t.velocity[0, i], t.angular_velocity[0, i])
@@ -203,7 +203,7 @@ def mujoco(
     for i, name in enumerate(t.shape):
         body = spec.worldbody.add_body(name=f"b{i}")
         if t.static[i]:
-            body.pos, body.quat = t.position[0, i], np.roll(t.quat_xyzw[0, i], 1)
+            body.pos, body.quat = t.position[0, i], np.roll(t.orientation[0, i], 1)
         else:
             body.add_freejoint()
             body.explicitinertial = True
@@ -233,8 +233,8 @@ def mujoco(
     data: Any = engine.MjData(model)
     moving = np.flatnonzero(~t.static)
     place, speed = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
-    place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.quat_xyzw[0, moving], 1, axis=-1)
-    turned = Rotation.from_quat(t.quat_xyzw[0, moving])
+    place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.orientation[0, moving], 1, axis=-1)
+    turned = Rotation.from_quat(t.orientation[0, moving])
     speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
 
     def state() -> tuple[np.ndarray, ...]:

@@ -390,7 +390,7 @@ def ran_away(trial: Trial) -> str:
 def rest(trials: Sequence[Trial], *, times: Sequence[float]) -> dict[str, float]:
     """How a body at rest behaves: drift after each of `times`, and speed, height and motion over the last second."""
     trial = trials[0]
-    path, turn = trial.path[:, 0], trial.motion.quat_xyzw[:, ~trial.motion.static][:, 0]
+    path, turn = trial.path[:, 0], trial.motion.orientation[:, ~trial.motion.static][:, 0]
     drift = 100 / size(trial.scene) * np.linalg.norm((path - path[0])[:, :2], axis=1)
     last = trial.time >= trial.time[-1] - 1.0
     seconds = max(float(np.ptp(trial.time[last])), 1e-9)

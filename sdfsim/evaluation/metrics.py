@@ -53,7 +53,7 @@ def compared(motion: Trajectory, truth: Trajectory, frames: slice) -> tuple[floa
     """Root mean squared distance m, and mean angle in degrees, over some frames of the bodies that move."""
     moving = ~truth.static
     apart = motion.position[frames, moving] - truth.position[frames, moving]
-    turns, true = (Rotation.from_quat(t.quat_xyzw[frames, moving].reshape(-1, 4)) for t in (motion, truth))
+    turns, true = (Rotation.from_quat(t.orientation[frames, moving].reshape(-1, 4)) for t in (motion, truth))
     angle = (turns * true.inv()).magnitude()
     return float(np.sqrt(np.square(apart).sum(-1).mean())), float(np.degrees(angle).mean())
 
@@ -68,7 +68,7 @@ def energy(motion: Trajectory) -> np.ndarray:
     """[T] J: kinetic and potential energy of the bodies that move, heights taken from the origin (the floor)."""
     moving = ~motion.static
     mass, inertia = motion.mass[moving], motion.inertia[moving]
-    velocity, quat = motion.velocity[:, moving], motion.quat_xyzw[:, moving]
+    velocity, quat = motion.velocity[:, moving], motion.orientation[:, moving]
     turned = Rotation.from_quat(quat.reshape(-1, 4)).inv()
     spin = turned.apply(motion.angular_velocity[:, moving].reshape(-1, 3)).reshape(velocity.shape)
     kinetic = 0.5 * (mass * np.square(velocity).sum(-1) + (inertia * np.square(spin)).sum(-1))

@@ -283,7 +283,7 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
 
 def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[str, Any]:
     """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up."""
-    if not all(np.isfinite(m.position).all() and np.isfinite(m.quat_xyzw).all() for m in motions):
+    if not all(np.isfinite(m.position).all() and np.isfinite(m.orientation).all() for m in motions):
         raise SdfsimError("a state is not finite")
     there = errors(motions, [every(first_frames(t, cases.steps + 1), stride) for t in cases.recorded])
     found = {str(stride * int(steps)): error for steps, error in there.items()}

@@ -21,7 +21,7 @@ def falling(cube_data, cube_meshes, tmp_path):
     two = replace(
         whole,
         **{name: getattr(whole, name)[[0, 0]] for name in of_bodies},
-        **{name: getattr(whole, name)[:, [0, 0]].copy() for name in ("quat_xyzw", "velocity")},
+        **{name: getattr(whole, name)[:, [0, 0]].copy() for name in ("orientation", "velocity")},
         position=np.tile([[0.0, 0.0, 50.0], [5.0, 0.0, 0.5]], (101, 1, 1)),
         angular_velocity=np.tile([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], (101, 1, 1)),
         inertia=whole.inertia[[0, 0]],

@@ -53,7 +53,7 @@ def test_engines_fly_freely_and_rest(tmp_path, run, package, substeps):
     motion, timing = run(start, steps, substeps)
     t = np.arange(steps + 1) * 0.02 * units.time
     path = np.array([3.0, 0.0, 8.5]) + np.outer(t, [1.0, 0, 0]) + 0.5 * np.outer(t * t, [0, 0, -9.81])
-    turned = 2 * np.arctan2(motion.quat_xyzw[-1, 1, 2], motion.quat_xyzw[-1, 1, 3])
+    turned = 2 * np.arctan2(motion.orientation[-1, 1, 2], motion.orientation[-1, 1, 3])
     # A symplectic step of h is off by g h t / 2 at most.
     slack = 0.5 * 9.81 * 0.4 * 0.02 / substeps * units.time
     assert np.linalg.norm(units.length * motion.position[:, 1] - path, axis=-1).max() < slack + 1e-4

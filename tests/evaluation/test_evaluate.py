@@ -35,7 +35,7 @@ def with_bowl(tmp_path):
     grown = {name: np.concatenate([0 * start, getattr(t, name)], 1) for name in ("velocity", "angular_velocity")}
     grown |= {"position": np.concatenate([start, t.position], 1), "static": np.array([True, False, False])}
     grown |= {name: np.concatenate([[0.0], getattr(t, name)]) for name in ("mass", "friction", "restitution")}
-    grown["quat_xyzw"] = np.concatenate([t.quat_xyzw[:, :1], t.quat_xyzw], 1)
+    grown["orientation"] = np.concatenate([t.orientation[:, :1], t.orientation], 1)
     grown["inertia"] = np.concatenate([np.zeros((1, 3)), t.inertia])
     grown["scale"], grown["shape"] = np.ones(3), np.array(["bowl", "ball", "ball"])
     replace(t, **grown).save(tmp_path / "0.npz")
@@ -153,7 +153,7 @@ def test_a_rebound_is_that_of_the_floor(tmp_path):
     place = np.zeros((24, 1, 3))
     place[:, 0, 2] = 0.1 + height
     motion = {"position": place, "velocity": np.stack([0 * speed, 0 * speed, speed], -1)[:, None]}
-    same = {"quat_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (24, 1, 1)), "angular_velocity": np.zeros((24, 1, 3))}
+    same = {"orientation": np.tile([0.0, 0.0, 0.0, 1.0], (24, 1, 1)), "angular_velocity": np.zeros((24, 1, 3))}
     told = {"engine": "mine", "floor": {"friction": 0.0, "restitution": 0.75}}
     data = slab_data(tmp_path, "test", sliding(0.0, **motion, **same), told)
     assert evaluate(data, errors_only=True)["model"]["23"]["translation_rmse"] < 0.015
@@ -200,6 +200,7 @@ def test_real_tosses_are_judged_on_their_own_table(data_dir, tmp_path):
         rows = slice(source["start"][k], source["start"][k + 1])
         names = ("position", "quat_xyzw", "velocity", "angular_velocity")
         motion = {name: source[name][rows, None].astype(float) for name in names}
+        motion["orientation"] = motion.pop("quat_xyzw")
         motion["position"] = motion["position"] + [0.0, 0.0, 0.0012]  # the table lies so much below z = 0
         one = {"scale": np.ones(1), "friction": np.ones(1), "restitution": np.ones(1), "static": np.zeros(1, bool)}
         one |= {"shape": np.array(["cube"]), "mass": np.array([0.37]), "inertia": np.full((1, 3), 0.00081)}

@@ -22,13 +22,13 @@ DT = 0.01
 def motion(scene: Scene, steps: int, moved=None, velocity=None) -> Trial:
     """A run in which body k is displaced by `moved`[k] [T+1, 3] m and has `velocity`[k]; all others are still."""
     start = start_motion(scene)
-    place, turn = (np.repeat(values, steps + 1, axis=0) for values in (start.position, start.quat_xyzw))
+    place, turn = (np.repeat(values, steps + 1, axis=0) for values in (start.position, start.orientation))
     speed = np.zeros_like(place)
     for k, path in (moved or {}).items():
         place[:, k] += path
     for k, values in (velocity or {}).items():
         speed[:, k] = values
-    found = {"position": place, "quat_xyzw": turn, "velocity": speed, "angular_velocity": np.zeros_like(place)}
+    found = {"position": place, "orientation": turn, "velocity": speed, "angular_velocity": np.zeros_like(place)}
     return Trial(scene, replace(start, **found, dt=DT))
 
 

@@ -20,7 +20,7 @@ def test_rotation_error_is_the_mean_angle_and_ignores_the_quaternions_sign():
     truth = Rotation.random(12, rng=np.random.default_rng(0))
     turn = Rotation.from_rotvec(np.repeat([[0.0, 0.0, np.radians(10)], [np.radians(30), 0.0, 0.0]], 6, axis=0))
     recorded, turned = (
-        balls(np.zeros((6, 2, 3)), quat_xyzw=sign * turns.as_quat().reshape(6, 2, 4))
+        balls(np.zeros((6, 2, 3)), orientation=sign * turns.as_quat().reshape(6, 2, 4))
         for sign, turns in ((1.0, truth), (-1.0, truth * turn))
     )
     assert compared(turned, recorded, slice(None))[1] == pytest.approx(20.0)
@@ -51,7 +51,7 @@ def test_the_energy_of_a_flying_body_is_constant_and_is_what_it_should_be():
 
 def test_spin_is_taken_about_the_bodys_own_axes():
     quarter = Rotation.from_euler("x", 90, degrees=True).as_quat()  # the body's z axis becomes the world's -y axis
-    turned = balls(np.zeros((2, 1, 3)), quat_xyzw=np.tile(quarter, (2, 1, 1)), inertia=np.array([[1.0, 2.0, 3.0]]))
+    turned = balls(np.zeros((2, 1, 3)), orientation=np.tile(quarter, (2, 1, 1)), inertia=np.array([[1.0, 2.0, 3.0]]))
     turned = replace(turned, angular_velocity=np.tile([0.0, 4.0, 0.0], (2, 1, 1)))
     np.testing.assert_allclose(energy(turned), 0.5 * 3.0 * 16.0)
 

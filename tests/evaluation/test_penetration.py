@@ -24,7 +24,7 @@ def apart(*offsets: float, **fields):
     turn = np.array([0.0, np.sin(0.5 * np.arctan2(0.6, 0.8)), 0.0, np.cos(0.5 * np.arctan2(0.6, 0.8))])  # z -> axis
     position = np.array([[[0.0, 0.0, 9.0], np.array([0.0, 0.0, 9.0]) + d * axis] for d in offsets])
     motion = balls(position, **fields)
-    return replace(motion, quat_xyzw=np.tile(turn, (len(offsets), 2, 1)))
+    return replace(motion, orientation=np.tile(turn, (len(offsets), 2, 1)))
 
 
 def test_two_balls_are_as_deep_in_each_other_as_their_centres_say():

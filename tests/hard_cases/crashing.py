@@ -307,7 +307,7 @@ def falling(seed: int) -> Trajectory:
     per_body = {"scale": 1.0, "mass": 1.0, "friction": 0.5, "restitution": 0.3}
     return Trajectory(
         position=position,
-        quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (frames, 2, 1)),
+        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (frames, 2, 1)),
         velocity=velocity,
         angular_velocity=np.zeros((frames, 2, 3)),
         shape=np.array(["cube", "cube"]),

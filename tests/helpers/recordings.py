@@ -24,7 +24,7 @@ def trajectory(frames: int = 4, bodies: int = 2) -> Trajectory:
     quat = rng.normal(size=(frames, bodies, 4))
     return Trajectory(
         position=rng.normal(size=(frames, bodies, 3)),
-        quat_xyzw=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        orientation=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
         velocity=rng.normal(size=(frames, bodies, 3)),
         angular_velocity=rng.normal(size=(frames, bodies, 3)),
         shape=np.array(["cube", "spot"]),
@@ -45,7 +45,7 @@ def balls(position, **fields) -> Trajectory:
     frames, bodies = position.shape[:2]
     defaults = {
         "position": position,
-        "quat_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (frames, bodies, 1)),
+        "orientation": np.tile([0.0, 0.0, 0.0, 1.0], (frames, bodies, 1)),
         "velocity": np.zeros((frames, bodies, 3)),
         "angular_velocity": np.zeros((frames, bodies, 3)),
         "shape": np.array(["ball"] * bodies),
@@ -79,7 +79,7 @@ def bouncing(seed: int):
         trajectory(),
         position=position,
         velocity=velocity,
-        quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (frames, 2, 1)),
+        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (frames, 2, 1)),
         angular_velocity=np.zeros((frames, 2, 3)),
         shape=np.array(["ball", "ball"]),
         scale=np.ones(2),

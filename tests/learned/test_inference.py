@@ -166,7 +166,7 @@ def test_recordings_in_a_batch_move_as_each_alone_and_as_in_torch(steps, box_sha
     def recording(count: int) -> Trajectory:
         quat, spread = draw.normal(size=(1, count, 4)), np.linspace(0.0, 1.0, count)[:, None] * [0.3, 0.2, 1.2]
         return Trajectory(
-            position=spread[None] + [0.0, 0.0, 0.6], quat_xyzw=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+            position=spread[None] + [0.0, 0.0, 0.6], orientation=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
             velocity=draw.normal(size=(1, count, 3)), angular_velocity=draw.normal(size=(1, count, 3)),
             shape=np.array(["box"] * count), scale=np.ones(count), mass=draw.uniform(1, 5, count),
             inertia=draw.uniform(0.2, 0.3, (count, 3)), friction=draw.uniform(size=count),

@@ -83,7 +83,7 @@ def test_uncompiled_kernels_stay_within_their_arrays_and_come_to_the_same(tmp_pa
     assert {"ring", "bowl", "slider", "drum", "gem", "cross", "left", "right"} <= set(compiled[2]) and plain[
         2
     ] == compiled[2]
-    # Where the ring meets the bowl a contact is refined to 5e-4 of its size, and rounding decides which try is the last.
+    # The ring meets the bowl where a contact is refined to 5e-4 of its size; rounding decides which try is the last.
     ring = np.arange(len(plain[0])) == 2
     np.testing.assert_allclose(plain[0][~ring], compiled[0][~ring], atol=1e-5)
     np.testing.assert_allclose(plain[1][~ring], compiled[1][~ring], atol=1e-4)

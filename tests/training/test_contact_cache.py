@@ -148,7 +148,7 @@ def test_frames_are_made_anew_when_the_floor_is_another_one(tmp_path):
 def test_only_recordings_of_the_teacher_are_followed_with_its_habits(tmp_path):
     """A slab that lies on the floor is pushed up by the teacher's margin."""
     still = {"position": np.tile([0.0, 0.0, 0.1], (5, 1, 1)), "velocity": np.zeros((5, 1, 3))}
-    still |= {"quat_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (5, 1, 1)), "angular_velocity": np.zeros((5, 1, 3))}
+    still |= {"orientation": np.tile([0.0, 0.0, 0.0, 1.0], (5, 1, 1)), "angular_velocity": np.zeros((5, 1, 3))}
     up = {}
     for name, engine in (("pybullet", engine_settings(0.02, 5)), ("mine", {})):
         (tmp_path / name).mkdir()
