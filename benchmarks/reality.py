@@ -413,7 +413,7 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     def lost(name: str) -> float:
         return float(np.mean(result[name]["test"][0]) - np.mean(result[OURS]["test"][0]))
 
-    rows = [head]
+    rows: list[tuple[str, ...]] = [head]
     for name in sorted(result, key=lambda name: (lost(name), name != OURS)):
         one = result[name]
         apart = [ours - its for ours, its in zip(result[OURS]["test"], one["test"], strict=True)]
@@ -426,12 +426,12 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> None:
     """Errors against time, and a toss as seen and as predicted."""
-    time, way, turn = dt * np.arange(1, FRAMES + 1), [], []
+    time, way, turn = (dt * np.arange(1, FRAMES + 1)).tolist(), [], []
     for name, (_, _, found) in moved.items():
         apart = np.linalg.norm(found.position - truth.position, axis=-1) / SIDE
         angle = (_turns(found) * _turns(truth).inv()).magnitude().reshape(apart.shape)
-        way.append(Line(name, time, 100.0 * np.median(apart, 0)))
-        turn.append(Line(name, time, np.degrees(np.median(angle, 0))))
+        way.append(Line(name, time, (100.0 * np.median(apart, 0)).tolist()))
+        turn.append(Line(name, time, np.degrees(np.median(angle, 0)).tolist()))
     draw(
         [Panel("median of 100 tosses", "s", "% of the side", way), Panel("", "s", "degrees", turn)], out / "reality.png"
     )
@@ -440,8 +440,8 @@ def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> No
     place = {name: motion.position[typical] for name, motion in seen.items()}
     along = place["recorded"][-1, :2] - place["recorded"][0, :2]
     along /= np.linalg.norm(along)
-    side = [Line(name, p[:, :2] @ along, p[:, 2]) for name, p in place.items()]
-    height = [Line(name, time, p[:, 2]) for name, p in place.items()]
+    side = [Line(name, (p[:, :2] @ along).tolist(), p[:, 2].tolist()) for name, p in place.items()]
+    height = [Line(name, time, p[:, 2].tolist()) for name, p in place.items()]
     draw([Panel("a typical toss", "m along it", "m", side), Panel("", "s", "height, m", height)], out / "toss.png")
 
 

@@ -462,8 +462,9 @@ class _Part:
                         found.setdefault((a // many, low, high), []).append(at)
                         now.add((a, (a // many, low, high)))
             # A change in the first frame may be of a start that is a little wrong.
-            change = np.linalg.norm(state.velocity - before - pull, axis=-1) > IMPACT * np.linalg.norm(pull)
-            impacts |= {key for a, key in now if t and change[a]}
+            change = np.linalg.norm(state.velocity - before - pull, axis=-1)
+            sudden = set(np.flatnonzero(change > IMPACT * np.linalg.norm(pull)).tolist())
+            impacts |= {key for a, key in now if t and a in sudden}
         return [(*key, np.concatenate(points), key in impacts) for key, points in sorted(found.items())]
 
 
@@ -487,7 +488,8 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
 
     def alike(**given: float) -> np.ndarray:
         """All coefficients of moving bodies of these products, the others as the scene has them."""
-        return np.clip([given.get(p.kind, s) for p, s in zip(problem.parameters, start, strict=True)], low, high)
+        values = [given[p.kind] if p.kind in given else p.start for p in problem.parameters]
+        return np.clip(values, low, high)
 
     # A sweep over all coefficients alike finds the valley; the fit goes down in it.
     tried = [start, *(alike(friction=f, restitution=e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95))]
@@ -574,19 +576,20 @@ def _searched(
     and the covariance of the best tries for other draws of the same recordings, in widths."""
     from scipy.optimize import differential_evolution
 
-    tries, costs = [], []
+    tries: list[np.ndarray] = []
+    told: list[np.ndarray] = []
 
     def cost(values: np.ndarray) -> float:
         tries.append(values.copy())
-        costs.append(np.bincount(windows.group, np.sqrt(1.0 + windows.errors(values) ** 2) - 1.0))
-        return float(costs[-1].sum())
+        told.append(np.bincount(windows.group, np.sqrt(1.0 + windows.errors(values) ** 2) - 1.0))
+        return float(told[-1].sum())
 
     rng = np.random.default_rng(0)
     crowd = best + AROUND * width * rng.standard_normal((CROWD, len(best)))
     crowd[0] = best
-    limits, crowd = list(zip(*bounds, strict=True)), np.clip(crowd, *bounds)
-    found = differential_evolution(cost, limits, init=crowd, maxiter=ROUNDS, tol=0.0, polish=False, rng=0).x
-    costs = np.array(costs)[:, np.unique(windows.group)]
+    limits, begun = list(zip(*bounds, strict=True)), cast("Any", np.clip(crowd, *bounds))
+    found = differential_evolution(cost, limits, init=begun, maxiter=ROUNDS, tol=0.0, polish=False, rng=0).x
+    costs = np.array(told)[:, np.unique(windows.group)]
     drawn = rng.multinomial(costs.shape[1], np.full(costs.shape[1], 1.0 / costs.shape[1]), DRAWS)
     best_of = np.array(tries)[np.argmin(costs @ drawn.T, axis=0)] / width
     return found, np.cov(best_of.T).reshape(len(best), len(best))
