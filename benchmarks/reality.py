@@ -396,7 +396,7 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     pictures(moved, test_truth, dt, out)
     text = (
         f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
-        f"95 % intervals; in brackets sdfsim less the other, toss by toss. Starts fit the free flight to {off:.2f} mm "
+        f"95 % intervals; sdfsim less the other is toss by toss. Starts fit the free flight to {off:.2f} mm "
         f"and {turned_off:.2f} degrees (medians of root mean squares); recorded cubes fall with {falls:.3f} +- "
         f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
     )
