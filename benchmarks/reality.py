@@ -392,7 +392,9 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     every = [*fit, *test]
     off = 1e3 * np.median([start.off for start in every])
     turned_off = np.degrees(np.median([start.turned_off for start in every]))
-    write_json(out / "reality.json", {"gravity": gravity, "fall": [falls, sure], "engines": _plain(result)})
+    seen = shown(recordings_of(known, scene))
+    kept = {"gravity": gravity, "fall": [falls, sure], "shown": seen, "engines": _plain(result)}
+    write_json(out / "reality.json", kept)
     pictures(moved, test_truth, dt, out)
     text = (
         f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
@@ -404,6 +406,40 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
 
 
 OURS = "sdfsim"
+
+
+def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
+    """What recordings say of contacts without any engine, each as quartiles and how many there are: of first impacts of
+    one corner (the next one a centimetre higher) the restitution, the impulse along the table over that across it, and
+    the change of the spin over that of a rigid corner; of stretches of 8 frames in which a face slides, the
+    deceleration over gravity, by speed."""
+    corners = 0.5 * SIDE * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    found: dict[str, list[float]] = {}
+    for r in recordings:
+        fly, speed, spin = r.flying[:, 0], r.velocity[:, 0], r.angular_velocity[:, 0]
+        for t in range(len(fly) - 3):
+            t2 = next((u for u in (t + 1, t + 2, t + 3) if fly[t] and fly[u] and (speed[u] - speed[t])[2] > 0.0), 0)
+            if not t2:
+                continue
+            at, after = (Rotation.from_quat(r.orientation[u, 0]).apply(corners) for u in (t, t2))
+            low = int(at[:, 2].argmin())
+            push = MASS * (speed[t2] - speed[t] + (t2 - t) * r.dt * np.array([0.0, 0.0, GRAVITY]))
+            turn = np.cross(at[low], push) / INERTIA
+            came = (speed[t] + np.cross(spin[t], at[low]))[2]
+            if came < -0.2 and np.sort(at[:, 2])[1] - at[low, 2] > 0.01:
+                went = (speed[t2] + np.cross(spin[t2], after[low]))[2]
+                found.setdefault("restitution", []).append(-went / came)
+                found.setdefault("impulse along over across", []).append(np.hypot(*push[:2]) / push[2])
+                found.setdefault("spin over a rigid corner's", []).append(turn @ (spin[t2] - spin[t]) / (turn @ turn))
+            break
+        slides = r.known & ~fly & (np.linalg.norm(spin, axis=1) < 1.0) & (np.abs(speed[:, 2]) < 0.03)
+        for t in (t for t in range(len(fly) - 7) if slides[t : t + 8].all()):
+            fast = float(np.linalg.norm(speed[t + 3 : t + 5].mean(0)))
+            name = next((f"friction up to {end} m/s" for end in (0.2, 0.4, 0.7) if 0.1 < fast < end), "")
+            if name:
+                slow = np.linalg.norm(speed[t + 7] - speed[t]) / (7 * r.dt * GRAVITY)
+                found.setdefault(name, []).append(float(slow))
+    return {name: [*np.percentile(values, [25, 50, 75]).tolist(), len(values)] for name, values in found.items()}
 
 
 def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
