@@ -392,11 +392,13 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     every = [*fit, *test]
     off = 1e3 * np.median([start.off for start in every])
     turned_off = np.degrees(np.median([start.turned_off for start in every]))
-    write_json(out / "reality.json", {"gravity": gravity, "fall": [falls, sure], "engines": _plain(result)})
+    seen = shown(recordings_of(known, scene))
+    kept = {"gravity": gravity, "fall": [falls, sure], "shown": seen, "engines": _plain(result)}
+    write_json(out / "reality.json", kept)
     pictures(moved, test_truth, dt, out)
     text = (
         f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
-        f"95 % intervals; in brackets sdfsim less the other, toss by toss. Starts fit the free flight to {off:.2f} mm "
+        f"95 % intervals; sdfsim less the other is toss by toss. Starts fit the free flight to {off:.2f} mm "
         f"and {turned_off:.2f} degrees (medians of root mean squares); recorded cubes fall with {falls:.3f} +- "
         f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
     )
@@ -406,6 +408,40 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
 OURS = "sdfsim"
 
 
+def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
+    """What recordings say of contacts without any engine, each as quartiles and how many there are: of first impacts of
+    one corner (the next one a centimetre higher) the restitution, the impulse along the table over that across it, and
+    the change of the spin over that of a rigid corner; of stretches of 8 frames in which a face slides, the
+    deceleration over gravity, by speed."""
+    corners = 0.5 * SIDE * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    found: dict[str, list[float]] = {}
+    for r in recordings:
+        fly, speed, spin = r.flying[:, 0], r.velocity[:, 0], r.angular_velocity[:, 0]
+        for t in range(len(fly) - 3):
+            t2 = next((u for u in (t + 1, t + 2, t + 3) if fly[t] and fly[u] and (speed[u] - speed[t])[2] > 0.0), 0)
+            if not t2:
+                continue
+            at, after = (Rotation.from_quat(r.orientation[u, 0]).apply(corners) for u in (t, t2))
+            low = int(at[:, 2].argmin())
+            push = MASS * (speed[t2] - speed[t] + (t2 - t) * r.dt * np.array([0.0, 0.0, GRAVITY]))
+            turn = np.cross(at[low], push) / INERTIA
+            came = (speed[t] + np.cross(spin[t], at[low]))[2]
+            if came < -0.2 and np.sort(at[:, 2])[1] - at[low, 2] > 0.01:
+                went = (speed[t2] + np.cross(spin[t2], after[low]))[2]
+                found.setdefault("restitution", []).append(-went / came)
+                found.setdefault("impulse along over across", []).append(np.hypot(*push[:2]) / push[2])
+                found.setdefault("spin over a rigid corner's", []).append(turn @ (spin[t2] - spin[t]) / (turn @ turn))
+            break
+        slides = r.known & ~fly & (np.linalg.norm(spin, axis=1) < 1.0) & (np.abs(speed[:, 2]) < 0.03)
+        for t in (t for t in range(len(fly) - 7) if slides[t : t + 8].all()):
+            fast = float(np.linalg.norm(speed[t + 3 : t + 5].mean(0)))
+            name = next((f"friction up to {end} m/s" for end in (0.2, 0.4, 0.7) if 0.1 < fast < end), "")
+            if name:
+                slow = np.linalg.norm(speed[t + 7] - speed[t]) / (7 * r.dt * GRAVITY)
+                found.setdefault(name, []).append(float(slow))
+    return {name: [*np.percentile(values, [25, 50, 75]).tolist(), len(values)] for name, values in found.items()}
+
+
 def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     """Whom we lose to comes first, then ours, then the others."""
     head = ("engine", "position, % of the side", "rotation, degrees", "sdfsim less it", "on those 60", "found")
@@ -413,7 +449,7 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     def lost(name: str) -> float:
         return float(np.mean(result[name]["test"][0]) - np.mean(result[OURS]["test"][0]))
 
-    rows = [head]
+    rows: list[tuple[str, ...]] = [head]
     for name in sorted(result, key=lambda name: (lost(name), name != OURS)):
         one = result[name]
         apart = [ours - its for ours, its in zip(result[OURS]["test"], one["test"], strict=True)]
@@ -426,12 +462,12 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> None:
     """Errors against time, and a toss as seen and as predicted."""
-    time, way, turn = dt * np.arange(1, FRAMES + 1), [], []
+    time, way, turn = (dt * np.arange(1, FRAMES + 1)).tolist(), [], []
     for name, (_, _, found) in moved.items():
         apart = np.linalg.norm(found.position - truth.position, axis=-1) / SIDE
         angle = (_turns(found) * _turns(truth).inv()).magnitude().reshape(apart.shape)
-        way.append(Line(name, time, 100.0 * np.median(apart, 0)))
-        turn.append(Line(name, time, np.degrees(np.median(angle, 0))))
+        way.append(Line(name, time, (100.0 * np.median(apart, 0)).tolist()))
+        turn.append(Line(name, time, np.degrees(np.median(angle, 0)).tolist()))
     draw(
         [Panel("median of 100 tosses", "s", "% of the side", way), Panel("", "s", "degrees", turn)], out / "reality.png"
     )
@@ -440,8 +476,8 @@ def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> No
     place = {name: motion.position[typical] for name, motion in seen.items()}
     along = place["recorded"][-1, :2] - place["recorded"][0, :2]
     along /= np.linalg.norm(along)
-    side = [Line(name, p[:, :2] @ along, p[:, 2]) for name, p in place.items()]
-    height = [Line(name, time, p[:, 2]) for name, p in place.items()]
+    side = [Line(name, (p[:, :2] @ along).tolist(), p[:, 2].tolist()) for name, p in place.items()]
+    height = [Line(name, time, p[:, 2].tolist()) for name, p in place.items()]
     draw([Panel("a typical toss", "m along it", "m", side), Panel("", "s", "height, m", height)], out / "toss.png")
 
 

@@ -58,8 +58,10 @@ CROWD, ROUNDS, AROUND = 24, 14, 0.15  # of the search between them: points, roun
 WIDTH = {
     "friction": 1.0, "restitution": 1.0, "mass": 3.0, "inertia": 0.5, "size": 0.1, "height": 0.05, "tilt": 0.05,
 }  # fmt: skip
-# A factor of inertia of exp(0.5) is nearly that of a hollow shell: with all of its mass inside, no body has more.
 FARTHEST = {"mass": 7.0, "inertia": 0.5, "size": 0.15, "height": 0.15, "tilt": 0.15}
+SHELL = (
+    5.0 / 3.0
+)  # of the inertia of a solid cube or ball has a hollow one: with its mass inside, no such body has more
 FACTORS = ("mass", "inertia", "size")
 
 
@@ -229,7 +231,8 @@ class Problem:
         for kind in ("inertia", "size"):
             for name, rows in seen.items():
                 if rows[0] < many:
-                    self._add(kind, name, rows)
+                    most = max(0.0, math.log(SHELL / self.inertia_factor(rows[0]))) if kind == "inertia" else None
+                    self._add(kind, name, rows, high=most)
         for name, rows in static.items():
             if len(rows) == 1:  # copies lie on a grid
                 points = np.concatenate([p for _, _, b, p, _ in touched if b == rows[0]])
@@ -256,6 +259,13 @@ class Problem:
         if kind == "restitution" and any(max(pair) < len(self.moving) for pair in self.pairs):
             return 1.0  # what bodies do to each other fixes what is whose, and a scene has none above 1
         return high / known if known > 0.0 else high
+
+    def inertia_factor(self, body: int) -> float:
+        """The scene's, of a moving body."""
+        b = self.bodies[body]
+        shape = self.scene.shapes[b.shape]
+        own = b.mass / shape.volume * shape.inertia * b.scale**2
+        return 1.0 if b.inertia is None else float(np.trace(b.inertia) / np.trace(own))
 
     def _touched_at(self, body: int, points: np.ndarray) -> Ground:
         """Of points [P, 3] in model units."""
@@ -444,7 +454,7 @@ class _Part:
     def touched(self) -> list[tuple[int, int, int, np.ndarray, bool]]:
         """See `Windows.touched`. Inner steps one by one: what rebounds is away again at the end of a frame."""
         many, total, inner = self.shape[2], self.shape[1] * self.shape[2], self.options.substeps
-        there = ~np.isnan(self.goal[..., 0]).all(-1)
+        there = np.asarray(~np.isnan(self.goal[..., 0]).all(-1))
         fine = replace(self.options, dt=self.options.dt / inner, substeps=1)
         state, carry = self.start, self.solver.init(self.bodies, self.start, fine)
         pull = self.options.dt * self.options.gravity
@@ -462,8 +472,9 @@ class _Part:
                         found.setdefault((a // many, low, high), []).append(at)
                         now.add((a, (a // many, low, high)))
             # A change in the first frame may be of a start that is a little wrong.
-            change = np.linalg.norm(state.velocity - before - pull, axis=-1) > IMPACT * np.linalg.norm(pull)
-            impacts |= {key for a, key in now if t and change[a]}
+            change = np.square(state.velocity - before - pull).sum(-1)
+            sudden = set(np.flatnonzero(change > IMPACT**2 * (pull @ pull)).tolist())
+            impacts |= {key for a, key in now if t and a in sudden}
         return [(*key, np.concatenate(points), key in impacts) for key, points in sorted(found.items())]
 
 
@@ -487,7 +498,8 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
 
     def alike(**given: float) -> np.ndarray:
         """All coefficients of moving bodies of these products, the others as the scene has them."""
-        return np.clip([given.get(p.kind, s) for p, s in zip(problem.parameters, start, strict=True)], low, high)
+        values = [given[p.kind] if p.kind in given else p.start for p in problem.parameters]
+        return np.clip(values, low, high)
 
     # A sweep over all coefficients alike finds the valley; the fit goes down in it.
     tried = [start, *(alike(friction=f, restitution=e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95))]
@@ -574,19 +586,20 @@ def _searched(
     and the covariance of the best tries for other draws of the same recordings, in widths."""
     from scipy.optimize import differential_evolution
 
-    tries, costs = [], []
+    tries: list[np.ndarray] = []
+    told: list[np.ndarray] = []
 
     def cost(values: np.ndarray) -> float:
         tries.append(values.copy())
-        costs.append(np.bincount(windows.group, np.sqrt(1.0 + windows.errors(values) ** 2) - 1.0))
-        return float(costs[-1].sum())
+        told.append(np.bincount(windows.group, np.sqrt(1.0 + windows.errors(values) ** 2) - 1.0))
+        return float(told[-1].sum())
 
     rng = np.random.default_rng(0)
     crowd = best + AROUND * width * rng.standard_normal((CROWD, len(best)))
     crowd[0] = best
-    limits, crowd = list(zip(*bounds, strict=True)), np.clip(crowd, *bounds)
-    found = differential_evolution(cost, limits, init=crowd, maxiter=ROUNDS, tol=0.0, polish=False, rng=0).x
-    costs = np.array(costs)[:, np.unique(windows.group)]
+    limits, begun = list(zip(*bounds, strict=True)), cast("Any", np.clip(crowd, *bounds))
+    found = differential_evolution(cost, limits, init=begun, maxiter=ROUNDS, tol=0.0, polish=False, rng=0).x
+    costs = np.array(told)[:, np.unique(windows.group)]
     drawn = rng.multinomial(costs.shape[1], np.full(costs.shape[1], 1.0 / costs.shape[1]), DRAWS)
     best_of = np.array(tries)[np.argmin(costs @ drawn.T, axis=0)] / width
     return found, np.cov(best_of.T).reshape(len(best), len(best))
@@ -681,10 +694,7 @@ def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, A
         elif p.kind == "size":
             entry["scale"] = b.scale * math.exp(value)
         elif p.kind == "inertia":
-            shape = problem.scene.shapes[b.shape]
-            own = b.mass / shape.volume * shape.inertia * b.scale**2
-            given = 1.0 if b.inertia is None else np.trace(b.inertia) / np.trace(own)
-            entry["inertia_factor"] = float(given * math.exp(value))
+            entry["inertia_factor"] = problem.inertia_factor(p.bodies[0]) * math.exp(value)
         if p.bodies[0] < many:
             entry.setdefault("mass", b.mass)  # a density would make another mass of another size
     for body, ground in problem.ground.items():

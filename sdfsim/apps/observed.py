@@ -86,9 +86,11 @@ def load_recordings(
             )
             scene = scene or own
             rows = [k for k, b in enumerate(own.bodies) if b in movers(own)]
-            arrays = [getattr(rollout, n)[:, rows] for n in ("position", "orientation", "velocity", "angular_velocity")]
-            dt, sure = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0, np.ones(arrays[0].shape[:2], bool)
-            found.append(Recording(str(file), dt, *arrays, sure.all(1), ~sure, sure, (arrays[0], arrays[1])))
+            place, turn, speed, spin = (
+                getattr(rollout, n)[:, rows] for n in ("position", "orientation", "velocity", "angular_velocity")
+            )
+            dt, sure = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0, np.ones(place.shape[:2], bool)
+            found.append(Recording(str(file), dt, place, turn, speed, spin, sure[:, 0], ~sure, sure, (place, turn)))
         elif scene is None:
             raise SdfsimError(f"{file}: a recording without its scene", "give it: --scene scene.yaml")
         else:

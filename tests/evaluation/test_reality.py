@@ -3,6 +3,7 @@ velocities that the recording's own authors give."""
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,12 @@ from benchmarks.reality import (
     FIT,
     FRAMES,
     GRAVITY,
+    OURS,
+    SCENE,
     SIDE,
     TEST,
-    Poses,
+    Motion,
+    Start,
     Toss,
     cost,
     errors,
@@ -25,13 +29,19 @@ from benchmarks.reality import (
     flight,
     identified,
     load_tosses,
+    ours,
     recorded,
     split,
 )  # fmt: skip
 from sdfsim.base.errors import SdfsimError
+from sdfsim.scene.load import load_scene
 
 DT = 1.0 / 148.0
-VALUES = {"friction": 0.2, "restitution": 0.1, "softness": 0.01, "damping": 1.0, "height": 0.0, "side": 1.0}
+VALUES = {
+    "friction": 0.2, "restitution": 0.1, "softness": 0.01, "damping": 1.0, "height": 0.0, "side": 1.0, "inertia": 1.0,
+    "stiffness": 5.0, "dissipation": 1.0,
+}  # fmt: skip
+NAMES = [OURS, *(name for name in ENGINES if name != "Drake" or importlib.util.find_spec("pydrake"))]
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +96,7 @@ def test_the_acceleration_of_falling_is_found():
 
 
 def test_a_toss_that_begins_on_the_table_has_no_start():
-    with pytest.raises(SdfsimError, match=r"\b0 frames"):
+    with pytest.raises(SdfsimError, match="0 frames before its first impact"):
         fitted_start(thrown(np.zeros(3), np.zeros(3), height=0.05))
 
 
@@ -95,18 +105,26 @@ def test_errors_are_those_of_a_shift_and_a_turn():
     truth = recorded([toss, toss])
     assert truth.position.shape == (2, FRAMES, 3)
     turned = Rotation.from_rotvec([0.0, 0.0, np.radians(10.0)]) * Rotation.from_quat(truth.quat_xyzw[1])
-    moved = Poses(truth.position.copy(), np.stack([truth.quat_xyzw[0], turned.as_quat()]))
+    moved = Motion(truth.position.copy(), np.stack([truth.quat_xyzw[0], turned.as_quat()]))
     moved.position[0] += [0.03 * SIDE, 0.0, 0.04 * SIDE]
     way, angle = errors(moved, truth)
     assert way == pytest.approx([5.0, 0.0], abs=1e-9)
     assert angle == pytest.approx([0.0, 10.0], abs=1e-5)
 
 
-@pytest.mark.parametrize("name", ENGINES)
-def test_an_engine_flies_along_the_parabola(name):
+def moved(name: str, starts: list[Start], height: float, folder: Path) -> Motion:
+    if name != OURS:
+        return ENGINES[name][0](starts, DT, GRAVITY, VALUES | {"height": height})
+    text = SCENE.format(gravity=-GRAVITY, side=SIDE, mass=0.37, factor=1.0)
+    (folder / "scene.yaml").write_text(text.replace("plane: {}", f"plane: {{offset: {height}}}"))
+    return ours(starts, DT, load_scene(folder / "scene.yaml"))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_engine_flies_along_the_parabola(name, tmp_path):
     """Those that add gravity before they move start half a step earlier; else they are a millimetre low."""
     start = fitted_start(thrown(np.array([1.0, 0.2, 1.5]), np.array([1.0, 2.0, 3.0]), frames=100))
-    found = ENGINES[name][0]([start], DT, GRAVITY, VALUES | {"height": -10.0})
+    found = moved(name, [start], -10.0, tmp_path)
     time = DT * np.arange(1, FRAMES + 1)[:, None]
     exact = start.position + time * start.velocity - 0.5 * time**2 * [0.0, 0.0, GRAVITY]
     assert np.abs(found.position[0] - exact).max() < 1e-6
@@ -114,18 +132,17 @@ def test_an_engine_flies_along_the_parabola(name):
     assert (Rotation.from_quat(found.quat_xyzw[0]) * turned.inv()).magnitude().max() < 1e-5
 
 
-@pytest.mark.parametrize("name", ENGINES)
-def test_tosses_side_by_side_meet_the_table_alone(name):
+@pytest.mark.parametrize("name", NAMES)
+def test_tosses_side_by_side_meet_the_table_alone(name, tmp_path):
     """They begin in the same place, where cubes that met each other would be thrown apart."""
     starts = [
         fitted_start(thrown(np.array([1.0, 0.2, up]), np.array([1.0, 2.0, 3.0]), frames=100)) for up in (0.2, 0.3)
     ]
-    engine = ENGINES[name][0]
-    together = engine(starts, DT, GRAVITY, VALUES)
-    alone = engine(starts[1:], DT, GRAVITY, VALUES)
+    together = moved(name, starts, 0.0, tmp_path)
+    alone = moved(name, starts[1:], 0.0, tmp_path)
     assert np.abs(together.position[1] - alone.position[0]).max() < 1e-9
     lies = 0.5 * SIDE * np.abs(Rotation.from_quat(alone.quat_xyzw[0, -1]).as_matrix()[2]).sum()
-    assert alone.position[0, -1, 2] == pytest.approx(lies, abs=2e-3)  # it has come down
+    assert alone.position[0, -1, 2] == pytest.approx(lies, abs=3e-3)  # it has come down
 
 
 def test_the_search_finds_a_minimum_within_bounds():
@@ -138,19 +155,19 @@ def test_the_search_finds_a_minimum_within_bounds():
 
 
 def test_a_toss_that_ends_on_another_face_counts_as_far():
-    truth = Poses(np.zeros((2, FRAMES, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, FRAMES, 1)))
+    truth = Motion(np.zeros((2, FRAMES, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, FRAMES, 1)))
     turned = truth.quat_xyzw.copy()
     turned[1] = Rotation.from_euler("x", 90, degrees=True).as_quat()
-    assert cost(Poses(truth.position, turned), truth) == pytest.approx(15.0)
+    assert cost(Motion(truth.position, turned), truth) == pytest.approx(15.0)
     turned[1] = Rotation.from_euler("x", 20, degrees=True).as_quat()
-    assert cost(Poses(truth.position, turned), truth) == pytest.approx(10.0)
+    assert cost(Motion(truth.position, turned), truth) == pytest.approx(10.0)
 
 
-def test_no_recordings_are_reported(tmp_path):
+def test_no_recordings_are_told(tmp_path):
     with pytest.raises(SdfsimError, match=r"cube\.npz: cannot be read"):
         load_tosses(tmp_path)
     np.savez(tmp_path / "cube.npz", start=[0, 3], dt=DT, position=np.zeros((3, 3)))
-    with pytest.raises(SdfsimError, match=r"cube\.npz: .*'quat_xyzw'"):
+    with pytest.raises(SdfsimError, match=r"cube\.npz: there is no array 'quat_xyzw'"):
         load_tosses(tmp_path)
 
 
