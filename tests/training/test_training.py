@@ -85,7 +85,7 @@ def test_perfect_predictions_have_no_loss_and_free_flight_has(ball_data):
 def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets, preset, tmp_path):
     place = tmp_path / "run"
     plan = train_module.PRESETS[preset]
-    task, held_out = train_module._tasks(plan, [ball_data], CPU, lambda f, m: None)
+    task, held_out = train_module._tasks(plan, [ball_data], lambda f, m: None)
     before = held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
     report = train(ball_data, place, preset=preset)
     assert report["held_out_loss"] < 0.7 * before
@@ -98,7 +98,7 @@ def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets,
 @pytest.mark.parametrize("kind", [kind for kind in SURFACE if kind != "sdf-sim"])
 def test_the_baselines_learn_and_move_bodies(ball_data, kind, tmp_path):
     plan = Preset(kind, {"width": 16, "steps": 2}, steps=60, batch=2, rate=3e-3, nodes=30, noise=0.003)
-    task, held_out = train_module._tasks(plan, [ball_data], CPU, lambda f, m: None)
+    task, held_out = train_module._tasks(plan, [ball_data], lambda f, m: None)
     before = held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
     report = train(ball_data, tmp_path, preset=plan)
     assert report["held_out_loss"] < 0.7 * before
