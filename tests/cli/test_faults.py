@@ -18,7 +18,7 @@ def stop_after(steps: int, how):
     """A `Simulator.frames` that breaks after some steps, as `how(frame)` says."""
     real = Simulator.frames
 
-    def broken(self, count):
+    def broken(self, count, at_once=None):
         for frame in real(self, steps):
             yield frame
         raise how(frame)
@@ -27,7 +27,7 @@ def stop_after(steps: int, how):
 
 
 def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: SimulationError("step 4: not finite", f)))
+    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: SimulationError("step 4: not finite", f.frames(0, 0))))
     out = tmp_path / "run"
     done = run("simulate", scene, "-o", out, "--model", model, "--json")
     assert done.exit_code == 3 and "error: step 4: not finite" in done.stderr

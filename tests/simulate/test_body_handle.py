@@ -182,7 +182,7 @@ def test_variants_run_with_the_options_of_their_simulator(free_flight):
 def test_variants_run_on_the_device_of_their_simulator(monkeypatch):
     """A machine without a GPU shows it by what the jobs are told."""
     sim, jobs = Simulator(small()), []
-    monkeypatch.setattr(simulator_module, "parallel", lambda function, some: jobs.extend(some) or [(0, [None])])
+    monkeypatch.setattr(simulator_module, "threads", lambda function, some: jobs.extend(some) or [(0, [None])])
     sim.device = "cuda:0"
     sim.rollouts([{}], steps=1)
     assert jobs[0][2]["device"] == "cuda:0"
