@@ -27,7 +27,8 @@ def stop_after(steps: int, how):
 
 
 def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: SimulationError("step 4: not finite", f.frames(0, 0))))
+    broken = stop_after(3, lambda f: SimulationError("step 4: not finite", f.frames(0, 0)))
+    monkeypatch.setattr(Simulator, "frames", broken)
     out = tmp_path / "run"
     done = run("simulate", scene, "-o", out, "--model", model, "--json")
     assert done.exit_code == 3 and "error: step 4: not finite" in done.stderr

@@ -39,8 +39,8 @@ def test_round_trip(tmp_path):
     ("change", "complaint"),
     [
         ({"mass": np.array([-1.0, 1.0])}, "mass: must be > 0"),
-        ({"quat_xyzw": np.zeros((4, 2, 3))}, "quat_xyzw: must be [4, 2, 4]"),
-        ({"quat_xyzw": np.zeros((4, 2, 4))}, "quat_xyzw: must be unit quaternions"),
+        ({"orientation": np.zeros((4, 2, 3))}, "quat_xyzw: must be [4, 2, 4]"),
+        ({"orientation": np.zeros((4, 2, 4))}, "quat_xyzw: must be unit quaternions"),
         ({"shape": np.array(["cube", "../cube"])}, "shape: '../cube'"),
         ({"static": np.array([0, 2])}, "static: must be true or false"),
     ],
