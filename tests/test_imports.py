@@ -138,6 +138,19 @@ def test_the_library_itself_is_light():
     assert done.stdout.strip() == "[]"
 
 
+def test_the_solver_runs_without_torch(tmp_path):
+    """As `sdfsim simulate` does, of a scene of closed forms."""
+    code = (
+        "import atexit, sys\nfrom cli import app\n"
+        "names = ('torch', 'open3d', 'rerun', 'trimesh', 'skimage')\n"
+        "atexit.register(lambda: print([m for m in names if m in sys.modules]))\n"
+        f"args = ['simulate', 'samples/tower.yaml', '--seconds', '0.02', '--viewer', 'none', '-o', '{tmp_path}/run']\n"
+        "app(args)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 def test_training_needs_torch_and_numpy_only():
     code = (
         "import importlib.metadata as m, re, sys\n"
