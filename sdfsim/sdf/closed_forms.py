@@ -156,7 +156,7 @@ class CylinderSdf(ClosedForm):
         aside, above = away - radius, np.abs(points[:, 2]) - half
         corner = (aside > 0) & (above > 0)
         length = np.hypot(np.maximum(aside, 0), np.maximum(above, 0))
-        slanted = (aside[:, None] * outward + above[:, None] * end) / np.maximum(length, tiny)[:, None]
+        slanted = (aside[:, None] * outward + above[:, None] * end) / np.where(corner, length, 1.0)[:, None]
         side = aside > above
         distance = np.where(corner, length, np.maximum(aside, above))
         gradient = np.where(corner[:, None], slanted, np.where(side[:, None], outward, end))
