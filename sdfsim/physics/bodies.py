@@ -112,13 +112,11 @@ class Touch(Rows):
 
     touching: np.ndarray  # [N] bool, whether contacts acted in the last inner step
     quiet: np.ndarray  # [N] int64, for how many steps a body in contact has stayed near its anchor
-    anchor: np.ndarray  # [N, 7] float64, position and orientation that it has stayed near
+    anchor: np.ndarray  # [N, 14] float64, pose that it has stayed near, and that half of that time later
     island: np.ndarray  # [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake
     pair: np.ndarray  # [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has
     count: np.ndarray
-    # [P, 24, 16] float64: where a point is on either body (about its centre of mass, in its axes), the normal from the
-    # second to the first, the distance, the impulse along the normal and the tangential one [3], the two patches that
-    # meet
+    # [P, POINTS, COLUMNS] float64, see `sdfsim.physics.solver.world`
     point: np.ndarray
 
 

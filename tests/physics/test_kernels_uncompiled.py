@@ -83,9 +83,10 @@ def test_uncompiled_kernels_stay_within_their_arrays_and_come_to_the_same(tmp_pa
     assert {"ring", "bowl", "slider", "drum", "gem", "cross", "left", "right"} <= set(compiled[2]) and plain[
         2
     ] == compiled[2]
-    # The ring meets the bowl where a contact is refined to 5e-4 of its size; rounding decides which try is the last.
+    # The ring, whose contacts with the bowl are refined along a surface, differs by 2.6e-5 m and 8e-4 m/s after its
+    # impact, the others by 1e-7 m. Rounding may decide which try of the refinement is the last; that is not proved.
     ring = np.arange(len(plain[0])) == 2
     np.testing.assert_allclose(plain[0][~ring], compiled[0][~ring], atol=1e-5)
     np.testing.assert_allclose(plain[1][~ring], compiled[1][~ring], atol=1e-4)
-    np.testing.assert_allclose(plain[0][ring], compiled[0][ring], atol=2e-4)
-    np.testing.assert_allclose(plain[1][ring], compiled[1][ring], atol=1e-2)
+    np.testing.assert_allclose(plain[0][ring], compiled[0][ring], atol=5e-5)
+    np.testing.assert_allclose(plain[1][ring], compiled[1][ring], atol=2e-3)

@@ -176,6 +176,7 @@ def test_cuda_gives_what_the_cpu_gives() -> None:
     here, there = sdf(points), sdf.to("cuda")(points.cuda())
     assert there[0].is_cuda
     torch.testing.assert_close(here[0], there[0].cpu(), rtol=1e-4, atol=1e-5)
-    # The slope jumps from cell to cell: rounding may put a point at a face on its other side.
+    # The slope jumps from cell to cell, and rounding may put a point at a face on its other side: on the one GPU where
+    # this has run a few of 5,000 points were off, by 0.003 at most.
     apart = (here[1] - there[1].cpu()).abs().amax(1)
     assert int((apart > 1e-3).sum()) <= 5 and float(apart.max()) < 0.02

@@ -40,7 +40,7 @@ def run_steps(shapes, world, work, motion, rules, manifolds, script, most, kept,
     """Advance `motion` by so many steps, in place; the first state that cannot be ends it early.
 
     Args:
-        most: [6] what a state may be, see `survey.broken`.
+        most: [5] what a state may be, see `survey.broken`.
         within: bodies that are no farther apart touch.
 
     Returns:
