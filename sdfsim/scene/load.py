@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.document import Document
+from sdfsim.scene.joints import joints_of
 from sdfsim.scene.scene import Body, Effects, Motion, Scene, Waypoints
 from sdfsim.scene.schema import FITTED, UNITS, BodyTable, SceneTable, ShapeTable
 from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
@@ -61,6 +62,7 @@ def load_scene(
         for name, offset in zip(entry.names(), entry.offsets(), strict=True):
             way = made.path and replace(made.path, position=made.path.position + offset)
             bodies.append(replace(made, name=name, position=made.position + offset, path=way))
+    joints = joints_of(table.joints, bodies, document.wrong)
     document.check()
     loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
@@ -76,6 +78,7 @@ def load_scene(
         missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
         notes=tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", [])),
         caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
+        joints=joints,
     )
 
 
