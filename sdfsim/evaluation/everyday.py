@@ -807,12 +807,6 @@ def checks(row: str, at: Setting) -> Iterator[tuple[str, Check]]:
         yield f"{row}: {check.name} [{at}]", check
 
 
-def failures(row: str, settings: Sequence[Setting]) -> dict[str, float]:
-    """How many checks of a row do not hold, and how many there are."""
-    found = [check for at in settings for _, check in checks(row, at)]
-    return {"fail": float(sum(not check.holds for check in found)), "checks": float(len(found))}
-
-
 def main(arguments: Iterable[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sdfsim.evaluation.everyday", description=__doc__)
     parser.add_argument("row", nargs="*", help=f"of {', '.join(ROWS)}; none for all")

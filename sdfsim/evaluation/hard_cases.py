@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import visible
 from sdfsim.data.scenarios import steady_faces
-from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures
+from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
 from sdfsim.evaluation.runs import Ran, by_model
@@ -616,10 +616,12 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
         seconds=2.0, repeats=repeats)  # fmt: skip
 
     fail, of = Figure("fail", "checks", 0, limit=0.0), Figure("checks", "in all", 0, judged=False)
-    usual = [Setting()] if quick else [*(Setting(size) for size in SIZES), Setting(yaw=37.0), *map(_of_kind, KINDS[1:])]
+    usual = [Setting()]
+    if not quick:
+        usual = [*(Setting(size) for size in SIZES), Setting(yaw=37.0), *(Setting(kind=kind) for kind in KINDS[1:])]
     for row in ROWS:
         add("everyday", f"everyday-{row}", row.replace("_", " "), lambda repeat: [], created, fail, of, repeats=1,
-            engines=False, own=partial(_everyday, row, usual))  # fmt: skip
+            engines=False, own=partial(failures, row, usual))  # fmt: skip
 
     def plain(repeat: int) -> list[Scene]:
         return [tossed((22, repeat, k)) for k in range(2 if quick else 4)]
@@ -635,12 +637,10 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
     return found
 
 
-def _of_kind(kind: str) -> Setting:
-    return Setting(kind=kind)
-
-
-def _everyday(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
-    return failures(row, [replace(at, by=partial(by_model, model=model)) for at in settings])
+def failures(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
+    """How many everyday checks of a row do not hold with a model, and how many there are."""
+    found = [check for at in settings for check in ROWS[row](replace(at, by=partial(by_model, model=model)))]
+    return {"fail": float(sum(not check.holds for check in found)), "checks": float(len(found))}
 
 
 def _meshes(folder: Path) -> dict[str, Shape]:
