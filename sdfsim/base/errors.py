@@ -14,7 +14,7 @@ EXIT_INTERRUPTED = 130
 
 
 def printable(text: str) -> str:
-    """`text` with escapes for what is not printable: file names and keys of strangers may hold terminal codes."""
+    """`text` with escapes for what is not printable: untrusted file names and keys may hold terminal codes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

@@ -22,8 +22,8 @@ from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape, with_sdf
 
-TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
-EVERY = 10  # frames between two that are looked at
+TOUCH = 0.01  # of the mean size of the moving bodies: a node this near to another surface is in contact
+EVERY = 10  # frames from one that is measured to the next
 
 
 @dataclass(frozen=True)

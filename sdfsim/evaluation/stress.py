@@ -52,9 +52,9 @@ class Study:
     Attributes:
         models: their names.
         engines: their names; the teacher where PyBullet is installed.
-        results: (case, who) -> figures (name -> a value a repetition), broke, outside and laws (lines; the last are
-            laws that a motion of ours breaks, by instruments that do not use the solve) and recording (a path in the
-            folder, or None); nothing for a case that one cannot take part in.
+        results: (case, who) -> figures (name -> a value a repetition); lines of broke, outside and laws (which a motion
+            of ours breaks, by instruments that do not use the solve); recording (a path in the folder, or None). There
+            is no entry where a model or engine does not take part in a case.
         quick: whether it is the short form.
     """
 

@@ -22,7 +22,7 @@ SMALL = 0.02
 # Mean of how far winding numbers at the surface are from those of a closed one. A sphere with an opening of the
 # fraction a has a / 2; cracks of no width have nearly nothing, however long they are.
 LEAK = 0.01
-# Sides of a face are looked at from this far off; sizes are relative to the largest extent.
+# Both sides of a face are tested this far from it; sizes are relative to the largest extent.
 STEP = 1e-4
 # Less of the surface than this is not worth cutting: the corners of small faces that cross each other.
 TRIFLE = 1e-3
@@ -47,8 +47,8 @@ class Solid:
     surface: Mesh
     body: Mesh  # what winding numbers, or the distance of a thickened solid, are taken of: the whole mesh, repaired
     notes: tuple[str, ...] = ()  # what was done to the mesh, a plain line each
-    thickness: float = 0.0  # m, of the sheet that `body` then is; 0 if it is none
-    closed: bool = True  # whether it has an inside without doubt; cracks and pinholes leave some
+    thickness: float = 0.0  # m, of the sheet that `body` then is; 0 for a solid
+    closed: bool = True  # whether its inside is certain; cracks and pinholes leave doubt
     simple: bool = False  # whether `surface` is one clean boundary, for which ray parity is exact
     # [F] int, how many faces of `surface` lie on each other where each is; None: one everywhere
     layers: np.ndarray | None = None

@@ -1,4 +1,4 @@
-"""Signed distances that are known in a box around a solid, made sane everywhere."""
+"""Signed distances that are known in a box around a solid, continued everywhere."""
 
 from __future__ import annotations
 
