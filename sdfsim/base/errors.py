@@ -51,7 +51,7 @@ class SceneError(SdfsimError):
 
 
 def run_main(main: Callable[[], None]) -> None:
-    """Run a script's `main`, and end the process where that meets what a user can act on, or is interrupted."""
+    """Run a script's `main`; end the process with one line for an SdfsimError, or quietly on Ctrl-C."""
     try:
         main()
     except SdfsimError as error:

@@ -31,7 +31,7 @@ from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, S
 from sdfsim.shape.shape import Shape, own_pieces
 
 SAME_INERTIA = 1e-3  # relative
-SOFTEST = 3.0  # MuJoCo: time in which a contact swings over 2 pi, in steps of the engine; it is stable from 2 on
+SOFTEST = 3.0  # MuJoCo: period of a contact's spring over 2 pi, in steps of the engine; stable from 2 on
 LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
 SI = Units(1.0, 1.0, 1.0)

@@ -19,7 +19,7 @@ from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, Shap
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")
-_HERE = "<scene>"  # what messages call a scene that is in no file
+_HERE = "<scene>"  # the name in messages of a scene without a file
 
 
 class SceneBuilder:

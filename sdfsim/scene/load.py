@@ -83,8 +83,8 @@ def load_scene(
 
 
 def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -> dict[str | None, Shape]:
-    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. What must
-    be fitted or sampled waits until all else is known to be right: a fit takes a minute."""
+    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. Shapes
+    that must be fitted or sampled are made last, when all else is valid: a fit takes a minute."""
     used = dict.fromkeys(body.shape for body in table.bodies)
     shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
     slow = {key: s.kind in FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
