@@ -42,7 +42,7 @@ def options(
 
 
 COMMANDS = [reconstruct, poses, distill, mesh, fit]
-COMMANDS += [motion.simulate, motion.plan, motion.view, motion.render, motion.identify, motion.export]
+COMMANDS += [motion.simulate, motion.samples, motion.plan, motion.view, motion.render, motion.identify, motion.export]
 COMMANDS += [motion.dataset, motion.train, motion.evaluate, motion.tradeoff, motion.stress, motion.info]
 for command in COMMANDS:
     app.command()(command)
