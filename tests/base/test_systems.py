@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path, PureWindowsPath
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -112,7 +113,7 @@ def test_a_folder_is_locked_as_windows_locks(tmp_path, monkeypatch):
 def test_paths_in_files_have_slashes_and_drives(monkeypatch):
     monkeypatch.setattr(files, "os", SimpleNamespace(path=ntpath))
     monkeypatch.setattr(files, "Path", PureWindowsPath)
-    home = PureWindowsPath("C:\\work\\room")
+    home: Any = PureWindowsPath("C:\\work\\room")
     assert path_from(home, "C:\\work\\shapes\\ring") == "../shapes/ring"
     assert path_from(home, "D:\\scans\\cup.obj") == "D:/scans/cup.obj"
 
