@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -43,6 +44,9 @@ class Session:
         self.progress = partial(self._bar.update, "")
 
     def __enter__(self) -> Session:
+        # Consoles of Windows know few characters; others are escaped, as Python does on stderr by itself.
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")
         default = signal.default_int_handler
         if signal.getsignal(signal.SIGINT) is default:
             signal.signal(signal.SIGINT, self._press)

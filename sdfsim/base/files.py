@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
+import importlib
 import json
 import logging
 import os
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -30,7 +30,17 @@ FREELY, MOST_GROWTH = 2**30, 100
 
 def user_cache(name: str) -> Path:
     """The folder `sdfsim/NAME` in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / name
+    own = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")  # the latter on Windows
+    return Path(own or Path.home() / ".cache") / "sdfsim" / name
+
+
+def path_from(folder: Path, path: Path | str) -> str:
+    """A path as files tell it that lie in `folder`: with slashes, which every system reads; whole where it lies on
+    another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return Path(os.path.abspath(path)).as_posix()
 
 
 @contextmanager
@@ -44,7 +54,8 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(partial, path)
     except OSError as error:
         raise SdfsimError(
-            f"{path}: cannot be written: {error.strerror or error}", "free some space or choose another folder"
+            f"{path}: cannot be written: {error.strerror or error}",
+            "free some space, close the program that has it open, or choose another folder",
         ) from error
     finally:
         partial.unlink(missing_ok=True)
@@ -131,14 +142,14 @@ def locked(folder: Path) -> Iterator[None]:
     path, made = folder / LOCK, not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = open(path, "a")
+        file = open(path, "a", encoding="utf-8")
     except OSError as error:
         raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another folder") from error
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(file)
             alone = os.path.samestat(os.fstat(file.fileno()), path.stat())
-        except (BlockingIOError, FileNotFoundError):  # the latter: another run has just ended and removed its lock
+        except (BlockingIOError, PermissionError, FileNotFoundError):  # the last: a run has just ended and removed it
             alone = False
         if not alone:
             raise SdfsimError(
@@ -150,10 +161,28 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            path.unlink(missing_ok=True)
+            try:
+                path.unlink(missing_ok=True)
+            except PermissionError:  # Windows removes no open file
+                file.close()
+                with suppress(PermissionError):  # another run has it by now
+                    path.unlink(missing_ok=True)
             if made:
                 with suppress(OSError):  # not empty: the run has written something
                     folder.rmdir()
+
+
+def _lock(file: IO[str]) -> None:
+    """Take the lock of an open file, which ends with this process. Raises BlockingIOError or PermissionError where
+    another one has it."""
+    try:
+        fcntl: Any = importlib.import_module("fcntl")
+    except ImportError:  # Windows
+        windows: Any = importlib.import_module("msvcrt")
+        file.seek(0)
+        windows.locking(file.fileno(), windows.LK_NBLCK, 1)
+        return
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def check_writable(folder: Path) -> None:
