@@ -56,23 +56,23 @@ _OTHER = "is of another scene, model or seed"
 
 
 def simulate(
-    scene_file: Path,
-    out: Path,
+    scene_file: Path | str,
+    out: Path | str,
     *,
-    model: str | None,
-    seconds: float | None,
-    seed: int | None,
-    viewer: Viewer,
-    device: str,
-    on_progress: StageProgress,
-    say: Callable[[str], None],
+    model: str | None = None,
+    seconds: float | None = None,
+    seed: int | None = None,
+    viewer: Viewer = "file",
+    device: str = "auto",
+    on_progress: StageProgress = lambda stage, fraction, message: None,
+    say: Callable[[str], None] = lambda line: None,
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
 ) -> dict[str, Any]:
-    """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd; an
-    earlier run in `out` is replaced. Returns the report; of the shapes that were fitted for this scene, `failed_checks`
-    names those that are not usable, and `caveats` those that are not exact.
+    """Simulate a scene file, or a sample by its name, and write config.yaml, report.json, rollout.npz and (unless
+    `viewer` is none) rollout.rrd; an earlier run in `out` is replaced. Returns the report; of the shapes that were
+    fitted for this scene, `failed_checks` names those that are not usable, and `caveats` those that are not exact.
 
     What is None is as the scene says: model, `seconds` of simulated time, seed. `until_settled` ends the run as soon as
     everything rests. `resume` goes on with the run in `out` that was interrupted, from the start where there is none; a
@@ -82,6 +82,7 @@ def simulate(
     finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
     what was computed before is in the folder.
     """
+    out = Path(out)
     # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
     check_device(device)
     if seconds is not None:
