@@ -31,7 +31,7 @@ from sdfsim.base.files import (
     write_text,
 )
 from sdfsim.base.parallel import Progress, StageProgress, silent
-from sdfsim.learned.model import load_model
+from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics.bodies import State, Touch, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
@@ -128,7 +128,8 @@ def simulate(
             parts = [simulator.initial_rollout()]
             kept.add(parts[0])
         write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
-        live = Playback(scene) if viewer in ("native", "web") else None
+        network = simulator.model.kind != SOLVER
+        live = Playback(scene, network=network) if viewer in ("native", "web") else None
         if live:
             if address := stream_to_viewer(live, viewer):
                 say(f"watch it at {address}")
