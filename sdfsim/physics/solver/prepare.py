@@ -12,7 +12,7 @@ import numpy as np
 from sdfsim.base.compiling import warn_compiling
 from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
-from sdfsim.physics.bodies import Bodies, State, Touch, Tracks, Units
+from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
 from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver import distance as kinds
@@ -355,7 +355,7 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
 def held_by(bodies: Bodies) -> Held:
     """The joints of a scene, with room for what an inner step makes of them."""
     empty = np.zeros((0, 3))
-    joints = bodies.joints or jointed.joints_of((), empty, Units(1.0, 1.0, 1.0))
+    joints = bodies.joints or jointed.joints_of((), empty, length=1.0, time=1.0, mass=1.0)
     order = jointed.ordered(joints, bodies.moves)
     j, k, f = len(joints), len(order.node), len(order.row)
     n = len(bodies) if j else 0
