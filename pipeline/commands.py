@@ -1,4 +1,4 @@
-"""From photos and meshes to shapes: reconstruct, its stages, and fit."""
+"""From photos and meshes to shapes: reconstruct, its stages, measure, and fit."""
 
 from __future__ import annotations
 
@@ -68,6 +68,20 @@ def reconstruct(
         progress=session.stage_progress,
     )  # fmt: skip
     _report_stages(session, report, out)
+
+
+@command
+def measure(
+    session: Session,
+    photos: Photos,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The page to write.")] = Path("measure.html"),
+) -> None:
+    """Photos -> a page in which clicks give --distance and --body."""
+    from pipeline.measure import measure as write_page
+
+    report = write_page(photos, out, on_progress=session.progress)
+    told = f"wrote {out}: {report['photos']} photos, {report['mib']} MiB"
+    session.report(report, [told, "open it in a browser: two clicks give --distance, one gives --body"])
 
 
 @command
@@ -154,13 +168,11 @@ def fit(
     from sdfsim.apps import fit as fitting
     from sdfsim.base.parallel import cluster as working_on
 
-    how = fitting.Options(options["recipe"] or "default", budget, cap, thicken, units)
-    if len(sources) == 1 and not sources[0].is_dir():
-        report = fitting.fit(sources[0], out, how, device=device, on_progress=session.progress)
-    else:
-        meshes = fitting.named_meshes(sources)
-        with working_on(cluster):
-            report = fitting.fit_many(meshes, out, how, device=device, on_progress=session.progress)
+    with working_on(cluster):
+        report = fitting.fit(
+            sources, out, recipe=options["recipe"] or "default", budget=budget, cap=cap, thicken=thicken, units=units,
+            device=device, on_progress=session.progress,
+        )  # fmt: skip
     tell_failed(session, report)
     if any("error" in shape for shape in report.get("shapes", {}).values()):
         session.exit_code = EXIT_ERROR
