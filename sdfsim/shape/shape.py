@@ -279,7 +279,7 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 def sdf_of_mesh(
     mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent, coarse: int = 1
 ) -> tuple[Sdf, dict, dict]:
-    """A mesh's exact SDF or a grid of it (see `sample_grid`), its entries of a shape's `source`, and its certificate."""
+    """A mesh's exact SDF or a grid of it, see `sample_grid`; its entries of a shape's `source`, and its certificate."""
     if kind == "mesh":
         return MeshSdf(mesh), {"sdf": "mesh"}, {}
     oracle = MeshDistance(mesh)

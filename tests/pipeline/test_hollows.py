@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ def turned(profile: Sequence[tuple[float, float]]) -> Mesh:
     """A solid of revolution with vertices every few millimetres along its profile."""
     corners = np.array(profile, float)
     line = [corners[:1]]
-    for start, end in zip(corners[:-1], corners[1:], strict=True):
+    for start, end in pairwise(corners):
         count = max(1, int(np.linalg.norm(end - start) / 0.008))
         line.append(start + (end - start) * np.arange(1, count + 1)[:, None] / count)
     return Mesh(*photo_sets.studio().lathe(np.concatenate(line)))
