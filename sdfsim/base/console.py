@@ -61,7 +61,7 @@ class Session:
         return self
 
     def _press(self, number: int, frame: FrameType | None) -> None:
-        self._pressed = True  # a library that is interrupted while it is imported fails in its own way
+        self._pressed = True  # a library that is interrupted during its import raises errors of its own
         raise KeyboardInterrupt
 
     def __exit__(
@@ -168,7 +168,7 @@ class _Bar:
             print(text, file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Leave what is drawn and go to the next line."""
+        """End the bar and go to the next line."""
         if self._progress is not None:
             self._progress.stop()
         self._progress, self._stage = None, None
@@ -189,7 +189,7 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold: numpy numbers and arrays and paths become plain, numbers that are not finite null."""
+    """A value for JSON: NumPy numbers, arrays and paths become plain, numbers that are not finite null."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
