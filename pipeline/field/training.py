@@ -73,7 +73,7 @@ class Settings:
     # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25  # of the ball that training starts from; small, as shadowed parts are hardly carved away
-    iterations: int = 2800  # steps of Adam; 4000 are no better on the bundled set
+    iterations: int = 1200  # steps of Adam
     rays: int = 512  # a step
     samples: int = 32  # along a ray inside the sphere
     long_side: int = 480  # of the photos used, px
@@ -511,7 +511,7 @@ def train(
         seen = only(local, [number for number in range(len(local.views)) if number not in test])
         maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
         carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
-        fused = fuse(carved, settings.size.levels[-1]) if maps else None
+        fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
         spent = time.monotonic() - begun
         matched = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
         budget = None if budget is None else budget - spent

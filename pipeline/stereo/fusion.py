@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
 from pipeline.field.interpolation import near_bricks, places_of
 from pipeline.progress import Progress, quiet
-from pipeline.stereo.compiled import carve
-from pipeline.stereo.depth import DepthMap, stacked
+from pipeline.stereo.compiled import carve, paint
+from pipeline.stereo.depth import DepthMap, stacked, straightened
 from sdfsim.base.parallel import threads
 
 FRONT, BACK = 3.0, 2.0  # cells before and behind a surface within which its distance counts
@@ -33,11 +34,15 @@ class Fused:
     side: int  # fine samples along a side, 2 n - 1
     bricks: np.ndarray  # [B, 3] int16 (z, y, x), see `places_of`
     fine: np.ndarray  # [B * 64] float32, what the fine samples of the bricks have more than the coarse ones
+    # [B * 64, 3] float32 RGB in 0..1, the mean of the photos that show the surface there; grey where none does
+    color: np.ndarray
 
 
-def fuse(maps: Sequence[DepthMap], side: int, *, on_progress: Progress = quiet) -> Fused | None:
+def fuse(
+    maps: Sequence[DepthMap], side: int, photos_folder: Path, *, on_progress: Progress = quiet
+) -> Fused | None:  # fmt: skip
     """Fuses depth maps in the space of the unit sphere, `side` samples along each side and twice as many near the
-    surface; None where they show no surface."""
+    surface, and the colours of their photos there; None where they show no surface."""
     given = _prepared(maps)
     line = np.linspace(-1, 1, side, dtype=np.float32)
     cell = float(line[1] - line[0])
@@ -56,7 +61,29 @@ def fuse(maps: Sequence[DepthMap], side: int, *, on_progress: Progress = quiet) 
     # Where less is known than that, the coarse distance goes on.
     share = np.clip(weight / SEEN, 0, 1) * (np.abs(start) < 1.5 * cell)
     fine = np.clip(share * (value - start), -cell, cell)
-    return Fused(coarse, 2 * side - 1, bricks, fine.astype(np.float32))
+    color = _painted(maps, given, place, coarse, start + fine, cell, photos_folder)
+    return Fused(coarse, 2 * side - 1, bricks, fine.astype(np.float32), color)
+
+
+def _painted(maps: Sequence[DepthMap], given: tuple[np.ndarray, ...], place: np.ndarray, coarse: np.ndarray,
+             value: np.ndarray, cell: float, photos_folder: Path) -> np.ndarray:  # fmt: skip
+    """Colours [R, 3] of the surface nearest to fine samples at `place` [R, 3] (z, y, x), with distances `value` [R]."""
+    inverse, sizes, _, trust, lines, _ = given
+    colors = np.zeros((*inverse.shape, 3), np.uint8)
+    for n, one in enumerate(maps):
+        picture = straightened(one.view, photos_folder, max(one.inverse.shape), "RGB")[0]
+        colors[n, : picture.shape[0], : picture.shape[1]] = picture
+    slope = np.stack([ndimage.map_coordinates(part, place.T / 2, order=1, mode="nearest")
+                      for part in np.gradient(coarse, cell)], 1)  # fmt: skip
+    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 0.5)
+    surface = ((cell / 2 * place - 1 - value[:, None] * slope)[:, ::-1]).astype(np.float32)
+    total, weight = np.zeros((len(place), 3), np.float32), np.zeros(len(place), np.float32)
+    parts = [slice(start, start + BATCH) for start in range(0, len(place), BATCH)]
+    jobs = [(np.ascontiguousarray(surface[part]), colors, inverse, sizes, trust, lines, BACK * cell, total[part],
+             weight[part]) for part in parts]  # fmt: skip
+    for _ in threads(paint, jobs):
+        pass
+    return np.where(weight[:, None] > 0, total / np.maximum(weight[:, None], 1e-9) / 255, 0.5).astype(np.float32)
 
 
 def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:

@@ -300,7 +300,8 @@ def ball_fused(side: int = 24) -> Fused:
     place = places_of(bricks)
     true = np.linalg.norm(place * 2 / (2 * side - 2) - 1, axis=1) - 0.5
     rest = true - map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
-    return Fused(coarse.astype(np.float32), 2 * side - 1, bricks, rest.astype(np.float32))
+    color = np.broadcast_to(np.float32([0.8, 0.5, 0.2]), (len(place), 3))
+    return Fused(coarse.astype(np.float32), 2 * side - 1, bricks, rest.astype(np.float32), color)
 
 
 def test_training_starts_from_fused_depth_and_half_a_cell_finer_than_without_bricks():
@@ -311,9 +312,12 @@ def test_training_starts_from_fused_depth_and_half_a_cell_finer_than_without_bri
     points = torch.randn(4000, 3, generator=rng)
     points = points / points.norm(dim=1, keepdim=True) * (0.5 + 0.02 * torch.randn(4000, 1, generator=rng))
     with torch.no_grad():
-        off = (field.start_of(points) - (points.norm(dim=1) - 0.5)).abs().mean()
+        off = (field.start_of(points)[0] - (points.norm(dim=1) - 0.5)).abs().mean()
         rough = (interpolate(field.start, points)[:, 0] - (points.norm(dim=1) - 0.5)).abs().mean()
-        assert (field.sdf(points) - field.start_of(points)).abs().mean() < 0.005
+        assert (field.sdf(points) - field.start_of(points)[0]).abs().mean() < 0.005
+        _, geometry, features = field.geometry_at(points)
+        color = field.color_of(geometry, features, points)
+    np.testing.assert_allclose(color.mean(0), [0.8, 0.5, 0.2], atol=0.1)
     assert off < 0.35 * rough  # the error of linear interpolation goes with the square of the cell
 
 
@@ -322,8 +326,7 @@ def test_bricks_are_added_once_and_features_stay_what_they_were():
     field = GridField(FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,)), 0, fused=fused)
     level, count = field.bricks[0], len(fused.bricks)
     assert isinstance(level, Bricks)
-    with torch.no_grad():
-        level.values += torch.arange(len(level.values))[:, None]
+    level.values.data += torch.arange(len(level.values))[:, None]
     before = level.values.detach().clone()
     line = torch.linspace(-1, 1, 24)
     cache = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1)
