@@ -59,7 +59,8 @@ HOLLOWS = 0.25  # of the training is done before filled free space is looked for
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
 PACE = 25  # steps between looks at the clock
-SCORED = 3  # pixels along each side of a held-out photo of which one is rendered
+# Pixels along each side of a held-out photo of which one is rendered, where that leaves so many on the long side.
+SCORED, LEAST_SCORED = 3, 100
 STEREO = 0.2  # of the progress that is shown
 HELD_OUT = "held_out"  # folder of the renders of photos that were not trained on
 EMPTY = 0.9  # grey of their pixels whose ray misses the trained sphere
@@ -571,7 +572,7 @@ def train(
 def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
           on_progress: Progress = quiet) -> dict:  # fmt: skip
     """PSNR of held-out views, in normalised space, for the report, at the training resolution (`psnr_px` on the long
-    side); empty where none shows anything of the unit sphere. Of their pixels, one of `SCORED` along each side is
+    side); empty where none shows anything of the unit sphere. Of large photos one pixel of `SCORED` along each side is
     rendered; writes these pictures to `out`/held_out."""
     rays = load_rays(views, photos_folder, trainer.settings.long_side, masks=False).to(trainer.device)
     shown: list[int] = rays.view.unique().tolist()
@@ -594,10 +595,11 @@ def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *
 
 @torch.no_grad()
 def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) -> tuple[float, np.ndarray]:
-    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere, one of `SCORED`
-    along each side."""
+    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere; of large photos
+    one of `SCORED` along each side."""
     assert trainer.cache is not None
-    index = torch.nonzero((rays.view == number) & (rays.pixel % SCORED == SCORED // 2).all(1))[:, 0]
+    every = SCORED if rays.sizes.max() >= SCORED * LEAST_SCORED else 1
+    index = torch.nonzero((rays.view == number) & (rays.pixel % every == every // 2).all(1))[:, 0]
     parts = []
     for part in index.split(4096):
         origins, directions = rays.at(part)
@@ -607,9 +609,9 @@ def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) 
         )  # fmt: skip
     rgb = torch.cat(parts)
     error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())
-    width, height = (-(-(int(side) - SCORED // 2) // SCORED) for side in rays.sizes[number])
+    width, height = (-(-(int(side) - every // 2) // every) for side in rays.sizes[number])
     picture = np.full((height, width, 3), EMPTY)
-    column, row = rays.pixel[index].cpu().numpy().T // SCORED
+    column, row = rays.pixel[index].cpu().numpy().T // every
     picture[row, column] = rgb.cpu().numpy()
     return -10 * math.log10(max(error, 1e-10)), (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
 
