@@ -13,9 +13,9 @@ from pipeline.cameras import Similarity
 from pipeline.materials import ASSUMED, MATERIALS, materials_of
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
-from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, scene_text, write_scene
+from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, floor_height, scene_text, write_scene
 from sdfsim.base.files import write_json
-from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape
@@ -201,3 +201,21 @@ def test_the_scene_file_names_the_source_of_every_number_and_what_is_assumed(fit
     assert above["- {name: object1"].startswith("# ceramic, a wall of 4 mm. From: density: CRC Handbook")
     assert above["- {name: floor"].startswith("# wood. From: density: CRC Handbook")
     assert all(above[f"- {{name: {name}"].startswith("# assumed") for name in ("scenery", "box"))
+
+
+def sheet(height: float, side: float = 1.0) -> Mesh:
+    """A level square."""
+    corners = np.array([[-side, -side, height], [side, -side, height], [side, side, height], [-side, side, height]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_the_added_floor_lies_below_a_level_surface_that_the_photos_show():
+    assert floor_height(sheet(0.001)) == pytest.approx(-0.002)  # 0.1 % of 2 m
+    assert floor_height(sheet(-0.004)) == pytest.approx(-0.006)
+    # A table whose floor is not in the photos, and a scrap at its height.
+    assert floor_height(sheet(0.3)) == 0.0
+    assert floor_height(joined([sheet(0.3), sheet(0.0, 0.1)])) == 0.0
+    text = scene_text(PLACEMENT, {}, None, floor=-0.002)
+    assert "just below the floor that the photos show" in text
+    plane = yaml.safe_load(text)["bodies"][0]["plane"]
+    assert plane == {"normal": [0, 0, 1], "offset": -0.002}
