@@ -220,6 +220,9 @@ def _locate(
     away = surface.hits(view.center, rays)[0]
     if not np.isfinite(away).any():
         raise SdfsimError(f"{option}: {text} shows nothing of the surface", "choose a pixel on what was reconstructed")
+    if option == "body":  # People point at the middle of it.
+        hit = int(np.isfinite(away).argmax())
+        return view.center + away[hit] * rays[hit]
     # People point at corners, which come out a little rounded, and just beside one is what lies far behind it: as far
     # away as the first pixel that shows none of that, but where they pointed.
     best = int((away < BEHIND * away.min()).argmax())
