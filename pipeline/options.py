@@ -49,6 +49,11 @@ class Options(BaseModel):
         None, ["fit"],
         "How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says).",
     )  # fmt: skip
+    # None: a grid for the preset quick, where no recipe is given
+    sdf: Literal["grid", "mlp"] | None = option(
+        None, ["fit"],
+        "What distances become: samples on a grid, or a fitted network (a reconstruction: as its preset says).",
+    )  # fmt: skip
     distance: tuple[str, str, float] | None = option(
         None, ["mesh"],
         "A distance that you know. A place is PHOTO:X,Y, what that pixel shows, or PHOTO, the camera itself.",
@@ -153,7 +158,7 @@ class Options(BaseModel):
 
     def of_stage(self, stage: str) -> dict[str, Any]:
         """The values, ready for JSON, on which the result of a stage depends."""
-        values = self.model_dump(mode="json") | {"recipe": self.fit_recipe()}
+        values = self.model_dump(mode="json") | {"recipe": self.fit_recipe(), "sdf": self.shape_sdf()}
         return {name: values[name] for name in names_of(stage)}
 
     def longer(self) -> str:
@@ -166,6 +171,11 @@ class Options(BaseModel):
     def fit_recipe(self) -> str:
         """The recipe of the fit, see `fit_mesh`: quick for the preset quick, else the default, where none is given."""
         return self.recipe or ("quick" if self.preset == "quick" else "default")
+
+    def shape_sdf(self) -> Literal["grid", "mlp"]:
+        """What the distances of shapes become: a grid for the preset quick, else a network, as whoever gives a recipe
+        wants one."""
+        return self.sdf or ("grid" if self.preset == "quick" and self.recipe is None else "mlp")
 
 
 def form_of(name: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import itertools
 import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
@@ -22,7 +23,9 @@ from sdfsim.geometry.mesh import Mesh, face_normals, joined
 from sdfsim.geometry.mesh_io import load_mesh, read_glb
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
+from sdfsim.sdf.far_field import BOX
 
+SAMPLES, BLOCK = (65, 193), 4  # fewest and most along a side of a grid; cells a side of what is sampled as a whole
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily
@@ -34,13 +37,14 @@ UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
 GAP = 0.3  # of the fall, as a share of the side
 
 
-def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
-              device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
-    `folder_of` names, and those that are there already are kept. Returns a certificate for each of `shapes`, and
-    `passed`, `reason` and `caveats` for all of them."""
+def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default",
+              sdf: Literal["grid", "mlp"] = "mlp", seed: int = 0, device: str = "cpu",
+              on_progress: Progress = quiet) -> dict:  # fmt: skip
+    """Fits a compact SDF to the scenery and to every body within the budget, s, or samples their distances on a grid;
+    each is a Shape folder in `out` that `folder_of` names, and those that are there already are kept. Returns a
+    certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.sdf.baked_grid import grid_certificate
-    from sdfsim.shape.make import fit_mesh
+    from sdfsim.shape.make import fit_mesh, mesh_shape
     from sdfsim.shape.shape import load_shape
 
     parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)
@@ -56,10 +60,16 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
             certificates[name] = load_shape(folder).certificate
             continue
         solid, shown = meshes_of(mesh_folder, name)
-        shape = fit_mesh(
-            solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
-            budget=None if budget is None else budget * share, on_progress=report, device=device,
-        )  # fmt: skip
+        if sdf == "grid":
+            side = samples_of(solid, parts["cell"])
+            shape = mesh_shape(
+                solid, name=name, kind="grid", cap=True, resolution=side, coarse=BLOCK, on_progress=report
+            )
+        else:
+            shape = fit_mesh(
+                solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
+                budget=None if budget is None else budget * share, on_progress=report, device=device,
+            )  # fmt: skip
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
         # The folder appears complete or not at all: a run that goes on keeps those that are there.
         shutil.rmtree(partial, ignore_errors=True)
@@ -69,6 +79,14 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+
+
+def samples_of(mesh: Mesh, cell: float) -> int:
+    """Samples along a side of the grid of a mesh from a field with cells of so many m: two a cell, as far as `SAMPLES`
+    allow."""
+    wide = 2 * BOX * float(np.ptp(mesh.vertices, axis=0).max())
+    blocks = np.clip(np.ceil(2 * wide / cell / BLOCK), *((np.array(SAMPLES) - 1) // BLOCK))
+    return int(blocks) * BLOCK + 1
 
 
 def folder_of(name: str) -> str:

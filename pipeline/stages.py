@@ -111,8 +111,9 @@ def do_fit(project: Project, work: Path) -> dict:
     if budget is None and project.options.budget is not None:
         budget = max(10.0, FIT_SHARE * project.options.budget)
     return fit_parts(
-        project.place("mesh"), work, budget=budget, recipe=project.options.fit_recipe(), seed=project.options.seed,
-        device=project.device(), on_progress=project.progress_of("fit"),
+        project.place("mesh"), work, budget=budget, recipe=project.options.fit_recipe(),
+        sdf=project.options.shape_sdf(), seed=project.options.seed, device=project.device(),
+        on_progress=project.progress_of("fit"),
     )  # fmt: skip
 
 
@@ -141,9 +142,9 @@ class Stage:
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
     "poses": Stage(do_poses, "poses", version=6),
-    "distill": Stage(do_distill, "distill", version=6),
-    "mesh": Stage(do_mesh, "mesh", version=11),
-    "fit": Stage(do_fit, "assets"),
+    "distill": Stage(do_distill, "distill", version=7),
+    "mesh": Stage(do_mesh, "mesh", version=12),
+    "fit": Stage(do_fit, "assets", version=2),
     "scene": Stage(do_scene, "scene", version=5),
 }
 

@@ -18,11 +18,12 @@ from pipeline.inputs.photos import load_photos
 from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.hollows import hollow
 from pipeline.mesh.placement import GRAVITY, Placement, Up, located_bodies, measured_scale, place
 from pipeline.mesh.supports import complete, on_any
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
-from pipeline.mesh.visibility import Visibility, hollow, to_bytes
+from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.options import Options
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import SdfsimError
@@ -32,7 +33,7 @@ from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
 
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
-RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "volsdf": 448}  # samples a side, by preset
+RESOLUTION = {"quick": 256, "standard": 320, "fine": 512, "volsdf": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 
@@ -100,10 +101,10 @@ def make_meshes(
     ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
     on_progress(0.82, "asking how far each place can be trusted")
     evidence, trusted = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
-    write_parts(parts, surface.visible, placement, evidence, out)
+    write_parts(parts, surface.visible, placement, evidence, out, field.finest * metres)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     write_bytes(out / TEXTURED, write_glb(textures))
-    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
+    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres, evidence) for name in parts.bodies}
     return {
         "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
         "completed_m2": [float(rounded(one.area * metres**2)) for one in completed],
@@ -112,7 +113,7 @@ def make_meshes(
         "up_confidence": placement.up_confidence, "size": placement.size_from,
         "size_assumed": placement.size_assumed, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
-        "hollows_m": {name: rounded(found).tolist() for name, found in deep.items() if found is not None},
+        "hollows": {name: found.to_dict() for name, found in deep.items() if found is not None},
         ("places" if clicked else "masks") + "_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
     }  # fmt: skip
 
@@ -153,8 +154,11 @@ def rounded(values: ArrayLike) -> np.ndarray:
     return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
 
 
-def write_parts(parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path) -> None:
-    """Writes meshes in metres with what the photos say about their vertices, `placement.json` and `parts.json`."""
+def write_parts(
+    parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path, cell: float
+) -> None:  # fmt: skip
+    """Writes meshes in metres with what the photos say about their vertices, `placement.json` and `parts.json`; the
+    latter also says how wide the field's cells are, m."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
@@ -171,7 +175,7 @@ def write_parts(parts: Parts, visible: Mesh, placement: Placement, evidence: Evi
         moved = write(f"objects/{name}.ply", mesh)
         low, high = moved.vertices.min(0), moved.vertices.max(0)
         objects.append({"name": name, "low": rounded(low).tolist(), "high": rounded(high).tolist()})
-    write_json(out / "parts.json", {"version": 1, "scenery": parts.solid is not None, "objects": objects})
+    write_json(out / "parts.json", {"version": 1, "scenery": parts.solid is not None, "cell": cell, "objects": objects})
     placement.save(out)
 
 

@@ -18,8 +18,6 @@ from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
 from pipeline.mesh.placement import located_bodies
-from pipeline.mesh.visibility import hollow
-from pipeline.report import hollow_line
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json
 from sdfsim.geometry.bvh import Caster
@@ -241,7 +239,7 @@ def two_colours(make) -> tuple[list, list[str]]:
 
 
 def test_a_jug_of_two_colours_stays_whole(tmp_path):
-    assert len(Scene(two_colours, ("lower", "upper"), 0.4, fill=0.01).split(tmp_path / "p").bodies) == 1
+    assert len(Scene(two_colours, ("lower", "upper"), 0.4, 65, fill=0.01).split(tmp_path / "p").bodies) == 1
 
 
 @pytest.fixture(scope="module")
@@ -312,18 +310,6 @@ def test_what_stands_apart_on_a_board_is_three_whole_bodies(tmp_path):
     for name, true in zip(found.bodies, ("torus", "jug", "carton"), strict=True):
         sides = np.ptp(shelf.parts[["torus", "carton", "jug"].index(true)].vertices, axis=0)
         np.testing.assert_allclose(np.ptp(found.bodies[name].vertices, axis=0), sides, rtol=0.01)
-
-
-def test_a_hollow_has_a_depth_and_what_is_below_it_is_floor_or_filling():
-    make = photo_sets.studio()
-    cup = Mesh(*make.lathe(np.array([(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.03), (0, 0.03)])))
-    depth, below = hollow(cup, 0.01) or (0, 0)
-    assert (depth, below) == (pytest.approx(0.13, abs=1e-3), pytest.approx(0.03, abs=1e-3))
-    assert hollow_line("cup", depth, below) == "cup: hollow, 0.13 m deep below its rim, on a floor 0.03 m thick"
-    filled = Mesh(*make.lathe(np.array([(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.12), (0, 0.12)])))
-    line = hollow_line("cup", *(hollow(filled, 0.01) or (0, 0)))
-    assert line == "cup: hollow to 0.04 m below its rim as far as photos see; the 0.12 m below that are solid"
-    assert hollow(filled, 0.05) is None and hollow(Mesh(*photo_sets.ring((0, 0, 0.05), 0.1, 0.04)), 0.01) is None
 
 
 def test_without_scenery_a_connected_pair_comes_apart_by_masks(tmp_path):
