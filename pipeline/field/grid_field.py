@@ -222,9 +222,10 @@ class GridField(Field):
     def refine(self, cache: Tensor) -> list[Tensor]:
         """Puts bricks wherever a cached SDF [n, n, n, 1] has its surface and there are none yet. Returns the features
         that they replace, level by level."""
-        before = [level.values for level in self.bricks]
+        before: list[Tensor] = []
         for level in self.bricks:
             assert isinstance(level, Bricks)
+            before.append(level.values)
             level.add(torch.from_numpy(near_bricks(cache[..., 0].cpu().numpy(), level.side)))
         return before
 

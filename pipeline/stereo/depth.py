@@ -137,7 +137,7 @@ def outside_mask(depth: DepthMap, photos_folder: Path) -> DepthMap:
             mask = np.asarray(image.convert("L").resize(depth.inverse.shape[::-1], Image.Resampling.BOX))
     except OSError as error:
         raise SdfsimError(f"{photos_folder}: no mask of {depth.view.name}", "run the photos stage again") from error
-    empty = ~ndimage.binary_dilation(mask > 0, iterations=2)
+    empty = np.logical_not(ndimage.binary_dilation(mask > 0, iterations=2))
     inverse = np.where(empty, np.float32(BEYOND), np.where(mask > 127, depth.inverse, 0))
     return replace(depth, inverse=inverse, certain=np.where(empty, np.float32(1), depth.certain))
 
@@ -278,8 +278,8 @@ def stacked(pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     if (sizes == sizes[0]).all():
         return np.array(pictures, np.float32), sizes
     whole = np.zeros((len(pictures), *sizes.max(0)), np.float32)
-    for place, picture in zip(whole, pictures, strict=True):
-        place[: picture.shape[0], : picture.shape[1]] = picture
+    for number, picture in enumerate(pictures):
+        whole[number, : picture.shape[0], : picture.shape[1]] = picture
     return whole, sizes
 
 

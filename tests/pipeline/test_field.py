@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from pipeline.cameras import View
 from pipeline.field.grid_field import (
+    Bricks,
     FieldSize,
     GridField,
     contract,
@@ -320,6 +321,7 @@ def test_bricks_are_added_once_and_features_stay_what_they_were():
     fused = ball_fused()
     field = GridField(FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,)), 0, fused=fused)
     level, count = field.bricks[0], len(fused.bricks)
+    assert isinstance(level, Bricks)
     with torch.no_grad():
         level.values += torch.arange(len(level.values))[:, None]
     before = level.values.detach().clone()
@@ -351,7 +353,9 @@ def test_a_run_that_goes_on_has_the_bricks_of_an_undisturbed_one(tmp_path, one_t
     assert second.load(tmp_path / "c.safetensors") and second.refined == (killed > 16)
     for _ in range(20 - killed):
         second.step()
-    assert whole.refined and len(whole.field.bricks[0].places) >= len(ball_fused().bricks)
+    assert whole.refined and isinstance(whole.field, GridField)
+    level = whole.field.bricks[0]
+    assert isinstance(level, Bricks) and len(level.places) >= len(ball_fused().bricks)
     for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
         assert torch.equal(a, b)
 
