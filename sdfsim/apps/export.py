@@ -135,7 +135,7 @@ def export(
     if collide != "pieces" and FORMATS[kind] is not _mjcf:
         raise SdfsimError(f"--collide {collide}: is for MuJoCo", "leave it out; USD has it for bodies without pieces")
     if fps is not None and (FORMATS[kind] in (_mjcf, _urdf) or not 0.0 < fps <= 1e4):
-        told = f"--fps {fps:g}: " + ("must be above 0, at most 10,000" if fps <= 0 or fps > 1e4 else "no motion in it")
+        told = f"--fps {fps:g}: " + ("no motion in it" if 0.0 < fps <= 1e4 else "must be above 0, at most 10,000")
         raise SdfsimError(told, "it goes with " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf)))
     if FORMATS[kind] is _usd:
         _extra("pxr.Usd")  # before shapes are fitted for minutes

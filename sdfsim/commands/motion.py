@@ -13,10 +13,6 @@ from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, tell_fa
 from sdfsim.base.console import Session, columns, duration
 from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
-_PACKAGES = (
-    *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
-    *("pydantic", "pybullet"),
-)
 SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
@@ -126,7 +122,7 @@ def view(
         viewer.screenshot(recording, picture, at=at)
         session.report({"screenshot": picture})
     else:
-        viewer.show(recording, web=web)
+        viewer.show(recording, web=web, say=session.say)
         session.report({"recording": recording})
 
 
@@ -231,24 +227,11 @@ def identify(
 
 @command
 def info(session: Session) -> None:
-    """Versions, devices and bundled models."""
-    import platform
-    from importlib import metadata
+    """Versions, devices and bundled models; what is missing here, and how to get it."""
+    from sdfsim.apps.about import about, about_lines
 
-    import torch
-
-    from sdfsim.base.version import __version__
-    from sdfsim.learned.model import model_names
-
-    versions = {"sdfsim": __version__, "python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "missing"
-    gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
-    threads = {"cpu_threads": torch.get_num_threads()}
-    session.report({"versions": versions, "devices": ["cpu", *gpus], **threads, "models": model_names()})
+    report = about()
+    session.report(report, about_lines(report))
 
 
 @command

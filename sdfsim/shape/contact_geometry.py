@@ -204,8 +204,8 @@ def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarr
 
 
 def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, inward: np.ndarray) -> dict[str, np.ndarray]:
-    """Nodes [K, 3] in the order of leaves, and these in clumps. A leaf has nodes of one patch only, and of one side of a
-    wall: the deepest node of a leaf stands for all of it, and from behind a wall no way leads along the surface."""
+    """Nodes [K, 3] in the order of leaves, and these in clumps. A leaf has nodes of one patch only, and of one side of
+    a wall: the deepest node of a leaf stands for all of it, and from behind a wall no way leads along the surface."""
     leaves: list[np.ndarray] = []
     clump_leaf, clump_ball = [0], [np.zeros((0, 4))]
     facing = inward / np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)

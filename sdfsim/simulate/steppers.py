@@ -22,7 +22,7 @@ from sdfsim.learned.model import SOLVER, SURFACE, Model
 from sdfsim.learned.training_ranges import outside_training
 from sdfsim.physics.bodies import Bodies, State, Units, awake
 from sdfsim.physics.free_flight import driven, fly, with_history
-from sdfsim.physics.motion import MOTION
+from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import SUBSTEPS, Options
 from sdfsim.physics.units import scene_units
 from sdfsim.physics.validity import NO_LIMITS, Fault, first_fault, limits
@@ -57,14 +57,10 @@ PHASES = {
 }
 
 
-@dataclass
-class Frames:
+@dataclass(frozen=True)
+class Frames(Motion):
     """What a recording keeps of each of K steps, model units."""
 
-    position: np.ndarray  # [K, N, 3]
-    orientation: np.ndarray  # [K, N, 4]
-    velocity: np.ndarray  # [K, N, 3]
-    angular_velocity: np.ndarray  # [K, N, 3]
     energy: np.ndarray  # [K, 3] kinetic and potential; what pulls have given in the step
     depth: np.ndarray  # [K] the deepest penetration
     touching: np.ndarray  # [K] int64, points where bodies touch
