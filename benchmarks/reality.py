@@ -52,7 +52,7 @@ FLIGHT = 6  # frames at least, to fit a start to
 INNER = 5  # inner steps of every engine in a frame
 IMPRATIO = 14.0  # MuJoCo: how much stiffer friction is than the normal
 TRAINED, SEEDS = (8, 16, 64, 256), 3  # tosses that networks are trained on, and networks of each
-STEPS, LOOKS = 600, 6  # of a training, and looks at the tosses that choose among its states
+STEPS, LOOKS = 240, 4  # of a training, and looks at the tosses that choose among its states
 FAR = 30.0  # % and degrees: errors of a toss that are larger count as this in the search for parameters
 CROWD, ROUNDS = 25, 15  # of that search: points (rounded up to a power of two), and how often each is tried anew
 

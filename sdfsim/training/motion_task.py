@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 SOFT = 0.02  # of a body's size: errors below count squared, above by their size
 LOST = 0.3  # of a body's size: errors count as less than this, since who is as far off has met with chance
 SLOW = 0.03  # model units of speed: what moves slower has come to rest
+IMPACT = 3.0  # times what gravity makes in a frame: larger changes of a velocity are of contacts
 HORIZONS = 0.25, 0.5, 1.0  # model units of time: lengths of windows, each batch has one of them
 NOISE = 2.0  # deviations of the tracker's noise, by which starts are disturbed
 KNOWN = 0.1  # of its noise in a pose over the spacing of frames: how uncertain a fitted velocity is
@@ -147,10 +148,13 @@ class MotionTask:
         begin, early = [], []
         for k, r in enumerate(self.recordings):
             speed = np.linalg.norm(r.velocity, axis=-1).max(1) / self.units.velocity
-            flies = r.flying.all(1)
-            flown = int((~flies).argmax())
+            touched = ~r.flying.all(1)
+            fall = np.asarray(self.scene.gravity) * r.dt
+            sudden = np.linalg.norm(np.diff(r.velocity, axis=0) - fall, axis=-1).max(1) > IMPACT * np.linalg.norm(fall)
+            touched[1:] |= sudden  # an impact between two frames of flight
+            flown = int(touched.argmax())
             for t in np.flatnonzero(r.known[:-LEAST]):
-                if speed[t] > SLOW and not flies[t + 1 : t + 1 + max(2, steps // 2)].all():
+                if speed[t] > SLOW and touched[t + 1 : t + 1 + max(2, steps // 2)].any():
                     begin.append((k, int(t)))
                     early.append(t < flown)
         if not begin:

@@ -75,7 +75,7 @@ def test_what_the_network_is_told_of_its_effect_is_what_it_has(bounces):
     task = MotionTask(recordings, scene)
     network = Run(PRESETS["impacts"], task, 10, 0, torch.device("cpu")).network
     assert isinstance(network, ImpulseNetwork)
-    hit = [int((~r.flying[:, 0]).argmax()) for r in recordings]
+    hit = [int((np.diff(r.velocity[:, 0, 2]) > 0).argmax()) for r in recordings]
     starts = task.starts([(k, max(0, t - 3)) for k, t in enumerate(hit)], 12)
     loss = task.loss(network, starts)
     loss.backward()
