@@ -125,14 +125,21 @@ def mesh_notes(mesh: dict) -> list[str]:
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
-    how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
+    how = {
+        "masks": "split where their masks end",
+        "clicks": "split where photos show a border between the places that you gave",
+        "shape": "split along a seam by shape; give masks to be sure",
+    }
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
-    lines += [f"no surface was found for the masks of {name}" for name in mesh.get("masks_without_surface", [])]
+    lines += [f"no body was found for {name}, which {by} name" for by in ("masks", "places")
+              for name in mesh.get(f"{by}_without_surface", [])]  # fmt: skip
     lines += [f"{name}: its surface was not moved all the way to where the photos agree: {why}"
               for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
     lines += [hollow_line(name, found) for name, found in mesh.get("hollows", {}).items()]
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
+    lines += [f"{area:.2g} m^2 of a level surface without texture were completed as a plane, from what is seen around: "
+              "nothing measured its height there" for area in mesh.get("completed_m2", [])]  # fmt: skip
     if mesh.get("left_out_m"):
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")

@@ -18,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from pipeline.cameras import PosedPhotos, Similarity, View
+from pipeline.field.exposure import Exposure, color_error, matched
 from pipeline.field.grid_field import Field, FieldSize, GridField, differences, stencil
 from pipeline.field.mlp_field import MlpField, MlpSize
 from pipeline.field.rendering import (
@@ -56,6 +57,10 @@ REFINED = 0.4  # of the training is done when bricks are put wherever the surfac
 # that training from fused depth starts with, in cells of the last level that is everywhere: the surface is there.
 ALL_LEVELS, ALL_LEVELS_FUSED, FUSED_BETA = 0.45, 0.15, 1.5
 HOLLOWS = 0.25  # of the training is done before filled free space is looked for
+EXPOSURE_RATE = 0.004  # Adam's, of the photos' gains and offsets, at the start
+# Standard deviation of the gains from which on photos that were not trained on are compared at an exposure of their
+# own; in rendered sets of one exposure it was below 0.01.
+VARIED = 0.03
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
 PACE = 25  # steps between looks at the clock
@@ -86,6 +91,7 @@ class Settings:
     depth: float = 0.3  # weight of |sdf| at the points of a depth sensor, at the start
     free: float = 1.0  # weight of what is solid between a camera and a point that it sees
     mask: float = 0.3  # weight of the opacity loss where photos have masks
+    exposure: float = 0.02  # weight of what draws the photos' exposures together; 0: they are alike
     surface_points: int = 512  # points of the eikonal loss
 
 
@@ -100,7 +106,7 @@ PRESETS = {
     # learned; sparse points, which the paper did without, get little weight.
     "volsdf": Settings(
         size=MlpSize(), iterations=100_000, rays=1024, samples=64, long_side=1600, rate=5e-4, eikonal=0.1,
-        curvature=0.0, sparse=0.1, free=0.0, surface_points=2048, stereo=0,
+        curvature=0.0, sparse=0.1, free=0.0, exposure=0.0, surface_points=2048, stereo=0,
     ),
 }  # fmt: skip
 
@@ -212,10 +218,15 @@ class Trainer:
         self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
         sight = supervision.sight if settings.free else supervision.sight[:0]
         self.free = FreeSpace(sight, settings.size.finest, device)
-        self.field = self.fresh()
-        self.optimizer = self.optimizer_of(self.field)
-        self.iteration, self.iterations, self.seconds = 0, settings.iterations, 0.0
+        self.begin()
         self.cache: Tensor | None = None
+
+    def begin(self) -> None:
+        """Makes everything as it is before the first step."""
+        self.field = self.fresh()
+        self.exposure = Exposure(len(self.rays.center)).to(self.device) if self.settings.exposure else None
+        self.optimizer = self.optimizer_of(self.field)
+        self.iteration, self.iterations, self.seconds, self.refined = 0, self.settings.iterations, 0.0, False
 
     def fresh(self) -> Field:
         """An untrained field."""
@@ -228,8 +239,12 @@ class Trainer:
         assert isinstance(field, GridField)
         networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "bricks", "background"))]
         features = [*field.grids, *(level.values for level in field.bricks), field.background]
-        groups = _groups((features, self.settings.rate), (networks, self.settings.rate / 4))
+        groups = _groups((features, self.settings.rate), (networks, self.settings.rate / 4), self.exposures())
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+
+    def exposures(self) -> tuple[list, float]:
+        """The photos' gains and offsets, where they are learned, and their rate."""
+        return [] if self.exposure is None else [*self.exposure.parameters()], EXPOSURE_RATE
 
     @property
     def fraction(self) -> float:
@@ -339,7 +354,13 @@ class Trainer:
             values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
         )
         out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.beta, behind)
-        losses = {"color": (out["rgb"] - truth).abs().mean()}
+        rgb = out["rgb"]
+        if self.exposure is not None:
+            opacity = None if self.rays.mask is None else out["opacity"]
+            rgb = self.exposure(rgb, opacity, BACKDROP, self.rays.view[index].long())
+        losses = {"color": color_error(rgb, truth)}
+        if self.exposure is not None:
+            losses["exposure"] = self.exposure.penalty() * settings.exposure
         if self.rays.mask is not None:
             wanted = self.rays.mask[index].float() / 255
             opacity = out["opacity"].clamp(1e-4, 1 - 1e-4)
@@ -380,6 +401,8 @@ class Trainer:
                 tensors[f"adam.{number}.{key}"] = torch.as_tensor(value).detach().contiguous()
         if self.cache is not None:
             tensors["cache"] = self.cache
+        if self.exposure is not None:
+            tensors["exposure"] = self.exposure.change.detach().contiguous()
         about = {
             "iteration": self.iteration, "iterations": self.iterations, "seconds": self.seconds,
             "active": self.field.active, "view_dependence": self.field.view_dependence, "refined": self.refined,
@@ -400,6 +423,8 @@ class Trainer:
                     raise ValueError("it is of another field")
                 tensors = {key: file.get_tensor(key).to(self.device) for key in file.keys()}
             self.field.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("field.")})
+            if self.exposure is not None:
+                self.exposure.load_state_dict({"change": tensors["exposure"]})
             self.optimizer = self.optimizer_of(self.field)
             for number, parameter in enumerate(self._parameters()):
                 names = [k for k in tensors if k.startswith(f"adam.{number}.")]
@@ -409,9 +434,7 @@ class Trainer:
             self.seconds, self.field.active = float(about["seconds"]), int(about["active"])
             self.field.view_dependence, self.refined = float(about["view_dependence"]), bool(about["refined"])
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            self.field = self.fresh()
-            self.optimizer = self.optimizer_of(self.field)
-            self.iteration, self.iterations, self.seconds, self.refined = 0, self.settings.iterations, 0.0, False
+            self.begin()
             raise SdfsimError(f"{path.name} cannot be read ({' '.join(str(error).split())[:80]})") from error
         self.cache = tensors.get("cache")
         self.find_filled()
@@ -434,7 +457,8 @@ class MlpTrainer(Trainer):
 
     def optimizer_of(self, field: Field) -> torch.optim.Adam:
         networks = [p for name, p in field.named_parameters() if name != "background"]
-        return torch.optim.Adam(_groups((networks, self.settings.rate), ([field.background], BACKGROUND_RATE)))
+        groups = _groups((networks, self.settings.rate), ([field.background], BACKGROUND_RATE), self.exposures())
+        return torch.optim.Adam(groups)
 
     @property
     def beta(self) -> Tensor:
@@ -502,7 +526,7 @@ def train(
     rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
     depth, agreed, noise = None, {}, 0.0
     fused: Fused | None = None
-    matched: dict[str, Any] = {}
+    paired: dict[str, Any] = {}
     if any(photo.depth for photo in photos):
         agreed = depth_scale(poses, depth_points(poses.views, photos, photos_folder))
         depth, noise = depth_points(poses.views, photos, photos_folder, scale=agreed["scale"]), agreed["spread"]
@@ -513,10 +537,10 @@ def train(
         carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
         fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
         spent = time.monotonic() - begun
-        matched = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
+        paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
         budget = None if budget is None else budget - spent
         if fused is not None and depth is None:
-            depth, noise = stereo_points(maps, local), matched["spread"]
+            depth, noise = stereo_points(maps, local), paired["spread"]
     supervision = supervision_of(local, settings.size.finest, depth, noise)
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device, fused)
@@ -531,7 +555,7 @@ def train(
     if budget is not None and not resumed:
         trainer.iterations = min(settings.iterations, max(FEWEST_STEPS, int(budget / per_step)))
     left = None if budget is None else budget - trainer.seconds
-    first_share = STEREO if matched else 0.0
+    first_share = STEREO if paired else 0.0
     saved = started = time.monotonic()
     first, before = trainer.iteration, trainer.seconds
     smooth: dict[str, float] = {}
@@ -561,7 +585,8 @@ def train(
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
-        "depth": agreed, "stereo": matched, "notes": notes,
+        "depth": agreed, "stereo": paired, "notes": notes,
+        "exposure_spread": round(trainer.exposure.spread(), 4) if trainer.exposure is not None else 0.0,
     }  # fmt: skip
     trained = Trained(trainer.field.cpu(), float(trainer.beta), to_unit, report)
     save_field(trained, out)
@@ -607,8 +632,10 @@ def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) 
             render(trainer.field, trainer.cache, origins, directions, float(trainer.beta),
                    samples=trainer.settings.samples, backdrop=backdrop)["rgb"]
         )  # fmt: skip
-    rgb = torch.cat(parts)
-    error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())
+    rgb, truth = torch.cat(parts), rays.rgb[index].float() / 255
+    if backdrop is None and trainer.exposure is not None and trainer.exposure.spread() > VARIED:
+        rgb = matched(rgb, truth)
+    error = float(((rgb - truth) ** 2).mean())
     width, height = (-(-(int(side) - every // 2) // every) for side in rays.sizes[number])
     picture = np.full((height, width, 3), EMPTY)
     column, row = rays.pixel[index].cpu().numpy().T // every

@@ -19,7 +19,8 @@ from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.hollows import hollow
-from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
+from pipeline.mesh.placement import GRAVITY, Placement, Up, located_bodies, measured_scale, place
+from pipeline.mesh.supports import complete, on_any
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
 from pipeline.mesh.visibility import Visibility, to_bytes
@@ -51,16 +52,29 @@ def make_meshes(
     inner, limit = field_distance(field), ball
     inside = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
     volume = sample_volume(inside, RESOLUTION[options.preset], on_progress=share_of(on_progress, 0.0, 0.25))
-    surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
+    surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.2))
     scale = None
     if options.distance is not None:
         scale = measured_scale(options.distance, posed.views, load_photos(photos), Caster(surface.raw))
+    clicked = {}
+    if options.body:
+        clicked = located_bodies(options.body, posed.views, load_photos(photos), Caster(surface.raw))
     capture, up = load_capture(photos), None
     if capture is not None and capture.up is not None:
         up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
     if capture is not None and scale is None and options.size is None:
         scale = 1 / to_unit.scale, f"metres of {capture.app}"
     placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
+    level, known, completed = placement.to_metres.rotation[2], None, []
+    if not alone:
+        on_progress(0.45, "looking for level surfaces without texture")
+        completed = complete(surface, level, field.finest, posed, photos)
+    if completed:
+        for one in completed:
+            volume = one.filled(volume)
+        known = on_any(completed, volume.cell)
+        surface = surface_of(volume, field, posed, photos, limit, known=known,
+                             on_progress=share_of(on_progress, 0.45, 0.05))  # fmt: skip
     if options.crop is not None:
         limit = box_of(placement, np.reshape(options.crop, (2, 3)))
         volume = volume.limited(limit)
@@ -69,11 +83,12 @@ def make_meshes(
                 "crop: the box holds nothing",
                 "corners are in metres, in the axes of the mesh/mesh.ply of a run without --crop",
             )
-        surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
+        surface = surface_of(volume, field, posed, photos, limit, known=known,
+                             on_progress=share_of(on_progress, 0.5, 0.2))  # fmt: skip
         # Where a person has cut the surroundings away, what is left is what they want to move.
         alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
     on_progress(0.7, "looking for bodies")
-    parts = split(surface, inside, field.finest, posed, photos, placement.to_metres.rotation[2], alone=alone)
+    parts = split(surface, inside, field.finest, posed, photos, level, alone=alone, clicked=clicked)
     on_progress(0.8, "drawing objects.png")
     draw_names(parts, posed.views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
@@ -92,13 +107,14 @@ def make_meshes(
     deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres, evidence) for name in parts.bodies}
     return {
         "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
+        "completed_m2": [float(rounded(one.area * metres**2)) for one in completed],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from,
         "size_assumed": placement.size_assumed, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
         "hollows": {name: found.to_dict() for name, found in deep.items() if found is not None},
-        "masks_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
+        ("places" if clicked else "masks") + "_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
     }  # fmt: skip
 
 

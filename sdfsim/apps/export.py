@@ -162,7 +162,7 @@ def _extra(module: str) -> Any:
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
     progress = partial(on_progress, "shapes")
-    run, source = None, find_scene(source)
+    run, source = None, source if source.exists() else find_scene(source)
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:

@@ -280,11 +280,21 @@ def dataset(
 def train(
     session: Session,
     data: Annotated[
-        list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
+        list[Path],
+        typer.Option(
+            help="Dataset folder; several are trained on together. With --scene: recordings of it, as `identify` reads "
+            "them.",
+            show_default=False,
+        ),
     ],
     out: Out,
+    scene: Annotated[
+        Path | None, typer.Option(help="The scene of recordings, best as `identify -o` wrote it.", show_default=False)
+    ] = None,
     preset: Annotated[
-        Literal["small", "alone", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        Literal[
+            "small", "alone", "impacts", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"
+        ],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
@@ -293,10 +303,10 @@ def train(
     ] = 0,
     device: str = "auto",
 ) -> None:
-    """Train a model on datasets."""
+    """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device}
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene}
     session.report(run_training(data, out, **how, on_progress=session.progress))
 
 

@@ -33,9 +33,9 @@ if TYPE_CHECKING:  # numba and torch take their time to load
     import torch
 
     from sdfsim.learned.families import Family
+    from sdfsim.learned.impulse import ImpulseNetwork
     from sdfsim.learned.near import Contacts, Pairs
     from sdfsim.learned.tensors import BodyTensors
-    from sdfsim.physics.solver.impulse import Weights
     from sdfsim.physics.solver.prepare import Compiled, Steps
     from sdfsim.physics.solver.record import Edges
 
@@ -84,7 +84,7 @@ class Carry:
     scene: Compiled | None = None  # the bodies for compiled code, if the stepper calls any
     # Weights of a network on the solve, for compiled code; the bodies as tensors, for a network on surface nodes. Both
     # also depend on the options.
-    weights: Weights | None = None
+    weights: ImpulseNetwork | None = None
     tensors: BodyTensors | None = None
     edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
     near: Contacts | Pairs | None = None  # where a network on surface nodes saw bodies near each other
@@ -265,13 +265,13 @@ class OnSolver(Solver):
         solved, edges = super()._step(state, carry), cast("Edges", carry.edges)
         if not (asked and len(edges.pair)):
             return solved
-        from sdfsim.learned.inference import corrected, packed, terms_of
+        from sdfsim.learned.inference import corrected, doubled
 
         with carry.timed("network_ms"):
             if carry.weights is None:
-                carry.weights = packed(cast("Any", self.model.network), friction=carry.options.friction)
-            terms, world = terms_of(carry.options, self.model.dt, self.trust), cast("Compiled", carry.scene).world
-            after = corrected(carry.weights, world, state, solved, edges, terms)
+                carry.weights = doubled(self.model.network)
+            known = self.model.dt, self.trust
+            after = corrected(carry.weights, carry.bodies, state, solved, edges, carry.options, *known)
         carry.counts |= {"nodes": len(np.unique(edges.pair)), "edges": len(edges.pair)}
         return after
 

@@ -13,9 +13,9 @@ from pipeline.cameras import Similarity
 from pipeline.materials import ASSUMED, MATERIALS, materials_of
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
-from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, samples_of, scene_text, write_scene
+from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, floor_height, samples_of, scene_text, write_scene
 from sdfsim.base.files import write_json
-from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.load import load_scene
 from sdfsim.sdf.grid import GridSdf
@@ -224,3 +224,21 @@ def test_shapes_without_a_fit_are_samples_of_their_meshes(meshes, tmp_path):
 @pytest.mark.parametrize(("side", "cell", "samples"), [(1.0, 0.01, 193), (1.0, 0.025, 113), (0.1, 0.02, 65)])
 def test_a_grid_has_two_samples_a_cell_within_limits(side, cell, samples):
     assert samples_of(cube(side, (0, 0, 0)), cell) == samples
+
+
+def sheet(height: float, side: float = 1.0) -> Mesh:
+    """A level square."""
+    corners = np.array([[-side, -side, height], [side, -side, height], [side, side, height], [-side, side, height]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_the_added_floor_lies_below_a_level_surface_that_the_photos_show():
+    assert floor_height(sheet(0.001)) == pytest.approx(-0.002)  # 0.1 % of 2 m
+    assert floor_height(sheet(-0.004)) == pytest.approx(-0.006)
+    # A table whose floor is not in the photos, and a scrap at its height.
+    assert floor_height(sheet(0.3)) == 0.0
+    assert floor_height(joined([sheet(0.3), sheet(0.0, 0.1)])) == 0.0
+    text = scene_text(PLACEMENT, {}, None, floor=-0.002)
+    assert "just below the floor that the photos show" in text
+    plane = yaml.safe_load(text)["bodies"][0]["plane"]
+    assert plane == {"normal": [0, 0, 1], "offset": -0.002}
