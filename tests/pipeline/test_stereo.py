@@ -13,8 +13,8 @@ from scipy.ndimage import map_coordinates
 from pipeline.cameras import PosedPhotos
 from pipeline.field.interpolation import places_of
 from pipeline.stereo.depth import BEYOND, DepthMap, neighbours, only, outside_mask, stereo, stereo_summary
-from pipeline.stereo.fusion import fuse
-from tests.helpers.balls import BALL, ball_on_plane, camera, grey_of, ring, shoot, true_depth
+from pipeline.stereo.fusion import behind, fuse
+from tests.helpers.balls import BALL, GROUND, ball_on_plane, camera, grey_of, ring, shoot, true_depth
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +84,21 @@ def test_fused_depth_is_the_signed_distance(scene, folder):
     inside = np.linalg.norm(grid, axis=-1) < 0.95
     away = np.abs(ball_on_plane(grid)) > 0.08
     assert ((fused.coarse < 0) == (ball_on_plane(grid) < 0))[inside & away].mean() > 0.97
+
+
+def test_what_lies_behind_the_sphere_is_there_in_its_colours(scene, folder):
+    """The plane goes on below: dense where it is in contracted space, and not above; colours are those of photos."""
+    _, maps = scene
+    found = behind(maps, 48, folder)
+    line = np.linspace(-1, 1, 48)
+    at = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., ::-1]
+    size = np.linalg.norm(at, axis=-1)
+    dense = (found[..., 0] > 0) & (size > 0.5) & (size < 0.75)
+    points = at[dense] / size[dense][:, None] / (2 - 2 * size[dense])[:, None]
+    assert dense.sum() > 300 and np.median(np.abs(points[:, 2] - GROUND)) < 0.15  # one to two cells there
+    assert (points[:, 2] < 0.3).mean() > 0.95
+    grey = 1 / (1 + np.exp(-10 * found[dense][:, 1:]))
+    assert 0.3 < grey.mean() < 0.7 and np.abs(grey[:, 0] - grey[:, 2]).max() < 0.05
 
 
 def test_what_no_photo_shows_makes_no_surface(scene, tmp_path):
