@@ -1,4 +1,4 @@
-"""From photos and meshes to shapes: reconstruct, its stages, and fit."""
+"""From photos and meshes to shapes: reconstruct, its stages, measure, and fit."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def options(*names: str, kept: bool = False) -> Callable[[Callable[..., None]], 
 
 
 @command
-@options("preset", "size", "distance", "crop", "drop", "material")
+@options("preset", "size", "distance", "crop", "body", "drop", "material", "sdf")
 def reconstruct(
     session: Session,
     photos: Photos,
@@ -68,6 +68,20 @@ def reconstruct(
         progress=session.stage_progress,
     )  # fmt: skip
     _report_stages(session, report, out)
+
+
+@command
+def measure(
+    session: Session,
+    photos: Photos,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The page to write.")] = Path("measure.html"),
+) -> None:
+    """Photos -> a page in which clicks give --distance and --body."""
+    from pipeline.measure import measure as write_page
+
+    report = write_page(photos, out, on_progress=session.progress)
+    told = f"wrote {out}: {report['photos']} photos, {report['mib']} MiB"
+    session.report(report, [told, "open it in a browser: two clicks give --distance, one gives --body"])
 
 
 @command
@@ -94,7 +108,7 @@ def distill(
 
 
 @command
-@options("preset", "size", "distance", "crop", kept=True)
+@options("preset", "size", "distance", "crop", "body", kept=True)
 def mesh(
     session: Session,
     folder: Annotated[Path, typer.Argument(help="Folder that distill has written.", show_default=False)],
@@ -111,7 +125,7 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 
 
 @command
-@options("recipe", kept=True)
+@options("recipe", "sdf", kept=True)
 def fit(
     session: Session,
     sources: Annotated[
@@ -148,16 +162,17 @@ def fit(
             raise SdfsimError("--cap, --thicken, --units and --cluster go with -o", exit_code=EXIT_USAGE)
         _run_stage(session, "fit", sources[0], then="scene", budget=budget, device=device, **options)
         return
+    if options["sdf"] == "grid":
+        message = "--sdf grid goes without -o: a scene samples a mesh file itself (sdf: grid)"
+        raise SdfsimError(message, exit_code=EXIT_USAGE)
     from sdfsim.apps import fit as fitting
     from sdfsim.base.parallel import cluster as working_on
 
-    how = fitting.Options(options["recipe"] or "default", budget, cap, thicken, units)
-    if len(sources) == 1 and not sources[0].is_dir():
-        report = fitting.fit(sources[0], out, how, device=device, on_progress=session.progress)
-    else:
-        meshes = fitting.named_meshes(sources)
-        with working_on(cluster):
-            report = fitting.fit_many(meshes, out, how, device=device, on_progress=session.progress)
+    with working_on(cluster):
+        report = fitting.fit(
+            sources, out, recipe=options["recipe"] or "default", budget=budget, cap=cap, thicken=thicken, units=units,
+            device=device, on_progress=session.progress,
+        )  # fmt: skip
     tell_failed(session, report)
     if any("error" in shape for shape in report.get("shapes", {}).values()):
         session.exit_code = EXIT_ERROR

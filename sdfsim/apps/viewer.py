@@ -8,11 +8,11 @@ import signal
 import socket
 import subprocess
 import sys
-import sysconfig
 import time
 import webbrowser
+from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
-from shutil import which
 
 from sdfsim.apps.recording import Playback
 from sdfsim.base.errors import SdfsimError
@@ -21,6 +21,7 @@ WINDOW = "1600x900"
 LOOPBACK = "127.0.0.1"  # where viewers listen; their own default would let the whole network in
 _GRPC_PORT, _WEB_PORT = 9876, 9090
 _START_SECONDS = 60.0
+_WINDOWS_CTRL_C = 0xC000013A  # the exit code there
 _TOAST_SECONDS = 10.0  # the notices of the start cover the plots until they fade
 _NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
 
@@ -41,8 +42,8 @@ def stream_to_viewer(playback: Playback, kind: str) -> str:
     if kind == "native":
         return ""
     atexit.register(_end, viewer)
-    page = f"http://localhost:{page_port}?url=rerun%2Bhttp://localhost:{port}/proxy"
-    if _has_screen():
+    page = _page(page_port, port)
+    if has_screen():
         webbrowser.open(page)
     return page
 
@@ -51,33 +52,45 @@ def _address(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
+def _page(page_port: int, port: int) -> str:
+    return f"http://localhost:{page_port}?url=rerun%2Bhttp://localhost:{port}/proxy"
+
+
 def _command(port: int, options: list[str]) -> list[str]:
-    return [_executable(), *options, "--bind", LOOPBACK, "--port", str(port)]
+    return [viewer_program(), *options, "--bind", LOOPBACK, "--port", str(port)]
 
 
 def _launch(port: int, options: list[str]) -> subprocess.Popen:
-    """A viewer in a group of its own: `rerun` is a script that starts the real one, and both have to go together."""
-    quiet = subprocess.DEVNULL
-    return subprocess.Popen(_command(port, options), stdout=quiet, stderr=quiet, start_new_session=True)
+    """A viewer in a group of its own, which a Ctrl-C that is meant for this process does not end."""
+    quiet, group = subprocess.DEVNULL, getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)  # Windows has no sessions
+    command = _command(port, options)
+    return subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True, creationflags=group)
 
 
 def check_screen(kind: str) -> None:
     """Raises SdfsimError when a window (`native`) is wanted where there is no screen."""
-    if kind == "native" and not _has_screen():
-        raise SdfsimError("--viewer native: there is no screen here", "use --viewer web, or --viewer file")
+    if kind == "native" and not has_screen():
+        raise SdfsimError("there is no screen here for a window", "watch it in the browser, --viewer web or view --web")
 
 
-def _has_screen() -> bool:
+def has_screen() -> bool:
+    """Whether a window can be shown."""
     return bool(sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def show(recording: Path, *, web: bool = False) -> None:
-    """Open a recording, and wait until the viewer is closed. Raises SdfsimError for no such recording, or where it
-    fails."""
+def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lambda line: None) -> None:
+    """Open a recording, and wait until the viewer is closed; `say` is told the address of a page in the browser
+    (`web`). Raises SdfsimError for no such recording, no screen for a window, or where it fails."""
     _check_recording(recording)
-    options = ["--web-viewer", "--web-viewer-port", str(_free_port(_WEB_PORT))] if web else []
-    code = subprocess.run(_command(_free_port(_GRPC_PORT), [str(recording), *options]), check=False).returncode
-    if code not in (0, -signal.SIGINT, 130):
+    port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
+    if web:
+        say(f"watch it at {_page(page_port, port)}")
+        say("the page stays up until Ctrl-C")
+    else:
+        check_screen("native")
+    options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
+    code = subprocess.run(_command(port, [str(recording), *options]), check=False).returncode
+    if code not in (0, -signal.SIGINT, 130, _WINDOWS_CTRL_C):
         raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")
 
 
@@ -127,13 +140,12 @@ def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | 
 
 
 def _end(process: subprocess.Popen) -> None:
+    process.terminate()
     try:
-        os.killpg(process.pid, signal.SIGTERM)
         process.wait(timeout=10)
-    except ProcessLookupError:
-        pass
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+        process.wait()
 
 
 def _check_recording(file: Path) -> None:
@@ -141,9 +153,14 @@ def _check_recording(file: Path) -> None:
         raise SdfsimError(f"{file}: no such recording", "give a rollout.rrd that simulate has written")
 
 
-def _executable() -> str:
-    """The `rerun` of this environment, which may not be on the PATH."""
-    found = which("rerun", path=sysconfig.get_path("scripts")) or which("rerun")
+def viewer_program() -> str:
+    """The viewer in the package of rerun itself: its script `rerun` only starts it, and need not be on the PATH, nor
+    end what it started. Another one may be named by RERUN_CLI_PATH, as that script does."""
+    package = find_spec("rerun_cli")
+    folders = package.submodule_search_locations if package else None
+    home = Path(next(iter(folders or []), "."))
+    places = [home / "Rerun.app" / "Contents" / "MacOS" / "Rerun", home / "rerun", home / "rerun.exe"]
+    found = os.environ.get("RERUN_CLI_PATH") or next((str(place) for place in places if place.is_file()), None)
     if not found:
         raise SdfsimError("the rerun program is missing", "pip install rerun-sdk")
     return found

@@ -13,11 +13,7 @@ from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, tell_fa
 from sdfsim.base.console import Session, columns, duration
 from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
-_PACKAGES = (
-    *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
-    *("pydantic", "pybullet"),
-)
-SceneFile = Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)]
+SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
     list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
@@ -95,6 +91,21 @@ def plan(
 
 
 @command
+def samples(
+    session: Session,
+    out: Annotated[Path | None, typer.Option("-o", "--out", metavar="PATH", help="Copy all of them here.")] = None,
+) -> None:
+    """The scenes that come with sdfsim; a copy of them to change."""
+    from sdfsim.scene import bundled
+
+    known = bundled.samples()
+    lines = columns(list(known.items()))
+    if out is not None:
+        lines = [f"wrote {bundled.copy_samples(out)}: {', '.join(known)}"]
+    session.report({"samples": known, "folder": out or bundled.sample_folder()}, lines)
+
+
+@command
 def view(
     session: Session,
     recording: Annotated[Path, typer.Argument(help="rollout.rrd", show_default=False)],
@@ -111,7 +122,7 @@ def view(
         viewer.screenshot(recording, picture, at=at)
         session.report({"screenshot": picture})
     else:
-        viewer.show(recording, web=web)
+        viewer.show(recording, web=web, say=session.say)
         session.report({"recording": recording})
 
 
@@ -154,12 +165,24 @@ def export(
         typer.Option("-o", "--out", metavar="FILE", help="Ends in .glb .usd .usda .usdc .xml .mjcf .urdf or .csv."),
     ],
     scene: OfRun = None,
+    fps: Annotated[float | None, typer.Option(help="Frames of the motion in a second (default: every step).")] = None,
+    collide: Annotated[
+        Literal["pieces", "sdf"], typer.Option(help="How MuJoCo collides meshes; sdf is exact there, and slow.")
+    ] = "pieces",
     allow_outside: Outside = False,
 ) -> None:
     """Shape, scene or run -> a file of other programs (docs/export.md)."""
     from sdfsim.apps import export as room
 
-    report = room.export(source, out, scene_file=scene, allow_outside=allow_outside, on_progress=session.stage_progress)
+    report = room.export(
+        source,
+        out,
+        scene_file=scene,
+        fps=fps,
+        collide=collide,
+        allow_outside=allow_outside,
+        on_progress=session.stage_progress,
+    )
     files = report["files"]
     lines = [
         f"bodies {report['bodies']}, frames {report['frames']}",
@@ -204,24 +227,11 @@ def identify(
 
 @command
 def info(session: Session) -> None:
-    """Versions, devices and bundled models."""
-    import platform
-    from importlib import metadata
+    """Versions, devices and bundled models; what is missing here, and how to get it."""
+    from sdfsim.apps.about import about, about_lines
 
-    import torch
-
-    from sdfsim.base.version import __version__
-    from sdfsim.learned.model import model_names
-
-    versions = {"sdfsim": __version__, "python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "missing"
-    gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
-    threads = {"cpu_threads": torch.get_num_threads()}
-    session.report({"versions": versions, "devices": ["cpu", *gpus], **threads, "models": model_names()})
+    report = about()
+    session.report(report, about_lines(report))
 
 
 @command
@@ -270,11 +280,21 @@ def dataset(
 def train(
     session: Session,
     data: Annotated[
-        list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
+        list[Path],
+        typer.Option(
+            help="Dataset folder; several are trained on together. With --scene: recordings of it, as `identify` reads "
+            "them.",
+            show_default=False,
+        ),
     ],
     out: Out,
+    scene: Annotated[
+        Path | None, typer.Option(help="The scene of recordings, best as `identify -o` wrote it.", show_default=False)
+    ] = None,
     preset: Annotated[
-        Literal["small", "alone", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        Literal[
+            "small", "alone", "impacts", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"
+        ],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
@@ -283,10 +303,10 @@ def train(
     ] = 0,
     device: str = "auto",
 ) -> None:
-    """Train a model on datasets."""
+    """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device}
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene}
     session.report(run_training(data, out, **how, on_progress=session.progress))
 
 

@@ -8,6 +8,9 @@ import numpy as np
 
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, lattice
 
+BOWL_WALL = 0.12  # of the bowl, relative to its outer radius
+PACKED = 0.6  # part of a space which packed balls fill
+
 
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
     """A box with full extents `size` m: 8 vertices, 12 faces."""
@@ -48,11 +51,22 @@ def torus(major: float = 0.35, minor: float = 0.15, segments: int = 64, sides: i
     return _tube(_torus_rings(major, minor, segments, sides))
 
 
+def tube(outer: float, inner: float, height: float, segments: int = 64) -> Mesh:
+    """A tube about z of radii `outer` and `inner` m."""
+    turn = 2 * np.pi * np.arange(segments) / segments
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return _sleeve(outer * circle, inner * circle, height)
+
+
 def gear() -> Mesh:
     """A spur gear about z: 12 teeth of 0.1 m, 0.2 m thick, with a bore of radius 0.12 m."""
-    outer, inner = _gear_outline()
+    return _sleeve(*_gear_outline(), 0.2)
+
+
+def _sleeve(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
+    """What is between two outlines [K, 2] m, counter-clockwise, and half of `height` m from z = 0."""
     count = len(outer)
-    layers = [np.column_stack([outline, np.full(count, z)]) for z in (-0.1, 0.1) for outline in (outer, inner)]
+    layers = [np.column_stack([line, np.full(count, z)]) for z in (-height / 2, height / 2) for line in (outer, inner)]
     this, following = np.arange(count), (np.arange(count) + 1) % count
     low_out, low_in, high_out, high_in = (count * layer for layer in range(4))
     quads = [
@@ -67,10 +81,16 @@ def torus_knot() -> Mesh:
     return _tube(_knot_rings(192, 24))
 
 
-def bowl(radius: float = 0.5, wall: float = 0.06) -> Mesh:
+def bowl(radius: float = 0.5, wall: float = 0.5 * BOWL_WALL) -> Mesh:
     """Half of a spherical shell about the origin, of outer `radius` m and `wall` m thick, open at the top (+z)."""
     outer, inner = _bowl_profiles(radius, wall, 16)
     return _revolve(np.concatenate([outer, inner[::-1]]), 64)
+
+
+def bowl_radii(count: int, ball: float) -> tuple[float, float]:
+    """Inner and outer radius m of a bowl with twice the room that `count` packed balls of diameter `ball` m take."""
+    inner = ball * (2.0 * count / (4 * PACKED)) ** (1 / 3)
+    return inner, inner / (1 - BOWL_WALL)
 
 
 def shoe() -> Mesh:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,15 @@ import numpy as np
 import yaml
 
 from sdfsim.base.errors import SceneError, nearest
-from sdfsim.base.files import write_text
+from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.load import load_scene
-from sdfsim.scene.scene import Scene
-from sdfsim.scene.schema import VERSION, BodyTable, SceneTable, ShapeTable
+from sdfsim.scene.scene import WORLD, Scene
+from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, ShapeTable
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")
-_HERE = "<scene>"  # what messages call a scene that is in no file
+_HERE = "<scene>"  # the name in messages of a scene without a file
 
 
 class SceneBuilder:
@@ -27,11 +26,12 @@ class SceneBuilder:
     itself: gravity, duration, seed, model, effects; raises SceneError for no such key."""
 
     def __init__(self, **settings: Any) -> None:
-        known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies")]
+        known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies", "joints")]
         _check(settings, known, "a scene")
         self._settings = _plain(settings)
         self._shapes: dict[str, dict[str, Any]] = {}
         self._bodies: list[dict[str, Any]] = []
+        self._joints: list[dict[str, Any]] = []
 
     def add(self, name: str, **keys: Any) -> SceneBuilder:
         """Add a body, or many copies of one, and return the scene.
@@ -48,6 +48,19 @@ class SceneBuilder:
             self._shapes[name] = _plain(shape)
             body = {"shape": name, **body}
         self._bodies.append(_plain({"name": name, **body}))
+        return self
+
+    def join(self, name: str, type: str, *bodies: str, **keys: Any) -> SceneBuilder:
+        """Add a joint between two bodies, the second of which may be "world" and is so where only one is given, and
+        return the scene.
+
+        Keys are those of `joints` in docs/scene.md: `join("door", "hinge", "leaf", anchor=(0, 0, 1), axis=(0, 0, 1))`.
+        Raises SceneError for no such key; values are checked by `load`, all at once.
+        """
+        given = ("name", "type", "bodies")
+        _check(keys, [key for key in JointTable.model_fields if key not in given], f"joint {name!r}")
+        held = [*bodies, WORLD] if len(bodies) == 1 else list(bodies)
+        self._joints.append(_plain({"name": name, "type": type, "bodies": held, **keys}))
         return self
 
     def load(self, on_progress: Progress = silent) -> Scene:
@@ -70,7 +83,7 @@ class SceneBuilder:
         """The file; paths start at `folder`, or stay as they are."""
 
         def moved(path: Any) -> Any:
-            return os.path.relpath(path, folder) if folder and isinstance(path, str) else path
+            return path_from(folder, path) if folder and isinstance(path, str) else path
 
         document = {"version": VERSION, **self._settings}
         if str(document.get("model", "")).endswith(".safetensors"):
@@ -82,6 +95,8 @@ class SceneBuilder:
             }
         if self._bodies:
             document["bodies"] = self._bodies
+        if self._joints:
+            document["joints"] = self._joints
         return yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=10**9)
 
 

@@ -31,6 +31,7 @@ class Plan:
     rotation: Effect
     friction: Effect
     restitution: Effect
+    joints: Effect
     sleep: Effect
     static: tuple[str, ...]  # names of the bodies by how they move, as the next two
     dynamic: tuple[str, ...]
@@ -74,6 +75,10 @@ def plan(scene: Scene) -> Plan:
     sleep = "the file says off" if asked.sleep == "off" else "what rests freezes until something disturbs it"
     turning = "the file says off: bodies translate only" if asked.rotation == "off" else "only the file can say off"
     no_saving = "; off saves nothing"
+    jointed = len(scene.joints) > 0 and asked.joints != "off"
+    holding = f"{len(scene.joints)} joints hold bodies" if jointed else "the file says off"
+    held = Effect(jointed, holding if scene.joints else "there are none", "effects.joints, joints")
+    resting = contact.on or held.on
     return Plan(
         gravity=Effect(size > 0, f"{size:g} m/s^2" if size else "the file sets it to zero", "gravity"),
         free_flight=of_kind("dynamic", "in closed form while they touch nothing"),
@@ -83,9 +88,10 @@ def plan(scene: Scene) -> Plan:
         rotation=Effect(asked.rotation != "off", turning, "effects.rotation"),
         friction=of_pairs(asked.friction, pairs.frictional, "friction"),
         restitution=of_pairs(asked.restitution, pairs.bouncy, "restitution", no_saving),
+        joints=held,
         sleep=Effect(
-            contact.on and asked.sleep != "off",
-            sleep if contact.on else "contact is off: nothing can come to rest",
+            resting and asked.sleep != "off",
+            sleep if resting else "contact is off: nothing can come to rest",
             "effects.sleep",
         ),
         static=names["static"],

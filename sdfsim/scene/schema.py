@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,7 +26,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from sdfsim.base.errors import nearest
 from sdfsim.geometry.primitives import PRIMITIVES
 from sdfsim.scene.document import NOTHING, Loc, Numeral
-from sdfsim.scene.scene import Motion, Switch
+from sdfsim.scene.scene import WORLD, JointKind, Motion, Switch
 from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
     MESH_FILE,
@@ -113,6 +114,8 @@ def _find(text: str, info: ValidationInfo) -> Path:
     context: Any = info.context
     home: Path = context["folder"]
     place = home / text
+    if "\\" in text and not os.path.lexists(place):  # written on Windows
+        place = home / text.replace("\\", "/")
     try:
         # Where it leads when every link is followed; of a folder, also where the files of a shape lead.
         inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE, SKIN_FILE) if place.is_dir() else ()
@@ -213,6 +216,7 @@ class EffectsTable(Table):
     restitution: Switch = key("contacts rebound", "auto")
     rotation: Switch = key("bodies turn", "auto")
     sleep: Switch = key("what rests is frozen until something disturbs it", "auto")
+    joints: Switch = key("joints hold bodies", "auto")
 
 
 class Primitive(Table):
@@ -447,6 +451,145 @@ class BodyTable(Turned):
         return (cells - [(nx - 1) / 2, (ny - 1) / 2, 0.0]) * self.arrange.spacing
 
 
+class SpringTable(Table):
+    """A spring of a hinge, a slider or a distance: linear, about where it is at rest."""
+
+    stiffness: Number = key("of a hinge in N m/rad, else in N/m", unit="", gt=0)
+    rest: Number = key("where a slider, or the length at which a distance, is at rest", 0.0, "m")
+    rest_deg: Number = key("where a hinge is at rest", 0.0, "degrees")
+
+
+class MotorTable(Table):
+    """A motor of a hinge or a slider: it keeps a speed, or goes to a place and holds it there, as far as it is strong
+    enough."""
+
+    speed: Number | None = key("of the first body against the second; of a hinge in rad/s, else in m/s", None)
+    position: Number | None = key("where a slider is to go", None, "m")
+    position_deg: Number | None = key("where a hinge is to go", None, "degrees")
+    most: Number = key("the largest torque of a hinge in N m, the largest force of a slider in N", gt=0)
+    time: Number = key("what is left of the way shrinks to a third in this time; goes with a place", 0.1, "s", gt=0)
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        yield from _one_of(data, ("speed", "position", "position_deg"), required=True)
+        if "time" in data and "speed" in data:
+            yield ("time",), "goes with position and position_deg only"
+
+
+class BreaksTable(Table):
+    """What a joint can bear; what is more breaks it for good."""
+
+    force: Number | None = key("the largest", None, "N", gt=0)
+    torque: Number | None = key("the largest", None, "N m", gt=0)
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        if not {"force", "torque"} & data.keys():
+            yield (), "force or torque is required"
+
+
+# Which keys go with which joints, beside those that go with all.
+_OF_JOINT: dict[str, tuple[str, ...]] = {
+    "hinge": ("axis", "limits_deg", "start_deg", "restitution", "damping", "friction", "spring", "motor"),
+    "slider": ("axis", "limits", "start", "restitution", "damping", "friction", "spring", "motor"),
+    "ball": ("axis", "cone_deg", "restitution", "damping", "friction"),
+    "fixed": (),
+    "distance": ("to", "rod", "rope", "restitution", "damping", "spring"),
+}
+_OF_ALL_JOINTS = ("name", "type", "bodies", "anchor", "frame", "breaks_at", "collide")
+_NEEDED = {"hinge": ("anchor", "axis"), "slider": ("axis",), "ball": ("anchor",), "distance": ("anchor", "to")}
+
+
+def _ordered(ends: list[float]) -> list[float]:
+    if ends[1] < ends[0]:
+        raise _problem(f"must not be below the first (got {ends[0]:g} to {ends[1]:g})")
+    return ends
+
+
+Ends = Annotated[list[Number], Field(min_length=2, max_length=2), AfterValidator(_ordered)]
+
+
+class JointTable(Table):
+    """Holds two bodies together, or one in the `world`. The first is held by the second: angles and positions are those
+    of the first against the second, right-handed about the axis."""
+
+    name: Text = key("unique among joints")
+    type: JointKind = key(
+        "`hinge` turns about an axis, `slider` goes along one, `ball` turns about a point, `fixed` lets nothing move, "
+        "`distance` keeps two points apart: by a `rod`, a `rope` or a `spring`"
+    )
+    bodies: Annotated[list[Text], Field(min_length=2, max_length=2)] = key(
+        f"names of two bodies; the second may be `{WORLD}`"
+    )
+    anchor: Vector | None = key(
+        "the point that both share; of a distance its end at the first body; the first body's origin without it", None,
+        "m",
+    )  # fmt: skip
+    to: Vector | None = key("of a distance: its end at the second body", None, "m")
+    axis: Direction | None = key("of a hinge, a slider and the cone of a ball; of any length", None)
+    frame: Text = key(
+        f"where anchor, to and axis are told: `{WORLD}`, as bodies lie at the start, or the name of one of both "
+        "bodies: from its shape's origin along its axes",
+        WORLD,
+    )
+    start: Number = key("the position that a slider has at the start", 0.0, "m")
+    start_deg: Number = key("the angle that a hinge has at the start", 0.0, "degrees")
+    limits: Ends | None = key("the least and the largest position of a slider", None, "m")
+    limits_deg: Ends | None = key("the least and the largest angle of a hinge; turns add up", None, "degrees")
+    cone_deg: Number | None = key(
+        "of a ball: how far the axis of the first body may lean from that of the second", None, "degrees", ge=0, le=180
+    )
+    rod: Number | None = key("the points stay so far apart; as they are at the start", None, "m", gt=0)
+    rope: Number | None = key("the points are at most so far apart", None, "m", gt=0)
+    restitution: Number = key("how limits and ropes rebound", 0.0, ge=0, le=1)
+    damping: Number = key("of hinges and balls in N m s/rad, else in N s/m", 0.0, ge=0)
+    friction: Number = key("of hinges and balls a torque in N m, of sliders a force in N", 0.0, ge=0)
+    spring: SpringTable | None = key("pulls back", None)
+    motor: MotorTable | None = key("drives", None)
+    breaks_at: BreaksTable | None = key("what it can bear", None)
+    collide: Literal["on", "off"] = key("whether the two bodies may touch each other", "off")
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        kind = data.get("type")
+        if kind not in _OF_JOINT:
+            return
+        for name in data:
+            if name in cls.model_fields and name not in (*_OF_JOINT[kind], *_OF_ALL_JOINTS):
+                fit = ", ".join(k for k, keys in _OF_JOINT.items() if name in keys)
+                yield (name,), f"goes with {fit} only (this is a {kind})"
+        for name in _NEEDED.get(kind, ()):
+            if name not in data:
+                yield (name,), f"is required: this is a {kind}"
+        if kind == "distance":
+            yield from _one_of(data, ("rod", "rope"))
+            yield from _one_of(data, ("rod", "spring"))
+            if not {"rod", "rope", "spring"} & data.keys():
+                yield (), "one of rod, rope, spring is required: this is a distance"
+        if "cone_deg" in data and "axis" not in data:
+            yield ("axis",), "is required: cone_deg is told from it"
+        if "restitution" in data and not {"limits", "limits_deg", "cone_deg", "rope"} & data.keys():
+            yield ("restitution",), "goes with limits or a rope only"
+        if kind == "distance" and "damping" in data and "rod" in data:
+            yield ("damping",), "does not go with rod: its ends come no nearer"
+        for table, wrong in (("spring", ("rest", "rest_deg")), ("motor", ("position", "position_deg"))):
+            inner = data.get(table)
+            name = wrong[0 if kind == "hinge" else 1]
+            if isinstance(inner, dict) and name in inner and table in _OF_JOINT[kind]:
+                yield (table, name), f"does not go with a {kind}: give {wrong[1 if kind == 'hinge' else 0]}"
+
+    def check_values(self) -> Iterator[Fault]:
+        if self.frame not in (WORLD, *self.bodies):
+            told = f"must be {WORLD}, {self.bodies[0]} or {self.bodies[1]} (got {self.frame!r})"
+            yield ("frame",), told
+        for ends, start, name, unit in (
+            (self.limits, self.start, "start", "m"), (self.limits_deg, self.start_deg, "start_deg", "degrees"),
+        ):  # fmt: skip
+            if ends is not None and not ends[0] <= start <= ends[1]:
+                told = f"is beyond the limits, {ends[0]:g} to {ends[1]:g} {unit} (got {start:g} {unit})"
+                yield (name if name in self.model_fields_set else f"limits{name[5:]}",), told
+
+
 class SceneTable(Table):
     """The whole file."""
 
@@ -460,6 +603,7 @@ class SceneTable(Table):
     effects: EffectsTable = key("which effects to compute", EffectsTable())
     shapes: dict[str, ShapeTable] = key("shapes by name", {})
     bodies: Annotated[list[BodyTable], Field(min_length=1)] = key("all bodies")
+    joints: list[JointTable] = key("what holds bodies together", [])
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -493,6 +637,31 @@ class SceneTable(Table):
             for k, partner in enumerate(body.collides_with or []):
                 if partner not in first and partner not in copies:
                     yield ("bodies", i, "collides_with", k), f"no body is called {partner!r}{nearest(partner, first)}"
+        yield from self._joint_faults()
+
+    def _joint_faults(self) -> Iterator[Fault]:
+        motion = {name: self.motion_of(body) for body in self.bodies for name in body.names()}
+        copies = {body.name: body.copies for body in self.bodies if body.name not in motion}
+        first: dict[str, int] = {}
+        for i, joint in enumerate(self.joints):
+            if first.setdefault(joint.name, i) != i:
+                told = f"two joints are called {joint.name!r} (the first is joints[{first[joint.name]}])"
+                yield ("joints", i, "name"), told
+            known = True
+            for k, name in enumerate(joint.bodies):
+                where, known = ("joints", i, "bodies", k), known and (name in motion or (k == 1 and name == WORLD))
+                if name == WORLD and name in motion:
+                    yield where, f"a body is called {WORLD!r} too: give it another name"
+                elif name == WORLD and k == 0:
+                    yield where, f"{WORLD} must be the second: it holds the first"
+                elif name in copies:
+                    yield where, f"there are {copies[name]} bodies {name!r}: give one, such as {name}[0]"
+                elif name not in motion and name != WORLD:
+                    yield where, f"no body is called {name!r}{nearest(name, motion)}"
+            if known and joint.bodies[0] == joint.bodies[1]:
+                yield ("joints", i, "bodies"), f"must be two (got {joint.bodies[0]!r} twice)"
+            elif known and "dynamic" not in (motion.get(name) for name in joint.bodies):
+                yield ("joints", i, "bodies"), "holds nothing: one of both must be dynamic"
 
     def flat(self, body: BodyTable) -> bool:
         """Whether it is a plane."""
@@ -517,6 +686,10 @@ _SECTIONS: dict[str, type[Table]] = {
     "bodies[]: plane": Plane,
     "bodies[]: arrange": Arrange,
     "bodies[]: path[]": Waypoint,
+    "joints[]": JointTable,
+    "joints[]: spring": SpringTable,
+    "joints[]: motor": MotorTable,
+    "joints[]: breaks_at": BreaksTable,
 }
 
 

@@ -31,7 +31,7 @@ from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sa
 if TYPE_CHECKING:
     import torch
 
-# m, sizes of meshes that need no word; without known units the largest is less, for few things that move are larger.
+# m, sizes of meshes that need no remark; without known units the largest is less, for few moving things are larger.
 USUAL, LARGE = (1e-3, 100.0), 5.0
 # Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
 OWN_SHARE, EDGE_SHARE = 0.6, 0.85
@@ -142,9 +142,9 @@ def shape_from_mesh(
     """The shape of a mesh file: made on first use, then taken from a cache (by default `sdfsim/shapes` in the user's
     cache folder) keyed by what the file describes.
 
-    `units` are metres per unit of the file (None: metres, with a doubt), `thicken` m is a thickness for an open sheet;
-    of `sdf`, "mlp" fits the network, "grid" and "mesh" fit nothing (see `mesh_shape`). `source["notes"]` lists what was
-    done to the mesh, and what `remarks` there are. Raises SdfsimError where the mesh cannot be used.
+    `units` are metres per unit of the file (None: unknown, taken as metres), `thicken` m is a thickness for an open
+    sheet. With `sdf` "mlp" the network is fitted; "grid" and "mesh" need no fit (see `mesh_shape`). `source["notes"]`
+    lists what was done to the mesh, and `remarks`. Raises SdfsimError where the mesh cannot be used.
     """
     path = Path(path)
     mesh = load_mesh(path)
@@ -159,9 +159,8 @@ def shape_from_mesh(
 
 
 def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
-    """Notes on a mesh file as it was read, a line each: that glTF was turned; and its size, where that is odd
-    for the `units` (metres per unit) that are taken for its numbers. Many parts are drawn in millimetres, and few
-    files state it."""
+    """Notes on a mesh file, a line each: that glTF was turned; and its size, where that is unusual in the `units`
+    (metres per unit). Many parts are drawn in millimetres, and few files state it."""
     notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
     size = units * float(np.ptp(mesh.vertices, axis=0).max())
     if not given and size > LARGE:
@@ -173,12 +172,12 @@ def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
 
 def mesh_shape(
     mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
-    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
+    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent, coarse: int = 1,
 ) -> Shape:  # fmt: skip
-    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
-    Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
+    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it (see `sample_grid`), nodes and mass
+    as a fit has them. Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
     solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
-    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress, coarse)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
     source = {"kind": "mesh"} | note | ({"notes": list(solid.notes)} if solid.notes else {})
     return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), certificate, source)

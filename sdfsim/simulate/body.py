@@ -18,7 +18,7 @@ Numbers = Sequence[float] | np.ndarray
 
 
 class LiveScene:
-    """A scene in motion, in model units. It notes which bodies somebody changes, for the stepper to be told."""
+    """A scene in motion, in model units. It records which bodies the user changes, to announce them to the stepper."""
 
     scene: Scene
     units: Units
@@ -67,8 +67,7 @@ class ContactPoint:
 
 
 class BodyHandle:
-    """One body of a simulator, by its `name`: read it, set it, push and pull it. What is set counts from the next step
-    on."""
+    """One body of a simulator, by its `name`: read it, set it, push and pull it. Changes act from the next step on."""
 
     __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
 
@@ -128,8 +127,14 @@ class BodyHandle:
         return float(self._simulator.bodies.mass[self._row]) * self._simulator.units.mass
 
     @property
+    def inertia(self) -> np.ndarray:
+        """[3, 3] kg m^2, about the centre of mass, in the shape's axes; of a body that moves by itself."""
+        sim = self._simulator
+        return sim.bodies.inertia[self._row] * sim.units.mass * sim.units.length**2
+
+    @property
     def asleep(self) -> bool:
-        """Whether it rests and is left out until something disturbs it."""
+        """Whether it sleeps: it rests, and costs nothing until something disturbs it."""
         touch = self._simulator.state.touch
         return touch is not None and bool(touch.island[self._row] >= 0)
 
@@ -143,8 +148,7 @@ class BodyHandle:
             sim, row = self._simulator, self._row
             turn = np.cross(_vector("at", at) - self.centre, given)
             axes = pose.to_matrix(sim.state.orientation[row])
-            inertia = axes @ sim.bodies.inertia[row] @ axes.T * sim.units.mass * sim.units.length**2
-            self.angular_velocity = self.angular_velocity + np.linalg.solve(inertia, turn)
+            self.angular_velocity = self.angular_velocity + np.linalg.solve(axes @ self.inertia @ axes.T, turn)
 
     def pull(self, force: Numbers, at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)) -> None:
         """Let a force [3] N and a torque [3] N m act from now on, in world axes, until the next call or `reset`; zero

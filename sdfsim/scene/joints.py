@@ -1,0 +1,120 @@
+"""Joints of a scene: from points and axes in the world, or in a body, to a frame at each of both bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sdfsim.scene.document import Loc
+from sdfsim.scene.scene import WORLD, Body, Joint, JointKind, Motor, Spring
+from sdfsim.scene.schema import JointTable
+
+NEAR = 1e-3  # of its length, by which a rod may differ from the distance at the start
+
+
+def held(
+    name: str,
+    kind: JointKind,
+    bodies: tuple[int, int],
+    known: Sequence[Body],
+    *,
+    anchor: np.ndarray,
+    axis: np.ndarray | None = None,
+    to: np.ndarray | None = None,
+    start: float = 0.0,
+    **others: Any,
+) -> Joint:
+    """A joint of bodies as they lie at the start.
+
+    Args:
+        bodies: indices into `known`, the second -1 for the world.
+        anchor: [3] m, world; of a distance its end at the first body.
+        axis: [3] unit vector, world; None where the joint has none.
+        to: [3] m, world, the end of a distance at the second body.
+        start: the angle (rad) of a hinge, or the position (m) of a slider.
+        others: fields of `Joint`.
+    """
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    axis = np.array([1.0, 0.0, 0.0]) if axis is None else np.asarray(axis, np.float64)
+    side = np.eye(3)[np.argmin(np.abs(axis))]
+    side = np.cross(axis, side) / np.linalg.norm(np.cross(axis, side))
+    frame = Rotation.from_matrix(np.stack([axis, side, np.cross(axis, side)], 1))
+    turned = frame * Rotation.from_rotvec([start, 0.0, 0.0]) if kind == "hinge" else frame
+    other = np.asarray(anchor if to is None else to, np.float64)
+    other = other - start * axis if kind == "slider" else other
+    anchors, frames = [], []
+    for body, point, axes in zip(bodies, (np.asarray(anchor, np.float64), other), (turned, frame), strict=True):
+        place, back = np.zeros(3), Rotation.identity()
+        if body >= 0:
+            place, back = known[body].position, Rotation.from_quat(known[body].quat_xyzw).inv()
+        anchors.append(back.apply(point - place))
+        frames.append((back * axes).as_quat())
+    return Joint(name, kind, bodies, np.stack(anchors), np.stack(frames), **others)
+
+
+def joints_of(
+    tables: Sequence[JointTable], bodies: Sequence[Body], wrong: Callable[[Loc, str], None]
+) -> tuple[Joint, ...]:
+    """The joints of a scene file whose bodies are known; calls `wrong` where points do not fit what joins them."""
+    number = {body.name: k for k, body in enumerate(bodies)}
+    return tuple(
+        _joint(table, bodies, number, lambda key, told, i=i: wrong(("joints", i, key), told))
+        for i, table in enumerate(tables)
+    )
+
+
+def _joint(
+    table: JointTable, bodies: Sequence[Body], number: dict[str, int], wrong: Callable[[str, str], None]
+) -> Joint:
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    first, second = (number.get(name, -1) for name in table.bodies)
+    place, turn = np.zeros(3), Rotation.identity()
+    if table.frame != WORLD:
+        place = bodies[number[table.frame]].position
+        turn = Rotation.from_quat(bodies[number[table.frame]].quat_xyzw)
+    anchor = bodies[first].position if table.anchor is None else place + turn.apply(table.anchor)
+    to = None if table.to is None else place + turn.apply(table.to)
+    if to is not None:
+        apart = float(np.linalg.norm(anchor - to))
+        if table.rod is not None and not abs(apart - table.rod) <= NEAR * table.rod:
+            wrong("rod", f"must be the distance of its ends at the start, {apart:.6g} m (got {table.rod:g} m)")
+        if table.rope is not None and apart > table.rope * (1.0 + NEAR):
+            wrong(
+                "rope", f"must be at least the distance of its ends at the start, {apart:.6g} m (got {table.rope:g} m)"
+            )
+    hinge, spring, motor, breaks = table.type == "hinge", table.spring, table.motor, table.breaks_at
+    ends = table.limits
+    if table.limits_deg is not None:
+        ends = [math.radians(end) for end in table.limits_deg]
+    if table.cone_deg is not None:
+        ends = [0.0, math.radians(table.cone_deg)]
+    if table.rope is not None:
+        ends = [0.0, table.rope]
+    place_of = None if motor is None else motor.position
+    if motor is not None and motor.position_deg is not None:
+        place_of = math.radians(motor.position_deg)
+    return held(
+        table.name,
+        table.type,
+        (first, second),
+        bodies,
+        anchor=anchor,
+        axis=None if table.axis is None else turn.apply(table.axis),
+        to=to,
+        start=math.radians(table.start_deg) if hinge else table.start,
+        limits=None if ends is None else (float(ends[0]), float(ends[1])),
+        length=table.rod,
+        restitution=table.restitution,
+        damping=table.damping,
+        friction=table.friction,
+        spring=spring and Spring(spring.stiffness, math.radians(spring.rest_deg) if hinge else spring.rest),
+        motor=motor and Motor(motor.most, motor.speed, place_of, motor.time),
+        breaks_force=math.inf if breaks is None or breaks.force is None else breaks.force,
+        breaks_torque=math.inf if breaks is None or breaks.torque is None else breaks.torque,
+        collides=table.collide == "on",
+    )
