@@ -34,7 +34,7 @@ from sdfsim.physics.solver.vectors import (
 MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 
 
-@njit(**FAST)
+@njit(**FAST, inline="always")  # where it is called, and not once more by itself
 def advance(shapes, world, work, motion, rules, manifolds):
     """Advance `motion` by one step, in place; time is that of the bodies that go, however many others there are.
 
