@@ -3,6 +3,7 @@ defaults, frames, inertias and includes, and what it refuses is no MJCF."""
 
 from __future__ import annotations
 
+import importlib
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +40,7 @@ def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
     file draws them. Raises SdfsimError where MuJoCo is not installed or refuses the file, for no such keyframe, or for
     geometry that no body can have."""
     try:
-        import mujoco
+        mujoco: Any = importlib.import_module("mujoco")
     except ImportError as error:
         raise SdfsimError("mujoco is not installed: it reads MJCF", "pip install 'sdfsim[mjcf]'") from error
     try:
@@ -49,13 +50,11 @@ def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
         line = re.search(r"\bline (\d+)", told)
         where = f"{path}:{line[1]}" if line else str(path)
         raise SdfsimError(f"{where}: MuJoCo refuses it ({told})", "a URDF needs the ending .urdf") from error
-    return _Reader(path, model, key).robot()
+    return _Reader(path, mujoco, model, key).robot()
 
 
 class _Reader:
-    def __init__(self, path: Path, model: Any, key: str | None) -> None:
-        import mujoco
-
+    def __init__(self, path: Path, mujoco: Any, model: Any, key: str | None) -> None:
         self.mj, self.path, self.model, self.data = mujoco, path, model, mujoco.MjData(model)
         self.left: list[str] = []
         self.notes: list[str] = []
@@ -93,11 +92,10 @@ class _Reader:
             self.left.append(named("gravcomp of bodies", self._names(model.body, np.flatnonzero(model.body_gravcomp))))
         links: list[Link] = []
         geoms: list[list[int]] = []  # that each link touches others with
-        self.link: list[int] = []  # of every body; -1 for those that never move, which are held by none
+        self.link: list[int] = []  # of every body, its first; -1 for the world, and where there is nothing
         for b in range(model.nbody):
             made = self._links(b)
-            moves = model.body_weldid[b] != 0
-            self.link.append(len(links) if moves else -1)
+            self.link.append(len(links) if b and made else -1)
             links += [link for link, _ in made]
             geoms += [own for _, own in made]
         joints = [joint for b in range(1, model.nbody) for joint in self._joints(b)]
@@ -157,7 +155,7 @@ class _Reader:
             part = self._part(g)
             if part is None:
                 continue
-            called = self.model.geom(g).name or (name if b and len(geoms) == 1 else f"{name}_{g}")
+            called = name if b and len(geoms) == 1 else self.model.geom(g).name or f"{name}_{g}"
             while called in names or (called != name and called in self._all_bodies()):
                 called += "_"
             names.append(called)
@@ -170,7 +168,7 @@ class _Reader:
     def _all_bodies(self) -> set[str]:
         return {self._body_name(b) for b in range(self.model.nbody)}
 
-    def _surface(self, geoms: list[int], name: str) -> dict[str, float]:
+    def _surface(self, geoms: list[int], name: str) -> dict[str, Any]:
         """Coefficients of which two alike give MuJoCo's as their product."""
         if not geoms:
             return {}
@@ -237,7 +235,7 @@ class _Reader:
     def _joints(self, b: int) -> list[Held]:
         model, data, types = self.model, self.data, self.mj.mjtJoint
         child, parent = self.link[b], self.link[model.body_parentid[b]]
-        if child < 0:
+        if model.body_weldid[b] == 0:
             return []
         first, count = model.body_jntadr[b], model.body_jntnum[b]
         if not count:
@@ -317,7 +315,8 @@ class _Reader:
             ends = [int(model.eq_obj1id[k]), max(int(model.eq_obj2id[k]), 0)]
             of_bodies = int(model.eq_objtype[k]) == int(mj.mjtObj.mjOBJ_BODY)
             both = [self.link[b] for b in ends] if of_bodies else [-1, -1]
-            known = kind in (mj.mjtEq.mjEQ_CONNECT, mj.mjtEq.mjEQ_WELD) and max(both) >= 0 and self.data.eq_active[k]
+            moves = of_bodies and any(model.body_weldid[b] != 0 for b in ends)
+            known = kind in (mj.mjtEq.mjEQ_CONNECT, mj.mjtEq.mjEQ_WELD) and moves and self.data.eq_active[k]
             if not known:
                 others.append(name)
                 continue
@@ -349,10 +348,11 @@ class _Reader:
             name, first = model.tendon(k).name or f"tendon_{k}", model.tendon_adr[k]
             wraps = range(first, first + model.tendon_num[k])
             sites = [int(model.wrap_objid[w]) for w in wraps if int(model.wrap_type[w]) == int(mj.mjtWrap.mjWRAP_SITE)]
-            both = [self.link[int(model.site_bodyid[s])] for s in sites]
+            ends_of = [int(model.site_bodyid[s]) for s in sites]
+            both, moves = [self.link[b] for b in ends_of], any(model.body_weldid[b] != 0 for b in ends_of)
             stiff, low = float(model.tendon_stiffness[k]), float(model.tendon_range[k, 0])
             rope = bool(model.tendon_limited[k])
-            known = len(sites) == len(wraps) == 2 and max(both) >= 0 and both[0] != both[1]
+            known = len(sites) == len(wraps) == 2 and moves and both[0] != both[1]
             if not known or not (rope or stiff or k in rods) or (rope and low > NEAR):
                 others.append(name)
                 continue

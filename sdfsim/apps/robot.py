@@ -132,7 +132,7 @@ def write_scene(
 
     Raises SdfsimError for a link that cannot be a body, or where files cannot be written.
     """
-    whole, notes = _apart(_merged(robot))
+    whole, notes = _apart(_merged(robot, {WORLD, FLOOR} if floor else {WORLD}))
     folder = out.with_name(f"{out.stem}_shapes")
     scene = SceneBuilder(**({} if whole.gravity is None else {"gravity": _round(whole.gravity)}))
     made: list[tuple[Shape | None, dict[str, Any], np.ndarray, dict[str, Any]]] = []
@@ -148,7 +148,7 @@ def write_scene(
             if shape is not None and np.isfinite(shape.sdf.bounds).all()
         ]
         lift[2] = -min(corners, default=0.0)
-        scene.add(FLOOR, plane={}, restitution=0.0)
+        scene.add(FLOOR, plane={}, friction=1.0, restitution=0.0)
     partners = _partners(whole, [shape for shape, *_ in made], poses, floor, notes)
     folders: list[Path] = []
     for link, (shape, keys, _, mass), pose, touches in zip(whole.links, made, poses, partners, strict=True):
@@ -182,7 +182,7 @@ def _round(values: Any) -> Any:
     return found.tolist()
 
 
-def _merged(robot: Robot) -> Robot:
+def _merged(robot: Robot, taken: set[str]) -> Robot:
     """Links that can be no bodies of their own go into those that they are fixed to, and what is fixed to what never
     moves is still itself, without a joint."""
     links, joints, notes = list(robot.links), list(robot.joints), list(robot.notes)
@@ -235,17 +235,22 @@ def _merged(robot: Robot) -> Robot:
         pairs = {tuple(sorted((number.get(home(a), -1), number.get(home(b), -1)))) for a, b in apart}
         apart = frozenset((a, b) for a, b in pairs if 0 <= a < b)
     return replace(
-        robot, links=tuple(_renamed([links[k] for k in kept])), joints=tuple(joints), apart=apart, notes=tuple(notes)
+        robot,
+        links=tuple(_renamed([links[k] for k in kept], taken)),
+        joints=tuple(joints),
+        apart=apart,
+        notes=tuple(notes),
     )
 
 
-def _renamed(links: list[Link]) -> Iterator[Link]:
-    """A body cannot be called as the world is."""
-    taken = {link.name for link in links} | {WORLD, FLOOR}
+def _renamed(links: list[Link], taken: set[str]) -> Iterator[Link]:
+    """Links with names that are not taken, nor those of others."""
+    names = {link.name for link in links} | taken
     for link in links:
         name = link.name
-        while name in (WORLD, FLOOR) or (name != link.name and name in taken):
+        while name in taken or (name != link.name and name in names):
             name += "_"
+        names.add(name)
         yield replace(link, name=name)
 
 

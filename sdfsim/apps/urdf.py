@@ -31,6 +31,7 @@ KINDS = {
     "planar": "",
 }
 GEOMETRIES = ("box", "sphere", "cylinder", "capsule", "mesh", "plane")
+_ORIGIN = (0.0, 0.0, 0.0)
 _ROOT = ("link", "joint", "material")
 _OF_LINK = ("inertial", "visual", "collision", "contact")
 _OF_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics")
@@ -135,8 +136,8 @@ class _Reader:
         found = self.child(element, "origin")
         if found is None:
             return np.eye(4)
-        turn = Rotation.from_euler("xyz", self.numbers(found, "rpy", 3, np.zeros(3)))
-        return pose_of(self.numbers(found, "xyz", 3, np.zeros(3)), turn)
+        turn = Rotation.from_euler("xyz", self.numbers(found, "rpy", 3, _ORIGIN))
+        return pose_of(self.numbers(found, "xyz", 3, _ORIGIN), turn)
 
     # --- the robot ---
 
@@ -239,7 +240,7 @@ class _Reader:
                 )
                 about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
                 inertia = pose[:3, :3] @ about @ pose[:3, :3].T
-        surface = {"friction": 0.5, "restitution": 0.0}
+        surface: dict[str, Any] = {"friction": 0.5, "restitution": 0.0}
         contact = self.child(element, "contact")
         for child in contact if contact is not None else ():
             if child.tag in _OF_CONTACT:
@@ -285,7 +286,7 @@ class _Reader:
 
     def _mesh(self, element: Element, *, needed: bool) -> Mesh | None:
         """None where it is only shown and cannot be."""
-        name, scale = self.text(element, "filename"), self.numbers(element, "scale", 3, np.ones(3))
+        name, scale = self.text(element, "filename"), self.numbers(element, "scale", 3, (1.0, 1.0, 1.0))
         place = self._find(name)
         try:
             if place is None:
