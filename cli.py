@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.commands import distill, fit, mesh, poses, reconstruct
+from pipeline.commands import distill, fit, measure, mesh, poses, reconstruct
 from sdfsim.commands import motion
 
 YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
@@ -41,8 +41,8 @@ def options(
     gc.set_threshold(YOUNG)
 
 
-COMMANDS = [reconstruct, poses, distill, mesh, fit]
-COMMANDS += [motion.simulate, motion.plan, motion.view, motion.render, motion.identify, motion.export]
+COMMANDS = [reconstruct, measure, poses, distill, mesh, fit]
+COMMANDS += [motion.simulate, motion.samples, motion.plan, motion.view, motion.render, motion.identify, motion.export]
 COMMANDS += [motion.dataset, motion.train, motion.evaluate, motion.tradeoff, motion.stress, motion.info]
 for command in COMMANDS:
     app.command()(command)

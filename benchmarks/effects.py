@@ -20,9 +20,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.engines import ours
 from benchmarks.results import ROOT, script, write_section
 from sdfsim.evaluation.harness import markdown, number, one_thread
+from sdfsim.evaluation.runs import timed_rollout
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -37,7 +37,7 @@ def cost(scene: Scene) -> tuple[float, np.ndarray]:
     simulator, taken, end = Simulator(scene), [], np.zeros((0, 3))
     for _ in range(REPEATS):
         simulator.reset()
-        rollout, timing = ours(simulator, STEPS)
+        rollout, timing = timed_rollout(simulator, STEPS)
         taken.append(timing.cpu_ms)
         end = rollout.position[-1]
     return float(np.median(taken)), end

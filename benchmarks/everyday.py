@@ -26,24 +26,21 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.engines import motion_rollout
 from benchmarks.engines.drake import drake
 from benchmarks.results import progress, script, write_section
-from benchmarks.rivals import USUAL, in_pieces
+from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
-from sdfsim.data.pybullet_sim import DT
+from sdfsim.data.pybullet_sim import SUBSTEPS
 from sdfsim.evaluation import engines, everyday
-from sdfsim.evaluation.engines import LONGEST, Engine, NotInstalled, TooSlow, start_of_scene
-from sdfsim.evaluation.everyday import ROWS, Check, Runner, Setting, checks, solved
+from sdfsim.evaluation.engines import LONGEST, Engine, TooSlow
+from sdfsim.evaluation.everyday import ROWS, Check, Setting, checks
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
-from sdfsim.learned.model import SOLVER
-from sdfsim.physics.rollout import Rollout, join
+from sdfsim.evaluation.runs import Ran, Runner, by_engine, by_model, still
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.convex_pieces import convex_vertices
 from sdfsim.shape.shape import own_pieces
-from sdfsim.simulate.simulator import Simulator
 
 OURS, DRAKE = "sdfsim", "Drake"
 ENGINES: dict[str, tuple[str, Engine | None]] = {  # their package, and how they run
@@ -62,44 +59,25 @@ class NotRun(SdfsimError):
 
 
 def runner(name: str, folder: Path) -> Runner:
-    """Runs scenes with an engine, whose files are in `folder`; raises NotRun where it cannot. See `Runner`."""
+    """Runs scenes with an engine, whose files are in `folder`; raises NotRun where it cannot."""
 
-    def timely(scene: Scene, seconds: float) -> tuple[Rollout, str]:
-        began = time.process_time()
+    def run(scene: Scene, seconds: float) -> Ran:
+        began, engine = time.process_time(), ENGINES[name][1]
+        if why := unknown_to(name, scene):
+            raise NotRun(why)
         try:
-            found = moved(name, scene, seconds, folder)
-        except TooSlow:
-            raise NotRun("too slow") from None
+            if engine is None:
+                found = by_model(scene, seconds)
+            else:
+                parts = in_parts(scene, folder / "pieces")
+                found = by_engine(parts, seconds, engine, folder / "engine", scene_units(scene))
+        except SdfsimError as error:
+            raise NotRun("too slow" if isinstance(error, TooSlow) else error.message) from error
         if time.process_time() - began > LONGEST:
             raise NotRun("too slow")
         return found
 
-    return timely
-
-
-def moved(name: str, scene: Scene, seconds: float, folder: Path) -> tuple[Rollout, str]:
-    """A scene's motion by an engine: see `Runner`. Raises NotRun and TooSlow."""
-    engine = ENGINES[name][1]
-    if engine is None:
-        return solved(scene, seconds)
-    if why := unknown_to(name, scene):
-        raise NotRun(why)
-    units = scene_units(scene)
-    try:
-        start = start_of_scene(in_parts(scene, folder / "pieces"), folder / "engine", units)
-    except SdfsimError as error:
-        raise NotRun(error.message) from error
-    try:
-        motion, _ = engine(start, max(1, round(seconds / (DT * units.time))), USUAL)
-    except NotInstalled as error:
-        raise NotRun(error.message) from error
-    except TooSlow:
-        raise
-    except SdfsimError as error:
-        return still(scene, seconds), error.message
-    rollout = motion_rollout(scene, motion, units)
-    finite = np.isfinite(rollout.position).all() and np.isfinite(rollout.velocity).all()
-    return (rollout, "") if finite else (still(scene, seconds), "a position is not finite")
+    return run
 
 
 def unknown_to(name: str, scene: Scene) -> str:
@@ -130,12 +108,6 @@ def in_parts(scene: Scene, folder: Path) -> Scene:
     return in_pieces(replace(scene, shapes=tuple(shapes)), folder)
 
 
-def still(scene: Scene, seconds: float) -> Rollout:
-    """The start of a scene, and the same state after `seconds`: checks read this where there is no motion."""
-    first = Simulator(scene, SOLVER).initial_rollout()
-    return join([first, replace(first, time=first.time + seconds)])
-
-
 # --- judging ---
 
 
@@ -145,19 +117,19 @@ def judged(row: str, at: Setting, run: Runner) -> Iterator[tuple[str, Check, str
     broken: list[str] = []
     seen = False
 
-    def watched(scene: Scene, seconds: float) -> tuple[Rollout, str]:
+    def watched(scene: Scene, seconds: float) -> Ran:
         nonlocal seen
         if seen:  # a check is of the scenes that were run since the checks before it
             seen = False
             absent.clear()
             broken.clear()
         try:
-            rollout, broke = run(scene, seconds)
+            found = run(scene, seconds)
         except NotRun as error:
             absent.append(error.message)
-            return still(scene, seconds), ""
-        broken.extend([broke] if broke else [])
-        return rollout, broke
+            return still(scene, seconds)
+        broken.extend([found.broke] if found.broke else [])
+        return found
 
     for name, check in checks(row, replace(at, by=watched)):
         seen = True
@@ -237,7 +209,7 @@ def table(results: Results) -> str:
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
     """Every installed engine's results of rows."""
-    content = [at.full, str(at), USUAL, LONGEST, inspect.getsource(everyday)]
+    content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday)]
     sources = inspect.getsource(engines) + inspect.getsource(sys.modules[drake.__module__])
     how = {name: sources if name != OURS else "" for name in ENGINES}
     jobs = [

@@ -20,13 +20,13 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.engines import ours
 from benchmarks.results import progress, script
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of, read_info
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
+from sdfsim.evaluation.runs import timed_rollout
 from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.impulse import Velocities
 from sdfsim.learned.model import SOLVER, load_model
@@ -81,7 +81,7 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
             substeps = method.substeps or used.inner or SUBSTEPS
             simulator.options = replace(simulator.options, substeps=substeps)
             simulator.stepper = stepper_of(used)  # trusted, whatever the scene
-            taken.append(1e3 * ours(simulator, STEPS_TIMED)[1].cpu_ms)
+            taken.append(1e3 * timed_rollout(simulator, STEPS_TIMED)[1].cpu_ms)
     return {"us": statistics.median(taken)}
 
 

@@ -28,7 +28,6 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.engines import in_metres, ours
 from benchmarks.engines.drake import drake
 from benchmarks.engines.newton import newton
 from benchmarks.results import in_turn, progress, script, spread, write_section
@@ -37,13 +36,14 @@ from sdfsim.apps.export import convex_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_arrays, write_text
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import Trajectory, conditions_of
+from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation import engines
-from sdfsim.evaluation.engines import Engine, rollout_motion, start_of_scene
+from sdfsim.evaluation.engines import Engine, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
+from sdfsim.evaluation.runs import Ran, scene_rollout, timed_rollout
 from sdfsim.geometry.mesh import Mesh, clean
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
 from sdfsim.physics.bodies import largest_extent
@@ -209,22 +209,22 @@ def in_pieces(scene: Scene, folder: Path) -> Scene:
 # --- measuring ---
 
 
-def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tuple[Trajectory, float, float]:
-    """An engine's motion of a scene in m and s, its ms per simulated second, and the seconds that preparing took."""
+def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tuple[Ran, float, float]:
+    """An engine's motion of a scene, its ms per simulated second, and the seconds that preparing took."""
     units = scene_units(scene)
     began = time.perf_counter()
     if run := ENGINES[name]:
         start = start_of_scene(in_pieces(scene, folder / "pieces"), folder / "engine", units)
         prepared = time.perf_counter() - began
         motion, timing = run(start, steps, inner)
-        return in_metres(motion, units), timing.cpu_ms / (0.02 * units.time), prepared
+        return Ran(scene, scene_rollout(scene, motion, units)), timing.cpu_ms / (0.02 * units.time), prepared
     simulator = Simulator(scene, "solver")
     simulator.options = replace(simulator.options, substeps=inner)
     next(simulator.frames(1))
     prepared = time.perf_counter() - began
     simulator.reset()
-    rollout, timing = ours(simulator, steps)
-    return rollout_motion(scene, rollout), timing.cpu_ms / (0.02 * units.time), prepared
+    rollout, timing = timed_rollout(simulator, steps)
+    return Ran(scene, rollout), timing.cpu_ms / (0.02 * units.time), prepared
 
 
 def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
@@ -254,7 +254,7 @@ def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str,
     steps, inners = (HEAP_STEPS, (USUAL,)) if case in LARGE else (STEPS, INNER)
     size = [min(largest_extent(s.shapes[b.shape]) * b.scale for b in s.bodies if b.motion == "dynamic") for s in scenes]
     found: dict[int, dict[str, float]] = {}
-    motions: dict[int, list[Trajectory]] = {}
+    motions: dict[int, list[Ran]] = {}
     prepare, broken = 0.0, {}
     with peak_memory() as memory:
         for inner in inners:
@@ -265,7 +265,7 @@ def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str,
                 break  # finer steps take longer still
             motions[inner] = [motion for motion, _, _ in runs]
             prepare = max(prepare, *(one for _, _, one in runs))
-            deep = np.concatenate([depths(s, m) / w for s, m, w in zip(scenes, motions[inner], size, strict=True)])
+            deep = np.concatenate([depths(one) / w for one, w in zip(motions[inner], size, strict=True)])
             found[inner] = {
                 "ms": float(np.mean([ms for _, ms, _ in runs])),
                 "deep": float(np.percentile(deep, 95)) if len(deep) else 0.0,
@@ -274,16 +274,16 @@ def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str,
     for inner, mine in motions.items():
         if INNER[-1] in motions and inner != INNER[-1]:
             gaps = [
-                np.linalg.norm((one.position - best.position)[: COMPARED + 1, ~one.static], axis=-1).ravel() / w
+                np.linalg.norm((one.path - best.path)[: COMPARED + 1], axis=-1).ravel() / w
                 for one, best, w in zip(mine, motions[INNER[-1]], size, strict=True)
             ]
             found[inner]["away"] = float(np.sqrt(np.mean(np.concatenate(gaps) ** 2)))
     return {"inner": found, "broken": broken, "prepare_s": prepare, "mib": memory["mib"]}
 
 
-def lost(case: str, motion: Trajectory, size: float) -> int:
+def lost(case: str, run: Ran, size: float) -> int:
     """Bodies that fell off their pegs, through the floor, or flew off."""
-    height, start = motion.position[-1, ~motion.static, 2], motion.position[0, ~motion.static, 2]
+    height, start = run.path[-1, :, 2], run.path[0, :, 2]
     gone = (height < -0.1 * size) | (height > start + 2.0 * size)
     return int((gone | (height < 1.2)).sum() if case == "mugs on pegs" else gone.sum())
 

@@ -27,17 +27,17 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.engines import in_metres
 from benchmarks.results import progress, script, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import Trajectory, conditions_of
-from sdfsim.evaluation.engines import Engine, bullet, mujoco, rollout_motion, start_of_scene
+from sdfsim.data.dataset import conditions_of
+from sdfsim.evaluation.engines import Engine, bullet, mujoco, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
+from sdfsim.evaluation.runs import Ran, scene_rollout
 from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import scene_units
@@ -89,7 +89,7 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
         "contacts": float(rollout.counters["contacts"].mean()),
         "broken": broken,
         "peak_mib": memory["mib"],
-    } | _where(scene, rollout_motion(scene, rollout))
+    } | _where(Ran(scene, rollout))
 
 
 def engine(run: Engine, file: Path, steps: int) -> dict:
@@ -100,15 +100,15 @@ def engine(run: Engine, file: Path, steps: int) -> dict:
     with peak_memory() as memory:
         motion, timing = run(start, steps)
     known = {"bodies": int((~motion.static).sum()), "ms": timing.cpu_ms, "peak_mib": memory["mib"]}
-    return known | _where(scene, in_metres(motion, units))
+    return known | _where(Ran(scene, scene_rollout(scene, motion, units)))
 
 
-def _where(scene: Scene, motion: Trajectory) -> dict[str, float]:
+def _where(run: Ran) -> dict[str, float]:
     """How deep bodies are in each other, mm, and how many are below the floor at the end."""
-    depth = depths(scene, motion)
+    depth = depths(run)
     return {
         "depth_95": 1e3 * float(np.percentile(depth, 95)) if len(depth) else 0.0,
-        "lost": int((motion.position[-1, :, 2] < -0.1).sum()),
+        "lost": int((run.motion.position[-1, :, 2] < -0.1).sum()),
     }
 
 
@@ -164,7 +164,7 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
     mib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     subprocess.run([*command, "render", str(run), "-o", str(home / f"{name}.mp4")], check=True, capture_output=True)
     loaded, rollout = load_scene(scene), Rollout.load(run / "rollout.npz")
-    depth = depths(loaded, rollout_motion(loaded, rollout), every=20)
+    depth = depths(Ran(loaded, rollout), every=20)
     moving = [k for k, b in enumerate(loaded.bodies) if b.motion == "dynamic"]
     return {
         "bodies": len(moving),

@@ -1,4 +1,4 @@
-"""From photos and meshes to shapes: reconstruct, its stages, and fit."""
+"""From photos and meshes to shapes: reconstruct, its stages, measure, and fit."""
 
 from __future__ import annotations
 
@@ -68,6 +68,20 @@ def reconstruct(
         progress=session.stage_progress,
     )  # fmt: skip
     _report_stages(session, report, out)
+
+
+@command
+def measure(
+    session: Session,
+    photos: Photos,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The page to write.")] = Path("measure.html"),
+) -> None:
+    """Photos -> a page in which clicks give --distance and --body."""
+    from pipeline.measure import measure as write_page
+
+    report = write_page(photos, out, on_progress=session.progress)
+    told = f"wrote {out}: {report['photos']} photos, {report['mib']} MiB"
+    session.report(report, [told, "open it in a browser: two clicks give --distance, one gives --body"])
 
 
 @command

@@ -30,7 +30,7 @@ def main() -> None:
     rng = np.random.default_rng(0)
     place = rollout.position[:, 1] + NOISE * rng.standard_normal((len(rollout.time), 3))
     place[12] += 0.05  # a jump
-    with (HERE / "toss.csv").open("w", newline="") as file:
+    with (HERE / "toss.csv").open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         rows.writerow("time,body,x,y,z,qx,qy,qz,qw".split(","))
         for t, now in enumerate(rollout.time):

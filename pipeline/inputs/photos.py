@@ -81,7 +81,7 @@ def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -
     (out / "images").mkdir(parents=True, exist_ok=True)
     photos: list[Photo] = []
     views: list[View] = []
-    for origin, picture, known, fraction in _pictures(source, long_side):
+    for origin, picture, known, fraction in pictures(source, long_side):
         name, lens = f"{len(photos):04d}.jpg", None
         if known:
             picture, view, lens = rectified(picture, known, name, origin)
@@ -118,8 +118,8 @@ def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
-def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, ReadPhoto, KnownCamera | None, float]]:
-    """Name, picture, camera where it is known, and share done."""
+def pictures(source: Source, long_side: int = LONG_SIDE) -> Iterator[tuple[str, ReadPhoto, KnownCamera | None, float]]:
+    """Name, picture, camera where it is known, and share done, of every photo of what is no archive."""
     if source.video:
         from pipeline.inputs.video import chosen_frames
 

@@ -209,6 +209,7 @@ def _end(text: str, photos: list[Photo]) -> tuple[Photo, tuple[float, float] | N
     SdfsimError for no such photo or several, or a pixel outside it."""
     match = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
     name, pixel = (match[1], (float(match[2]), float(match[3]))) if match else (text, None)
+    name = Path(name).as_posix()  # with slashes on Windows too
     found = [p for p in photos if p.source == name] or [p for p in photos if Path(p.source).name == name]
     if len(found) != 1:
         which = f"{len(found)} photos are" if found else "no photo is"

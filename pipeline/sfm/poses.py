@@ -194,7 +194,7 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
 def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
     """Fraction done and a message, from the child's lines and the row counts of its database."""
     count = job["count"]
-    said = re.findall(r"^(phase|placed) (\w+)$", lines.read_text(errors="replace"), re.MULTILINE)
+    said = re.findall(r"^(phase|placed) (\w+)$", lines.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
     phase = dict(said).get("phase", "features")
     if phase == "mapping":
         placed = [int(number) for word, number in said if word == "placed"] or [0]

@@ -93,7 +93,7 @@ def matches(pycolmap, job: dict, database: Path) -> None:
         pairs = alike(pycolmap, job, database)
     if pairs is not None:
         listed = database.with_name("pairs.txt")
-        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
         pairing = pycolmap.ImportedPairingOptions(block_size=100, match_list_path=listed)
         pycolmap.match_image_pairs(database, pairing_options=pairing, **common)
     else:

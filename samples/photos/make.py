@@ -296,7 +296,7 @@ def main() -> None:
         "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT,
         "table_width": TABLE_SIZE[0], "table_height": TABLE_HEIGHT, "frames": frames,
     }  # fmt: skip
-    (folder / "transforms.json").write_text(json.dumps(about, indent=1))
+    (folder / "transforms.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     print()
 
 

@@ -86,7 +86,7 @@ def write(layout: str, out: Path, *, exact: bool = False, every: int = 1, seed: 
         seed: of all noise.
     """
     rng = np.random.default_rng(seed)
-    about = json.loads((PHOTOS / "transforms.json").read_text())
+    about = json.loads((PHOTOS / "transforms.json").read_text(encoding="utf-8"))
     frames = about["frames"][::every]
     photos = [PHOTOS / frame["file_path"] for frame in frames]
     true = [np.array(frame["transform_matrix"]) for frame in frames]
@@ -132,7 +132,7 @@ def _record3d(out: Path, photos: list, poses: list, measured: list, lens: dict, 
         "K": [lens["fx"], 0, 0, 0, lens["fy"], 0, lens["cx"], lens["cy"], 1],
         "poses": [[*Rotation.from_matrix(p[:3, :3]).as_quat().tolist(), *p[:3, 3].tolist()] for p in poses],
     }  # fmt: skip
-    (out / ("metadata.json" if exr else "metadata")).write_text(json.dumps(metadata))
+    (out / ("metadata.json" if exr else "metadata")).write_text(json.dumps(metadata), encoding="utf-8")
 
 
 def _polycam(out: Path, photos: list, poses: list, measured: list, lens: dict, about: dict) -> None:
@@ -144,7 +144,7 @@ def _polycam(out: Path, photos: list, poses: list, measured: list, lens: dict, a
         shutil.copyfile(photo, folders["images"] / photo.name)
         matrix = {f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)}
         camera = {**lens, "width": about["w"], "height": about["h"], "blur_score": 200.0, **matrix}
-        (folders["cameras"] / f"{name}.json").write_text(json.dumps(camera))
+        (folders["cameras"] / f"{name}.json").write_text(json.dumps(camera), encoding="utf-8")
         Image.fromarray((1000 * depth).round().astype(np.uint16)).save(folders["depth"] / f"{name}.png")
         Image.fromarray((127 * confidence).astype(np.uint8)).save(folders["confidence"] / f"{name}.png")
 
@@ -160,7 +160,7 @@ def _nerfstudio(out: Path, photos: list, poses: list, measured: list, lens: dict
         frames.append({"file_path": image, "depth_file_path": map_, "transform_matrix": pose.tolist()})
     content = {"camera_model": "OPENCV", "fl_x": lens["fx"], "fl_y": lens["fy"], "cx": lens["cx"], "cy": lens["cy"],
                "w": about["w"], "h": about["h"], "frames": frames}  # fmt: skip
-    (out / "transforms.json").write_text(json.dumps(content))
+    (out / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
 
 
 if __name__ == "__main__":

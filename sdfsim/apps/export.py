@@ -46,7 +46,9 @@ STEP = 0.001  # s, of MuJoCo
 SOFT = 4.0  # steps, over 2 pi: the time in which a contact of MuJoCo swings
 MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
 MOST_GROUPS = 31  # MuJoCo's bit masks
-RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "joints")  # names of ours, or of MuJoCo's own
+# Names of ours, of MuJoCo's own, and of devices, which no file may have on Windows.
+RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "joints", "con", "prn", "aux", "nul")
+RESERVED += tuple(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))
 XML = ElementTree.Element
 
 

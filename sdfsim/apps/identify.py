@@ -22,7 +22,7 @@ import yaml
 
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import write_text
+from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
@@ -738,7 +738,7 @@ def write_scene(found: Identified, scene_file: Path, out: Path) -> list[str]:
         model = _value(root, "model")
         named += [model] if model is not None and model.value.endswith(".safetensors") else []
         for node in (node for node in named if node is not None):
-            node.value = os.path.relpath(scene_file.resolve().parent / node.value, out.resolve().parent)
+            node.value = path_from(out.resolve().parent, scene_file.resolve().parent / node.value)
             notes = [f"{out} names files outside its folder: simulate it with --allow-outside, or write it beside them"]
     text = yaml.serialize(root, Dumper=yaml.SafeDumper, width=120)
     read_scene(out, allow_outside=True, text=text)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import resource
+import importlib
+import sys
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -51,7 +52,7 @@ def describe(
         "nodes": decided.nodes,
         "pairs": {**asdict(decided.pairs), "apart": decided.pairs.possible - near, "near": near},
         "step": {k: float(counters[k][1:].max()) for k in ("contacts", "nodes", "edges")},
-        "memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "memory_mib": _peak_mib(),
         "step_ms": step_ms,
         "run_s": 1e-3 * step_ms * steps,
         "model": simulator.model.name,
@@ -66,6 +67,15 @@ def describe(
         "failed_checks": [f"fit of shape {told}" for told in scene.missed],
         "notes": list(scene.notes),
     }
+
+
+def _peak_mib() -> float | None:
+    """The most memory that this process has had, MiB; None on Windows, which does not tell it this way."""
+    try:
+        resource: Any = importlib.import_module("resource")
+    except ImportError:
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def plan_lines(report: dict[str, Any]) -> list[str]:
@@ -85,7 +95,8 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s "
         f"with {report['substeps']} inner steps each",
         f"a step (over the first {TRIAL_STEPS}): {report['step_ms']:.2g} ms, {step['contacts']:.0f} contacts, "
-        f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network; {report['memory_mib']:.0f} MiB",
+        f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network"
+        + ("" if report["memory_mib"] is None else f"; {report['memory_mib']:.0f} MiB"),
         f"the whole run at that pace: {duration(report['run_s'])}; more where bodies meet later on",
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",

@@ -36,6 +36,7 @@ from sdfsim.physics.bodies import State, Touch, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import EARTH
+from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene, fingerprints
 from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
@@ -90,6 +91,7 @@ def simulate(
     check_writable(out)
     check_own(out, "simulate", *_RESULTS)
     check_screen(viewer)
+    scene_file = find_scene(scene_file)
     scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
     for note in scene.notes:
         say(note)

@@ -8,11 +8,10 @@ import signal
 import socket
 import subprocess
 import sys
-import sysconfig
 import time
 import webbrowser
+from importlib.util import find_spec
 from pathlib import Path
-from shutil import which
 
 from sdfsim.apps.recording import Playback
 from sdfsim.base.errors import SdfsimError
@@ -21,6 +20,7 @@ WINDOW = "1600x900"
 LOOPBACK = "127.0.0.1"  # where viewers listen; their own default would let the whole network in
 _GRPC_PORT, _WEB_PORT = 9876, 9090
 _START_SECONDS = 60.0
+_WINDOWS_CTRL_C = 0xC000013A  # the exit code there
 _TOAST_SECONDS = 10.0  # the notices of the start cover the plots until they fade
 _NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
 
@@ -56,9 +56,10 @@ def _command(port: int, options: list[str]) -> list[str]:
 
 
 def _launch(port: int, options: list[str]) -> subprocess.Popen:
-    """A viewer in a group of its own: `rerun` is a script that starts the real one, and both have to go together."""
-    quiet = subprocess.DEVNULL
-    return subprocess.Popen(_command(port, options), stdout=quiet, stderr=quiet, start_new_session=True)
+    """A viewer in a group of its own, which a Ctrl-C that is meant for this process does not end."""
+    quiet, group = subprocess.DEVNULL, getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)  # Windows has no sessions
+    command = _command(port, options)
+    return subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True, creationflags=group)
 
 
 def check_screen(kind: str) -> None:
@@ -77,7 +78,7 @@ def show(recording: Path, *, web: bool = False) -> None:
     _check_recording(recording)
     options = ["--web-viewer", "--web-viewer-port", str(_free_port(_WEB_PORT))] if web else []
     code = subprocess.run(_command(_free_port(_GRPC_PORT), [str(recording), *options]), check=False).returncode
-    if code not in (0, -signal.SIGINT, 130):
+    if code not in (0, -signal.SIGINT, 130, _WINDOWS_CTRL_C):
         raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")
 
 
@@ -127,13 +128,12 @@ def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | 
 
 
 def _end(process: subprocess.Popen) -> None:
+    process.terminate()
     try:
-        os.killpg(process.pid, signal.SIGTERM)
         process.wait(timeout=10)
-    except ProcessLookupError:
-        pass
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+        process.wait()
 
 
 def _check_recording(file: Path) -> None:
@@ -142,8 +142,13 @@ def _check_recording(file: Path) -> None:
 
 
 def _executable() -> str:
-    """The `rerun` of this environment, which may not be on the PATH."""
-    found = which("rerun", path=sysconfig.get_path("scripts")) or which("rerun")
+    """The viewer in the package of rerun itself: its script `rerun` only starts it, and need not be on the PATH, nor
+    end what it started. Another one may be named by RERUN_CLI_PATH, as that script does."""
+    package = find_spec("rerun_cli")
+    folders = package.submodule_search_locations if package else None
+    home = Path(next(iter(folders or []), "."))
+    places = [home / "Rerun.app" / "Contents" / "MacOS" / "Rerun", home / "rerun", home / "rerun.exe"]
+    found = os.environ.get("RERUN_CLI_PATH") or next((str(place) for place in places if place.is_file()), None)
     if not found:
         raise SdfsimError("the rerun program is missing", "pip install rerun-sdk")
     return found

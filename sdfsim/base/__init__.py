@@ -1,1 +1,1 @@
-"""What every room uses: errors, files, work on all cores, options and output of commands."""
+"""Shared by all rooms: errors, files, work on all cores, options and output of commands."""

@@ -41,7 +41,7 @@ Cluster = Annotated[
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
     """A command: `work` with a `Session` made for it, and with the options --json, --device and -v. Work that does not
-    compute takes no `device`; it is checked all the same."""
+    compute takes no `device`; the option is still checked."""
     given = inspect.signature(work, eval_str=True).parameters
 
     @wraps(work)

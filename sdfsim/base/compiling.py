@@ -25,7 +25,7 @@ def is_compiled(function: Any) -> bool:
     if function.signatures:
         return True
     try:
-        # Of this source file as it is now; empty where it has changed since.
+        # The entries for the source file as it is now; empty if it has changed since.
         return bool(function._cache._cache_file._load_index())
-    except (AttributeError, OSError):  # nothing is kept, or nothing can be read there
+    except (AttributeError, OSError):  # there is no cache, or it cannot be read
         return False

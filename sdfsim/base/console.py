@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -43,6 +44,9 @@ class Session:
         self.progress = partial(self._bar.update, "")
 
     def __enter__(self) -> Session:
+        # Consoles of Windows know few characters; others are escaped, as Python does on stderr by itself.
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")
         default = signal.default_int_handler
         if signal.getsignal(signal.SIGINT) is default:
             signal.signal(signal.SIGINT, self._press)
@@ -57,7 +61,7 @@ class Session:
         return self
 
     def _press(self, number: int, frame: FrameType | None) -> None:
-        self._pressed = True  # a library that is interrupted while it is imported fails in its own way
+        self._pressed = True  # a library that is interrupted during its import raises errors of its own
         raise KeyboardInterrupt
 
     def __exit__(
@@ -164,7 +168,7 @@ class _Bar:
             print(text, file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Leave what is drawn and go to the next line."""
+        """End the bar and go to the next line."""
         if self._progress is not None:
             self._progress.stop()
         self._progress, self._stage = None, None
@@ -185,7 +189,7 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold: numpy numbers and arrays and paths become plain, numbers that are not finite null."""
+    """A value for JSON: NumPy numbers, arrays and paths become plain, numbers that are not finite null."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

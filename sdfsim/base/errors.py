@@ -14,7 +14,7 @@ EXIT_INTERRUPTED = 130
 
 
 def printable(text: str) -> str:
-    """`text` with escapes for what is not printable: file names and keys of strangers may hold terminal codes."""
+    """`text` with escapes for what is not printable: untrusted file names and keys may hold terminal codes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -51,7 +51,7 @@ class SceneError(SdfsimError):
 
 
 def run_main(main: Callable[[], None]) -> None:
-    """Run a script's `main`, and end the process where that meets what a user can act on, or is interrupted."""
+    """Run a script's `main`; end the process with one line for an SdfsimError, or quietly on Ctrl-C."""
     try:
         main()
     except SdfsimError as error:

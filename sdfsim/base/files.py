@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
+import importlib
 import json
 import logging
 import os
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -30,21 +30,32 @@ FREELY, MOST_GROWTH = 2**30, 100
 
 def user_cache(name: str) -> Path:
     """The folder `sdfsim/NAME` in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / name
+    own = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")  # the latter on Windows
+    return Path(own or Path.home() / ".cache") / "sdfsim" / name
+
+
+def path_from(folder: Path, path: Path | str) -> str:
+    """A path as files tell it that lie in `folder`: with slashes, which every system reads; whole where it lies on
+    another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return Path(os.path.abspath(path)).as_posix()
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it takes the final name when the block ends without an error. Raises
     SdfsimError where the disk is full or the folder not writable."""
-    # Unique also among the threads of a worker, and the hosts that share a folder.
+    # Unique also across the threads of a worker, and the hosts that share a folder.
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
     try:
         yield partial
         os.replace(partial, path)
     except OSError as error:
         raise SdfsimError(
-            f"{path}: cannot be written: {error.strerror or error}", "free some space or choose another folder"
+            f"{path}: cannot be written: {error.strerror or error}",
+            "free some space, close the program that has it open, or choose another folder",
         ) from error
     finally:
         partial.unlink(missing_ok=True)
@@ -92,7 +103,7 @@ def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True)
 
 def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
     """All arrays of an `.npz` file; messages call it `what`. Raises SdfsimError where it is
-    absent, cut short, no such file, or claims an absurd size."""
+    absent, cut short, not an archive, or would unpack to an absurd size."""
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
@@ -100,13 +111,13 @@ def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
             raise ValueError(f"it would unpack to {unpacked / 2**30:.1f} GiB")
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
-    except Exception as error:  # the readers raise whatever a damaged file made them stumble over
+    except Exception as error:  # readers of damaged files raise errors of many types
         raise SdfsimError(f"{path}: cannot be read as {what}: {error}", hint) from error
 
 
 def cached_arrays(path: Path, what: str, make: Callable[[], dict[str, Any]]) -> dict[str, np.ndarray]:
-    """The arrays of a cache file, or made and kept there. A damaged file is made again; where none can be written, as
-    on a full disk, a warning says so and the arrays are made the next time too."""
+    """The arrays of a cache file, made and written there on first use. A damaged file is made again. If none can be
+    written, as on a full disk, a warning says so and the arrays are made the next time too."""
     if path.is_file():
         try:
             return read_arrays(path, what, "delete it")
@@ -123,22 +134,22 @@ def cached_arrays(path: Path, what: str, make: Callable[[], dict[str, Any]]) -> 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make a folder, keep other runs out of it inside the block, and clear away what a killed one left half-written.
+    """Make a folder, lock other runs out of it inside the block, and remove half-written files of a killed run.
 
-    The system lifts the lock when this process ends, however it ends. A folder made here goes again if nothing came
-    into it. Raises SdfsimError where another run is in there, or the folder cannot be written.
+    The system lifts the lock when this process ends, however it ends. A folder made here is removed again if it stays
+    empty. Raises SdfsimError where another run is in there, or the folder cannot be written.
     """
     path, made = folder / LOCK, not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = open(path, "a")
+        file = open(path, "a", encoding="utf-8")
     except OSError as error:
         raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another folder") from error
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(file)
             alone = os.path.samestat(os.fstat(file.fileno()), path.stat())
-        except (BlockingIOError, FileNotFoundError):  # the latter: another run has just ended and removed its lock
+        except (BlockingIOError, PermissionError, FileNotFoundError):  # the last: a run has just ended and removed it
             alone = False
         if not alone:
             raise SdfsimError(
@@ -150,10 +161,28 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            path.unlink(missing_ok=True)
+            try:
+                path.unlink(missing_ok=True)
+            except PermissionError:  # Windows removes no open file
+                file.close()
+                with suppress(PermissionError):  # another run has it by now
+                    path.unlink(missing_ok=True)
             if made:
-                with suppress(OSError):  # not empty: something came of it
+                with suppress(OSError):  # not empty: the run has written something
                     folder.rmdir()
+
+
+def _lock(file: IO[str]) -> None:
+    """Take the lock of an open file, which ends with this process. Raises BlockingIOError or PermissionError where
+    another one has it."""
+    try:
+        fcntl: Any = importlib.import_module("fcntl")
+    except ImportError:  # Windows
+        windows: Any = importlib.import_module("msvcrt")
+        file.seek(0)
+        windows.locking(file.fileno(), windows.LK_NBLCK, 1)
+        return
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def check_writable(folder: Path) -> None:
@@ -167,8 +196,8 @@ def check_writable(folder: Path) -> None:
 
 
 def check_own(folder: Path, command: str, *names: str) -> None:
-    """Raises SdfsimError where what a run replaces in a folder, config.yaml and the files `names`, does not come from
-    an earlier run of the same command."""
+    """Raises SdfsimError if config.yaml or the files `names`, which a run replaces in a folder, do not come from an
+    earlier run of the same command."""
     import yaml  # here, for training needs torch and numpy only
 
     there = [name for name in (CONFIG, *names) if os.path.lexists(folder / name)]

@@ -1,4 +1,4 @@
-"""Torch, imported when something of it is first asked for: who simulates with the solver alone never waits for it."""
+"""Torch, imported on first use: simulations with the solver alone never import it."""
 
 from __future__ import annotations
 

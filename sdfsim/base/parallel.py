@@ -30,7 +30,7 @@ def silent(fraction: float, message: str) -> None:
     """Progress that is not shown."""
 
 
-_most = 0  # threads that torch has by itself; 0 where nobody has asked
+_most = 0  # threads that torch has by default; 0 before `choose_threads` asks
 
 
 def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
@@ -63,7 +63,7 @@ def threads(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tup
 
 
 def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:
-    """In a worker: one thread, and Ctrl-C is the caller's business. On a single core the caller works itself."""
+    """In a worker: one thread, and Ctrl-C is left to the caller. On a single core the caller itself runs this."""
     global _most
     if os.getpid() != caller:
         if threading.current_thread() is threading.main_thread():

@@ -17,7 +17,7 @@ _PACKAGES = (
     *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
     *("pydantic", "pybullet"),
 )
-SceneFile = Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)]
+SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
     list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
@@ -92,6 +92,21 @@ def plan(
     for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
         session.say(f"failed check: {check}")
     session.report(report, room.plan_lines(report))
+
+
+@command
+def samples(
+    session: Session,
+    out: Annotated[Path | None, typer.Option("-o", "--out", metavar="PATH", help="Copy all of them here.")] = None,
+) -> None:
+    """The scenes that come with sdfsim; a copy of them to change."""
+    from sdfsim.scene import bundled
+
+    known = bundled.samples()
+    lines = columns(list(known.items()))
+    if out is not None:
+        lines = [f"wrote {bundled.copy_samples(out)}: {', '.join(known)}"]
+    session.report({"samples": known, "folder": out or bundled.sample_folder()}, lines)
 
 
 @command

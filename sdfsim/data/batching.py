@@ -1,4 +1,4 @@
-"""Many trajectories side by side: as one set of bodies, and simulated again by a model."""
+"""Many trajectories at once: as one set of bodies, and simulated again by a model."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def merged(
     """Bodies of all trajectories, each at its frame of [W], then one floor they share; worlds do not touch each other.
 
     Masses and inertias are relative to the mean mass of the bodies that move in the trajectory, as in `Simulator`:
-    inverse masses are inputs of networks on surface nodes. Units are of length and time; their mass is to be 1.
+    inverse masses are inputs of networks on surface nodes. `units` must have a mass of 1.
     """
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
     relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]
@@ -80,13 +80,13 @@ def scene_of(
 
 
 def centred(shape: Shape) -> Shape:
-    """The shape with its origin as the centre of mass, as trajectories have it; itself where it is so, with all that
-    has been made of it for contact."""
+    """The shape with its centre of mass at the origin, as trajectories need it. A shape that has it there already is
+    returned itself, with its contact geometry."""
     return replace(shape, com=np.zeros(3)) if shape.com.any() else shape
 
 
 def state_at(trajectories: list[Trajectory], frames: list[int], like: State) -> State:
-    """The state of all trajectories, each at its frame; the floor, which is last, as in `like`."""
+    """The state of all trajectories, each at its frame; the floor, which comes last, as in `like`."""
 
     each = [[getattr(t, name)[k] for t, k in zip(trajectories, frames, strict=True)] for name in MOTION]
     return placed(like, *map(np.concatenate, each))
@@ -104,14 +104,13 @@ def roll_out(
     as_teacher: bool = False,
     floor: tuple[float, float] = FLOOR,
 ) -> list[Trajectory]:
-    """Simulate one batch of trajectories of one step and one gravity from their first frames; the same bodies in the
-    predicted motion, steps + 1 frames.
+    """Simulate a batch of trajectories that share step and gravity from their first frames. Returns the predicted
+    motions, steps + 1 frames.
 
-    The recording engine makes `substeps` inner steps in one. `as_teacher` the solver takes over three habits of
-    the teacher: bodies are larger by `MARGIN` than their shapes, what is pushed out adds to the speed of a rebound, and
-    friction is bounded along two axes.
-    "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit code 3) for a state that is not
-    finite.
+    The solve makes `substeps` inner steps in a recorded one. With `as_teacher` it has three habits of the teacher:
+    bodies are larger by `MARGIN` than their shapes, the push out of an overlap adds to the speed of a rebound, and
+    friction is bounded along two axes. "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit
+    code 3) for a state that is not finite.
     """
     stepper = stepper_of(model, contact=contact, free_flight=free_flight)
     units = model_units(stepper, group[0])
@@ -121,7 +120,7 @@ def roll_out(
         margin=MARGIN / units.length if as_teacher else 0.0,
     )  # fmt: skip
     known, plane = {name: stepper.surface(shape) for name, shape in shapes.items()}, stepper.surface(PLANE)
-    # The solve is fastest with each on its own, on all cores; a network with all of them in one graph.
+    # The solve is fastest with one trajectory at a time, on all cores; a network with all of them in one graph.
     alone = model.kind == SOLVER
     groups = [[t] for t in group] if alone else [group]
     jobs = [(some, known, plane, units, stepper, options, steps, floor) for some in groups]
@@ -178,7 +177,7 @@ def every(trajectory: Trajectory, stride: int) -> Trajectory:
 
 
 def model_units(stepper: Stepper, like: Trajectory) -> Units:
-    """Model units in which the recorded step is the model's own; where it has none those of its bodies of a metre."""
+    """Model units in which the recorded step is the model's own; of models without a step, units of a metre."""
     model = stepper.model
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
     if not stepper.on_surfaces:

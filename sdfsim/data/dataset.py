@@ -28,7 +28,7 @@ SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
 LONGEST_STEP = 10.0  # s, between recorded frames
 LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
-EXACTLY = 1e-3  # of what gravity adds in a step: tolerance of a free flight
+EXACTLY = 1e-3  # of what gravity adds in a step: in free flight velocities differ by less from that
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
 IN_FILE = {"orientation": "quat_xyzw"}  # names of arrays that differ there
 _AXES = {  # T frames, N bodies
@@ -54,14 +54,14 @@ class Trajectory(Motion):
     gravity: np.ndarray  # [3] m/s^2
 
     def save(self, path: Path) -> None:
-        """Write the file; its velocities are to be those that the engine recorded."""
+        """Write the file. Its velocities must be those that the engine recorded."""
         arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
         write_arrays(path, {IN_FILE.get(name, name): array for name, array in arrays.items()})
 
     @classmethod
     def load(cls, path: Path, *, as_recorded: bool = False) -> Trajectory:
         """Read and check one file. The `dataset.json` beside it, or in the folder above, has the engine's inner step;
-        `as_recorded` leaves velocities as the engine recorded them, from which it goes on when it is started again.
+        `as_recorded` keeps the velocities of the engine, from which the same engine continues.
         Raises SdfsimError with the file and the field that is wrong."""
         found = _checked(path, read_arrays(path, "a trajectory"))
         recorded = cls(**{name: found.pop(IN_FILE[name]) for name in IN_FILE}, **found)
@@ -97,7 +97,7 @@ def engine_substep(data: Path) -> float:
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The fields of a trajectory in the types that the rest of the code counts on."""
+    """The fields of a trajectory, checked, in the types that the rest of the code expects."""
     if missing := [name for name in _AXES if name not in arrays]:
         raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
     found: dict[str, Any] = {}

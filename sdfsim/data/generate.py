@@ -36,8 +36,8 @@ def make_dataset(
 ) -> dict:
     """Write `trajectories` files under `out/SPLIT/` and the Shape folders under `out/shapes/`; returns a report.
 
-    Files that exist are kept, so that an interrupted run goes on where it was. With the same shapes, trajectory k of a
-    split depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
+    Files that exist are kept, so that an interrupted run continues. With the same shapes, trajectory k of a split
+    depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
     (see `split_of`), so that those of validation and test are never trained on.
 
     Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; `random_solids`
@@ -94,7 +94,7 @@ def make_dataset(
 
 
 def report_lines(report: dict) -> list[str]:
-    """The report of `make_dataset` for people."""
+    """The report of `make_dataset` as lines."""
     return [
         f"{report['dataset']}: {report['trajectories']} {report['split']} trajectories, {report['made_now']} made now; "
         f"{report['shapes']} shapes to draw from",
@@ -136,7 +136,8 @@ def _make_one(recipe: str, cast: Cast, fps: int, seed: list[int], index: int, pa
 def _origins(
     recipe: str, shapes: Path | None, random_solids: int, bodies: int | None, on_progress: Progress
 ) -> list[Origin]:
-    """Where the shapes of a recipe come from, its own scenery last, when all options go with it."""
+    """Where the shapes of a recipe come from, its own scenery last. Raises SdfsimError for options that it does not
+    take."""
     plan = RECIPES[recipe]
     unused = {
         "--bodies": bodies is not None and not plan.counted,

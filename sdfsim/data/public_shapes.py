@@ -21,7 +21,7 @@ from sdfsim.base.files import FREELY, user_cache, write_bytes
 from sdfsim.base.parallel import Progress, silent
 
 KUBRIC = "https://storage.googleapis.com/kubric-public/assets/KuBasic"
-# One commit, so that nothing there can move.
+# One commit, so that the files cannot change.
 YCB = (
     "https://raw.githubusercontent.com/eleramp/pybullet-object-models/92a8d73c817d5af3866743e92195a62d9449f92c"
     "/pybullet_object_models/ycb_objects"
@@ -70,7 +70,7 @@ def _check(content: bytes, expected: str, what: str, hint: str) -> None:
 
 
 def _fetched(url: str, hint: str) -> dict[str, bytes]:
-    """The files of an archive by their last names alone, so that no path in it decides anything; a single one by ""."""
+    """The files of an archive by their base names, so that no path in it matters; a single file under ""."""
     import pooch
 
     pooch.get_logger().setLevel("WARNING")  # it would log the checksum of each download

@@ -1,7 +1,7 @@
 """The teacher: PyBullet with Kubric's settings (an optional extra, `pip install sdfsim[data]`).
 
-docs/teacher.md compares the settings one by one. An inner step is taken before the first, with the bodies far apart,
-because the engine has the inertias of a mass of 1 kg in it.
+docs/teacher.md compares the settings one by one. Before the first inner step the engine makes another one, with the
+bodies far apart, because it would use the inertias of a mass of 1 kg in it.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def write_urdf(geometry: str, path: Path) -> Path:
 
 
 def engine_settings(step: float, substeps: int) -> dict:
-    """What `dataset.json` is to say of the engine at recorded steps of `step` s in `substeps` inner ones."""
+    """The engine settings in `dataset.json`, for recorded steps of `step` s in `substeps` inner ones."""
     return ENGINE_SETTINGS | BODY_SETTINGS | MAXIMAL | {"timeStep": step / substeps}
 
 

@@ -76,7 +76,7 @@ HEIGHTS = (0.1, 2.0)  # m, under a body that falls
 MEETING = (0.1, 1.0)  # s, until the bodies of a pair touch
 ALOFT = 32.0  # m, the lowest pair: more than it falls in 2 s, with what a hit may add
 APART = 12.0  # m between the heights of pairs
-HALF = 0.5  # of the bodies: along x or y, of a spin that fits, or unturned; the others any way
+HALF = 0.5  # of the bodies move along x or y, have the spin of rolling, or are unturned; the others are random
 
 Bodies = list[tuple[ShapeSource, TeacherBody]]
 Draw = Callable[[ShapeSource], TeacherBody]
@@ -240,7 +240,8 @@ def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: s
     """Put bodies down, after those that the teacher has: all at rest, all dropped from `DROP` at most, all given a
     nudge, or pressed into one another, as `start` says. False when one found no room.
 
-    Only the last overlap; models learn from them how bodies part. Shapes have a largest extent of 1 m at scale 1.
+    Only pressed bodies overlap; models learn from them how bodies separate. Shapes have a largest extent of 1 m at
+    scale 1.
     """
     first, below, top = len(teacher.bodies), np.zeros(2), 0.0
     poses: list[Pose] = []

@@ -24,7 +24,7 @@ from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.make import analytic_shape, fit_pieces
 
-NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since those are what really touches
+NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since contacts happen there
 THINNEST = 0.02  # thickness over largest extent below which a mesh is left out: no fit resolves it
 VISUAL, COLLISION = "visual_geometry.obj", "collision_geometry.obj"  # the two files of a NAME/ folder
 VHACD = {"resolution": 1_000_000, "concavity": 0.0025, "maxNumVerticesPerCH": 64}
@@ -49,7 +49,7 @@ class Origin:
 
     @property
     def how(self) -> str:
-        """How its convex pieces come about."""
+        """Where its convex pieces come from."""
         return "primitive" if self.primitive else "own" if self.pieces else "vhacd"
 
     def digest(self) -> str:

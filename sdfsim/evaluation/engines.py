@@ -26,13 +26,12 @@ from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.motion import MOTION
-from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape, own_pieces
 
 SAME_INERTIA = 1e-3  # relative
-SOFTEST = 3.0  # MuJoCo: time in which a contact swings over 2 pi, in steps of the engine; it is stable from 2 on
+SOFTEST = 3.0  # MuJoCo: period of a contact's spring over 2 pi, in steps of the engine; stable from 2 on
 LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
 SI = Units(1.0, 1.0, 1.0)
@@ -129,13 +128,6 @@ def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
         dt=DT,
         gravity=scene.gravity / units.acceleration,
     )
-
-
-def rollout_motion(scene: Scene, rollout: Rollout) -> Trajectory:
-    """Our motion of a scene as a recording of the bodies of `start_motion`."""
-    frames = (rollout.position, rollout.orientation, rollout.velocity, rollout.angular_velocity)
-    found = {name: values[:, solid_bodies(scene)] for name, values in zip(MOTION, frames, strict=True)}
-    return replace(start_motion(scene), **found, dt=float(rollout.meta["dt"]))
 
 
 def solid_bodies(scene: Scene) -> np.ndarray:

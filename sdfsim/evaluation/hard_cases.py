@@ -19,15 +19,14 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import visible
-from sdfsim.data.dataset import Trajectory
 from sdfsim.data.scenarios import steady_faces
-from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures, solved
+from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
+from sdfsim.evaluation.runs import Ran, by_model
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import largest_extent
-from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Effects, Scene
 from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.shape import Shape
@@ -54,27 +53,7 @@ APART = 0.1  # of a body's size: motions farther from each other than this have 
 RUNAWAY = 10.0  # times the energy at the start, and no motion is worth measuring
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One motion of one scene: of all bodies but planes, up to the last good state."""
-
-    scene: Scene
-    motion: Trajectory
-    broke: str = ""  # why it ended early
-    rollout: Rollout | None = None  # the simulator's own record; None of an engine
-
-    @property
-    def path(self) -> np.ndarray:
-        """[T, M, 3] m, positions of the dynamic bodies."""
-        return self.motion.position[:, ~self.motion.static]
-
-    @property
-    def time(self) -> np.ndarray:
-        """[T] s."""
-        return self.motion.dt * np.arange(len(self.motion.position))
-
-
-Measure = Callable[[Sequence["Trial"]], dict[str, float]]
+Measure = Callable[[Sequence[Ran]], dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -375,7 +354,7 @@ def size(scene: Scene) -> float:
     return float(np.mean([largest_extent(scene.shapes[b.shape]) * b.scale for b in _dynamic(scene)]))
 
 
-def ran_away(trial: Trial) -> str:
+def ran_away(trial: Ran) -> str:
     """When a motion had more than `RUNAWAY` times the energy it started with; empty if never.
 
     The energy at the start counts from one size below the lowest body, so that it is not zero.
@@ -387,7 +366,7 @@ def ran_away(trial: Trial) -> str:
     return f"more than {RUNAWAY:g} times the energy of the start from {trial.time[at[0]]:.2f} s on" if len(at) else ""
 
 
-def rest(trials: Sequence[Trial], *, times: Sequence[float]) -> dict[str, float]:
+def rest(trials: Sequence[Ran], *, times: Sequence[float]) -> dict[str, float]:
     """How a body at rest behaves: drift after each of `times`, and speed, height and motion over the last second."""
     trial = trials[0]
     path, turn = trial.path[:, 0], trial.motion.orientation[:, ~trial.motion.static][:, 0]
@@ -402,7 +381,7 @@ def rest(trials: Sequence[Trial], *, times: Sequence[float]) -> dict[str, float]
     }
 
 
-def standing(trials: Sequence[Trial]) -> dict[str, float]:
+def standing(trials: Sequence[Ran]) -> dict[str, float]:
     """How many bodies of a stack have fallen, and how far the others have shifted sideways at most, % of size."""
     path, scene = trials[0].path, trials[0].scene
     heights = []
@@ -414,21 +393,21 @@ def standing(trials: Sequence[Trial]) -> dict[str, float]:
     return {"fallen": float(fallen.sum()), "shift": float(shift[~fallen].max(initial=0.0))}
 
 
-def squeezed(trials: Sequence[Trial]) -> dict[str, float]:
+def squeezed(trials: Sequence[Ran]) -> dict[str, float]:
     """Penetration of a stack, % of size, and how many have fallen."""
-    depth = depths(trials[0].scene, trials[0].motion)
+    depth = depths(trials[0])
     return standing(trials) | {"worst depth": 100 * float(depth.max(initial=0.0)) / size(trials[0].scene)}
 
 
-def separated(trials: Sequence[Trial]) -> dict[str, float]:
+def separated(trials: Sequence[Ran]) -> dict[str, float]:
     """Highest speed m/s of bodies that start in each other, and how deep they still are at the end, % of size."""
     scene, motion = trials[0].scene, trials[0].motion
     speed = np.linalg.norm(motion.velocity[:, ~motion.static], axis=2)
-    left = depths(scene, motion, every=max(1, len(motion.position) - 1)).max(initial=0.0)
+    left = depths(trials[0], every=max(1, len(motion.position) - 1)).max(initial=0.0)
     return {"exit speed": float(speed.max()), "depth left": 100 * float(left) / size(scene)}
 
 
-def passed(trials: Sequence[Trial]) -> dict[str, float]:
+def passed(trials: Sequence[Ran]) -> dict[str, float]:
     """Share % of bodies thrown at a plate about the origin that have been below it while over its area."""
     shares = []
     for trial in trials:
@@ -440,7 +419,7 @@ def passed(trials: Sequence[Trial]) -> dict[str, float]:
     return {"through": float(np.mean(shares))}
 
 
-def rebound(trials: Sequence[Trial], *, restitution: float) -> dict[str, float]:
+def rebound(trials: Sequence[Ran], *, restitution: float) -> dict[str, float]:
     """Mean height of the first rebound of balls dropped onto the floor, % of what they fell, against e^2."""
     scene, motion, shares = trials[0].scene, trials[0].motion, []
     for k, body in enumerate(_dynamic(scene)):
@@ -451,7 +430,7 @@ def rebound(trials: Sequence[Trial], *, restitution: float) -> dict[str, float]:
     return {"rebound": float(np.mean(shares)), "error": abs(float(np.mean(shares)) - 100 * restitution**2)}
 
 
-def slipped(trials: Sequence[Trial], *, friction: float, offsets: Sequence[float]) -> dict[str, float]:
+def slipped(trials: Sequence[Ran], *, friction: float, offsets: Sequence[float]) -> dict[str, float]:
     """Where a body on a slope begins to slide, in degrees from atan(friction); trials from rest, by rising offsets.
 
     The first angle counts at which it travels more than half of what it would slide two degrees beyond the critical
@@ -472,7 +451,7 @@ def slide(friction: float, degrees: float, seconds: float, gravity: float) -> fl
     return 0.5 * gravity * max(0.0, float(np.sin(angle) - friction * np.cos(angle))) * seconds**2
 
 
-def heaped(trials: Sequence[Trial]) -> dict[str, float]:
+def heaped(trials: Sequence[Ran]) -> dict[str, float]:
     """A pile in a bowl: penetration, who left through the wall, and energy beyond that of the start."""
     scene, motion = trials[0].scene, trials[0].motion
     bowl = next(b for b in scene.bodies if b.name == "bowl")
@@ -482,7 +461,7 @@ def heaped(trials: Sequence[Trial]) -> dict[str, float]:
     radius, under = np.linalg.norm(from_centre, axis=2), from_centre[..., 2] < 0
     out = (under[:-1] & under[1:] & (radius[:-1] < middle) & (radius[1:] >= middle)).any(0)
     course, weight = energy(motion), motion.mass[~motion.static].sum() * np.linalg.norm(scene.gravity)
-    depth = depths(scene, motion, every=10)
+    depth = depths(trials[0], every=10)
     return {
         "depth 95 %": 100 * float(np.percentile(depth, 95)) / size(scene) if len(depth) else 0.0,
         "through the wall": float(out.sum()),
@@ -490,14 +469,14 @@ def heaped(trials: Sequence[Trial]) -> dict[str, float]:
     }
 
 
-def created(trials: Sequence[Trial]) -> dict[str, float]:
+def created(trials: Sequence[Ran]) -> dict[str, float]:
     """Energy that came from nothing: share % of steps that add more than `GAIN` of the start's, and the worst, %."""
     courses = [energy(trial.motion) for trial in trials]
     gains = np.concatenate([np.diff(course) / course[0] for course in courses])
     return {"steps with gain": 100 * float((gains > GAIN).mean()), "worst gain": 100 * float(gains.max(initial=0.0))}
 
 
-def turned_back(trials: Sequence[Trial], *, degrees: Sequence[float]) -> dict[str, float]:
+def turned_back(trials: Sequence[Ran], *, degrees: Sequence[float]) -> dict[str, float]:
     """Deviation % of size, at the end, of turned scenes from themselves; `degrees` is one group's, the first 0."""
     apart = 0.0
     for start in range(0, len(trials), len(degrees)):
@@ -507,7 +486,7 @@ def turned_back(trials: Sequence[Trial], *, degrees: Sequence[float]) -> dict[st
     return {"deviation": apart}
 
 
-def diverged(trials: Sequence[Trial]) -> dict[str, float]:
+def diverged(trials: Sequence[Ran]) -> dict[str, float]:
     """Mean time s until motions of the second half are 10 % of a size from the first half's; their length if never."""
     half, times = len(trials) // 2, []
     for one, other in zip(trials[:half], trials[half:], strict=True):
@@ -517,7 +496,7 @@ def diverged(trials: Sequence[Trial]) -> dict[str, float]:
     return {"diverges after": float(np.mean(times))}
 
 
-def _apart(reference: Trial, other: Trial, back: Rotation) -> np.ndarray:
+def _apart(reference: Ran, other: Ran, back: Rotation) -> np.ndarray:
     """[T] % of size: root mean square over the bodies of how far they are from each other."""
     frames = min(len(reference.path), len(other.path))
     returned = back.apply(other.path[:frames].reshape(-1, 3)).reshape(frames, -1, 3)
@@ -637,10 +616,12 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
         seconds=2.0, repeats=repeats)  # fmt: skip
 
     fail, of = Figure("fail", "checks", 0, limit=0.0), Figure("checks", "in all", 0, judged=False)
-    usual = [Setting()] if quick else [*(Setting(size) for size in SIZES), Setting(yaw=37.0), *map(_of_kind, KINDS[1:])]
+    usual = [Setting()]
+    if not quick:
+        usual = [*(Setting(size) for size in SIZES), Setting(yaw=37.0), *(Setting(kind=kind) for kind in KINDS[1:])]
     for row in ROWS:
         add("everyday", f"everyday-{row}", row.replace("_", " "), lambda repeat: [], created, fail, of, repeats=1,
-            engines=False, own=partial(_everyday, row, usual))  # fmt: skip
+            engines=False, own=partial(failures, row, usual))  # fmt: skip
 
     def plain(repeat: int) -> list[Scene]:
         return [tossed((22, repeat, k)) for k in range(2 if quick else 4)]
@@ -656,12 +637,10 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
     return found
 
 
-def _of_kind(kind: str) -> Setting:
-    return Setting(kind=kind)
-
-
-def _everyday(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
-    return failures(row, [replace(at, by=partial(solved, model=model)) for at in settings])
+def failures(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
+    """How many everyday checks of a row do not hold with a model, and how many there are."""
+    found = [check for at in settings for check in ROWS[row](replace(at, by=partial(by_model, model=model)))]
+    return {"fail": float(sum(not check.holds for check in found)), "checks": float(len(found))}
 
 
 def _meshes(folder: Path) -> dict[str, Shape]:

@@ -225,7 +225,7 @@ def peak_memory() -> Iterator[dict[str, float | None]]:
     """Sets "mib" to the most by which the process grew inside the block; None where Linux does not report it."""
     peak: dict[str, float | None] = {"mib": None}
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # the peak counts from here
         before = _status("VmRSS")
     except OSError:
         yield peak
@@ -236,5 +236,5 @@ def peak_memory() -> Iterator[dict[str, float | None]]:
 
 def _status(name: str) -> float:
     """kB of an entry of /proc/self/status."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return next(float(line.split()[1]) for line in lines if line.startswith(f"{name}:"))

@@ -14,16 +14,16 @@ from scipy.spatial.transform import Rotation
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import Trajectory
 from sdfsim.evaluation.engines import dataset_urdf
+from sdfsim.evaluation.runs import Ran
 from sdfsim.geometry.mesh_io import load_pieces
-from sdfsim.scene.scene import Scene
 from sdfsim.sdf.grid import GridSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape, with_sdf
 
-TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
-EVERY = 10  # frames between two that are looked at
+TOUCH = 0.01  # of the mean size of the moving bodies: a node this near to another surface is in contact
+EVERY = 10  # frames from one that is measured to the next
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ def penetration(motions: list[Trajectory], solids: dict[str, ExactSolid]) -> dic
     }
 
 
-def depths(scene: Scene, motion: Trajectory, every: int = 5) -> np.ndarray:
-    """[F] m, depth of the deepest node, in every `every`-th frame (see `rollout_motion`) in which bodies touch.
-    The only plane of the scene, if any, is the floor z = 0."""
+def depths(run: Ran, every: int = 5) -> np.ndarray:
+    """[F] m, depth of the deepest node, in every `every`-th frame in which bodies touch. The only plane of the scene,
+    if any, is the floor z = 0."""
     solids = {}
-    for name in set(motion.shape.tolist()):
-        shape = scene.shapes[int(name)]
+    for name in set(run.motion.shape.tolist()):
+        shape = run.scene.shapes[int(name)]
         solids[name] = _exact(replace(shape, nodes=shape.nodes - shape.com), shape.com)
-    return _touching(deepest(motion, solids, every))
+    return _touching(deepest(run.motion, solids, every))
 
 
 def _touching(distance: np.ndarray) -> np.ndarray:

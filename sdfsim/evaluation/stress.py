@@ -19,15 +19,15 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.base.version import __version__
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
-from sdfsim.evaluation.engines import Engine, bullet, rollout_motion, shape_urdf, start_motion, start_of_scene
-from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Trial, cases, ran_away
+from sdfsim.evaluation.engines import Engine, TooSlow, bullet, shape_urdf
+from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
+from sdfsim.evaluation.runs import Ran, by_engine, by_model, still
 from sdfsim.learned.model import Model, load_model, model_names
 from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import PlaneSdf
-from sdfsim.simulate.simulator import SimulationError, Simulator
 from sdfsim.simulate.steppers import stepper_of
 
 VERSION = 5  # counts up when the measurements change, so that kept results are measured again
@@ -52,9 +52,9 @@ class Study:
     Attributes:
         models: their names.
         engines: their names; the teacher where PyBullet is installed.
-        results: (case, who) -> figures (name -> a value a repetition), broke, outside and laws (lines; the last are
-            laws that a motion of ours breaks, by instruments that do not use the solve) and recording (a path in the
-            folder, or None); nothing for a case that one cannot take part in.
+        results: (case, who) -> figures (name -> a value a repetition); lines of broke, outside and laws (which a motion
+            of ours breaks, by instruments that do not use the solve); recording (a path in the folder, or None). There
+            is no entry where a model or engine does not take part in a case.
         quick: whether it is the short form.
     """
 
@@ -122,7 +122,7 @@ def stress(
                 jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments))
         for name in others if case.engines else []:
             settings = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
-            jobs.append(Job(case.name, name, [content, settings], _tried, (case, (name, engines[name]), device, out)))
+            jobs.append(Job(case.name, name, [content, settings], _tried, (case, engines[name], device, out)))
             cut |= {id(shape): shape for scene in scenes[case.name][0] for shape in scene.shapes}
     with locked(out):
         for shape in cut.values():  # before the work is split up, so that no two processes cut one mesh into pieces
@@ -134,8 +134,8 @@ def stress(
     return Study(found, names, others, results, quick)
 
 
-def _tried(case: Case, model: Model | tuple[str, Engine], device: str, out: Path) -> dict[str, Any]:
-    """All repetitions of a case with one model, or with an engine and its name: see `Study.results`."""
+def _tried(case: Case, model: Model | Engine, device: str, out: Path) -> dict[str, Any]:
+    """All repetitions of a case with one model or engine: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
     broke, outside, laws, recording = [], [], [], None
     if isinstance(model, Model) and (about := GROUPS[case.group].about) in constant_in_training(model):
@@ -146,24 +146,18 @@ def _tried(case: Case, model: Model | tuple[str, Engine], device: str, out: Path
             for name, value in case.own(model).items():
                 figures[name].append(value)
             continue
-        if not isinstance(model, Model):
-            runs = [by_engine(*model, scene, out / "engine", case.seconds) for scene in scenes]
-        else:
-            places = [device, "cuda"] if case.cuda else [device]
-            runs = [simulated(scene, model, place, case.seconds) for place in places for scene in scenes]
+        places = [device, "cuda"] if case.cuda else [device]
+        runs = [ran(model, scene, case.seconds, place, out / "engine") for place in places for scene in scenes]
         measured = case.measure(runs)
         for name, values in figures.items():
             values.append(float(measured[name]))
         broke += [run.broke for run in runs if run.broke]
-        outside += [line for run in runs if run.rollout for line in run.rollout.meta["outside_training"]]
-        for run in runs:
-            if run.rollout:
-                verdict = judged(run.scene, run.rollout, every=max(1, len(run.rollout) // LOOKED_AT))
-                laws += verdict.broken
+        for run in runs if isinstance(model, Model) else []:
+            outside += run.rollout.meta["outside_training"]
+            laws += judged(run.scene, run.rollout, every=max(1, len(run.rollout) // LOOKED_AT)).broken
         missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
         shown = next((run for run in runs if run.broke), runs[0])
         if isinstance(model, Model) and not recording and (broke or missed):
-            assert shown.rollout is not None
             recording = f"recordings/{model.name}/{case.name}.rrd"
             (out / recording).parent.mkdir(parents=True, exist_ok=True)
             watched = shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum()))
@@ -172,27 +166,16 @@ def _tried(case: Case, model: Model | tuple[str, Engine], device: str, out: Path
     return {"figures": figures, "broke": broke, "recording": recording, **lines}
 
 
-def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Trial:
-    """Our motion of a scene; one that ran away counts as broken."""
-    broke = ""
+def ran(who: Model | Engine, scene: Scene, seconds: float, device: str, folder: Path) -> Ran:
+    """The motion of a scene by a model or by an engine; one that ran away, or took too long, counts as broken."""
     try:
-        rollout = Simulator(scene, model, device).run(seconds=seconds)
-    except SimulationError as error:
-        rollout, broke = error.rollout, error.message
-    run = Trial(scene, rollout_motion(scene, rollout), broke, rollout)
-    return run if broke else replace(run, broke=ran_away(run))
-
-
-def by_engine(name: str, engine: Engine, scene: Scene, folder: Path, seconds: float) -> Trial:
-    """An engine's motion of a scene (see `start_of_scene`), with its files in `folder`. It has no sleep."""
-    try:
-        motion, _ = engine(start_of_scene(scene, folder), max(1, round(seconds / DT)))
-    except SdfsimError as error:
-        if name == TEACHER:
-            raise
-        return Trial(scene, start_motion(scene), error.message)
-    run = Trial(scene, motion)
-    return replace(run, broke=ran_away(run))
+        if isinstance(who, Model):
+            run = by_model(scene, seconds, who, device)
+        else:
+            run = by_engine(scene, seconds, who, folder)
+    except TooSlow as error:
+        return still(scene, seconds, error.message)
+    return run if run.broke else replace(run, broke=ran_away(run))
 
 
 # --- what came out ---

@@ -210,7 +210,7 @@ def variants(models: Sequence[str], *, quick: bool) -> list[Variant]:
 
 
 def arranged(variant: Variant, cases: Cases) -> dict[str, Shape]:
-    """The shapes with the nodes and distances that a variant wants."""
+    """The shapes with the nodes and distances of a variant."""
     shapes = {}
     kind, _, count = variant.nodes.partition(" ")
     for name, shape in cases.shapes.items():
@@ -334,7 +334,7 @@ def tradeoff(
     """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
 
     Args:
-        source: dataset folder, or a scene file, which the teacher is then asked about; None takes a random scene of
+        source: dataset folder, or a scene file, which the teacher then simulates; None takes a random scene of
             boxes and balls.
         out: folder to write; results that it holds already are kept.
         models: names or paths (none: the solver and all bundled networks).

@@ -50,7 +50,7 @@ class Winding:
     than ray parity."""
 
     def __init__(self, mesh: Mesh) -> None:
-        # igl computes in float32 within: far from the origin, or in small units, that would cost the sign.
+        # igl computes in float32 inside: far from the origin, or in small units, signs would be wrong.
         self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
         self._size = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
         self._vertices = np.ascontiguousarray((mesh.vertices - self._centre) / self._size)

@@ -162,7 +162,7 @@ def read_gltf(path: Path) -> FileMesh:
 
 
 class _GltfReader:
-    """A file that is read: its header, and its buffers as bytes. Raises ValueError where there is something wrong."""
+    """A file that is read: its header, and its buffers as bytes. Raises ValueError where it is damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -185,7 +185,7 @@ class _GltfReader:
         return self.header.get(name, [])
 
     def _bytes(self, entry: dict[str, Any], own: bytes | None = None) -> bytes | None:
-        """What a buffer or an image holds that is not in a view; None where it is nowhere."""
+        """The content of a buffer or of an image without a view; None where there is none."""
         uri = entry.get("uri")
         if uri is None:
             return own

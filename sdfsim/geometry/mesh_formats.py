@@ -27,19 +27,19 @@ PLACES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 TRIED = 64
 # A triangle of a fan may lean the other way by this part of its polygon's area.
 FLAT = 1e-9
-TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # Pillow starts other programs to draw some of the other formats
+TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # Pillow starts other programs for some of the other formats
 FACET = 50  # bytes of a triangle in a binary STL, behind 84 of its header
 
 
 class Ragged(NamedTuple):
-    """A list a row."""
+    """A column of lists, one for each row."""
 
     length: np.ndarray  # [N] int64
     values: np.ndarray  # [sum of them]
 
 
 class FileMesh(NamedTuple):
-    """The triangles of a file, as they stand in it."""
+    """The triangles of a file, unchanged."""
 
     vertices: np.ndarray  # [V, 3] float64
     faces: np.ndarray  # [F, 3] int64
@@ -110,7 +110,7 @@ def _element(
         }, start
 
     def lengths(at: int) -> tuple[list[int], int]:
-        """Of the row that begins there: items in each column, and its end."""
+        """Items in each column of the row that begins at a byte, and its end."""
         items = []
         for counter, kind in zip(counters, kinds, strict=True):
             count = 1

@@ -111,8 +111,8 @@ def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
 
 
 def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit.
-    `attributes` are more properties of the vertices by name, [V] int32 or float32; most programs pass over them."""
+    """A mesh as binary PLY, vertices in double precision: it is read back to the last bit. `attributes` are more
+    properties of the vertices by name, [V] int32 or float32; most programs ignore them."""
     columns = [(axis, "<f8", "double") for axis in "xyz"]
     values = list(mesh.vertices.T)
     if mesh.colors is not None:
@@ -154,7 +154,7 @@ def read_glb(path: Path) -> dict[str, Mesh]:
 def write_glb(meshes: dict[str, Mesh]) -> bytes:
     """Meshes with textures as binary glTF: a node each by its name, all below one that turns them to glTF's y up.
 
-    Vertices become single precision, textures JPEG. They hold the light of the photos: nothing else is to light them.
+    Vertices become single precision, textures JPEG. They hold the light of the photos, so viewers should add no light.
     """
     file = GltfWriter()
     for name, mesh in meshes.items():

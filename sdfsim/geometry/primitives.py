@@ -48,11 +48,22 @@ def torus(major: float = 0.35, minor: float = 0.15, segments: int = 64, sides: i
     return _tube(_torus_rings(major, minor, segments, sides))
 
 
+def tube(outer: float, inner: float, height: float, segments: int = 64) -> Mesh:
+    """A tube about z of radii `outer` and `inner` m."""
+    turn = 2 * np.pi * np.arange(segments) / segments
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return _sleeve(outer * circle, inner * circle, height)
+
+
 def gear() -> Mesh:
     """A spur gear about z: 12 teeth of 0.1 m, 0.2 m thick, with a bore of radius 0.12 m."""
-    outer, inner = _gear_outline()
+    return _sleeve(*_gear_outline(), 0.2)
+
+
+def _sleeve(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
+    """What is between two outlines [K, 2] m, counter-clockwise, and half of `height` m from z = 0."""
     count = len(outer)
-    layers = [np.column_stack([outline, np.full(count, z)]) for z in (-0.1, 0.1) for outline in (outer, inner)]
+    layers = [np.column_stack([line, np.full(count, z)]) for z in (-height / 2, height / 2) for line in (outer, inner)]
     this, following = np.arange(count), (np.arange(count) + 1) % count
     low_out, low_in, high_out, high_in = (count * layer for layer in range(4))
     quads = [

@@ -1,4 +1,4 @@
-"""Any triangle mesh -> the solid that it bounds, or one line why it bounds none.
+"""Any triangle mesh -> the solid that it bounds, or an error that says why it bounds none.
 
 Vertices [V, 3 + K] and corners of triangles [F, 3, 3 + K] hold coordinates, and K columns (colours) that new vertices
 get by the same averages.
@@ -17,12 +17,12 @@ from sdfsim.geometry.bvh import ClosestPoint, Crossings, Winding
 from sdfsim.geometry.mass import integrals
 from sdfsim.geometry.mesh import Frame, Mesh, clean, components, directed_edges, is_closed, lattice, normal_frame
 
-# Openings are closed unasked up to this fraction of the surface, smallest first.
+# Openings are always closed up to this fraction of the surface, smallest first.
 SMALL = 0.02
 # Mean of how far winding numbers at the surface are from those of a closed one. A sphere with an opening of the
 # fraction a has a / 2; cracks of no width have nearly nothing, however long they are.
 LEAK = 0.01
-# Sides of a face are looked at from this far off; sizes are relative to the largest extent.
+# Both sides of a face are tested this far from it; sizes are relative to the largest extent.
 STEP = 1e-4
 # Less of the surface than this is not worth cutting: the corners of small faces that cross each other.
 TRIFLE = 1e-3
@@ -47,8 +47,8 @@ class Solid:
     surface: Mesh
     body: Mesh  # what winding numbers, or the distance of a thickened solid, are taken of: the whole mesh, repaired
     notes: tuple[str, ...] = ()  # what was done to the mesh, a plain line each
-    thickness: float = 0.0  # m, of the sheet that `body` then is; 0 if it is none
-    closed: bool = True  # whether it has an inside without doubt; cracks and pinholes leave some
+    thickness: float = 0.0  # m, of the sheet that `body` then is; 0 for a solid
+    closed: bool = True  # whether its inside is certain; cracks and pinholes leave doubt
     simple: bool = False  # whether `surface` is one clean boundary, for which ray parity is exact
     # [F] int, how many faces of `surface` lie on each other where each is; None: one everywhere
     layers: np.ndarray | None = None
@@ -95,7 +95,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
     rays = Crossings(_plain(vertices, faces))
 
     def around(points: np.ndarray) -> np.ndarray:
-        """Winding numbers [P]: those that three rays agree on, which is nearly all, and in doubt the exact ones."""
+        """Winding numbers [P]: by three rays where these agree, which is nearly everywhere, else exactly."""
         found = np.stack([rays(points, direction) for direction in range(3)])
         value, doubt = found[0], (found != found[0]).any(0)
         value[doubt] = winding(points[doubt])
@@ -108,7 +108,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     body = _mesh(vertices, faces, frame, mesh.colors)
     corners = vertices[faces]
-    # First a look at every 0.05 of the surface; only what crosses itself is cut, and that finely.
+    # First a test every 0.05 of the surface; only surfaces that cross themselves are cut, and finely.
     probes = no_longer_than(corners, 0.05)
     boundary = side(*centres_and_normals(probes))
     weights = face_areas(probes)

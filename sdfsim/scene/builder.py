@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import yaml
 
 from sdfsim.base.errors import SceneError, nearest
-from sdfsim.base.files import write_text
+from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import WORLD, Scene
@@ -19,7 +18,7 @@ from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, Shap
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")
-_HERE = "<scene>"  # what messages call a scene that is in no file
+_HERE = "<scene>"  # the name in messages of a scene without a file
 
 
 class SceneBuilder:
@@ -84,7 +83,7 @@ class SceneBuilder:
         """The file; paths start at `folder`, or stay as they are."""
 
         def moved(path: Any) -> Any:
-            return os.path.relpath(path, folder) if folder and isinstance(path, str) else path
+            return path_from(folder, path) if folder and isinstance(path, str) else path
 
         document = {"version": VERSION, **self._settings}
         if str(document.get("model", "")).endswith(".safetensors"):

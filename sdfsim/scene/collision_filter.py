@@ -22,9 +22,9 @@ class PairCounts:
     total: int  # all there are
     unmoved: int  # of these, without a dynamic body: they may overlap as they like
     excluded: int  # of the others, those that `collides_with` keeps apart
-    possible: int  # what is left
+    possible: int  # the remaining pairs
     frictional: int  # of the possible ones, with a friction product above zero
-    bouncy: int  # likewise with a restitution product above zero
+    bouncy: int  # of the possible ones, with a restitution product above zero
 
 
 def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:

@@ -43,7 +43,7 @@ class Document:
         self.data = self._read(root, (), root.start_mark.line + 1)
 
     def wrong(self, loc: Loc, text: str, line: int | None = None) -> None:
-        """Note a fault of the value under `loc`, in its line or another."""
+        """Record a fault of the value under `loc`, in its line or another."""
         if line is None:
             line = next(self._line[loc[:depth]] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:200]

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
+from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.document import Document
 from sdfsim.scene.joints import joints_of
 from sdfsim.scene.scene import Body, Effects, Motion, Scene, Waypoints
@@ -39,13 +40,14 @@ def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = No
 def load_scene(
     path: Path | str, on_progress: Progress = silent, *, allow_outside: bool = False, text: str | None = None
 ) -> Scene:
-    """Read a scene file, and load or fit the shapes that its bodies use; the scene is in SI units.
+    """Read a scene file, by its path or the name of a sample, and load or fit the shapes that its bodies use; the scene
+    is in SI units.
 
     Paths inside the file are taken from its folder; unless `allow_outside`, they may not lead out of it. `text` is what
     is in the file, where it is not written yet. Raises SceneError with one line `FILE:LINE: FIELD: what is wrong` for
     every fault found.
     """
-    path = Path(path)
+    path = find_scene(path) if text is None else Path(path)
     table, document = read_scene(path, allow_outside=allow_outside, text=text)
     shapes = _load_shapes(table, document, on_progress)
     order = {key: i for i, key in enumerate(shapes)}
@@ -83,8 +85,8 @@ def load_scene(
 
 
 def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -> dict[str | None, Shape]:
-    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. What must
-    be fitted or sampled waits until all else is known to be right: a fit takes a minute."""
+    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. Shapes
+    that must be fitted or sampled are made last, when all else is valid: a fit takes a minute."""
     used = dict.fromkeys(body.shape for body in table.bodies)
     shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
     slow = {key: s.kind in FITTED or s.sdf == "grid" for key, s in table.shapes.items()}

@@ -63,7 +63,7 @@ class Body:
         mass: kg (already resolved from a density; bodies that are not dynamic have 0).
         inertia: [3, 3] kg m^2 about the centre of mass, shape axes; None means mass / volume times the shape's own.
         friction: Coulomb coefficient (the product of the two bodies' counts).
-        restitution: likewise.
+        restitution: likewise the product counts.
         collides_with: names of the bodies it may touch, or None for all.
         path: of a kinematic body.
     """
@@ -181,7 +181,7 @@ class Scene:
 
 
 def fingerprints(scene: Scene) -> dict[str, str]:
-    """Tell a scene from others with bodies of the same names: a digest each of its `shapes` (which bodies have
+    """Distinguish a scene from others with bodies of the same names: a digest each of its `shapes` (which bodies have
     which, how large, and how they move), of what else its `bodies` are (but for paths and who may touch whom), and of
     `gravity`. Six digits count, and of fitted shapes the mesh, so that a fit that is made again, or the last digits of
     another machine, make no other scene of it."""

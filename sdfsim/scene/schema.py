@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -113,6 +114,8 @@ def _find(text: str, info: ValidationInfo) -> Path:
     context: Any = info.context
     home: Path = context["folder"]
     place = home / text
+    if "\\" in text and not os.path.lexists(place):  # written on Windows
+        place = home / text.replace("\\", "/")
     try:
         # Where it leads when every link is followed; of a folder, also where the files of a shape lead.
         inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE, SKIN_FILE) if place.is_dir() else ()

@@ -1,4 +1,4 @@
-"""A signed distance baked to a grid of bricks, a hundred times faster than a network: for the contact solve."""
+"""A signed distance baked to a grid of bricks for the contact solve: a hundred times faster than a network."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SIDE = 8  # cells of a brick along each side
 CELLS = 128  # along the largest extent of a solid
 FINEST = 512  # likewise, where walls are thin
 PADDING = 4.0  # cells around the solid
-WALL = 2.0  # cells that a wall needs for either of its sides to be seen
+WALL = 2.0  # cells that a wall must be thick for a grid to have both of its sides
 CHUNK = 2**18  # points evaluated at once
 SPREAD = 512  # places all over a surface
-# Of the largest extent: how near they are before, how near after so many steps towards it.
+# Of the largest extent: how near these places are at first, and after so many steps towards the surface.
 CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
 
 
@@ -147,7 +147,7 @@ def unseen_wall(sdf: Sdf, grid: BakedGrid) -> float | None:
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     low, high = sdf.bounds
     places = np.random.default_rng(0).uniform(low, high, (64 * SPREAD, 3))
-    # From close by: edges are what is nearest to much of the space farther away.
+    # From close by: farther away edges are nearest to much of the space.
     places = places[np.abs(np.asarray(sdf(places)[0])) <= CLOSE * extent][: 2 * SPREAD]
     for _ in range(PROJECTIONS):
         distance, gradient = sdf(places)

@@ -1,4 +1,4 @@
-"""Signed distances that are known in a box around a solid, made sane everywhere."""
+"""Signed distances that are known in a box around a solid, continued everywhere."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ BOX = 0.7
 # Gradients are returned no shorter and no longer than this. A network's slope is within it almost everywhere near the
 # surface, but rounds off the ridge in the middle of a thin wall, where x - f grad f / |grad f|^2 would fly off.
 SLOPE = (0.9, 1.1)
-# Beyond the box distances are returned smaller by this part, which makes up for feet that are not quite the nearest;
-# the full part from `FADE` on, so that nothing jumps at the box.
+# Beyond the box distances are returned smaller by this part, because feet are not quite the nearest; the full part from
+# `FADE` on, so that distances do not jump at the box.
 CAUTION, FADE = 0.03, 0.1
 
 # Points [P, 3] in the box -> value [P], gradient [P, 3].

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 # are off by some 1e-7: nearer than this the offset to them gives no direction, and differences over the step do.
 NEAR = 1e-5
 STEP = 1e-4
-# Farther out float32 runs out of range (at 1e19), so such points are moved to this box. What
-# is nearest to that one is as near as makes no difference.
+# Farther out float32 overflows (at 1e19), so such points are moved to this box. The face that is nearest to the moved
+# point is near enough.
 FAR = 1e3
 # A difference quotient shorter than this is no direction: a crack, a sheet without thickness.
 FLAT = 0.05

@@ -1,7 +1,7 @@
 """The compact SDF network, and its hand-written forward, gradient and training sweeps.
 
-The sweeps work in memory that stays. Fresh memory is what they would otherwise wait for: an array of a megabyte is
-given back to the system and faulted in again at every operation, which costs more than the arithmetic.
+The sweeps keep their memory. The system takes back an array of a megabyte and faults it in again at every operation,
+which would cost more than the arithmetic.
 """
 
 from __future__ import annotations

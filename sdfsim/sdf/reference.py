@@ -22,7 +22,7 @@ BLOCK = 512
 
 
 class Reference(NamedTuple):
-    """What is known about query points."""
+    """Distances at query points."""
 
     distance: np.ndarray  # [P] float64 m, positive outside
     closest: np.ndarray  # [P, 3] float64 m, the nearest point of the surface
@@ -30,7 +30,7 @@ class Reference(NamedTuple):
 
 
 class DistanceOracle(Protocol):
-    """Something that knows true distances: what the fit learns from."""
+    """True distances, from which a fit learns."""
 
     surface: Mesh  # the boundary as triangles, for sampling points on it
     closed: bool  # whether signs are reliable everywhere, not only where `Reference.trusted`

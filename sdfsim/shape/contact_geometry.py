@@ -1,6 +1,6 @@
-"""What contacts ask of a shape, in its own frame at scale 1: made once, and kept beside the baked grids on disk.
+"""What contacts need of a shape, in its own frame at scale 1: made once, and kept beside the baked grids on disk.
 
-A shape is met as convex solids where it is one or made of such, and as a surface in the distances of others elsewhere.
+A shape that is convex, or made of convex pieces, collides as solids; any other as a surface in the distances of others.
 A thousand bodies of one shape share one geometry.
 """
 
@@ -25,7 +25,7 @@ from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices
 VERSION = 1  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
-MOST_PATCHES = 1024  # of a shape: the contact solve tells no more of them apart
+MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 # Of a solid's largest extent, from where its nodes look out, and of its thickness: not out of the other side of a wall.
@@ -36,10 +36,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class ContactSurface:
-    """The surface of a shape as K nodes in L leaves, and these in C clumps: what lies together is asked together.
+    """The surface of a shape as K nodes in L leaves, and these in C clumps: neighbours are searched together.
 
-    Leaves and clumps have balls that hold the surface around their nodes, not the nodes alone: what is farther from a
-    ball than a contact may be cannot touch, whatever the shape and however few its nodes are.
+    Leaves and clumps have balls that hold the surface around their nodes, not the nodes alone: a body that is farther
+    from a ball than a contact may be cannot touch, whatever the shape and however few its nodes are.
     """
 
     node: np.ndarray  # [K, 3] m, leaf by leaf
@@ -61,7 +61,7 @@ NO_LABELS = {"label": np.zeros((0, 0, 0), np.int16), "label_low": np.zeros(3), "
 
 @dataclass(frozen=True, eq=False)
 class ContactGeometry:
-    """Of one shape, of which it has the fields; each part is made when it is first asked for."""
+    """What contacts need of one shape; each part is made on first use."""
 
     sdf: Sdf
     nodes: np.ndarray
@@ -70,7 +70,7 @@ class ContactGeometry:
 
     @cached_property
     def grid(self) -> BakedGrid | None:
-        """The distance for where there is no closed form. A wall too thin for it is warned of."""
+        """The baked distance of a shape without a closed form. A wall that is too thin for it gives a warning."""
         if isinstance(self.sdf, ClosedForm):
             return None
         grid = baked(self.sdf, self.nodes, self.pieces)
@@ -81,8 +81,8 @@ class ContactGeometry:
 
     @cached_property
     def solids(self) -> tuple[ConvexPiece, ...]:
-        """What the shape collides as: its convex pieces, its closed form, or its own hull; nothing for a plane, and for
-        what is none of these."""
+        """What the shape collides as: its convex pieces, its closed form, or its own hull; empty for a plane, and for a
+        shape that is not convex and has no pieces."""
         if self.pieces:
             return tuple(hull(piece) for piece in self.pieces)
         if isinstance(self.sdf, ClosedForm):
@@ -159,8 +159,8 @@ def patches_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> dic
 def check_pieces(what: str, pieces: Sequence[np.ndarray]) -> None:
     """Raises SdfsimError, which says `what` has them, for more than `MOST_PATCHES` convex pieces."""
     if len(pieces) > MOST_PATCHES:
-        told = f"{what} is made of {len(pieces):,} convex pieces (at most {MOST_PATCHES:,})"
-        raise SdfsimError(told, "cut it into fewer ones, or fit its mesh without pieces")
+        message = f"{what} is made of {len(pieces):,} convex pieces (at most {MOST_PATCHES:,})"
+        raise SdfsimError(message, "cut it into fewer ones, or fit its mesh without pieces")
 
 
 def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sa
 if TYPE_CHECKING:
     import torch
 
-# m, sizes of meshes that need no word; without known units the largest is less, for few things that move are larger.
+# m, sizes of meshes that need no remark; without known units the largest is less, for few moving things are larger.
 USUAL, LARGE = (1e-3, 100.0), 5.0
 # Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
 OWN_SHARE, EDGE_SHARE = 0.6, 0.85
@@ -142,9 +142,9 @@ def shape_from_mesh(
     """The shape of a mesh file: made on first use, then taken from a cache (by default `sdfsim/shapes` in the user's
     cache folder) keyed by what the file describes.
 
-    `units` are metres per unit of the file (None: metres, with a doubt), `thicken` m is a thickness for an open sheet;
-    of `sdf`, "mlp" fits the network, "grid" and "mesh" fit nothing (see `mesh_shape`). `source["notes"]` lists what was
-    done to the mesh, and what `remarks` there are. Raises SdfsimError where the mesh cannot be used.
+    `units` are metres per unit of the file (None: unknown, taken as metres), `thicken` m is a thickness for an open
+    sheet. With `sdf` "mlp" the network is fitted; "grid" and "mesh" need no fit (see `mesh_shape`). `source["notes"]`
+    lists what was done to the mesh, and `remarks`. Raises SdfsimError where the mesh cannot be used.
     """
     path = Path(path)
     mesh = load_mesh(path)
@@ -159,9 +159,8 @@ def shape_from_mesh(
 
 
 def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
-    """Notes on a mesh file as it was read, a line each: that glTF was turned; and its size, where that is odd
-    for the `units` (metres per unit) that are taken for its numbers. Many parts are drawn in millimetres, and few
-    files state it."""
+    """Notes on a mesh file, a line each: that glTF was turned; and its size, where that is unusual in the `units`
+    (metres per unit). Many parts are drawn in millimetres, and few files state it."""
     notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
     size = units * float(np.ptp(mesh.vertices, axis=0).max())
     if not given and size > LARGE:

@@ -74,12 +74,12 @@ class Shape:
 
     @property
     def shown(self) -> Mesh:
-        """What to draw."""
+        """The mesh to draw."""
         return self.mesh if self.skin is None else self.skin
 
     @cached_property
     def contact(self) -> ContactGeometry:
-        """What contacts ask of it."""
+        """What contacts need of it."""
         return ContactGeometry(self.sdf, self.nodes, self.pieces, self.mesh)
 
     def save(self, folder: str | Path) -> Path:

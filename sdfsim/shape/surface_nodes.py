@@ -18,7 +18,7 @@ PROJECTIONS = 3
 DEFAULT_GRID = 24
 DEFAULT_COUNT = 512  # what the bundled model was trained with; docs/tradeoff.md has what fewer cost
 DIRECTIONS = 1000  # in which nodes are to reach as far as the surface
-CHUNK = 10_000  # points looked at together
+CHUNK = 10_000  # points in one product
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
 

@@ -1,1 +1,1 @@
-"""A scene and a model become a motion: the step, and the runs that repeat it."""
+"""A scene and a model become a motion: steps, and the runs that repeat them."""

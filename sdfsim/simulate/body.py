@@ -18,7 +18,7 @@ Numbers = Sequence[float] | np.ndarray
 
 
 class LiveScene:
-    """A scene in motion, in model units. It notes which bodies somebody changes, for the stepper to be told."""
+    """A scene in motion, in model units. It records which bodies the user changes, to announce them to the stepper."""
 
     scene: Scene
     units: Units
@@ -67,8 +67,7 @@ class ContactPoint:
 
 
 class BodyHandle:
-    """One body of a simulator, by its `name`: read it, set it, push and pull it. What is set counts from the next step
-    on."""
+    """One body of a simulator, by its `name`: read it, set it, push and pull it. Changes act from the next step on."""
 
     __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
 
@@ -129,7 +128,7 @@ class BodyHandle:
 
     @property
     def asleep(self) -> bool:
-        """Whether it rests and is left out until something disturbs it."""
+        """Whether it sleeps: it rests, and costs nothing until something disturbs it."""
         touch = self._simulator.state.touch
         return touch is not None and bool(touch.island[self._row] >= 0)
 

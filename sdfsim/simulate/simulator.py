@@ -72,7 +72,7 @@ class Simulator(LiveScene):
 
     Raises:
         SdfsimError: no such model or device, an invalid time step, a body that moves without mass or without nodes
-            that tell how it turns, one that is too large, too far away or too fast.
+            enough to define its rotation, one that is too large, too far away or too fast.
     """
 
     def __init__(
@@ -188,19 +188,19 @@ class Simulator(LiveScene):
 
     @property
     def carry(self) -> Carry:
-        """What the stepper keeps of this run, made when first asked for."""
+        """What the stepper keeps of this run, made on first use."""
         if self._carry is None:
             self._carry = self.stepper.init(self.bodies, self._state, self._options)
             self._carry.checked = True
         return self._carry
 
     def reset(self) -> None:
-        """Go back to the start of the scene."""
+        """Return to the start of the scene."""
         self.restore(self._start)
 
     def restore(self, state: State) -> None:
         """Go on from a state that steps have led to, here or in another simulator of the same scene, as they would have
-        gone on there: to the last bit, and what slept sleeps on. One that somebody has changed is for `state`. Raises
+        gone on there: to the last bit, and what slept sleeps on. For a state that you have changed set `state`. Raises
         SdfsimError for a state that cannot be."""
         if broken := first_fault(state, self._options.dt):
             raise SdfsimError(self._described(broken))
@@ -213,16 +213,16 @@ class Simulator(LiveScene):
     def __getitem__(self, name: str) -> BodyHandle:
         """A body by its name. Raises SdfsimError where there is none of that name."""
         if name not in self._names:
-            told = nearest(name, self._names)
-            raise SdfsimError(f"there is no body {name!r}{told}", f"there are {', '.join(self._names[:20])}")
+            close = nearest(name, self._names)
+            raise SdfsimError(f"there is no body {name!r}{close}", f"there are {', '.join(self._names[:20])}")
         return BodyHandle(self, self._names.index(name))
 
     def contact_points(self) -> list[ContactPoint]:
         """Where bodies touch in the present state, as the last step of the contact solve has left it. Raises
-        SdfsimError for networks on surface nodes, which know no impulses."""
+        SdfsimError for networks on surface nodes, which have no impulses."""
         if not self.stepper.forces:
             raise SdfsimError(
-                "networks on surface nodes tell no impulses", "take the solver, or a network on top of it"
+                "networks on surface nodes report no impulses", "take the solver, or a network on top of it"
             )
         from sdfsim.physics.solver.prepare import contact_points
 
@@ -275,7 +275,7 @@ class Simulator(LiveScene):
         return max(1, round(seconds / self.dt)) if seconds else 0
 
     def initial_rollout(self) -> Rollout:
-        """The present state as a rollout of one frame; raises as `steps` does."""
+        """The current state as a rollout of one frame; raises as `steps` does."""
         self._accept()
         state, (points, pairs, depth) = self._state, self.stepper.touching(self._state, self._carry)
         counts = dict.fromkeys((*COUNTS, *PHASES), 0.0) if self._carry is None else self._carry.counts
@@ -291,7 +291,7 @@ class Simulator(LiveScene):
         return self._rollout(frames, 0.0)
 
     def si_state(self) -> State:
-        """The present state in metres and seconds: motion and time alone."""
+        """Motion and time of the current state, in metres and seconds."""
         u, state = self.units, self.state
         units = dict(zip(MOTION, (u.length, 1.0, u.velocity, 1.0 / u.time), strict=True))
 
@@ -320,8 +320,8 @@ class Simulator(LiveScene):
             raise self._broke(self._described(carry.fault), carry.frames if keep else None)
 
     def _accept(self, *, keep: bool = False) -> None:
-        """What came from outside is looked at before anything is computed from it, and the stepper is told. Raises
-        SimulationError where it cannot be, with no frame where somebody does `keep` those before."""
+        """Check what the user has changed before anything is computed from it, and announce it to the stepper. Raises
+        SimulationError for a state that cannot be; its rollout has no frame if the caller does `keep` those before."""
         if not (self._handed or self._changed):
             return
         state, good, changed = self._state, self._good, np.zeros(len(self.bodies), bool)
@@ -348,9 +348,9 @@ class Simulator(LiveScene):
     def _broke(self, what: str, frames: Frames | None = None) -> SimulationError:
         """The error, with the `frames` up to the last good state, or that state alone."""
         last = f"the last good state is that of step {self.steps_done}, t = {self.steps_done * self.dt:.4g} s"
-        told = f"step {self.steps_done + 1}: {what}; {last}"
+        message = f"step {self.steps_done + 1}: {what}; {last}"
         known = self.initial_rollout() if frames is None else self._rollout(frames, 0.0)
-        return SimulationError(told, known)
+        return SimulationError(message, known)
 
     def _rollout(self, frames: Frames, milliseconds: float) -> Rollout:
         """Frames up to the present step in SI units, each of which took so many milliseconds."""
@@ -407,8 +407,8 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
         if body.motion != "dynamic" and name in ("velocity", "angular_velocity", "mass"):
             raise SdfsimError(f"variant: body {body.name!r}: is {body.motion}, so it has no {name}")
         if body.path is not None and name in ("position", "quat_xyzw"):
-            told = f"variant: body {body.name!r}: is on a path, so its {name} cannot be changed"
-            raise SdfsimError(told, "change the path in the scene")
+            message = f"variant: body {body.name!r}: is on a path, so its {name} cannot be changed"
+            raise SdfsimError(message, "change the path in the scene")
         new[name] = value if count else float(value)
     if "quat_xyzw" in new:
         new["quat_xyzw"] = new["quat_xyzw"] / max(np.linalg.norm(new["quat_xyzw"]), 1e-300)

@@ -1,9 +1,9 @@
 """What takes a state to the next one: free flight alone, the contact solve, and the networks, all by one contract.
 
 `stepper_of` makes a stepper of a model. `init` gives a `Carry` for the bodies and the start of a run, `advance` makes
-one step or many in one call, and `announce` reports what somebody has changed between steps. Each stage sees only what
-is in play: an effect that is off is not computed, a body without contact is not in a network's graph, and what sleeps
-is not looked at until something moves beside it.
+one step or many in one call, and `announce` reports what the user has changed between steps. Each stage sees only what
+is in play: an effect that is off is not computed, a body without contact is not in a network's graph, and a body that
+sleeps costs nothing until something moves beside it.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ class Carry:
     fault: Fault | None = None  # of the state after these, where that cannot be
     given: float = 0.0  # model energy that pulls have given in these
     frames: Frames | None = None  # of these, where they were asked for
-    scene: Compiled | None = None  # as compiled code wants it, where any is asked
-    # weights: likewise of a network on the solve; tensors: the bodies as one on surface nodes wants them. Both are made
-    # of the options too.
+    scene: Compiled | None = None  # the bodies for compiled code, if the stepper calls any
+    # Weights of a network on the solve, for compiled code; the bodies as tensors, for a network on surface nodes. Both
+    # also depend on the options.
     weights: Weights | None = None
     tensors: BodyTensors | None = None
     edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
@@ -108,19 +108,19 @@ class Carry:
 
 @dataclass(frozen=True)
 class Stepper:
-    """The contract; free flight of all bodies is what it does by itself."""
+    """The contract of all steppers. This class alone lets all bodies fly freely."""
 
     model: Model
     mean: bool = False  # whether model units follow the mean size of the bodies that move, not the smallest
 
     on_surfaces: ClassVar[bool] = False  # whether it works on surface nodes: on CUDA too, in steps of its own length
-    forces: ClassVar[bool] = True  # whether it knows forces that pull at bodies, and tells impulses of contacts
+    forces: ClassVar[bool] = True  # whether bodies can be pulled, and contacts report impulses
     sleeps: ClassVar[bool] = False  # whether it freezes what rests
-    network: ClassVar[bool] = False  # whether one has its say in it
+    network: ClassVar[bool] = False  # whether a network takes part
 
     @property
     def distances(self) -> bool:
-        """Whether it asks the compiled distances of a scene."""
+        """Whether it uses the compiled distances of a scene."""
         return False
 
     def units(self, scene: Scene, dt: float | None = None) -> Units:
@@ -133,19 +133,19 @@ class Stepper:
         return shape
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
-        """One line for everything in scenes that is beyond what it was trained or checked with."""
+        """A line for each way in which scenes go beyond what it was trained or checked on."""
         return outside_training(scenes, self.model, units)
 
     def distrusted(self) -> Stepper:
-        """As it steps scenes that are beyond its training."""
+        """The stepper for scenes that are beyond its training."""
         return self
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
-        """A state that no step has led to, with what the first one needs."""
+        """A start state, completed with what the first step needs."""
         return state
 
     def init(self, bodies: Bodies, state: State, options: Options) -> Carry:
-        """What it keeps of a run that starts from `state`."""
+        """The carry of a run that starts from `state`."""
         if not self.distances:
             return Carry(bodies, options)
         from sdfsim.physics.solver.prepare import Compiled
@@ -153,16 +153,16 @@ class Stepper:
         return Carry(bodies, options, scene=Compiled(bodies, state))
 
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
-        """The state after somebody has changed pose, velocities or load of the bodies `changed` [N] bool, or gravity.
-        What was made of scenery is made anew where it is one of these."""
+        """The state after the user has changed pose, velocities or load of the bodies `changed` [N] bool, or gravity.
+        Data that is precomputed from static bodies is made again if one of them has changed."""
         scene = carry.scene
         if scene is not None and (changed & ~(scene.world.moves | scene.world.scripted)).any():
             scene.place(state)
         return state
 
     def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
-        """Make `n` steps, fewer where the state after one cannot be and the carry is `checked`; `keep` their frames.
-        The counts of the carry are then those of the last one that is kept."""
+        """Make `n` steps, and `keep` their frames. A `checked` carry ends them at the first state that cannot be. The
+        counts of the carry are those of the last step that is kept."""
         bodies, dt, frames = carry.bodies, carry.options.dt, []
         carry.done, carry.fault, carry.given, carry.frames = 0, None, 0.0, None
         for _ in range(n):
@@ -202,7 +202,7 @@ class Solver(Stepper):
     sleeps = True
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
-        """It has seen no training: it says where its inner step is longer than any that its laws were checked with."""
+        """It has no training: a line if its inner step is longer than any that its laws were checked with."""
         inner = self.model.dt * units.time / (self.model.inner or SUBSTEPS)
         if inner <= LONGEST:
             return []
@@ -308,11 +308,11 @@ class OnSurfaces(Stepper):
         return with_history(state, bodies, options)
 
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
-        """Bodies that were changed have come from where their velocities lead from."""
+        """The earlier positions of bodies that were changed follow from their velocities."""
         return with_history(super().announce(state, carry, changed), carry.bodies, carry.options, changed)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
-        """The edges were found at the start of the step; their points are told where `state` has the bodies."""
+        """The edges were found at the start of the step; their points are given for the poses of `state`."""
         if carry is None or carry.near is None or not len(near := carry.near):
             return super().touching(state, carry)
         from sdfsim.learned.near import where
@@ -375,7 +375,7 @@ class OnSurfaces(Stepper):
 
 
 def _given(before: State, after: State, dt: float) -> float:
-    """What the forces and torques that pull at bodies have given them in a step."""
+    """The work of pulling forces and torques in a step."""
     if before.load is None:
         return 0.0
     force, torque = before.load[:, :3], before.load[:, 3:]

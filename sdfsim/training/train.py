@@ -129,7 +129,7 @@ def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progre
                 if run.team.leads and due:  # a step's line in the log is part of it
                     entry = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss}
                     entry |= {"rate": run.plan.rate * run.share(), "held_out_loss": held_out_loss(run, held_out)}
-                    with open(out / "log.jsonl", "a") as log:
+                    with open(out / "log.jsonl", "a", encoding="utf-8") as log:
                         log.write(json.dumps(entry) + "\n")
             if not run.team.leads:
                 continue

@@ -15,9 +15,13 @@ import cli
 from sdfsim import load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
+from sdfsim.apps.recording import save_rollout
+from sdfsim.apps.recording_joints import ends, marks
 from sdfsim.base.errors import SdfsimError
+from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Joint, Scene
+from tests.helpers.runs import read
 
 LINK = """
   <link name="{name}">
@@ -481,3 +485,57 @@ def test_the_command_imports(tmp_path: Path) -> None:
     run = CliRunner().invoke(cli.app, ["import", str(file), "-o", str(tmp_path / "scene.yaml"), "--fixed", "--json"])
     assert run.exit_code == 0, run.output
     assert load_scene(tmp_path / "scene.yaml").bodies[0].motion == "static"
+
+
+def in_world(scene: Scene, body: int, points: np.ndarray) -> np.ndarray:
+    """Points from a body's centre of mass in its axes, in the world at the start."""
+    if body < 0:
+        return points
+    one = scene.bodies[body]
+    turn = Rotation.from_quat(one.quat_xyzw)
+    return one.position + turn.apply(points + one.scale * scene.shapes[one.shape].com)
+
+
+def test_recordings_show_axes_and_limits_where_they_are(tmp_path: Path) -> None:
+    scene = jointed().load()
+    by_name = {joint.name: joint for joint in scene.joints}
+    hinge = marks(scene, by_name["shoulder"])
+    axis, arc, needle = (in_world(scene, m.body, m.strips[0]) for m in hinge)
+    along = np.array([0, 1, 0.1]) / np.linalg.norm([0, 1, 0.1])
+    anchor = np.array([0.15, 0, 0.85])
+    assert (axis[1] - axis[0]) / np.linalg.norm(axis[1] - axis[0]) == pytest.approx(along)
+    assert axis.mean(0) == pytest.approx(anchor)
+    # The arc goes from the lower limit to the upper one, and the needle is at 20 of -30 to 70 degrees.
+    points = arc[1:-1] - anchor
+    turn = Rotation.from_rotvec(along * math.radians(50)).apply(points[0]) / np.linalg.norm(points[0])
+    assert turn == pytest.approx((needle[1] - needle[0]) / np.linalg.norm(needle[1] - needle[0]))
+    assert Rotation.from_rotvec(along * math.radians(100)).apply(points[0]) == pytest.approx(points[-1])
+    slider = marks(scene, by_name["track"])
+    way = in_world(scene, slider[0].body, slider[0].strips[0])
+    assert way == pytest.approx(np.array([[-0.6, 2, 0.3], [0.9, 2, 0.3]]))  # it starts at 0.1 of -0.5 to 1
+    place = np.array([[body.position for body in scene.bodies]])
+    turns = np.array([[body.quat_xyzw for body in scene.bodies]])
+    assert ends([by_name["string"]], place, turns, scene)[0, 0] == pytest.approx(
+        np.array([[1.4, 0.3, 1.4], [1.4, 0.3, 0.4]])
+    )
+
+
+def test_a_recording_has_a_line_for_each_joint(tmp_path: Path) -> None:
+    scene = jointed().load()
+    shape = (3, len(scene.bodies))
+    still = Rollout(
+        time=np.arange(3) * 0.1,
+        position=np.tile([b.position for b in scene.bodies], (3, 1, 1)),
+        orientation=np.tile([b.quat_xyzw for b in scene.bodies], (3, 1, 1)),
+        velocity=np.zeros((*shape, 3)),
+        angular_velocity=np.zeros((*shape, 3)),
+        contact_count=np.zeros(3, np.int64),
+        contact_point=np.zeros((0, 3)),
+        contact_body=np.zeros((0, 2), np.int64),
+        names=tuple(b.name for b in scene.bodies),
+    )
+    save_rollout(scene, still, tmp_path / "rollout.rrd")
+    entities = set(read(tmp_path / "rollout.rrd"))
+    told = " ".join(sorted(map(str, entities)))
+    for joint in scene.joints:
+        assert f"joint\\ {joint.name}" in told, told

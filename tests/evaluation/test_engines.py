@@ -15,7 +15,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import bullet, mujoco, shape_urdf, start_of_scene
-from sdfsim.evaluation.stress import TEACHER, by_engine
+from sdfsim.evaluation.runs import by_engine
 from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
@@ -64,7 +64,7 @@ def test_engines_fly_freely_and_rest(tmp_path, run, package, substeps):
 
 def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
     scene = hard_cases.tossed((3,))
-    motion = by_engine(TEACHER, bullet, scene, tmp_path, 0.04).motion
+    motion = by_engine(scene, 0.04, bullet, tmp_path).motion
     bodies = scene.bodies[:-1]
     assert motion.position.shape == (3, len(bodies), 3)
     np.testing.assert_allclose(motion.position[0], [b.position for b in bodies], atol=1e-12)

@@ -22,14 +22,14 @@ from benchmarks.everyday import (
     in_parts,
     is_installed,
     judged,
-    moved,
     runner,
     table,
     unknown_to,
 )
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import engines, everyday
-from sdfsim.evaluation.everyday import UNIT, Check, G, Put, Setting, about, fixed, floor, of_mesh, run, solid
+from sdfsim.evaluation.everyday import UNIT, Check, G, Put, Setting, about, fixed, floor, run, solid
+from sdfsim.evaluation.runs import by_model, still
 from sdfsim.scene.scene import Scene
 
 FAST = ["PyBullet", "MuJoCo"]
@@ -43,9 +43,9 @@ def scene_of(*bodies: Put) -> Scene:
 
     def kept(scene: Scene, seconds: float):
         seen.append(scene)
-        return bench.still(scene, seconds), ""
+        return still(scene, seconds)
 
-    run(Setting(by=kept), bodies, 0.1)
+    run(Setting(by=kept), "", bodies, 0.1)
     return seen[0]
 
 
@@ -53,7 +53,7 @@ def scene_of(*bodies: Put) -> Scene:
 @pytest.mark.parametrize(("size", "yaw"), [(0.1, 0.0), (0.02, 37.0), (1.0, 121.0)])
 def test_a_thrown_body_flies_and_turns(tmp_path, name, size, yaw):
     put = Put("it", CUBE, [1, 2, 50], v=[1, 0, 2], w=[0, 0, 3])
-    ran = run(Setting(size, yaw, by=runner(name, tmp_path)), [put, floor()], 0.4)
+    ran = run(Setting(size, yaw, by=runner(name, tmp_path)), "it", [put, floor()], 0.4)
     t = ran.seconds[-1]
     assert t == pytest.approx(0.4, abs=0.02)
     # An inner step of 1.3 ms at 10 cm puts the fall off by at most g t / 2 of it.
@@ -71,7 +71,7 @@ def test_a_thrown_body_flies_and_turns(tmp_path, name, size, yaw):
 @pytest.mark.parametrize("mu", [0.3, 0.5])
 def test_friction_is_the_product_on_floors_and_on_static_bodies(tmp_path, name, ground, mu):
     slab = Put("it", solid("analytic", "box", 2, 2, 0.3), [0, 0, 0.15], v=[1.5, 0, 0], mu=mu)
-    ran = run(Setting(by=runner(name, tmp_path)), [slab, ground], 1.0)
+    ran = run(Setting(by=runner(name, tmp_path)), "it", [slab, ground], 1.0)
     assert ran.place("it")[-1, 0] == pytest.approx(1.5**2 / (2 * mu * G) / UNIT, rel=0.03)
 
 
@@ -81,7 +81,7 @@ def test_restitution_is_the_product_on_floors_and_on_static_bodies(tmp_path, nam
     ball, box = Put("it", BALL, [0, 0, 1.5], e=e), fixed("box", solid("analytic", "box", 10, 10, 1), [0, 0, -0.5])
 
     def rebound(ground: Put) -> float:
-        return float(run(Setting(by=runner(name, tmp_path)), [ball, ground], 0.3).v("it")[:, 2].max())
+        return float(run(Setting(by=runner(name, tmp_path)), "it", [ball, ground], 0.3).v("it")[:, 2].max())
 
     assert rebound(box) == pytest.approx(rebound(floor()), rel=0.02)
     assert rebound(box) == pytest.approx(e * (2 * G * 1.0 * UNIT) ** 0.5, rel=0.15)
@@ -96,7 +96,7 @@ def test_cylinders_and_capsules_are_round(tmp_path, name):
         if k2 is None:
             k2 = shape.inertia[2, 2] / shape.volume / radius**2
         put = Put("it", shape, [0, 0, radius], about("x", 90), mu=1.0)
-        ran = run(Setting(by=runner(name, tmp_path)), [put, floor()], 1.0, tilt=slope)
+        ran = run(Setting(by=runner(name, tmp_path)), "it", [put, floor()], 1.0, tilt=slope)
         wanted = 0.5 * G * sin(radians(slope)) / (1 + k2) * ran.seconds[-1] ** 2 / UNIT
         assert ran.place("it")[-1, 0] == pytest.approx(wanted, rel=0.03)
         assert ran.place("it")[:, 2] == pytest.approx(radius, abs=0.005)
@@ -109,12 +109,12 @@ def test_cylinders_and_capsules_are_as_long_as_they_are(tmp_path, name, form):
     shape, wall = solid("analytic", form, 0.5, 2.0), solid("analytic", "box", 4, 4, 1)
     walls = [fixed(f"wall {side}", wall, [0, 0, side * 1.52]) for side in (-1, 1)]
     put = Put("it", shape, [0, 0, 0], v=[0, 0, 0.1], mu=0.0)
-    ran = run(Setting(by=runner(name, tmp_path)), [put, *walls], 0.1, gravity=0.0)
+    ran = run(Setting(by=runner(name, tmp_path)), "it", [put, *walls], 0.1, gravity=0.0)
     assert ran.place("it")[:, 2].max() == pytest.approx(0.02, abs=0.003)
 
 
 def test_a_convex_mesh_is_its_own_piece(tmp_path):
-    ball, box = of_mesh("mesh", "ball", 0.5, 3), fixed("box", solid("analytic", "box", 4, 4, 1), [0, 0, 0])
+    ball, box = solid("mesh", "ball", 0.5, 3), fixed("box", solid("analytic", "box", 4, 4, 1), [0, 0, 0])
     (piece,) = in_parts(scene_of(Put("it", ball, [0, 0, 2]), box), tmp_path).shapes[0].pieces
     assert len(piece) == len(ball.mesh.vertices)
     assert np.linalg.norm(piece, axis=1) == pytest.approx(0.5, abs=1e-3)
@@ -139,13 +139,13 @@ def test_bodies_on_a_path_and_tilted_planes_are_not_run_with_their_reason(tmp_pa
     tilted = replace(scene.bodies[2], quat_xyzw=about("x", 10).as_quat())
     for bodies in ((scene.bodies[0], led), (scene.bodies[0], tilted)):
         with pytest.raises(NotRun, match="level plane"):
-            moved(name, replace(scene, bodies=bodies), 0.1, tmp_path)
+            runner(name, tmp_path)(replace(scene, bodies=bodies), 0.1)
 
 
 def row_of_three(at: Setting) -> Iterator[Check]:
     """A cube that falls for 0.2 s: as it does, twice as fast, and with an absurd one between."""
     for e, times in ((0.0, 1.0), (0.5, 1.0), (0.0, 2.0)):
-        ran = run(at, [Put("it", CUBE, [0, 0, 50], e=e), floor()], 0.2)
+        ran = run(at, "it", [Put("it", CUBE, [0, 0, 50], e=e), floor()], 0.2)
         wanted = 50 - times * 0.5 * G * ran.seconds[-1] ** 2 / UNIT
         yield everyday.near(f"e = {e:g}, {times:g} times", ran.place("it")[-1, 2], wanted, 0.0, "sizes", 0.05)
         yield everyday.most(f"e = {e:g}, {times:g} times: spin", np.abs(ran.w("it")).max(), 1e-9)
@@ -166,7 +166,7 @@ def test_checks_of_a_scene_that_is_not_run_do_not_count_and_others_do(three):
     def bounceless(scene: Scene, seconds: float):
         if scene.bodies[0].restitution:
             raise NotRun("restitution")
-        return bench.solved(scene, seconds)
+        return by_model(scene, seconds)
 
     why = [(why, check.holds) for _, check, why, _ in judged("row", Setting(), bounceless)]
     assert [one for one, _ in why] == ["", "", "restitution", "restitution", "", ""]

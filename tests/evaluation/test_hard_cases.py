@@ -11,15 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import Simulator
 from sdfsim.evaluation import hard_cases
-from sdfsim.evaluation.engines import rollout_motion, start_motion
-from sdfsim.evaluation.hard_cases import Trial, cases
+from sdfsim.evaluation.engines import start_motion
+from sdfsim.evaluation.hard_cases import cases
 from sdfsim.evaluation.penetration import depths
+from sdfsim.evaluation.runs import Ran, scene_rollout
 from sdfsim.scene.scene import Body, Effects, Scene
 
 DT = 0.01
 
 
-def motion(scene: Scene, steps: int, moved=None, velocity=None) -> Trial:
+def motion(scene: Scene, steps: int, moved=None, velocity=None) -> Ran:
     """A run in which body k is displaced by `moved`[k] [T+1, 3] m and has `velocity`[k]; all others are still."""
     start = start_motion(scene)
     place, turn = (np.repeat(values, steps + 1, axis=0) for values in (start.position, start.orientation))
@@ -29,7 +30,7 @@ def motion(scene: Scene, steps: int, moved=None, velocity=None) -> Trial:
     for k, values in (velocity or {}).items():
         speed[:, k] = values
     found = {"position": place, "orientation": turn, "velocity": speed, "angular_velocity": np.zeros_like(place)}
-    return Trial(scene, replace(start, **found, dt=DT))
+    return Ran(scene, scene_rollout(scene, replace(start, **found, dt=DT)))
 
 
 def line(steps: int, x=0.0, y=0.0, z=0.0) -> np.ndarray:
@@ -40,7 +41,7 @@ def line(steps: int, x=0.0, y=0.0, z=0.0) -> np.ndarray:
 def test_energy_is_what_the_simulator_counts():
     scene = replace(hard_cases.tossed((5,)), effects=Effects(contact="off"))
     rollout = Simulator(scene).run(steps=5)
-    course = hard_cases.energy(rollout_motion(scene, rollout))
+    course = hard_cases.energy(Ran(scene, rollout).motion)
     counted = rollout.counters["kinetic_energy"] + rollout.counters["potential_energy"]
     np.testing.assert_allclose(course, counted, rtol=1e-9)
     np.testing.assert_allclose(course, course[0], rtol=1e-6)
@@ -77,13 +78,13 @@ def test_what_has_sunk_has_fallen_and_the_others_shift():
 def test_penetration_is_the_overlap_of_two_cubes_and_of_one_with_the_floor():
     scene = hard_cases.tower(2)
     rollout = motion(scene, 20, {1: line(20, z=-0.1)})
-    assert depths(scene, rollout.motion, every=20) == pytest.approx([0.1])
+    assert depths(rollout, every=20) == pytest.approx([0.1])
     found = hard_cases.squeezed([rollout])
     assert found["worst depth"] == pytest.approx(10.0) and found["fallen"] == 0.0
     sunk = hard_cases.on_floor([hard_cases.box(1.0)], [hard_cases.body("sunk", 0, [0, 0, 0])])
-    assert depths(sunk, motion(sunk, 5).motion, every=5) == pytest.approx([0.5])
+    assert depths(motion(sunk, 5), every=5) == pytest.approx([0.5])
     apart = hard_cases.overlapping(hard_cases.ball(), hard_cases.ball(), 1.2)
-    assert (depths(apart, motion(apart, 5).motion, every=5) == 0).all()
+    assert (depths(motion(apart, 5), every=5) == 0).all()
 
 
 def test_separation_gives_the_fastest_speed_and_what_is_left():

@@ -37,7 +37,7 @@ USABLE = {
     "walls_lost": 3.7e-2,
 }
 SIGN_FROM = 0.002
-WALL_FROM = 1e-5  # thinner walls are none
+WALL_FROM = 1e-5  # thinner walls do not count
 # Of half its thickness: how deep the middle of a wall is at least, whose sides make at most 26 degrees.
 PARALLEL = 0.9
 FAR_FROM = 0.1

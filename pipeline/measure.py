@@ -1,0 +1,62 @@
+"""A page on which clicks into photos become the options that name places: a known distance, and bodies."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from pipeline.inputs.captures import spread, unpack
+from pipeline.inputs.photos import pictures
+from pipeline.inputs.sources import find_source
+from pipeline.progress import Progress, quiet
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import check_writable, write_text
+
+SIDE = 1280  # px, the longer side of a photo on the page
+QUALITY = 82  # of JPEG: 48 photos of the bundled set are 5 MB
+PAGE = Path(__file__).with_name("measure.html")
+MARK = "__PHOTOS__"  # where the page has its photos
+
+
+def measure(given: Path | str, out: Path | str, *, on_progress: Progress = quiet) -> dict:
+    """Write one HTML file that holds the photos (what `reconstruct` takes) and needs nothing else, nor a network.
+
+    Two clicks in it give `--distance PLACE PLACE METRES`, one gives `--body NAME=PHOTO:X,Y`; pixels count in the
+    user's upright photo, whatever size it has on the page. Returns `page`, `photos` and `mib`. Raises SdfsimError where
+    `reconstruct` would refuse the photos, and where the page cannot be written.
+    """
+    given, out = Path(given), Path(out)
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise SdfsimError(f"{out}: not the name of a page", "end it in .html")
+    if out.is_dir():
+        raise SdfsimError(f"{out}: is a folder", "choose another -o")
+    check_writable(out.parent)
+    source = find_source(given)
+    with tempfile.TemporaryDirectory() as folder:
+        if source.archive is not None:
+            unpack(source.archive, Path(folder))
+            source = find_source(Path(folder), unpacked=True)
+        if source.capture:
+            source = replace(source, photos=tuple(spread(source.photos, source.frames)))
+        photos = []
+        for name, picture, _, fraction in pictures(source):
+            image = Image.fromarray(picture.pixels)
+            image.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
+            packed = io.BytesIO()
+            image.save(packed, "JPEG", quality=QUALITY)
+            width, height = picture.original
+            data = "data:image/jpeg;base64," + base64.b64encode(packed.getvalue()).decode()
+            photos.append({"name": name, "width": width, "height": height, "data": data})
+            on_progress(fraction, f"{len(photos)} photos")
+    # Nothing that a file is called can end the element in which this stands.
+    content = json.dumps({"given": str(given), "photos": photos}).replace("<", "\\u003c")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    page = PAGE.read_text(encoding="utf-8").replace(MARK, content)
+    write_text(out, page)
+    return {"page": out, "photos": len(photos), "mib": round(len(page) / 2**20, 1)}

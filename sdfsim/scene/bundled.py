@@ -1,0 +1,48 @@
+"""The sample scenes that come with the package, by name: `pile` is as good as the path of `pile.yaml`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from sdfsim.base.errors import SdfsimError, nearest
+
+
+def sample_folder() -> Path:
+    """Where the samples lie: in the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    return next(folder for folder in (package / "samples", package.parent / "samples") if folder.is_dir())
+
+
+def samples() -> dict[str, str]:
+    """What every sample scene shows, by its name: the comment in its first line."""
+    lines = {}
+    for file in sorted(sample_folder().glob("*.yaml")):
+        with file.open(encoding="utf-8") as opened:
+            lines[file.stem] = opened.readline().lstrip("# ").rstrip(" :\n")
+    return lines
+
+
+def find_scene(given: Path | str) -> Path:
+    """The scene file that is meant: a path, or the name of a sample where there is no file of that name. Raises
+    SdfsimError where it can be neither."""
+    path = Path(given)
+    if path.suffix or len(path.parts) != 1 or path.exists():
+        return path
+    known = samples()
+    if path.name not in known:
+        told = f"{path}: neither a scene file nor a sample{nearest(path.name, known)}"
+        raise SdfsimError(told, f"give a scene.yaml, or one of {', '.join(known)}")
+    return sample_folder() / f"{path.name}.yaml"
+
+
+def copy_samples(out: Path) -> Path:
+    """Copy all samples, with their shapes, photos and scripts, to a folder that is not there yet. Raises SdfsimError
+    where it is, or cannot be written."""
+    if out.exists():
+        raise SdfsimError(f"{out}: exists already, and nothing is replaced", "choose another -o")
+    try:
+        shutil.copytree(sample_folder(), out, ignore=shutil.ignore_patterns("__pycache__"))
+    except OSError as error:
+        raise SdfsimError(f"{out}: cannot be written: {error}", "choose another -o") from error
+    return out

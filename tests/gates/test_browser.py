@@ -1,0 +1,84 @@
+"""Pages in a real browser: clicks into photos become options, and a run is watched."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image, ImageDraw
+
+from pipeline.inputs.photos import prepare_photos
+from pipeline.measure import measure
+from pipeline.mesh.placement import check_distance
+from tests.helpers.browser import Browser
+
+pytestmark = pytest.mark.gate
+RED, GREEN = (255, 0, 0), (0, 255, 0)
+# Where the dots are, px of the upright photo, by the photo.
+DOTS = {"wide & big.jpg": (3010, 411), "turned.jpg": (200, 1105), "<b>it's.png": (33, 300)}
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """A large photo, one that was taken on its side, and a small one; each with a dot on grey."""
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    sizes = {"wide & big.jpg": (4000, 1500), "turned.jpg": (900, 1200), "<b>it's.png": (420, 380)}
+    for name, size in sizes.items():
+        image = Image.new("RGB", size, (120, 120, 120))
+        pen, (x, y), wide = ImageDraw.Draw(image), DOTS[name], max(size) / 100
+        pen.ellipse((x - wide, y - wide, x + wide, y + wide), fill=RED)
+        exif = Image.Exif()
+        if name == "turned.jpg":
+            image = image.transpose(Image.Transpose.ROTATE_90)
+            exif[ExifTags.Base.Orientation] = 6  # to be turned clockwise by a quarter
+        image.save(folder / name, quality=95, exif=exif)
+    return folder
+
+
+def dot(picture: Path) -> tuple[float, float]:
+    """Where the browser shows the red dot, px of its window. Marks are of another red, and lie elsewhere."""
+    pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    red = (pixels[..., 0] > 235) & (pixels[..., 1:].max(-1) < 30)
+    red[:, :180] = False  # the list of all photos
+    rows, columns = np.nonzero(red)
+    return float(columns.mean()), float(rows.mean())
+
+
+def test_clicks_give_the_options_to_paste(photos, tmp_path):
+    page = measure(photos, tmp_path / "measure.html")["page"]
+    found, _ = prepare_photos(photos, tmp_path / "prepared")
+    names = [photo.source for photo in found]
+    assert set(names) == set(DOTS)
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(page.as_uri())
+
+        def option() -> list[str]:
+            return shlex.split(browser.value("document.getElementById('option').textContent"))
+
+        def click_dot(name: str) -> None:
+            browser.value(f"document.getElementById('list').children[{names.index(name)}].click()")
+            browser.wait("document.getElementById('photo').complete")
+            browser.click(*dot(browser.picture(tmp_path / "page.png")))
+
+        assert option() == ["sdfsim", "reconstruct", str(photos), "-o", "room"]
+        browser.value("document.getElementById('metres').value = 1.25")
+        click_dot("wide & big.jpg")
+        click_dot("turned.jpg")
+        flag, first, second, metres = option()
+        assert flag == "--distance" and metres == "1.25"
+        check_distance((first, second, float(metres)), found)  # as the command checks it
+        browser.value("document.getElementById('body').click(); document.getElementById('name').value = 'cup'")
+        click_dot("<b>it's.png")
+        *_, flag, body = option()
+        assert flag == "--body" and body.startswith("cup=")
+        for text, name in ((first, "wide & big.jpg"), (second, "turned.jpg"), (body[4:], "<b>it's.png")):
+            assert text.rpartition(":")[0] == name
+            at = np.array(text.rpartition(":")[2].split(","), dtype=float)
+            long_side = max(next(photo.original for photo in found if photo.source == name))
+            assert np.abs(at - DOTS[name]).max() < 0.003 * long_side + 1
+        browser.value("document.getElementById('undo').click()")
+        assert option()[0] == "--distance" and len(option()) == 4
+        assert not browser.errors
