@@ -57,6 +57,7 @@ class World(NamedTuple):
     high: np.ndarray
     reach: np.ndarray  # [M] the highest end so far along `axis`
     axis: int  # 0, 1 or 2
+    apart: np.ndarray  # [E] int64, which bodies joints keep from touching, see `physics.joints.apart`
     # [0, 0] where there may be so many pairs that threads are worth their while, else [0]: loops on all cores take a
     # quarter of the time in which all is compiled, and are compiled for worlds of another type only.
     threads: np.ndarray = np.zeros(0)

@@ -1,0 +1,227 @@
+"""Joints of a scene as arrays in model units: what they are, what is known of them, and where they stand."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sdfsim.physics import pose
+from sdfsim.scene.scene import Joint
+
+if TYPE_CHECKING:
+    from sdfsim.physics.bodies import Units
+
+KINDS = ("hinge", "slider", "ball", "fixed", "distance")
+HINGE, SLIDER, BALL, FIXED, DISTANCE = range(5)
+# Columns of `Joints.number`: where a joint ends, how it rebounds there, what drags, pulls and drives it (0: nothing, 1:
+# to a speed, 2: to a place), how long its rod is (below 0: it has none), and what it bears.
+LOW, HIGH, BOUNCE, DAMPING, DRAG, STIFFNESS, REST, MOTOR, MOST, TIME, LENGTH, FORCE, TORQUE, NUMBERS = range(14)
+# Columns of `State.joints`: its angle, position or length, how fast that changes, what its motor aims at, whether it is
+# broken, whether nothing is known of its impulses; force and torque on the first body (at its anchor, world axes), the
+# impulses at its limit, of its motor or friction, of its spring and damping (a ball has three of both), all of the last
+# inner step; by how much its rows have to turn in an inner step so that they hold at its end; what the motor has given
+# in the step.
+COORD, SPEED, TARGET, BROKEN, FRESH, PULL, TWIST, STOP, DRIVE, SOFT, BEND, GIVEN, STATE = (
+    0, 1, 2, 3, 4, 5, 8, 11, 12, 15, 18, 24, 25,
+)  # fmt: skip
+NOTHING, TO_SPEED, TO_PLACE = range(3)  # what a motor does
+
+
+@dataclass(frozen=True)
+class Joints:
+    """J joints of N bodies; lengths, times and masses in model units."""
+
+    body: np.ndarray  # [J, 2] int64, the second -1 for the world
+    kind: np.ndarray  # [J] int64, of `KINDS`
+    anchor: np.ndarray  # [J, 2, 3] from the centres of mass, in the bodies' axes
+    axes: np.ndarray  # [J, 2, 3, 3] the axes of the joint's frames in those of the bodies, a row each
+    number: np.ndarray  # [J, NUMBERS], see the columns
+    target: np.ndarray  # [J] what motors aim at
+    collides: np.ndarray  # [J] bool, whether the two bodies may touch
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+
+def joints_of(joints: Sequence[Joint], com: np.ndarray, units: Units) -> Joints:
+    """Those of a scene; `com` [N, 3] are the centres of mass from the shapes' origins, model units."""
+    count = len(joints)
+    number, target = np.zeros((count, NUMBERS)), np.zeros(count)
+    number[:, LOW], number[:, HIGH], number[:, LENGTH] = -np.inf, np.inf, -1.0
+    force, torque = units.mass * units.acceleration, units.energy
+    for row, joint, k in zip(number, joints, range(count), strict=True):
+        turns = joint.kind in ("hinge", "ball")
+        length, effort = (1.0, torque) if turns else (units.length, force)
+        if joint.limits is not None:
+            one_sided = joint.kind in ("ball", "distance")
+            row[LOW] = -np.inf if one_sided else joint.limits[0] / length
+            row[HIGH] = joint.limits[1] / length
+        row[BOUNCE] = joint.restitution
+        row[DAMPING] = joint.damping / (effort / length * units.time)
+        row[DRAG] = joint.friction / effort
+        if joint.spring is not None:
+            row[STIFFNESS], row[REST] = joint.spring.stiffness * length / effort, joint.spring.rest / length
+        if (motor := joint.motor) is not None:
+            row[MOST], row[TIME] = motor.most / effort, motor.time / units.time
+            row[MOTOR] = TO_PLACE if motor.speed is None else TO_SPEED
+            aim = motor.position if motor.speed is None else motor.speed * units.time
+            target[k] = (aim or 0.0) / length
+        if joint.length is not None:
+            row[LENGTH] = joint.length / units.length
+        row[FORCE], row[TORQUE] = joint.breaks_force / force, joint.breaks_torque / torque
+    body = np.array([joint.bodies for joint in joints], np.int64).reshape(count, 2)
+    anchor = np.array([joint.anchor for joint in joints], np.float64).reshape(count, 2, 3) / units.length
+    anchor -= np.where(body[:, :, None] >= 0, com[body], 0.0)
+    turned = pose.to_matrix(np.array([joint.quat_xyzw for joint in joints], np.float64).reshape(-1, 4))
+    axes = np.ascontiguousarray(turned.reshape(count, 2, 3, 3).swapaxes(2, 3))
+    kind = np.array([KINDS.index(joint.kind) for joint in joints], np.int64)
+    collides = np.array([joint.collides for joint in joints], bool)
+    return Joints(body, kind, anchor, axes, number, target, collides)
+
+
+def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """[J, STATE] of joints of which nothing is known yet but where they stand."""
+    state = np.zeros((len(joints), STATE))
+    state[:, TARGET], state[:, FRESH] = joints.target, 1.0
+    # A hinge may be more than half a turn away from its zero: where it is within its limits.
+    ends = joints.number[:, LOW : HIGH + 1]
+    state[:, COORD] = np.where(np.isfinite(ends), ends, 0.0).mean(1)
+    state[:, COORD] = coordinates(joints, state[:, COORD], position, orientation)
+    return state
+
+
+def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """[J] the angle of hinges (the one nearest to `near` [J]), the position of sliders, the angle between the axes of
+    balls, the length of distances, and 0 of what is fixed, of bodies at `position` [N, 3] and `orientation` [N, 4]."""
+    if not len(joints):
+        return np.zeros(0)
+    known = joints.body >= 0
+    matrix = np.where(known[:, :, None, None], pose.to_matrix(orientation)[joints.body], np.eye(3))
+    place = np.where(known[:, :, None], position[joints.body], 0.0)
+    point = place + np.einsum("jsxy,jsy->jsx", matrix, joints.anchor)
+    axes = np.einsum("jsxy,jsky->jskx", matrix, joints.axes)
+    way = point[:, 0] - point[:, 1]
+
+    def times(k: int, m: int) -> np.ndarray:
+        return (axes[:, 0, k] * axes[:, 1, m]).sum(-1)
+
+    angle = np.arctan2(times(1, 2), times(1, 1))
+    angle += 2.0 * np.pi * np.floor((near - angle) / (2.0 * np.pi) + 0.5)
+    leaning = np.arctan2(np.linalg.norm(np.cross(axes[:, 0, 0], axes[:, 1, 0]), axis=-1), times(0, 0))
+    along, length = (axes[:, 1, 0] * way).sum(-1), np.linalg.norm(way, axis=-1)
+    return np.choose(joints.kind, [angle, along, leaning, np.zeros(len(joints)), length])
+
+
+def stored(joints: Joints, state: np.ndarray) -> float:
+    """The energy of springs."""
+    stiffness, away = joints.number[:, STIFFNESS], state[:, COORD] - joints.number[:, REST]
+    return float((0.5 * stiffness * away**2 * (state[:, BROKEN] == 0.0)).sum())
+
+
+@dataclass(frozen=True)
+class Order:
+    """In which bodies and joints are eliminated, and what that fills in; see `solver.joints.Held`."""
+
+    comp: np.ndarray
+    node: np.ndarray
+    of_body: np.ndarray
+    entry: np.ndarray
+    below: np.ndarray
+    row: np.ndarray
+    start: np.ndarray
+    target: np.ndarray
+
+
+def ordered(joints: Joints, moves: np.ndarray) -> Order:
+    """Eliminate what has the fewest neighbours first: bodies that move, and joints once one of their bodies is gone.
+    Trees are solved in a time that grows with their size, whatever their form."""
+    ends: list[list[int]] = [[int(b) for b in row if b >= 0 and moves[b]] for row in joints.body]
+    near: dict[int, set[int]] = {}
+    for j, bodies in enumerate(ends):
+        near[-1 - j] = set(bodies)
+        for b in bodies:
+            near.setdefault(b, set()).add(-1 - j)
+    comps: list[list[int]] = []
+    seen: set[int] = set()
+    for first in sorted(n for n in near if n >= 0):
+        if first in seen:
+            continue
+        seen.add(first)
+        todo, found = [first], []
+        while todo:
+            n = todo.pop()
+            found.append(n)
+            new = near[n] - seen
+            seen |= new
+            todo += sorted(new)
+        comps.append(found)
+    node: list[int] = []
+    fill: dict[int, list[int]] = {}
+    comp = [0]
+    for found in comps:
+        ready = {n for n in found if n >= 0}
+        queue = [(len(near[n]), n) for n in ready]
+        heapq.heapify(queue)
+        gone: set[int] = set()
+        while queue:
+            degree, n = heapq.heappop(queue)
+            if n in gone or degree != len(near[n]):
+                continue
+            gone.add(n)
+            node.append(n)
+            around = near[n]
+            fill[n] = list(around)
+            for m in around:
+                near[m] |= around
+                near[m] -= {n, m}
+                if n >= 0 and m < 0:
+                    ready.add(m)
+            for m in around & ready:
+                heapq.heappush(queue, (len(near[m]), m))
+        comp.append(len(node))
+    place = {n: k for k, n in enumerate(node)}
+    below, row, start, target = [0], [], [0], []
+    block: dict[tuple[int, int], int] = {}
+    for k, n in enumerate(node):
+        for r in sorted(place[m] for m in fill[n]):
+            block[r, k] = len(row)
+            row.append(r)
+        below.append(len(row))
+    for k in range(len(node)):
+        rows = row[below[k] : below[k + 1]]
+        for p, r in enumerate(rows):
+            target += [block[r, q] for q in rows[:p]] + [-1 - r]
+        start.append(len(target))
+    of_body = np.full(len(moves), -1, np.int64)
+    for n, k in place.items():
+        if n >= 0:
+            of_body[n] = k
+    entry = np.full((len(joints), 2), -1, np.int64)
+    for j, bodies in enumerate(joints.body):
+        for s, b in enumerate(bodies):
+            if b >= 0 and moves[b]:
+                pair = place[-1 - j], place[int(b)]
+                entry[j, s] = block[max(pair), min(pair)]
+
+    def whole(values: list[int]) -> np.ndarray:
+        return np.array(values, np.int64)
+
+    return Order(whole(comp), whole(node), of_body, entry, whole(below), whole(row), whole(start), whole(target))
+
+
+def apart(joints: Joints, count: int) -> np.ndarray:
+    """[N + 1 + E] int64: which bodies a body may not touch, as joints hold them: from place `apart[b]` to
+    `apart[b + 1]`; empty where there are none."""
+    pairs = [(int(a), int(b)) for a, b in joints.body[~joints.collides] if a >= 0 and b >= 0]
+    if not pairs:
+        return np.zeros(0, np.int64)
+    partners: list[list[int]] = [[] for _ in range(count)]
+    for a, b in pairs:
+        partners[a].append(b)
+        partners[b].append(a)
+    first = count + 1 + np.cumsum([0, *map(len, partners)])
+    return np.concatenate([first, [b for some in partners for b in some]]).astype(np.int64)
