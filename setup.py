@@ -1,8 +1,6 @@
 """What pyproject.toml cannot say: the samples are a folder beside the code, and in a wheel a part of it."""
 
-from setuptools import find_packages, setup
+from setuptools import find_namespace_packages, setup
 
-setup(
-    packages=[*find_packages(include=["sdfsim*", "pipeline*"]), "sdfsim.samples"],
-    package_dir={"sdfsim.samples": "samples"},
-)
+ours = find_namespace_packages(include=["sdfsim*", "pipeline*"], exclude=["*__pycache__*"])
+setup(packages=[*ours, "sdfsim.samples"], package_dir={"sdfsim.samples": "samples"})

@@ -165,13 +165,11 @@ def fit(
     from sdfsim.apps import fit as fitting
     from sdfsim.base.parallel import cluster as working_on
 
-    how = fitting.Options(options["recipe"] or "default", budget, cap, thicken, units)
-    if len(sources) == 1 and not sources[0].is_dir():
-        report = fitting.fit(sources[0], out, how, device=device, on_progress=session.progress)
-    else:
-        meshes = fitting.named_meshes(sources)
-        with working_on(cluster):
-            report = fitting.fit_many(meshes, out, how, device=device, on_progress=session.progress)
+    with working_on(cluster):
+        report = fitting.fit(
+            sources, out, recipe=options["recipe"] or "default", budget=budget, cap=cap, thicken=thicken, units=units,
+            device=device, on_progress=session.progress,
+        )  # fmt: skip
     tell_failed(session, report)
     if any("error" in shape for shape in report.get("shapes", {}).values()):
         session.exit_code = EXIT_ERROR

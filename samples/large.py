@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import run_main
 from sdfsim.base.files import write_text
+from sdfsim.geometry.primitives import bowl_radii
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape, shape_from_primitive
 from sdfsim.shape.shape import Shape, load_shape, scaled
@@ -30,8 +31,6 @@ from sdfsim.simulate.simulator import Simulator
 
 BALL = 0.52  # m, diameter
 MOST_BALLS = 512
-ROOM, PACKED = 2.0, 0.6  # a bowl's inside over the balls it is made for; how much of the space packed balls fill
-WALL = 0.12  # of the bowl primitive, relative to its outer radius
 LATTICE = 1.1  # diameters from ball to ball at the start
 GAP = 1.02  # bounding spheres from body to body at the start
 GRID = 48  # of the points that become nodes, along each side; far more than are kept
@@ -103,8 +102,7 @@ def ball_places(count: int, inner: float) -> np.ndarray:
 
 def bowl_scene(folder: Path, count: int, nodes: int | None) -> tuple[dict, int]:
     """Spheres a little above where they fit into the bowl that holds 512 of them twice."""
-    inner = BALL * (ROOM * MOST_BALLS / (4 * PACKED)) ** (1 / 3)
-    outer = inner / (1 - WALL)
+    inner, outer = bowl_radii(MOST_BALLS, BALL)
     shape_with_nodes("sphere", nodes).save(folder / "shapes/ball")
     sample_shape("bowl").save(folder / "shapes/bowl")
     rng = np.random.default_rng(SEED)

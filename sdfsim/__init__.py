@@ -6,13 +6,20 @@ The names below load their modules on first use, so that `import sdfsim` stays l
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from sdfsim.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from pipeline.stages import reconstruct
+    from sdfsim.apps.export import export
+    from sdfsim.apps.fit import fit
+    from sdfsim.apps.render import render
+    from sdfsim.apps.run import simulate
     from sdfsim.base.errors import SceneError, SdfsimError
     from sdfsim.physics.rollout import Rollout
     from sdfsim.scene.builder import SceneBuilder as Scene
@@ -28,7 +35,21 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 # Numba tells of an old TBB as it takes the next best of its threading layers, which is as good here.
 warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB version")
 
-__all__ = ["Rollout", "Scene", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
+__all__ = [
+    "Rollout",
+    "Scene",
+    "SceneError",
+    "SdfsimError",
+    "Shape",
+    "Simulator",
+    "export",
+    "fit",
+    "load_scene",
+    "load_shape",
+    "reconstruct",
+    "render",
+    "simulate",
+]
 
 _HOME = {
     "Rollout": "sdfsim.physics.rollout",
@@ -39,8 +60,28 @@ _HOME = {
     "Simulator": "sdfsim.simulate.simulator",
     "load_scene": "sdfsim.scene.load",
     "load_shape": "sdfsim.shape.shape",
+    "export": "sdfsim.apps.export",
+    "fit": "sdfsim.apps.fit",
+    "reconstruct": "pipeline.stages",
+    "render": "sdfsim.apps.render",
+    "simulate": "sdfsim.apps.run",
 }
 _THERE = {"Scene": "SceneBuilder"}  # names that differ there
+
+
+class _Package(ModuleType):
+    """A folder of the package has the name of a function, `simulate`. What is imported from it must not hide that."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 def __getattr__(name: str) -> Any:

@@ -35,9 +35,9 @@ HOPELESS = 0.5  # of all matches contradicting the poses: no focal length mends 
 # with a focal length of its own, it was up to 1.05.
 ZOOM = 1.12
 ABOUT = 1.03  # ratio of what two models leave unexplained up to which the one with fewer cameras is taken
-# Words to look photos up by, and features that each is made of: a set of hundreds of photos needs far fewer words than
-# the ready-made trees for millions.
-VOCABULARY, WORD_SAMPLES = 2048, 40
+# Features of a photo that tell which others look like it, the largest; how much nearer than the next a match of them
+# is; and matches of them from which on photos may show the same.
+LARGEST, DISTINCT, COMMON = 400, 0.8, 2
 STILL = 2.0  # px between the places of a match in two photos below which it did not move
 TURNS = 200  # pairs of photos at most that are asked for turns on the spot
 
@@ -102,29 +102,44 @@ def matches(pycolmap, job: dict, database: Path) -> None:
 
 
 def alike(pycolmap, job: dict, database: Path) -> list[tuple[str, str]]:
-    """Pairs of photos to match where all are too many: each photo with the `job["partners"]` that have most in common
-    with it. Their features are looked up among words made of these photos' own features."""
-    pycolmap.set_random_seed(job["seed"])  # whatever came before
-    words = pycolmap.VisualIndex.create(128, 64)  # numbers of a descriptor, and bits of what is kept of it
-    rng = np.random.default_rng(job["seed"])
+    """Pairs of photos to match where all are too many: each photo with the `job["partners"]` that look most like it.
+    Its largest features, which are few, are matched with theirs first (preemptive matching, Wu 2013)."""
     with pycolmap.Database.open(database) as opened:
-        images = {image.image_id: image.name for image in opened.read_all_images()}
-        found = [opened.read_descriptors(key) for key in sorted(images)]
-        each = max(1, VOCABULARY * WORD_SAMPLES // len(images))
-        some = [one.data[rng.permutation(len(one.data))[:each]] for one in found]
-        sample = pycolmap.FeatureDescriptorsFloat(type=found[0].type, data=np.concatenate(some).astype(np.float32))
-        count = min(VOCABULARY, len(sample.data) // WORD_SAMPLES)
-        if count == 0:
-            return []  # hardly a feature anywhere
-        options = pycolmap.VisualIndex.BuildOptions(
-            num_visual_words=count, num_iterations=10, num_rounds=1, num_threads=1
-        )
-        words.build(options, sample)
-        place = database.with_name("words.bin")
-        words.write(place)
-        pairing = pycolmap.VocabTreePairingOptions(num_images=job["partners"] + 1, vocab_tree_path=place)  # and itself
-        pairs = pycolmap.VocabTreePairGenerator(pairing, opened).all_pairs()
-    return sorted({(images[min(a, b)], images[max(a, b)]) for a, b in pairs if a != b})
+        images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
+        large = [
+            largest(opened.read_keypoints(image.image_id), opened.read_descriptors(image.image_id).data)
+            for image in images
+        ]
+    count = np.zeros((len(images), len(images)), int)
+    for a, first in enumerate(large):
+        for b in range(a):
+            count[a, b] = count[b, a] = in_common(first, large[b])
+    # The same for photos whose numbers are the same, whatever sorts them.
+    chosen = np.argsort(-count, axis=1, kind="stable")[:, : job["partners"]]
+    pairs = {(min(a, b), max(a, b)) for a, row in enumerate(chosen.tolist()) for b in row if count[a, b] >= COMMON}
+    return [(images[a].name, images[b].name) for a, b in sorted(pairs)]
+
+
+def largest(keypoints: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
+    """Descriptors [L, 128] float32 of unit length of the largest of some features, whose keypoints are [F, 6] (place
+    and affine shape)."""
+    area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    some = descriptors[np.argsort(-area, kind="stable")[:LARGEST]].astype(np.float32)
+    return some / np.maximum(np.linalg.norm(some, axis=1, keepdims=True), 1e-9)
+
+
+def in_common(first: np.ndarray, second: np.ndarray) -> int:
+    """How many features two photos have in common, by their descriptors [L, 128] and [M, 128] of unit length: each
+    other's nearest, and clearly nearer than the next."""
+    if min(len(first), len(second)) < 2:
+        return 0
+    cosine = first @ second.T
+    nearest, rows = cosine.argmax(1), np.arange(len(first))
+    best = cosine[rows, nearest]
+    mutual = cosine.argmax(0)[nearest] == rows
+    cosine[rows, nearest] = -1
+    angle, other = (np.arccos(np.clip(values, -1, 1)) for values in (best, cosine.max(1)))
+    return int((mutual & (angle < DISTINCT * other)).sum())
 
 
 def from_known(pycolmap, job: dict, database: Path, out: Path):
@@ -411,11 +426,18 @@ def main(job_path: str) -> None:
     matches(pycolmap, job, database)
     print("phase mapping", flush=True)
     counts, pairs = read_pairs(pycolmap, database)
-    result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
     if job["known_cameras"]:
         best, cameras = from_known(pycolmap, job, database, out), []
     else:
         best, cameras = best_mapping(pycolmap, job, database, pairs, out)
+        if len(posed_in(best)) < job["count"] and job["exhaustive_up_to"] < job["count"] <= job["all_up_to"]:
+            # What looks least alike may be what joins those that were left out to the others.
+            print("phase matches", flush=True)
+            matches(pycolmap, {**job, "exhaustive_up_to": job["count"]}, database)
+            print("phase mapping", flush=True)
+            counts, pairs = read_pairs(pycolmap, database)
+            best, cameras = best_mapping(pycolmap, job, database, pairs, out)
+    result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
     if best:
         result["views"] = views_in(best)
         result["cameras"] = cameras

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.apps import export_joints as jointed
 from sdfsim.apps.observed import COLUMNS
-from sdfsim.apps.recording import body_colors, framed, shown, with_normals
+from sdfsim.apps.recording import body_colors, framed, shown, sunk, with_normals
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, write_bytes, write_text
@@ -33,6 +33,7 @@ from sdfsim.geometry.gltf import GltfWriter, light
 from sdfsim.geometry.mesh import Mesh, convex_hull
 from sdfsim.geometry.mesh_io import wavefront
 from sdfsim.scene.builder import SceneBuilder
+from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Scene
@@ -42,6 +43,13 @@ from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 # Concavity relative to the size; and a search a third as long as CoACD's own, which finds pieces as good.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
 RATE = 60.0  # USD time codes in a second; programs step through the whole ones
+# Schemas of PhysX (Isaac Sim, ManiSkill) and Newton for distances that they sample, and the attribute that says in how
+# many cells along the longest side. None of them is part of OpenUSD.
+USD_GRIDS = {
+    "PhysxSDFMeshCollisionAPI": "physxSDFMeshCollision:sdfResolution",
+    "NewtonSDFCollisionAPI": "newton:sdfMaxResolution",
+}
+USD_CELLS = 256
 STEP = 0.001  # s, of MuJoCo
 SOFT = 4.0  # steps, over 2 pi: the time in which a contact of MuJoCo swings
 MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
@@ -50,6 +58,10 @@ MOST_GROUPS = 31  # MuJoCo's bit masks
 RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "joints", "con", "prn", "aux", "nul")
 RESERVED += tuple(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))
 XML = ElementTree.Element
+
+
+# How MuJoCo collides what is no closed form: as convex pieces, or as distances that it samples from the mesh itself.
+Collide = Literal["pieces", "sdf"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,7 @@ class Take:
     time: np.ndarray  # [T] s
     position: np.ndarray  # [T, N, 3] m, of the shapes' own origins
     quat_xyzw: np.ndarray  # [T, N, 4], the nearer of the two signs from one time to the next
+    collide: Collide = "pieces"
 
     @property
     def moving(self) -> bool:
@@ -78,6 +91,18 @@ class Take:
         """m to each side, of the sheet that is shown for a plane."""
         return 6.0 * framed(self.scene)[1]
 
+    def at_rate(self, fps: float) -> Take:
+        """The same motion at so many evenly spaced times in a second, between frames as if moved evenly."""
+        count = int(np.floor((self.time[-1] - self.time[0]) * fps + 1e-6)) + 1
+        time = self.time[0] + np.arange(count) / fps
+        after = np.clip(np.searchsorted(self.time, time), min(1, len(self.time) - 1), len(self.time) - 1)
+        before = np.maximum(after - 1, 0)
+        span = np.maximum(self.time[after] - self.time[before], 1e-12)
+        part = np.clip((time - self.time[before]) / span, 0.0, 1.0)[:, None, None]
+        place, turn = ((1.0 - part) * of[before] + part * of[after] for of in (self.position, self.quat_xyzw))
+        turn /= np.linalg.norm(turn, axis=-1, keepdims=True)
+        return replace(self, time=time, position=place, quat_xyzw=turn)
+
 
 Written = tuple[list[Path], list[str]]  # the files of an export, and what they do not hold, one line each
 
@@ -87,23 +112,37 @@ def export(
     out: Path | str,
     *,
     scene_file: Path | str | None = None,
+    fps: float | None = None,
+    collide: Collide = "pieces",
     allow_outside: bool = False,
     on_progress: StageProgress = lambda stage, fraction, message: None,
 ) -> dict[str, Any]:
-    """Write a run (folder or rollout.npz), a scene.yaml or a Shape folder in the format that the ending of `out` names
-    (see `FORMATS`); `scene_file` is of a run, None for the one that it was made from.
+    """Write a run (folder or rollout.npz), a scene.yaml, a sample by its name or a Shape folder in the format that the
+    ending of `out` names (see `FORMATS`).
 
-    Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, a
-    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
+    Args:
+        scene_file: of a run; None: the one that it was made from.
+        fps: frames of the motion in a second, evenly spaced; None: every step of the run.
+        collide: for MuJoCo, see `Collide`; "sdf" takes about thirty times as long there.
+
+    Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, an
+    option that the format has no use for, a damaged source, an extra that is not installed, a shape without convex
+    pieces, or a file that cannot be written.
     """
     source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
     kind = out.suffix.lower()
     if kind not in FORMATS:
         raise SdfsimError(f"{out}: unknown format {out.suffix or '(no ending)'}", "end it in " + " ".join(FORMATS))
+    if collide != "pieces" and FORMATS[kind] is not _mjcf:
+        raise SdfsimError(f"--collide {collide}: is for MuJoCo", "leave it out; USD has it for bodies without pieces")
+    if fps is not None and (FORMATS[kind] in (_mjcf, _urdf) or not 0.0 < fps <= 1e4):
+        told = f"--fps {fps:g}: " + ("must be above 0, at most 10,000" if fps <= 0 or fps > 1e4 else "no motion in it")
+        raise SdfsimError(told, "it goes with " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf)))
     if FORMATS[kind] is _usd:
         _extra("pxr.Usd")  # before shapes are fitted for minutes
     check_writable(out.parent)
-    take = _read(source, scene_file, allow_outside, on_progress)
+    take = replace(_read(source, scene_file, allow_outside, on_progress), collide=collide)
+    take = take if fps is None else take.at_rate(fps)
     out.parent.mkdir(parents=True, exist_ok=True)
     files, left_out = FORMATS[kind](take, out, on_progress)
     counts = {"bodies": len(take.names), "frames": len(take.time)}
@@ -124,7 +163,7 @@ def _extra(module: str) -> Any:
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
     progress = partial(on_progress, "shapes")
-    run = None
+    run, source = None, find_scene(source)
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:
@@ -274,9 +313,10 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             numbers[body.shape] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if key not in drawn:
-            material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8)
+            material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8, lit=True)
             drawn[key] = file.mesh(key, *numbers[body.shape], material)
         place, turn = take.position[:, k], take.quat_xyzw[:, k]
+        place = place - Rotation.from_quat(turn).apply([0.0, 0.0, sunk(take.scene, k)])
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
         file.nodes.append({"name": name, "mesh": drawn[key], **node})
         if take.moving and body.motion != "static":
@@ -406,10 +446,14 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
         return
     seen = _usd_mesh(stage, solid, shape.mesh)
     pieces = own_pieces(shape) if dynamic else []
-    # Engines collide moving bodies as convex pieces, and cut them themselves where there are none.
-    colliders = [(seen, "convexDecomposition" if dynamic else "none")]
+    # Engines collide what moves as distances from its surface that they sample themselves, unless it has pieces.
+    colliders = [(seen, "sdf" if dynamic else "none")]
     if pieces:
         colliders = [(_usd_mesh(stage, f"{path}/piece_{k}", piece), "convexHull") for k, piece in enumerate(pieces)]
+    elif dynamic:
+        for schema, cells in USD_GRIDS.items():
+            seen.AddAppliedSchema(schema)
+            seen.CreateAttribute(cells, _extra("pxr.Sdf").ValueTypeNames.Int).Set(USD_CELLS)
     for collider, approximation in colliders:
         if pieces:
             geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
@@ -439,11 +483,14 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 
 def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     scene, left_out = take.scene, _missing(take)
-    seen, cut = _write_assets(take, out, lambda body: True, on_progress)
+    sampled = take.collide == "sdf"
+    seen, cut = _write_assets(take, out, lambda body: not sampled, on_progress)
     root = XML("mujoco", model=_plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
     _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
     _add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
+    if sampled:  # from so many places, and for so long, MuJoCo looks for where two bodies are nearest
+        root[-1].attrib |= {"sdf_initpoints": "40", "sdf_iterations": "10"}
     _add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than is the default
     asset, world = _add(root, "asset"), _add(root, "worldbody")
     _add(world, "light", directional="true", castshadow="false", pos="0 0 10", dir="-0.4 0.3 -0.9")
@@ -496,6 +543,8 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             mesh = mesh_of(seen[body.shape], body.scale)
             _add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
             solids = [{"type": "mesh", "mesh": mesh_of(file, body.scale), "group": "3"} for file in cut[body.shape]]
+            if sampled:
+                solids = [{"type": "sdf", "mesh": mesh, "group": "3"}]
         else:
             form: Any = shape.sdf
             sizes = (take.plane_size(),) * 3 if isinstance(form, PlaneSdf) else form.scaled(body.scale).sizes

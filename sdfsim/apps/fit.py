@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +34,39 @@ class Options:
     units: Literal["m", "cm", "mm", "in"] | None = None
 
 
-def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
+def fit(
+    source: Path | str | Sequence[Path | str],
+    out: Path | str,
+    *,
+    recipe: Recipe = "default",
+    budget: float | None = None,
+    cap: bool = False,
+    thicken: float | None = None,
+    units: Literal["m", "cm", "mm", "in"] | None = None,
+    device: str = "auto",
+    on_progress: Progress = silent,
+) -> dict[str, Any]:
+    """Fit a mesh file and write the shape folder `out`, or several files, or those of a folder, into `out`/NAME.
+
+    Args:
+        recipe: how networks are fitted: "quick", "default", or "paper", as Rubanova et al. did.
+        budget: s, the longest time that one fit may take.
+        cap: close openings of any size.
+        thicken: m, the thickness that an open sheet gets.
+        units: of the mesh files; None: metres.
+        device: "cpu", "cuda" or "auto".
+
+    Returns the report of `fit_file`, or of `fit_many`. Raises SdfsimError where a mesh cannot be used, a folder cannot
+    be written, or there are no meshes; several meshes that cannot be used are told of in the report.
+    """
+    options = Options(recipe, budget, cap, thicken, units)
+    sources = [Path(source)] if isinstance(source, Path | str) else [Path(one) for one in source]
+    if len(sources) == 1 and not sources[0].is_dir():
+        return fit_file(sources[0], Path(out), options, device=device, on_progress=on_progress)
+    return fit_many(named_meshes(sources), Path(out), options, device=device, on_progress=on_progress)
+
+
+def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
     """Fit a mesh file and write the shape folder `out`, unless it is there from the same mesh and options. The report
     has the folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether
     it was missed. Raises SdfsimError where the mesh cannot be used, the folder cannot be written, or another run is
@@ -75,7 +108,7 @@ def _kept(folder: Path, request: str) -> Shape | None:
 
 
 def fit_lines(report: dict[str, Any]) -> list[str]:
-    """What a person reads of a `fit` report, or of one of `fit_many`: there every line begins with the shape's name."""
+    """What a person reads of a report of `fit`; of several meshes every line begins with the shape's name."""
     if "shapes" in report:
         lines = [f"{name}: {line}" for name, found in report["shapes"].items() for line in fit_lines(found)]
         return [*lines, f"wrote {report['folder']}"]
@@ -116,7 +149,7 @@ def fit_many(
 ) -> dict[str, Any]:
     """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, one after the other on a GPU.
 
-    Returns `shapes`, by name the report of `fit` or the `error` that kept a mesh from being fitted; and in
+    Returns `shapes`, by name the report of `fit_file` or the `error` that kept a mesh from being fitted; and in
     `failed_checks` what missed its certificate.
     """
     where, names = pick_device(device), list(meshes)
@@ -135,7 +168,7 @@ def fit_many(
 def _fit_one(file: Path, folder: Path, options: Options, device: str) -> dict[str, Any]:
     """A report, or the error; whatever happens to one mesh must not stop the others."""
     try:
-        return fit(file, folder, options, device=device, on_progress=silent)
+        return fit_file(file, folder, options, device=device, on_progress=silent)
     except SdfsimError as error:
         return {"error": error.message}
     except Exception as error:

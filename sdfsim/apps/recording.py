@@ -17,7 +17,9 @@ from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
 from sdfsim.geometry.primitives import plane
 from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.units import EARTH
 from sdfsim.scene.scene import Scene
+from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.steppers import PHASES
 
@@ -29,6 +31,8 @@ if TYPE_CHECKING:  # these take their time to load
 WORLD = "world"
 CONTACTS = "world/contacts"
 JOINTS = "world/joints"
+FORCES = "world/forces"
+STILL = "world/still"
 # What is plotted: the counters of a view by their legends.
 VIEWS = {
     "kinetic energy (J)": {"kinetic_energy": "kinetic energy (J)"},
@@ -43,26 +47,41 @@ STATIC_COLOR = (150, 150, 155)
 HUES = 32  # colours of bodies that move
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
+_FORCE_COLOR = (255, 170, 0)
+_STILL_COLOR = (60, 110, 230)
 _PHOTO_PIXELS = 320
 _TEXTURE_PIXELS = 2048
 MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
 COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
 _CREASE = np.cos(np.radians(40.0))
 _MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
+LONGEST = 5.0  # sizes of its body, an arrow
+LEAST, TOLD, MANY_LEAST = 0.05, 100, 3.0  # weights that an arrow stands for at least; of more bodies only for hits
 FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
 class Playback:
     """One recording of one scene, to be written to a file, or streamed to a viewer. Its first view shows all of the
-    scene, and where the motion is known already all of that."""
+    scene, and where the motion is known already all of that; then there are only the plots that have something to show.
+    `network` is whether there is one in the run."""
 
-    def __init__(self, scene: Scene, motion: Rollout | None = None) -> None:
+    def __init__(self, scene: Scene, motion: Rollout | None = None, *, network: bool = True) -> None:
         import rerun as rr
 
         self._rr = rr
         self._scene = scene
         self._centre, self._radius = framed(scene, motion)
         self._step = 0
+        self._before: Rollout | None = None  # the last frame that was logged
+        self._views = {name: list(keys) for name, keys in VIEWS.items() if network or name != "network"}
+        if motion is not None:
+            told = {key for key in PLOTS if np.any(motion.counters.get(key, 0.0))}
+            shown_of = {name: [key for key in keys if key in told] for name, keys in self._views.items()}
+            self._views = {name: keys for name, keys in shown_of.items() if keys}
+        self._movers = np.array([k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"], dtype=int)
+        self._mass = np.array([scene.bodies[k].mass for k in self._movers])
+        sizes = [float(np.ptp(shape.mesh.vertices, axis=0).max(initial=0.0)) for shape in scene.shapes]
+        self._size = np.array([scene.bodies[k].scale * sizes[scene.bodies[k].shape] for k in self._movers])
         self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
         self._crowds = _crowds(scene)
         crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
@@ -72,10 +91,11 @@ class Playback:
         self.stream = rr.RecordingStream("sdfsim")
 
     def blueprint(self) -> rrb.Blueprint:
-        """The layout: the scene on the left, plots of the counters on the right; nodes and contact points hidden."""
+        """The layout: the scene on the left, plots of the counters on the right. Nodes, contact points, forces and the
+        marks of bodies that stand still are hidden until somebody switches them on."""
         import rerun.blueprint as rrb
 
-        hidden = [CONTACTS, *(f"{path}/nodes" for _, path in self._alone)]
+        hidden = [CONTACTS, FORCES, STILL, *(f"{path}/nodes" for _, path in self._alone)]
         view = rrb.Spatial3DView(
             origin=WORLD,
             name="scene",
@@ -85,7 +105,7 @@ class Playback:
         )
         plots = [
             rrb.TimeSeriesView(origin="plots", contents=[f"plots/{key}" for key in keys], name=name)
-            for name, keys in VIEWS.items()
+            for name, keys in self._views.items()
         ]
         return rrb.Blueprint(
             rrb.Horizontal(view, rrb.Vertical(*plots), column_shares=[3, 1]),
@@ -111,7 +131,7 @@ class Playback:
             body, com = scene.bodies[k], self._com[k]
             shape = scene.shapes[body.shape]
             mesh = shown(shape, 6 * self._radius)
-            placed = replace(mesh, vertices=mesh.vertices * body.scale - com)
+            placed = replace(mesh, vertices=mesh.vertices * body.scale - com - [0.0, 0.0, sunk(self._scene, k)])
             self.stream.log(f"{path}/mesh", _shaded(rr, placed, colors[k]), static=True)
             if len(shape.nodes):
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
@@ -131,11 +151,16 @@ class Playback:
             self.stream.log(f"{JOINTS}/ropes", style, static=True)
         style = rr.Points3D.from_fields(colors=_CONTACT_COLOR, radii=rr.Radius.ui_points(4))
         self.stream.log(CONTACTS, style, static=True)
+        style = rr.Arrows3D.from_fields(colors=_FORCE_COLOR, radii=rr.Radius.ui_points(2))
+        self.stream.log(FORCES, style, static=True)
+        style = rr.Points3D.from_fields(colors=_STILL_COLOR, radii=rr.Radius.ui_points(6))
+        self.stream.log(STILL, style, static=True)
         for key, name in PLOTS.items():
             self.stream.log(f"plots/{key}", rr.SeriesLines(names=name), static=True)
 
     def log_steps(self, chunk: Rollout) -> None:
-        """Poses, contact points and counters of the frames of `chunk`, which follow the frames logged before."""
+        """Poses, contact points, forces, who stands still, and counters of the frames of `chunk`, which follow the
+        frames logged before."""
         rr, frames = self._rr, len(chunk.time)
         steps = np.arange(self._step, self._step + frames)
         self._step += frames
@@ -157,10 +182,40 @@ class Playback:
             self.stream.send_columns(f"{JOINTS}/ropes", times, lines.partition(np.full(frames, len(self._ropes))))
         points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)
         self.stream.send_columns(CONTACTS, times, points)
+        self._log_forces(chunk, times)
         for key in PLOTS:
             if key in chunk.counters:
                 values = np.asarray(chunk.counters[key], dtype=np.float64)
                 self.stream.send_columns(f"plots/{key}", times, rr.Scalars.columns(scalars=values))
+
+    def _log_forces(self, chunk: Rollout, times: list[Any]) -> None:
+        """At the centres of bodies, what others have pushed them with since the frame before: mass times change of
+        velocity, less gravity. An arrow as long as its body is the body's weight, or where there is no gravity that of
+        the Earth; at most `LONGEST` of it. And a point on each body that has not moved at all since then."""
+        rr, rows = self._rr, self._movers
+        ahead = self._before
+        parts = [chunk] if ahead is None else [ahead, chunk]
+        time, place, turn, speed, spin = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("time", "position", "orientation", "velocity", "angular_velocity")
+        )
+        self._before = chunk.frames(len(chunk.time) - 1, len(chunk.time))
+        place, turn, speed, spin = (of[:, rows] for of in (place, turn, speed, spin))
+        change = np.diff(speed, axis=0) / np.maximum(np.diff(time), 1e-12)[:, None, None] - self._scene.gravity
+        strength = float(np.linalg.norm(self._scene.gravity)) or EARTH
+        arrows = change / strength  # in weights
+        length = np.linalg.norm(arrows, axis=-1, keepdims=True)
+        arrows *= self._size[:, None] * np.minimum(1.0, LONGEST / np.maximum(length, 1e-12))
+        moved = (np.diff(place, axis=0) != 0).any(-1) | (np.diff(turn, axis=0) != 0).any(-1)
+        still = ~(moved | (speed[1:] != 0).any(-1) | (spin[1:] != 0).any(-1))
+        pushed = length[..., 0] > (LEAST if len(rows) <= TOLD else MANY_LEAST)
+        first = np.zeros((len(chunk.time) - len(change), len(rows)), bool)  # of the very first frame nothing is known
+        pushed, still = np.concatenate([first, pushed]), np.concatenate([first, still])
+        at = place[len(place) - len(chunk.time) :]
+        arrows = np.concatenate([np.zeros((len(first), len(rows), 3)), arrows])
+        found = rr.Arrows3D.columns(vectors=arrows[pushed], origins=at[pushed]).partition(pushed.sum(1))
+        self.stream.send_columns(FORCES, times, found)
+        self.stream.send_columns(STILL, times, rr.Points3D.columns(positions=at[still]).partition(still.sum(1)))
 
 
 class Crowd(NamedTuple):
@@ -371,6 +426,24 @@ def _reduced(image: Image.Image, longest: int) -> np.ndarray:
 def is_infinite(shape: Shape) -> bool:
     """Whether it is a plane."""
     return not np.isfinite(shape.sdf.bounds).all()
+
+
+def sunk(scene: Scene, row: int) -> float:
+    """m by which a plane is shown lower than it is: where scenery of another kind lies in it, as a floor that photos
+    show lies in the one below it that ends nowhere, the two would flicker through each other."""
+    body = scene.bodies[row]
+    if not is_infinite(scene.shapes[body.shape]):
+        return 0.0
+    up, most, lower = _turned(np.array([0.0, 0.0, 1.0]), body.quat_xyzw), 0.02 * framed(scene)[1], 0.0
+    for other in scene.bodies:
+        shape = scene.shapes[other.shape]
+        if other.motion == "static" and not isinstance(shape.sdf, ClosedForm):
+            corners = other.position + _turned(shape.shown.vertices * other.scale, other.quat_xyzw)
+            height = (corners - body.position) @ up
+            near = np.abs(height) < most
+            if near.any():
+                lower = max(lower, 0.05 * most - float(np.quantile(height[near], 0.01)))
+    return lower
 
 
 def shown(shape: Shape, half: float) -> Mesh:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, with_normals
+from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, sunk, with_normals
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
 from sdfsim.base.parallel import Progress, silent
@@ -156,10 +156,10 @@ class Studio:
         shapes = [scene.shapes[b.shape] for b in scene.bodies]
         self._floors = np.array([is_infinite(shape) for shape in shapes])
         self._models: list[_Model] = []
-        for body, shape, color in zip(scene.bodies, shapes, body_colors(scene), strict=True):
+        for k, (body, shape, color) in enumerate(zip(scene.bodies, shapes, body_colors(scene), strict=True)):
             mesh, normals = with_normals(shown(shape, 40.0 * radius))
             colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
-            vertices = body.scale * (mesh.vertices - shape.com)
+            vertices = body.scale * (mesh.vertices - shape.com) - [0.0, 0.0, sunk(scene, k)]
             self._models.append((replace(mesh, vertices=vertices, colors=colors), normals))
         forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
         right = np.cross(forward, eye.up)

@@ -31,7 +31,7 @@ from sdfsim.base.files import (
     write_text,
 )
 from sdfsim.base.parallel import Progress, StageProgress, silent
-from sdfsim.learned.model import load_model
+from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics.bodies import State, Touch, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
@@ -56,23 +56,23 @@ _OTHER = "is of another scene, model or seed"
 
 
 def simulate(
-    scene_file: Path,
-    out: Path,
+    scene_file: Path | str,
+    out: Path | str,
     *,
-    model: str | None,
-    seconds: float | None,
-    seed: int | None,
-    viewer: Viewer,
-    device: str,
-    on_progress: StageProgress,
-    say: Callable[[str], None],
+    model: str | None = None,
+    seconds: float | None = None,
+    seed: int | None = None,
+    viewer: Viewer = "file",
+    device: str = "auto",
+    on_progress: StageProgress = lambda stage, fraction, message: None,
+    say: Callable[[str], None] = lambda line: None,
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
 ) -> dict[str, Any]:
-    """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd; an
-    earlier run in `out` is replaced. Returns the report; of the shapes that were fitted for this scene, `failed_checks`
-    names those that are not usable, and `caveats` those that are not exact.
+    """Simulate a scene file, or a sample by its name, and write config.yaml, report.json, rollout.npz and (unless
+    `viewer` is none) rollout.rrd; an earlier run in `out` is replaced. Returns the report; of the shapes that were
+    fitted for this scene, `failed_checks` names those that are not usable, and `caveats` those that are not exact.
 
     What is None is as the scene says: model, `seconds` of simulated time, seed. `until_settled` ends the run as soon as
     everything rests. `resume` goes on with the run in `out` that was interrupted, from the start where there is none; a
@@ -82,6 +82,7 @@ def simulate(
     finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
     what was computed before is in the folder.
     """
+    out = Path(out)
     # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
     check_device(device)
     if seconds is not None:
@@ -127,7 +128,8 @@ def simulate(
             parts = [simulator.initial_rollout()]
             kept.add(parts[0])
         write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
-        live = Playback(scene) if viewer in ("native", "web") else None
+        network = simulator.model.kind != SOLVER
+        live = Playback(scene, network=network) if viewer in ("native", "web") else None
         if live:
             if address := stream_to_viewer(live, viewer):
                 say(f"watch it at {address}")

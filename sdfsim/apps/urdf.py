@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,6 +22,7 @@ from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
 from sdfsim.scene.scene import WORLD
 
 MOST_BYTES = 64 * 2**20  # of a file
+OPTIONAL = re.compile(rb"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: a variable of the environment, or else the rest
 KINDS = {
     "revolute": "hinge",
     "continuous": "hinge",
@@ -46,6 +48,11 @@ def read_urdf(path: Path, *, packages: Sequence[Path] = (), fixed: bool = False)
     Raises SdfsimError with file, line and element for what is not URDF, is missing, or is no tree.
     """
     return _Reader(path, packages).robot(fixed)
+
+
+def _environment(found: re.Match[bytes]) -> bytes:
+    value = os.environ.get(found[1].decode(), found[2].decode(errors="replace").strip())
+    return value.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;").encode()
 
 
 class _Reader:
@@ -75,10 +82,10 @@ class _Reader:
         parser.StartElementHandler, parser.CharacterDataHandler = start, builder.data
         parser.EndElementHandler = lambda tag: builder.end(tag)
         try:
-            # What comes before the first element is no XML, but common.
-            text = content.lstrip()
+            # Blanks before the first element and zero bytes after the last are no XML, but common.
+            text = content.lstrip().rstrip(b"\0 \t\r\n")
             self.skipped = content[: len(content) - len(text)].count(b"\n")
-            parser.Parse(text, True)
+            parser.Parse(OPTIONAL.sub(_environment, text), True)
         except expat.ExpatError as error:
             line = error.lineno + self.skipped
             raise SdfsimError(f"{self.path}:{line}: not valid XML ({expat.ErrorString(error.code)})") from error

@@ -169,12 +169,24 @@ def export(
         typer.Option("-o", "--out", metavar="FILE", help="Ends in .glb .usd .usda .usdc .xml .mjcf .urdf or .csv."),
     ],
     scene: OfRun = None,
+    fps: Annotated[float | None, typer.Option(help="Frames of the motion in a second (default: every step).")] = None,
+    collide: Annotated[
+        Literal["pieces", "sdf"], typer.Option(help="How MuJoCo collides meshes; sdf is exact there, and slow.")
+    ] = "pieces",
     allow_outside: Outside = False,
 ) -> None:
     """Shape, scene or run -> a file of other programs (docs/export.md)."""
     from sdfsim.apps import export as room
 
-    report = room.export(source, out, scene_file=scene, allow_outside=allow_outside, on_progress=session.stage_progress)
+    report = room.export(
+        source,
+        out,
+        scene_file=scene,
+        fps=fps,
+        collide=collide,
+        allow_outside=allow_outside,
+        on_progress=session.stage_progress,
+    )
     files = report["files"]
     lines = [
         f"bodies {report['bodies']}, frames {report['frames']}",

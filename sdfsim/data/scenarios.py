@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.data.dataset import FLOOR
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import ShapeSource
+from sdfsim.geometry.primitives import bowl_radii
 from sdfsim.learned.training_ranges import DEEPEST
 
 TRIES = 100  # places for one body before the scene is drawn again
@@ -29,9 +30,6 @@ PLAIN = (1.1, 0.5, 0.5)  # density, friction, restitution
 
 BALL = 0.52  # m, diameter
 BALLS = (1, 16)
-ROOM = 2.0  # a bowl's inside over the space that its balls fill
-PACKED = 0.6  # part of that space which balls fill
-WALL = 0.12  # of the bowl primitive, relative to its outer radius
 
 PILE = (5, 30)
 PILE_EXTENTS = (0.5, 1.5)  # m
@@ -117,9 +115,9 @@ def movi_c(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | N
 def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
     """Balls in loose layers above a bowl that has room for them."""
     count = cast.bodies or int(rng.integers(BALLS[0], BALLS[1] + 1))
-    inner = BALL * (ROOM * count / (4 * PACKED)) ** (1 / 3)
+    inner, outer = bowl_radii(count, BALL)
     vessel, ball = cast.scenery["bowl"], cast.scenery["ball"]
-    bodies = [(vessel, _body(vessel, 2 * inner / (1 - WALL), 0.0, *FLOOR))]
+    bodies = [(vessel, _body(vessel, 2 * outer, 0.0, *FLOOR))]
     position = upright(*bodies[0], np.zeros(2), 0.0, Rotation.identity())
     teacher.add(bodies[0][1], position)
     rim = position[2] + _box(*bodies[0], Rotation.identity())[1][2]

@@ -25,6 +25,7 @@ from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
 from sdfsim.evaluation.runs import Ran, by_model
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
+from sdfsim.geometry.primitives import BOWL_WALL, bowl_radii
 from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.scene.scene import Body, Effects, Scene
@@ -43,7 +44,6 @@ CARD = (0.06, 0.6, 1.0)  # m, thickness along x, standing
 LEAN = 20.0  # degrees from upright
 BALLS = 8  # dropped at once
 BOXES = ((1.0, 1.0, 1.0), (1.0, 0.7, 0.5), (1.0, 0.5, 0.5), (0.4, 1.0, 0.8))  # m, of those tossed
-WALL = 0.12  # of the bowl primitive, relative to its outer radius
 BOWL_BALL = 0.5  # m, size of what is piled into the bowl
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -293,16 +293,10 @@ def slope(friction: float, degrees: float) -> Scene:
     return on_floor([box(1.0, 1.0, 0.5)], [slab], tilt=degrees, friction=0.8)
 
 
-def bowl_radii(count: int) -> tuple[float, float]:
-    """(inner, outer) radius m of a bowl with twice the room that `count` bodies take."""
-    inner = BOWL_BALL * (2.0 * count / (4 * 0.6)) ** (1 / 3)
-    return inner, inner / (1 - WALL)
-
-
 def piled(count: int, repeat: int) -> Scene:
     """Balls and boxes in a loose lattice inside a bowl, and above it as far as they find no room."""
     rng = np.random.default_rng(repeat)
-    inner, outer = bowl_radii(count)
+    inner, outer = bowl_radii(count, BOWL_BALL)
     spacing = 1.2 * BOWL_BALL
     side = np.arange(-np.ceil(inner / spacing), np.ceil(inner / spacing) + 1) * spacing
     heights = np.arange(-np.floor(inner / spacing), 4 * len(side)) * spacing
@@ -456,7 +450,7 @@ def heaped(trials: Sequence[Ran]) -> dict[str, float]:
     scene, motion = trials[0].scene, trials[0].motion
     bowl = next(b for b in scene.bodies if b.name == "bowl")
     outer = 0.5 * bowl.scale
-    middle = outer * (1 - 0.5 * WALL)
+    middle = outer * (1 - 0.5 * BOWL_WALL)
     from_centre = trials[0].path - bowl.position
     radius, under = np.linalg.norm(from_centre, axis=2), from_centre[..., 2] < 0
     out = (under[:-1] & under[1:] & (radius[:-1] < middle) & (radius[1:] >= middle)).any(0)

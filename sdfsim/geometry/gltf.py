@@ -38,6 +38,9 @@ SPARSE = 2**24  # most rows of an accessor that has no values but sparse ones
 _OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
 
 
+_VERTICES, _CORNERS = 34962, 34963  # what a buffer view is for, in glTF's numbers
+
+
 class GltfWriter:
     """A file to be written: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
     that turns z up to glTF's y up."""
@@ -71,8 +74,11 @@ class GltfWriter:
         self._accessors.append(accessor | ({"normalized": True} if kind == "<u2" else {}))
         return len(self._accessors) - 1
 
-    def material(self, name: str, color: np.ndarray, texture: np.ndarray | None = None, rough: float = 1.0) -> int:
-        """A surface of a colour [3], as light, or with a texture [H, W, 3] uint8, which needs no other light."""
+    def material(
+        self, name: str, color: np.ndarray, texture: np.ndarray | None = None, *, rough: float = 1.0, lit: bool = False
+    ) -> int:
+        """A surface of a colour [3], as light, or with a texture [H, W, 3] uint8. The light of photos is in a texture
+        already, so it needs no other, unless it is to be `lit`: then shadows fall on it too."""
         surface: dict[str, Any] = {"baseColorFactor": [*map(float, color), 1.0]}
         made: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
         surface |= {"metallicFactor": 0.0, "roughnessFactor": rough}
@@ -83,12 +89,16 @@ class GltfWriter:
             Image.fromarray(texture).save(file, "JPEG", quality=92, subsampling=0)
             self._images.append({"bufferView": self._view(file.getvalue()), "mimeType": "image/jpeg"})
             surface["baseColorTexture"] = {"index": len(self._images) - 1}
-            made["extensions"] = {_UNLIT: {}}
+            if not lit:
+                made["extensions"] = {_UNLIT: {}}
         self.materials.append(made)
         return len(self.materials) - 1
 
     def mesh(self, name: str, attributes: dict[str, int], corners: int, material: int) -> int:
         """A mesh of accessors: attributes of its vertices, and the corners of its faces."""
+        for accessors, target in ((attributes.values(), _VERTICES), ([corners], _CORNERS)):
+            for accessor in accessors:
+                self._views[self._accessors[accessor]["bufferView"]]["target"] = target
         drawn = {"attributes": attributes, "indices": corners, "material": material}
         self.meshes.append({"name": name, "primitives": [drawn]})
         return len(self.meshes) - 1
@@ -99,7 +109,7 @@ class GltfWriter:
         lists = {"meshes": self.meshes, "materials": self.materials, "images": self._images}
         lists |= {"accessors": self._accessors, "bufferViews": self._views, "animations": self.animations}
         lists |= {"textures": [{"source": k} for k in range(len(self._images))]}
-        lists |= {"extensionsUsed": [_UNLIT] if self._images else []}
+        lists |= {"extensionsUsed": [_UNLIT] if any("extensions" in one for one in self.materials) else []}
         header = {
             "asset": {"version": "2.0", "generator": "sdfsim"},
             "scene": 0,

@@ -8,6 +8,9 @@ import numpy as np
 
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, lattice
 
+BOWL_WALL = 0.12  # of the bowl, relative to its outer radius
+PACKED = 0.6  # part of a space which packed balls fill
+
 
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
     """A box with full extents `size` m: 8 vertices, 12 faces."""
@@ -78,10 +81,16 @@ def torus_knot() -> Mesh:
     return _tube(_knot_rings(192, 24))
 
 
-def bowl(radius: float = 0.5, wall: float = 0.06) -> Mesh:
+def bowl(radius: float = 0.5, wall: float = 0.5 * BOWL_WALL) -> Mesh:
     """Half of a spherical shell about the origin, of outer `radius` m and `wall` m thick, open at the top (+z)."""
     outer, inner = _bowl_profiles(radius, wall, 16)
     return _revolve(np.concatenate([outer, inner[::-1]]), 64)
+
+
+def bowl_radii(count: int, ball: float) -> tuple[float, float]:
+    """Inner and outer radius m of a bowl with twice the room that `count` packed balls of diameter `ball` m take."""
+    inner = ball * (2.0 * count / (4 * PACKED)) ** (1 / 3)
+    return inner, inner / (1 - BOWL_WALL)
 
 
 def shoe() -> Mesh:

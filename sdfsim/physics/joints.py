@@ -22,8 +22,8 @@ HINGE, SLIDER, BALL, FIXED, DISTANCE = range(5)
 LOW, HIGH, BOUNCE, DAMPING, DRAG, STIFFNESS, REST, MOTOR, MOST, TIME, LENGTH, FORCE, TORQUE, NUMBERS = range(14)
 # Columns of `State.joints`: its angle, position or length, how fast that changes, what its motor aims at, whether it is
 # broken, whether nothing is known of its impulses; force and torque on the first body (at its anchor, world axes), the
-# impulses at its limit, of its motor or friction, of its spring and damping (a ball has three of both), all of the last
-# inner step; by how much its rows have to turn in an inner step so that they hold at its end; what the motor has given
+# impulses at its limit, of its motor and friction, of its spring and damping (a ball has three of both; behind the one
+# of a motor with friction stands that of the motor alone), all of the last inner step; by how much its rows have to turn in an inner step so that they hold at its end; what the motor has given
 # in the step.
 COORD, SPEED, TARGET, BROKEN, FRESH, PULL, TWIST, STOP, DRIVE, SOFT, BEND, GIVEN, STATE = (
     0, 1, 2, 3, 4, 5, 8, 11, 12, 15, 18, 24, 25,

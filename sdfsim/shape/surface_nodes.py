@@ -41,7 +41,7 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     points = points[reached]
     if len(points) == 0:
         raise SdfsimError("no surface nodes: the SDF has no zero level within its bounds")
-    return frame.outward(_one_per_voxel(frame.inward(points), voxel))
+    return frame.outward(one_per_voxel(frame.inward(points), voxel))
 
 
 def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
     return points
 
 
-def _one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
+def one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
     """The point nearest the middle of each occupied voxel; an average would leave the surface where it bends."""
     # Voxels centred on the origin: the faces of a normalised box at 0.5 then run through their middles.
     cell = np.round(points / voxel).astype(np.int64)

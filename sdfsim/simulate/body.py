@@ -127,6 +127,12 @@ class BodyHandle:
         return float(self._simulator.bodies.mass[self._row]) * self._simulator.units.mass
 
     @property
+    def inertia(self) -> np.ndarray:
+        """[3, 3] kg m^2, about the centre of mass, in the shape's axes; of a body that moves by itself."""
+        sim = self._simulator
+        return sim.bodies.inertia[self._row] * sim.units.mass * sim.units.length**2
+
+    @property
     def asleep(self) -> bool:
         """Whether it sleeps: it rests, and costs nothing until something disturbs it."""
         touch = self._simulator.state.touch
@@ -142,8 +148,7 @@ class BodyHandle:
             sim, row = self._simulator, self._row
             turn = np.cross(_vector("at", at) - self.centre, given)
             axes = pose.to_matrix(sim.state.orientation[row])
-            inertia = axes @ sim.bodies.inertia[row] @ axes.T * sim.units.mass * sim.units.length**2
-            self.angular_velocity = self.angular_velocity + np.linalg.solve(inertia, turn)
+            self.angular_velocity = self.angular_velocity + np.linalg.solve(axes @ self.inertia @ axes.T, turn)
 
     def pull(self, force: Numbers, at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)) -> None:
         """Let a force [3] N and a torque [3] N m act from now on, in world axes, until the next call or `reset`; zero

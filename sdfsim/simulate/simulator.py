@@ -13,7 +13,7 @@ import numpy as np
 
 from sdfsim.base.devices import check_device, pick_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
-from sdfsim.base.parallel import parallel, threads
+from sdfsim.base.parallel import Progress, parallel, silent, threads
 from sdfsim.base.version import __version__
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.learned.training_ranges import deep_starts
@@ -64,6 +64,19 @@ class SimulationError(SdfsimError):
 
 class Simulator(LiveScene):
     """Simulates one scene.
+
+        simulator = sdfsim.Simulator(sdfsim.load_scene("pile"))
+        rollout = simulator.run(seconds=2.0)             # all of the motion: `Rollout`, arrays in SI units
+        rollout.save("rollout.npz")
+
+        simulator.reset()
+        ball = simulator["ball"]                         # one body by its name: `BodyHandle`
+        ball.velocity = (1.0, 0.0, 0.0)                  # m/s, from the next step on
+        for state in simulator.steps(100):               # or `step(n)`: n steps at once
+            print(state.time, ball.position, simulator.contact_points())
+
+    `rollouts` runs many variants of the scene on all cores. `frames` yields a run in pieces, to be shown as it goes on.
+    `restore` goes back to a `state` of before.
 
     Args:
         scene: bodies, shapes, gravity; one written in Python is loaded first.
@@ -281,8 +294,9 @@ class Simulator(LiveScene):
         same = {"device": self.device, "seed": self.seed, **self._asked}
         return run_all(scenes, self.model, seconds, steps, **same)
 
-    def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
+    def run(self, seconds: float | None = None, steps: int | None = None, on_progress: Progress = silent) -> Rollout:
         """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
+        `on_progress` is called some times a second with the share that is done, 0 to 1, and a line that tells it.
 
         Raises SdfsimError for a length of time that is negative or not finite; SimulationError where the state broke,
         with what was computed in its `rollout`.
@@ -291,7 +305,10 @@ class Simulator(LiveScene):
             steps = self.steps_in(self.scene.duration if seconds is None else seconds)
         parts = [self.initial_rollout()]
         try:
-            parts += self.frames(steps)
+            for part in self.frames(steps):
+                parts.append(part)
+                done = sum(map(len, parts[1:])) + len(parts) - 1  # a rollout of k frames has k - 1 steps
+                on_progress(done / steps, f"{done} of {steps} steps")
         except SimulationError as error:
             raise SimulationError(error.message, join([*parts, error.rollout])) from None
         return join(parts)

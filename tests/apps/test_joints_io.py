@@ -188,6 +188,18 @@ def test_urdf_tells_what_it_leaves_out_and_what_it_made_otherwise(tmp_path: Path
     assert any("shoulder starts at 0.2 rad" in line for line in report["notes"])
 
 
+def test_what_other_readers_pass_over_is_passed_over(tmp_path: Path) -> None:
+    text = "\n \n" + ARM.replace('xyz="0.01 0.02 0.25"', 'xyz="$(optenv NO_SUCH_VARIABLE 0.01 0.02 0.25)"')
+    (tmp_path / "arm.urdf").write_bytes(text.encode() + b"\n\0")
+    scene, _ = imported(tmp_path / "arm.urdf", fixed=True)
+    plain, _ = imported(write(tmp_path / "plain", "arm.urdf", ARM), fixed=True)
+    for one, other in zip(scene.bodies, plain.bodies, strict=True):
+        assert one.position == pytest.approx(other.position, abs=1e-12)
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", "</robt>"))
+    with pytest.raises(SdfsimError, match=rf"arm\.urdf:{text.count(chr(10)) + 1}: not valid XML"):
+        import_robot(tmp_path / "arm.urdf", tmp_path / "scene.yaml")
+
+
 def test_a_floor_is_under_the_lowest_link(tmp_path: Path) -> None:
     scene, _ = imported(write(tmp_path, "arm.urdf", ARM), floor=True)
     base = next(body for body in scene.bodies if body.name == "base")

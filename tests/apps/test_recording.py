@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +20,13 @@ from sdfsim.apps.recording import (
     framed,
     save_reconstruction,
     save_rollout,
+    sunk,
     with_normals,
 )
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import box, sphere
 from sdfsim.physics.rollout import Rollout
+from sdfsim.shape.shape import load_shape
 from tests.helpers.runs import read
 
 STEPS = 6
@@ -130,16 +133,73 @@ def test_steps_one_by_one_make_the_same_recording(scene, rollout, tmp_path):
                 assert whole[entity][column] == parts[entity][column], (entity, column)
 
 
-def test_nodes_and_contacts_are_hidden_until_switched_on(scene, tmp_path, rollout):
-    save_rollout(scene, rollout, tmp_path / "rollout.rrd")
+def blueprint(path) -> str:
+    """What rerun's own program prints of a recording."""
     import subprocess
 
     from sdfsim.apps.viewer import _executable
 
-    command = [_executable(), "rrd", "print", str(tmp_path / "rollout.rrd")]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "overrides/world/contacts" in told and "overrides/world/brick/nodes" in told
-    assert told.count("EntityBehavior:visible") >= 3
+    command = [_executable(), "rrd", "print", "-vvv", str(path)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_nodes_contacts_and_forces_are_hidden_until_switched_on(scene, tmp_path, rollout):
+    save_rollout(scene, rollout, tmp_path / "rollout.rrd")
+    told = blueprint(tmp_path / "rollout.rrd")
+    for entity in ("contacts", "forces", "still", "brick/nodes"):
+        assert f"overrides/world/{entity}" in told
+    assert told.count("EntityBehavior:visible") >= 5
+
+
+def test_a_plot_with_nothing_to_show_is_not_there(scene, tmp_path, rollout):
+    for empty, shown in (((), ("network", "milliseconds")), (("nodes", "edges"), ("milliseconds", "contacts"))):
+        nothing = {key: np.zeros(STEPS + 1) for key in empty}
+        save_rollout(scene, replace(rollout, counters=rollout.counters | nothing), tmp_path / "rollout.rrd")
+        told = blueprint(tmp_path / "rollout.rrd")
+        views = re.findall(r"\[TimeSeries\] .*?\[(.+?)\]", told)
+        assert set(shown) <= set(views) and ("network" in views) == (not empty)
+
+
+def test_forces_are_weights_and_those_that_stand_still_are_marked(scene, tmp_path):
+    """A ball (2 m across) falls, while a brick (3 m) of whatever mass stands; then the brick is hit with ten times its
+    weight, and later moves evenly aside while it is held up."""
+    rollout = motion(scene, np.zeros(5, dtype=np.int64))
+    step, gravity = 0.25, 9.81
+    for name in ("position", "orientation", "velocity"):
+        getattr(rollout, name)[:] = getattr(rollout, name)[0]
+    rollout.velocity[:, 2] = -gravity * step * np.arange(5)[:, None] * [0, 0, 1]
+    rollout.position[:, 2, 2] = 100.0 + rollout.velocity[:, 2, 2]
+    rollout.velocity[3:, 3, 0] = 10 * gravity * step
+    rollout.position[4, 3, 0] += 1.0
+    save_rollout(scene, rollout, tmp_path / "rollout.rrd")
+    found = read(tmp_path / "rollout.rrd")
+    arrows = found["/world/forces"]["Arrows3D:vectors"]
+    assert [len(row) for row in arrows] == [0, 1, 1, 1, 1]  # the ball falls freely
+    for k, aside, up in ((1, 0.0, 1.0), (2, 0.0, 1.0), (4, 0.0, 1.0)):
+        np.testing.assert_allclose(arrows[k][0], [3.0 * aside, 0.0, 3.0 * up], atol=1e-5)
+    hit = np.array([10.0, 0.0, 1.0]) / np.sqrt(101.0) * 5.0 * 3.0  # cut to five lengths of the body
+    np.testing.assert_allclose(arrows[3][0], hit, rtol=1e-5)
+    np.testing.assert_allclose(found["/world/forces"]["Arrows3D:origins"][4][0], rollout.position[4, 3], rtol=1e-6)
+    assert [len(row) for row in found["/world/still"]["Points3D:positions"]] == [0, 1, 1, 0, 0]
+
+
+def test_a_plane_lies_below_scenery_that_lies_in_it_and_stays_elsewhere(scene):
+    """So that a floor from photos, uneven by millimetres, does not flicker through the floor without end."""
+    assert all(sunk(scene, k) == 0.0 for k in range(len(scene.bodies)))  # a brick of closed form beside it
+    rng = np.random.default_rng(0)
+    places = np.stack(np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30)), -1).reshape(-1, 2)
+    uneven = np.column_stack([places, rng.uniform(-0.01, 0.01, len(places))])
+    ground = replace(
+        scene.shapes[1], mesh=Mesh(uneven, np.array([[0, 1, 2]])), sdf=load_shape("samples/shapes/bowl").sdf
+    )
+    below = replace(scene, shapes=(scene.shapes[0], ground, *scene.shapes[2:]))
+    names = [shape.name for shape in scene.shapes]
+    assert names[0] == "plane" and names[1] == "brick"
+    below = replace(
+        below, bodies=tuple(replace(b, position=np.zeros(3)) if b.name == "shelf" else b for b in scene.bodies)
+    )
+    down = sunk(below, 0)
+    assert (uneven[:, 2] + down > 0).mean() > 0.98 and down < 0.05
 
 
 def test_a_reconstruction_shows_cameras_photos_points_and_surface(tmp_path):

@@ -22,7 +22,6 @@ from sdfsim.data.scenarios import (
     RECIPES,
     SPINS,
     STARTS,
-    WALL,
     Cast,
     at_rest,
     set_moving,
@@ -75,7 +74,7 @@ def test_balls_start_apart_and_stay_in_a_bowl_that_never_moves(cast, count):
     start, end = t.position[0, 1:], t.position[-1, 1:]
     apart = np.linalg.norm(start[:, None] - start[None], axis=-1) + BALL * np.eye(count)
     assert apart.min() >= BALL - 1e-9 and (t.scale[1:] == BALL).all()
-    inner = 0.5 * t.scale[0] * (1 - WALL)
+    inner = 0.5 * t.scale[0] * (1 - primitives.BOWL_WALL)
     rim = 0.5 * t.scale[0]
     # Nothing is in the wall: a ball's farthest point is within the inner sphere, but for a contact margin.
     assert np.linalg.norm(end - [0, 0, rim], axis=1).max() <= inner - 0.5 * BALL + 0.01

@@ -146,7 +146,7 @@ def test_a_body_that_slides_by_coulombs_law_slips_at_its_friction(actual):
 
 def test_who_crosses_the_wall_counts_and_who_comes_over_the_rim_does_not():
     scene = hard_cases.piled(8, 0)
-    _, outer = hard_cases.bowl_radii(8)
+    _, outer = hard_cases.bowl_radii(8, hard_cases.BOWL_BALL)
     bowl = scene.bodies[8].position
     still = hard_cases.heaped([motion(scene, 20)])
     assert still["through the wall"] == 0 and still["energy gain"] == 0 and still["depth 95 %"] == 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -82,25 +84,27 @@ def run(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture
-def mesh(run: Path, tmp_path: Path, monkeypatch):
-    """Runs the mesh stage with some options; gives its report and its folder."""
+@pytest.fixture(scope="module")
+def mesh(run: Path, tmp_path_factory) -> Iterator[Callable[..., tuple[dict, Path]]]:
+    """Runs the mesh stage with some options, once for all tests; gives its report and its folder."""
     trained = Trained(Drawn(), 0.01, Similarity(1.0, np.eye(3), np.zeros(3)), {"masked": False})  # type: ignore[arg-type]
-    monkeypatch.setattr(meshing, "load_field", lambda folder: trained)
-    monkeypatch.setitem(meshing.RESOLUTION, "quick", 97)
 
+    @cache
     def make(**options) -> tuple[dict, Path]:
-        places = run / "distill", run / "poses", run / "photos"
-        return make_meshes(*places, tmp_path, options_of(preset="quick", **options)), tmp_path
+        places, folder = (run / "distill", run / "poses", run / "photos"), tmp_path_factory.mktemp("mesh")
+        return make_meshes(*places, folder, options_of(preset="quick", **options)), folder
 
-    return make
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(meshing, "load_field", lambda folder: trained)
+        patch.setitem(meshing.RESOLUTION, "quick", 97)
+        yield make
 
 
 def test_a_cup_on_a_table_becomes_meshes_in_metres_with_names(mesh):
     corners = [np.array([x, 0.34, TOP]) for x in (-0.49, 0.49)]
     view = cameras()[10]
     places = [f"{view.source}:{u:.3f},{v:.3f}" for u, v in view.project(np.array(corners))[0]]
-    report, folder = mesh(distance=[*places, 1.2 * 0.98])
+    report, folder = mesh(distance=(*places, 1.2 * 0.98))
     scale = load_placement(folder).to_metres.scale
     assert scale == pytest.approx(1.2 / WIDTH, rel=0.02)
     assert report["objects"] == ["object1"] and report["up_confidence"] == "high"
@@ -139,13 +143,13 @@ def test_cropping_leaves_the_frame_and_what_is_within(mesh):
     whole = load_placement(folder)
     corners = np.sort(whole.to_metres.points(np.array([[-0.55, -0.4, 0.0], [0.55, 0.4, 0.45]])), axis=0)
     # Without the floor nothing reaches the end of the trained space: the table is what is left to move.
-    report, folder = mesh(size=2.0, crop=corners.ravel())
+    report, folder = mesh(size=2.0, crop=tuple(corners.ravel()))
     assert load_placement(folder).to_metres.to_dict() == whole.to_metres.to_dict()
     assert not read_parts(folder)["scenery"] and report["objects"] == ["object1"]
     vertices = load_mesh(folder / "objects" / "object1.ply").vertices
     assert (vertices > corners[0] - 0.02).all() and (vertices < corners[1] + 0.02).all()
     with pytest.raises(SdfsimError, match="crop: "):
-        mesh(crop=[5.0, 5, 5, 6, 6, 6])
+        mesh(crop=(5.0, 5, 5, 6, 6, 6))
 
 
 def test_lengths_are_reported_to_six_digits_of_the_largest():
@@ -165,6 +169,7 @@ def test_lengths_of_a_tiny_scene_are_those_of_its_meshes(mesh):
     )
 
 
+@cache
 def ball_and_photos(blocked: int = 0) -> tuple[Mesh, list[GreyPhoto]]:
     """A ball of radius 0.3 with a pattern of waves, as a mesh that is 2 % smaller, with bumps as large; and its photos.
     Before those cameras that look most from the side of +x stands a board with a pattern of its own."""

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.cameras import view_span
 from pipeline.inputs.photos import prepare_photos
-from pipeline.sfm import poses
+from pipeline.sfm import poses, worker
 from pipeline.sfm.agreement import agreement, contradicting, epipolar_errors, excess, excess_of_photos, unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find, views_of
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
@@ -492,8 +492,8 @@ def test_twenty_photos_of_one_or_two_zooms_are_posed_right(tmp_path, zooms):
 
 @pytest.mark.slow
 def test_photos_in_no_order_are_matched_by_what_they_show(tmp_path, monkeypatch):
-    """As if 48 photos were too many for all pairs, and their names told nothing: a third of the pairs is matched, and
-    all are posed, the loop around the table closed."""
+    """Their names tell nothing: a quarter of the pairs is matched, and all are posed, the loop around the table
+    closed."""
     from pipeline.cameras import load_views
 
     shuffled = np.random.default_rng(4).permutation(48)
@@ -501,13 +501,61 @@ def test_photos_in_no_order_are_matched_by_what_they_show(tmp_path, monkeypatch)
     for number, path in zip(shuffled, sorted((TABLE_VASE / "images").iterdir()), strict=True):
         shutil.copyfile(path, tmp_path / "in" / f"{number:03d}.jpg")
     photos, _ = prepare_photos(tmp_path / "in", tmp_path, long_side=640)
-    monkeypatch.setattr(poses, "EXHAUSTIVE_UP_TO", 40)
-    monkeypatch.setattr(poses, "PARTNERS", 10)
+    monkeypatch.setattr(poses, "PARTNERS", (10, 10))
     checks = solve(photos, tmp_path, tmp_path)
     listed = (tmp_path / "try_ordinary" / "pairs.txt").read_text().splitlines()
-    assert 200 < len(listed) < 48 * 10
+    assert 200 < len(listed) < 48 * 10 * 0.7
     assert checks["posed"] == 48 and checks["span_degrees"] > 300
     assert [view.focal for view in load_views(tmp_path)] == pytest.approx([620.0] * 48, rel=0.005)
+
+
+def write_features(database: Path, groups: list[int], shared: int) -> None:
+    """A database of photos that belong to groups: of each photo's 60 features as many are `shared` by its group."""
+    import pycolmap
+
+    rng = np.random.default_rng(0)
+    common = {group: rng.integers(0, 256, (shared, 128)) for group in set(groups)}
+    with pycolmap.Database.open(database) as opened:
+        camera = opened.write_camera(
+            pycolmap.Camera(model="SIMPLE_RADIAL", width=64, height=64, params=[60, 32, 32, 0])
+        )
+        for number, group in enumerate(groups):
+            image = opened.write_image(pycolmap.Image(name=f"{number}.jpg", camera_id=camera))
+            found = np.concatenate([common[group], rng.integers(0, 256, (60 - shared, 128))])
+            noise = rng.integers(-4, 5, found.shape)
+            places = np.column_stack([rng.random((60, 2)), np.full(60, 2.0), np.zeros((60, 2)), np.full(60, 2.0)])
+            opened.write_keypoints(image, places.astype(np.float32))
+            data = np.clip(found + noise, 0, 255).astype(np.uint8)
+            kind = pycolmap.FeatureExtractorType.SIFT
+            opened.write_descriptors(image, pycolmap.FeatureDescriptors(type=kind, data=data))
+
+
+def test_photos_are_paired_with_those_that_have_most_in_common(tmp_path):
+    import pycolmap
+
+    write_features(tmp_path / "database.db", [0, 1, 0, 1, 0, 1, 2], 30)
+    pairs = worker.alike(pycolmap, {"partners": 3}, tmp_path / "database.db")
+    assert sorted(pairs) == [
+        ("0.jpg", "2.jpg"), ("0.jpg", "4.jpg"), ("1.jpg", "3.jpg"), ("1.jpg", "5.jpg"), ("2.jpg", "4.jpg"),
+        ("3.jpg", "5.jpg"),
+    ]  # fmt: skip
+    assert len(worker.alike(pycolmap, {"partners": 1}, tmp_path / "database.db")) < 6
+
+
+@pytest.mark.parametrize(("posed", "again"), [(40, False), (39, True)])
+def test_what_looks_least_alike_is_matched_too_where_photos_are_left_out(posed, again, tmp_path, monkeypatch):
+    job = {**ORDINARY, "count": 40, "all_up_to": 150, "seed": 0, "known_cameras": "", "judge": ""}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    limits: list[int] = []
+    monkeypatch.setattr(worker, "watch_parent", lambda: None)
+    monkeypatch.setattr(worker, "features", lambda *args: None)
+    monkeypatch.setattr(worker, "matches", lambda pycolmap, job, database: limits.append(job["exhaustive_up_to"]))
+    monkeypatch.setattr(worker, "read_pairs", lambda *args: ({}, []))
+    monkeypatch.setattr(worker, "findings", lambda *args: {})
+    monkeypatch.setattr(worker, "best_mapping", lambda *args: (None, []))
+    monkeypatch.setattr(worker, "posed_in", lambda model: [None] * posed)
+    worker.main(str(tmp_path / "job.json"))
+    assert limits == [30, 40] if again else [30]
 
 
 @pytest.mark.slow

@@ -203,9 +203,10 @@ def two_colours(make) -> tuple[list, list[str]]:
 
 
 def test_a_jug_of_two_colours_stays_whole(tmp_path):
-    assert len(Scene(two_colours, ("lower", "upper"), 0.4, fill=0.01).split(tmp_path / "p").bodies) == 1
+    assert len(Scene(two_colours, ("lower", "upper"), 0.4, 65, fill=0.01).split(tmp_path / "p").bodies) == 1
 
 
+@pytest.mark.slow
 def test_books_in_a_stack_come_apart_by_their_masks(tmp_path):
     books = Scene(photo_sets.touching, BOOKS, 0.4, 129)
     found = books.split(tmp_path / "p", BOOKS)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfsim import load_scene
+from sdfsim.geometry.primitives import bowl_radii
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "samples"))
 
@@ -13,7 +14,7 @@ import large
 
 
 def test_balls_start_inside_the_bowl_without_touching():
-    inner = large.BALL * (large.ROOM * large.MOST_BALLS / (4 * large.PACKED)) ** (1 / 3)
+    inner, _ = bowl_radii(large.MOST_BALLS, large.BALL)
     places = large.ball_places(large.MOST_BALLS, inner)
     assert places.shape == (512, 3)
     below = places[places[:, 2] < 0]

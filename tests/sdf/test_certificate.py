@@ -139,7 +139,7 @@ def test_an_added_error_is_measured_as_it_is(scale: float) -> None:
 
 
 class Ball:
-    """A ball of 0.5 m in closed form, as an oracle. (Its middle is as near to all faces of a mesh, which takes long.)"""
+    """A ball of 0.5 m in closed form, as an oracle: all faces of a mesh are as near to its middle, which takes long."""
 
     surface, closed = primitives.sphere(0.5, 5), True
     bounds = SphereSdf(0.5).bounds

@@ -1152,7 +1152,8 @@ def _tell(motion, work, rules, held, rows, r):
             before = _reads(held.axis, j, 0, motion.velocity, motion.angular, held.body[j, 0], held.body[j, 1])
             mean = 0.5 * (before + state[j, SPEED])
             own = impulse + (rows.grip[r] if mean > 0.0 else -rows.grip[r])
-            state[j, GIVEN] += min(max(own, -rows.strong[r]), rows.strong[r]) * mean
+            state[j, DRIVE + 1] = min(max(own, -rows.strong[r]), rows.strong[r])
+            state[j, GIVEN] += state[j, DRIVE + 1] * mean
     else:
         for e in range(3):
             if rows.row[r, 3 + e] != 0.0:
@@ -1286,15 +1287,16 @@ def _resting(motion, held, c):
 @njit(**BARE)
 def _kick(world, work, motion, rules, held, c, share):
     """A share of what springs, damping, motors and friction have given in the last inner step, to velocities."""
+    state = held.state
     for k in range(held.comp[c], held.comp[c + 1]):
         if held.node[k] >= 0:
             continue
         j = -1 - held.node[k]
-        if held.state[j, BROKEN] > 0.0:
+        if state[j, BROKEN] > 0.0:
             continue
         a, b = held.body[j, 0], held.body[j, 1]
         for e in range(3 if held.kind[j] == BALL else 1):
-            impulse = share * (held.state[j, SOFT + e] + held.state[j, DRIVE + e])
+            impulse = share * (state[j, SOFT + e] + state[j, DRIVE + e])
             if impulse == 0.0:
                 continue
             line, i, row = held.axis, j, 0
@@ -1302,7 +1304,10 @@ def _kick(world, work, motion, rules, held, c, share):
                 row = 3 + e
                 line = held.line
                 _write_turn(line, j, row, _unit(e))
-            _eased(world, work, rules, line, i, row, a, b, held.eased, 0)
+            eased = _eased(world, work, rules, line, i, row, a, b, held.eased, 0)
+            if held.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # of which the motor's work is told
+                before = _reads(line, i, row, motion.velocity, motion.angular, a, b)
+                state[j, GIVEN] += share * state[j, DRIVE + 1] * (before + 0.5 * impulse * eased)
             for s in range(2):
                 body = held.body[j, s]
                 if body >= 0 and world.moves[body]:

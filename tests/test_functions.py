@@ -1,0 +1,85 @@
+"""The functions of the package: the commands without a shell."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+
+import cli
+import sdfsim
+from sdfsim.simulate.simulator import Simulator
+
+ROOT = Path(__file__).resolve().parents[1]
+# Options of the shell alone: how it reports, and where.
+SHELL = {"as_json", "verbose", "device", "photos", "sources", "scene", "source", "out", "cluster"}
+OTHERWISE = {"first": "from_stage", "last": "until_stage"}
+OWN = {("export", "scene"): "scene_file"}
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "fit", "simulate", "export"])
+def test_a_function_takes_what_its_command_takes(name):
+    (info,) = [c for c in cli.app.registered_commands if c.callback and c.callback.__name__ == name]
+    assert info.callback is not None
+    command = typer.main.get_command_from_info(info, pretty_exceptions_short=True, rich_markup_mode=None)
+    asked = {OTHERWISE.get(p.name, p.name) for p in command.params if p.name} - SHELL - {"help"}
+    asked |= {own for (of, shell), own in OWN.items() if of == name and any(p.name == shell for p in command.params)}
+    known = set(inspect.signature(getattr(sdfsim, name)).parameters)
+    if name == "reconstruct":
+        from pipeline.options import Options
+
+        known |= set(Options.model_fields)
+    assert asked - known == set() and len(asked) > 1
+    assert (inspect.getdoc(getattr(sdfsim, name)) or "").count("\n") > 2
+
+
+def test_the_function_simulate_is_not_hidden_by_the_folder_of_that_name():
+    code = (
+        "import sdfsim\n"
+        "from sdfsim.simulate.simulator import Simulator\n"
+        "import importlib\nimportlib.import_module('sdfsim.simulate.steppers')\n"
+        "assert sdfsim.Simulator is Simulator and callable(sdfsim.simulate)\n"
+        "assert sdfsim.simulate.__module__ == 'sdfsim.apps.run'\n"
+        "assert set(sdfsim.__all__) <= set(dir(sdfsim))\n"
+        "from sdfsim import simulate\nassert simulate is sdfsim.simulate"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+def test_a_run_tells_how_far_it_is(tmp_path):
+    scene = sdfsim.Scene(duration=0.05)
+    scene.add("ball", sphere={"radius": 0.1}, position=(0, 0, 1))
+    told: list[tuple[float, str]] = []
+    rollout = Simulator(scene.load()).run(steps=7, on_progress=lambda done, line: told.append((done, line)))
+    shares = [done for done, _ in told]
+    assert shares == sorted(shares) and shares[-1] == 1.0 and told[-1][1] == "7 of 7 steps" and len(rollout) == 7
+
+    stages: list[str] = []
+    scene.save(tmp_path / "scene.yaml")
+    report = sdfsim.simulate(
+        tmp_path / "scene.yaml", tmp_path / "run", viewer="none", on_progress=lambda stage, *_: stages.append(stage)
+    )
+    assert report["status"] == "done" and "simulate" in stages
+    made = sdfsim.export(tmp_path / "run", tmp_path / "run.csv")
+    assert made["frames"] == report["steps"] + 1
+
+
+def test_a_handle_knows_its_inertia():
+    """A box of 1 x 2 x 3 m and 6 kg, turned: m/12 (b^2 + c^2) about its own axes."""
+    scene = sdfsim.Scene()
+    scene.add("box", box={"size": [1.0, 2.0, 3.0]}, position=(0, 0, 5), mass=6.0, euler_xyz_deg=(30, 40, 50))
+    handle = Simulator(scene.load())["box"]
+    np.testing.assert_allclose(handle.inertia, 0.5 * np.diag([13.0, 10.0, 5.0]), rtol=1e-9, atol=1e-9)
+    before = handle.angular_velocity
+    arm, impulse = np.array([0.3, -0.2, 0.5]), np.array([0.0, 2.0, 1.0])
+    handle.push(impulse, at=handle.centre + arm)
+    from scipy.spatial.transform import Rotation
+
+    axes = Rotation.from_euler("xyz", [30, 40, 50], degrees=True).as_matrix()
+    turned = handle.angular_velocity - before
+    np.testing.assert_allclose(axes @ handle.inertia @ axes.T @ turned, np.cross(arm, impulse), atol=1e-9)
