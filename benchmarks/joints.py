@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement, tostring
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -48,11 +48,11 @@ def mjcf(scene: Loaded, step: float) -> str:
         return " ".join(f"{v:.9g}" for v in values)
 
     def solid(element: Element, body: Body) -> None:
-        form = scene.shapes[body.shape].sdf
+        form: Any = scene.shapes[body.shape].sdf
         size = [0, 0, 1] if form.KIND == "plane" else 0.5 * np.ptp(form.bounds, axis=0)
-        contact = {} if scene.effects.contact != "off" else {"contype": "0", "conaffinity": "0"}
+        contact: Any = {} if scene.effects.contact != "off" else {"contype": "0", "conaffinity": "0"}
         friction = f"{body.friction**2:g} 0.001 0.0001"
-        mass = {"mass": f"{body.mass:.9g}"} if body.mass else {}
+        mass: Any = {"mass": f"{body.mass:.9g}"} if body.mass else {}
         SubElement(element, "geom", type=form.KIND, size=numbers(size), friction=friction, **mass, **contact)
 
     def place(k: int) -> Element:
@@ -65,11 +65,11 @@ def mjcf(scene: Loaded, step: float) -> str:
         if above >= 0:
             base, turn = scene.bodies[above].position, Rotation.from_quat(scene.bodies[above].quat_xyzw)
         own = turn.inv() * Rotation.from_quat(body.quat_xyzw)
-        at = {"pos": numbers(turn.inv().apply(body.position - base)), "quat": numbers(np.roll(own.as_quat(), 1))}
+        at: Any = {"pos": numbers(turn.inv().apply(body.position - base)), "quat": numbers(np.roll(own.as_quat(), 1))}
         made[k] = element = SubElement(parent, "body", name=body.name, **at)
         if joint is not None:
             axis = Rotation.from_quat(joint.quat_xyzw[0]).apply([1.0, 0.0, 0.0])
-            given = {"type": joint.kind, "pos": numbers(joint.anchor[0]), "damping": str(joint.damping)}
+            given: Any = {"type": joint.kind, "pos": numbers(joint.anchor[0]), "damping": str(joint.damping)}
             given |= {"frictionloss": str(joint.friction)}
             if joint.kind == "hinge":
                 given["axis"] = numbers(axis)
@@ -88,6 +88,8 @@ def mjcf(scene: Loaded, step: float) -> str:
 
 def timed(scene: Loaded) -> tuple[float, float, float]:
     """Milliseconds a simulated second of ours and of MuJoCo's, and the inner step in ms."""
+    import mujoco  # part of the extra `bench`
+
     simulator = Simulator(scene)
     simulator.step(2)
     simulator.reset()
@@ -96,8 +98,9 @@ def timed(scene: Loaded) -> tuple[float, float, float]:
     simulator.step(steps)
     ours = time.perf_counter() - started
     inner = simulator.dt / simulator.options.substeps
-    model = mujoco.MjModel.from_xml_string(mjcf(scene, inner))
-    data = mujoco.MjData(model)
+    engine: Any = mujoco
+    model = engine.MjModel.from_xml_string(mjcf(scene, inner))
+    data = engine.MjData(model)
     for body in scene.bodies:
         row = model.body(body.name).id
         if body.motion == "dynamic" and model.body_jntnum[row] and model.jnt_type[model.body_jntadr[row]] == 0:
@@ -105,7 +108,7 @@ def timed(scene: Loaded) -> tuple[float, float, float]:
             data.qvel[first : first + 3] = body.velocity
     started = time.perf_counter()
     for _ in range(math.ceil(SECONDS / inner)):
-        mujoco.mj_step(model, data)
+        engine.mj_step(model, data)
     theirs = time.perf_counter() - started
     return 1e3 * ours / SECONDS, 1e3 * theirs / SECONDS, 1e3 * inner
 

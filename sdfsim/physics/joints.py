@@ -10,25 +10,34 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdfsim.physics import pose
+from sdfsim.physics.joint_columns import (
+    BOUNCE,
+    BROKEN,
+    COORD,
+    DAMPING,
+    DRAG,
+    FORCE,
+    FRESH,
+    HIGH,
+    KINDS,
+    LENGTH,
+    LOW,
+    MOST,
+    MOTOR,
+    NUMBERS,
+    REST,
+    STATE,
+    STIFFNESS,
+    TARGET,
+    TIME,
+    TO_PLACE,
+    TO_SPEED,
+    TORQUE,
+)
 from sdfsim.scene.scene import Joint
 
 if TYPE_CHECKING:
     from sdfsim.physics.bodies import Units
-
-KINDS = ("hinge", "slider", "ball", "fixed", "distance")
-HINGE, SLIDER, BALL, FIXED, DISTANCE = range(5)
-# Columns of `Joints.number`: where a joint ends, how it rebounds there, what drags, pulls and drives it (0: nothing, 1:
-# to a speed, 2: to a place), how long its rod is (below 0: it has none), and what it bears.
-LOW, HIGH, BOUNCE, DAMPING, DRAG, STIFFNESS, REST, MOTOR, MOST, TIME, LENGTH, FORCE, TORQUE, NUMBERS = range(14)
-# Columns of `State.joints`: its angle, position or length, how fast that changes, what its motor aims at, whether it is
-# broken, whether nothing is known of its impulses; force and torque on the first body (at its anchor, world axes), the
-# impulses at its limit, of its motor and friction, of its spring and damping (a ball has three of both; behind the one
-# of a motor with friction stands that of the motor alone), all of the last inner step; by how much its rows have to turn in an inner step so that they hold at its end; what the motor has given
-# in the step.
-COORD, SPEED, TARGET, BROKEN, FRESH, PULL, TWIST, STOP, DRIVE, SOFT, BEND, GIVEN, STATE = (
-    0, 1, 2, 3, 4, 5, 8, 11, 12, 15, 18, 24, 25,
-)  # fmt: skip
-NOTHING, TO_SPEED, TO_PLACE = range(3)  # what a motor does
 
 
 @dataclass(frozen=True)
@@ -129,6 +138,7 @@ class Order:
     comp: np.ndarray
     node: np.ndarray
     of_body: np.ndarray
+    of_comp: np.ndarray
     entry: np.ndarray
     below: np.ndarray
     row: np.ndarray
@@ -196,10 +206,10 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
         for p, r in enumerate(rows):
             target += [block[r, q] for q in rows[:p]] + [-1 - r]
         start.append(len(target))
-    of_body = np.full(len(moves), -1, np.int64)
+    of_body, of_comp = np.full(len(moves), -1, np.int64), np.full(len(moves), -1, np.int64)
     for n, k in place.items():
         if n >= 0:
-            of_body[n] = k
+            of_body[n], of_comp[n] = k, np.searchsorted(comp, k, side="right") - 1
     entry = np.full((len(joints), 2), -1, np.int64)
     for j, bodies in enumerate(joints.body):
         for s, b in enumerate(bodies):
@@ -210,7 +220,9 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
     def whole(values: list[int]) -> np.ndarray:
         return np.array(values, np.int64)
 
-    return Order(whole(comp), whole(node), of_body, entry, whole(below), whole(row), whole(start), whole(target))
+    return Order(
+        whole(comp), whole(node), of_body, of_comp, entry, whole(below), whole(row), whole(start), whole(target)
+    )
 
 
 def apart(joints: Joints, count: int) -> np.ndarray:

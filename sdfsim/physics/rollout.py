@@ -90,10 +90,9 @@ class Rollout:
         try:
             counters = {k.removeprefix("counter_"): arrays.pop(k) for k in list(arrays) if k.startswith("counter_")}
             names = tuple(str(n) for n in arrays.pop("names"))
-            if "joint_names" in arrays:
-                arrays["joint_names"] = tuple(str(n) for n in arrays["joint_names"])
+            joints = tuple(str(n) for n in arrays.pop("joint_names", ()))
             meta = json.loads(str(arrays.pop("meta")))
-            return cls(**arrays, counters=counters, names=names, meta=meta)
+            return cls(**arrays, counters=counters, names=names, meta=meta, joint_names=joints)
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{path}: not a rollout of sdfsim ({error})") from error
 

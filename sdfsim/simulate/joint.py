@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.physics.joints import BROKEN, COORD, PULL, SPEED, TARGET, TWIST
+from sdfsim.physics.joint_columns import BROKEN, COORD, PULL, SPEED, TARGET, TWIST
 from sdfsim.scene.scene import Joint
 from sdfsim.simulate.body import LiveScene
 

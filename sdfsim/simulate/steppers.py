@@ -22,7 +22,8 @@ from sdfsim.learned.model import SOLVER, SURFACE, Model
 from sdfsim.learned.training_ranges import outside_training
 from sdfsim.physics.bodies import Bodies, State, Units, awake
 from sdfsim.physics.free_flight import driven, fly, with_history
-from sdfsim.physics.joints import COORD, PULL, STATE, stored
+from sdfsim.physics.joint_columns import COORD, PULL, STATE
+from sdfsim.physics.joints import stored
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import SUBSTEPS, Options
 from sdfsim.physics.units import scene_units

@@ -40,7 +40,7 @@ from sdfsim.physics.solver.vectors import (
 
 @njit(**FAST)
 def advance(shapes, world, work, motion, rules, manifolds, held):
-    """Advance `motion` by one step, in place, and what is known of the joints that have bodies `held`; time is that of
+    """Advance `motion` by one step, in place, and what is known of the joints that hold bodies; time is that of
     the bodies that go, however many others there are.
 
     Returns:
@@ -53,7 +53,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held):
         to_matrix(motion.orientation, b, matrix)
         work.met[b] = False
     manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds)
-    jointed = len(held.body) > 0
+    jointed = len(held.each.body) > 0
     while rules.sleep and (woken(world, motion, manifolds, near) or (jointed and roused(world, motion, held))):
         manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
@@ -74,7 +74,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held):
             for x in range(9):
                 free[b, x] = 0.0
             motion.touching[b] = False
-            if world.moves[b] and motion.island[b] < 0 and (work.beside[b] or (jointed and held.of_body[b] >= 0)):
+            if world.moves[b] and motion.island[b] < 0 and (work.beside[b] or (jointed and held.graph.of_body[b] >= 0)):
                 _prepare(world, motion, matrix, inverse, work.wrench, rules, free, b)
         if jointed:
             assemble(world, work, motion, rules, held, True)
@@ -105,7 +105,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held):
     if jointed:
         end_step(world, work, motion, rules, held)
     if rules.sleep:
-        put_to_sleep(world, motion, rules, manifolds, held)
+        put_to_sleep(world, motion, rules, manifolds, held.graph.of_body, held.each.body)
     met = 0  # of those that are awake still
     for b in world.going:
         met += work.met[b] and motion.island[b] < 0

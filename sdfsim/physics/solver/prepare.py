@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from sdfsim.base.compiling import warn_compiling
+from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
-from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks, Units
 from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import Options
@@ -19,7 +19,7 @@ from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.physics.solver.edges import nodes_within
-from sdfsim.physics.solver.joints import ROWS, Held, Trial
+from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows, Trial
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
@@ -76,7 +76,7 @@ class Compiled:
         n, count = steps if keep else 0, len(self.bodies)
         kept = Kept(
             np.empty((n, count, 3)), np.empty((n, count, 4)), np.empty((n, count, 3)), np.empty((n, count, 3)),
-            np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, len(self.held.body), 7)),
+            np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, len(self.held.each.body), 7)),
         )  # fmt: skip
         # An integer of another kind would be compiled for anew.
         bodies = (self.shapes, self.world, self.work, motion, rules, manifolds, self.held)
@@ -88,7 +88,7 @@ class Compiled:
         if state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
-            self.held.state[:] = 0.0 if state.joints is None else state.joints
+            self.held.each.state[:] = 0.0 if state.joints is None else state.joints
         if state.load is not self._load:
             self.work.wrench[:] = 0.0 if state.load is None else state.load
             self._load = state.load
@@ -119,7 +119,7 @@ class Compiled:
         )  # fmt: skip
         arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
         moved = {name: array[rows] for name, array in zip(MOTION, arrays, strict=True)}
-        known = None if state.joints is None else self.held.state.copy()
+        known = None if state.joints is None else self.held.each.state.copy()
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         asleep = int((motion.island[rows] >= 0).sum())
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
@@ -178,9 +178,11 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, *, gravity: boo
     touch = state.touch
     if bodies.joints is not None and state.joints is not None and changed.any():
         # Nothing is known of the impulses of joints at what was changed, nor of what they connect.
-        place = jointed.coordinates(bodies.joints, state.joints[:, jointed.COORD], state.position, state.orientation)
+        place = jointed.coordinates(
+            bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
+        )
         known = state.joints.copy()
-        known[:, jointed.COORD], known[:, jointed.FRESH] = place, 1.0
+        known[:, joint_columns.COORD], known[:, joint_columns.FRESH] = place, 1.0
         state = replace(state, joints=known)
     if touch is None:
         return state
@@ -355,16 +357,24 @@ def held_by(bodies: Bodies) -> Held:
     empty = np.zeros((0, 3))
     joints = bodies.joints or jointed.joints_of((), empty, Units(1.0, 1.0, 1.0))
     order = jointed.ordered(joints, bodies.moves)
-    j, k, f, n = len(joints), len(order.node), len(order.row), len(bodies) if len(joints) else 0
+    j, k, f = len(joints), len(order.node), len(order.row)
+    n = len(bodies) if j else 0
 
     def room(*shape: int) -> np.ndarray:
         return np.zeros(shape)
 
     return Held(
-        joints.body, joints.kind, joints.anchor, joints.axes, joints.number, **vars(order),
-        state=room(j, jointed.STATE), line=room(j, ROWS, 12), active=np.zeros((j, ROWS), np.int64), soft=room(j, ROWS),
-        wanted=room(j, ROWS), impulse=room(j, ROWS), error=room(j, ROWS), later=room(j, ROWS), axis=room(j, 1, 12),
-        diagonal=room(k, 6, 6), inverse=room(k, 6, 6), block=room(f, 6, 6), low=room(f, 6, 6), x=room(k, 6),
-        eased=room(1, 24), trial=Trial(room(n, 3), room(n, 4), room(n, 3), room(n, 3)), frame=room(n, 3, 3),
-        turned=room(1, 4), tried=room(1, 3, 3), reply=room(n, 6), calm=np.zeros(n, np.bool_),
+        graph=Graph(**vars(order)),
+        factors=Factors(room(k, 6, 6), room(k, 6, 6), room(f, 6, 6), room(f, 6, 6), room(k, 6)),
+        each=Each(
+            joints.body, joints.kind, joints.anchor, joints.axes, joints.number, room(j, joint_columns.STATE),
+            room(j, 1, 12),
+        ),
+        rows=Rows(
+            room(j, ROWS, 12), np.zeros((j, ROWS), np.int64), room(j, ROWS), room(j, ROWS), room(j, ROWS),
+            room(j, ROWS), room(j, ROWS), room(1, 24),
+        ),
+        trial=Trial(room(n, 3), room(n, 4), room(n, 3), room(n, 3), room(n, 3, 3), room(1, 4), room(1, 3, 3)),
+        reply=room(n, 6),
+        calm=np.zeros(n, np.bool_),
     )  # fmt: skip

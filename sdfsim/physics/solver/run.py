@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.physics.joints import COORD, PULL
+from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
 from sdfsim.physics.solver.joints import given, stored
 from sdfsim.physics.solver.record import no_edges
@@ -80,17 +80,17 @@ def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most,
                 )
                 if wrong >= 0:
                     return manifolds, edges, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
-        pulled = _pulled(going, work.wrench, motion, place, spin, dt) + given(held)
+        pulled = _pulled(going, work.wrench, motion, place, spin, dt) + given(held.each)
         total += pulled
         if len(kept.depth):
             kept.position[k], kept.orientation[k] = motion.position, motion.orientation
             kept.velocity[k], kept.angular_velocity[k] = motion.velocity, motion.angular
             kept.energy[k, 0], kept.energy[k, 1] = _energies(world, motion, rules)
-            kept.energy[k, 1] += stored(held)
-            for j in range(len(held.body)):
-                kept.joint[k, j, 0] = held.state[j, COORD]
+            kept.energy[k, 1] += stored(held.each)
+            for j in range(len(held.each.body)):
+                kept.joint[k, j, 0] = held.each.state[j, COORD]
                 for x in range(6):
-                    kept.joint[k, j, 1 + x] = held.state[j, PULL + x]
+                    kept.joint[k, j, 1 + x] = held.each.state[j, PULL + x]
             kept.energy[k, 2] = pulled
             here = touching(manifolds, motion.position, motion.orientation, within)
             while found + len(here.pair) > len(pair):
