@@ -27,7 +27,8 @@ from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, largest_extent
-from sdfsim.physics.joints import DAMPING, DRAG, initial
+from sdfsim.physics.joint_columns import DAMPING, DRAG
+from sdfsim.physics.joints import initial
 from sdfsim.physics.options import STEP, SUBSTEPS, Options
 from sdfsim.physics.solver.world import FIRST
 from sdfsim.physics.units import scene_units

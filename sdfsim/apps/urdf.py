@@ -286,8 +286,11 @@ class _Reader:
             if form.tag != "sphere":
                 caps = 2.0 * sizes["radius"] if form.tag == "capsule" else 0.0
                 sizes["height"] = self.number(form, "length") + caps
+        if any(np.min(value) == 0.0 for value in sizes.values()):
+            self.notes.append(f"{self.where(form)} has no size: it is left out")
+            return None
         for key, value in sizes.items():
-            if np.min(value) <= 0.0:
+            if np.min(value) < 0.0:
                 raise self.wrong(form, f"{key} must be above zero (got {form.get(key) or value})")
         return Part(form.tag, pose, sizes, mesh, self.where(form), color)  # type: ignore[arg-type]
 

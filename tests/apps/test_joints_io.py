@@ -217,7 +217,7 @@ def test_a_floor_is_under_the_lowest_link(tmp_path: Path) -> None:
         ('child link="tool0"', 'child link="upper"', "held by two joints"),
         ("</robot>", "</robt>", "not valid XML (mismatched tag)"),
         ('<box size="0.2 0.2 0.2"/>', '<mesh filename="package://a/b.obj"/>', "no such file: package://a/b.obj"),
-        ('<box size="0.2 0.2 0.2"/>', '<box size="0.2 0 0.2"/>', "size must be above zero"),
+        ('<box size="0.2 0.2 0.2"/>', '<box size="0.2 -1 0.2"/>', "size must be above zero"),
         ('<box size="0.2 0.2 0.2"/>', "<cone/>", "must hold one of box, sphere"),
     ],
 )
