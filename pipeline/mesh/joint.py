@@ -88,11 +88,14 @@ def find_joint(one: Mesh, other: Mesh, *, seed: int = 0) -> FoundJoint:
         back = np.linalg.inv(motion)
         return max(_off(part[0], motion, on[1], FAR * size), _off(there[0], back, on[0], FAR * size)), motion
 
-    few = (part[0][:: max(1, len(part[0]) // FEW)], part[1][:: max(1, len(part[1]) // FEW)])
-    rough = sorted((tried(_laid(few, start, on[1], size)) for start in _starts(part[0], there[0])), key=lambda e: e[0])
+    few = [
+        (some[0][:: max(1, len(some[0]) // FEW)], some[1][:: max(1, len(some[0]) // FEW)]) for some in (part, there)
+    ]
+    rough = [tried(_laid(few[0], few[1], start, on, size)) for start in _starts(part[0], there[0])]
+    rough.sort(key=lambda entry: entry[0])
     found, mid = [], part[0].mean(0)
     for _, motion in rough[:BEST]:
-        off, motion = tried(_laid(part, motion, on[1], size, reaches=(3.0 * FINE, FINE, FINE, FINE)))
+        off, motion = tried(_laid(part, there, motion, on, size, reaches=(3.0 * FINE, FINE, FINE, FINE)))
         found.append((off, *_screw(motion, mid), motion))
     least = max(min(off for off, *_ in found), EXACT * size)
     if least > FIT * size:
@@ -168,28 +171,39 @@ def _away(surface: ClosestPoint, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(surface(points)[0] - points, axis=1)
 
 
+Points = tuple[np.ndarray, np.ndarray]  # [P, 3] m of a surface, with the normals there
+
+
 def _laid(
-    part: tuple[np.ndarray, np.ndarray], start: np.ndarray, surface: ClosestPoint, size: float,
+    part: Points, there: Points, start: np.ndarray, on: tuple[ClosestPoint, ClosestPoint], size: float,
     reaches: Sequence[float] = (COARSE, 0.5 * COARSE, 0.25 * COARSE),
 ) -> np.ndarray:  # fmt: skip
-    """[4, 4] by ICP of points with normals, to planes: of those that face as the surface does, looking ever nearer."""
+    """[4, 4] by ICP, points to planes: of the part in the first state on the second's surface, and of the part in the
+    second state on the first's, looking ever nearer. Edges of a part that lies flush in the one state are seen in the
+    other."""
     motion = start.copy()
     for reach in reaches:
         for _ in range(ROUNDS):
-            here, facing = part[0] @ motion[:3, :3].T + motion[:3, 3], part[1] @ motion[:3, :3].T
-            point, normal = surface(here)
-            distance = np.linalg.norm(point - here, axis=1)
-            kept = (distance <= reach * size) & ((facing * normal).sum(1) > 0.5)
+            turn, shift = motion[:3, :3], motion[:3, 3]
+            here, facing = part[0] @ turn.T + shift, part[1] @ turn.T
+            goal, normal = on[1](here)
+            back, normal_back = on[0]((there[0] - shift) @ turn)
+            # What moves, where it is to go along a normal, and which way it faces and should.
+            moving = np.concatenate([here, back @ turn.T + shift])
+            goal = np.concatenate([goal, there[0]])
+            along = np.concatenate([normal, normal_back @ turn.T])
+            alike = np.concatenate([(facing * normal).sum(1), (normal_back @ turn.T * there[1]).sum(1)])
+            distance = np.linalg.norm(goal - moving, axis=1)
+            kept = (distance <= reach * size) & (alike > 0.5)
             if kept.sum() < 12:
                 break
+            moving, goal, along = moving[kept], goal[kept], along[kept]
             # What is seen in one state only has no partner, or a wrong one, which is far.
-            known = distance[kept]
-            weight = 1.0 / (1.0 + (known / (2.0 * np.median(known) + 1e-6 * size)) ** 2)
-            weight = np.maximum(weight, 0.05) * (known <= reach * size)
-            middle = here[kept].mean(0)
-            lever = here[kept] - middle
-            rows = np.concatenate([np.cross(lever, normal[kept]), normal[kept]], 1)
-            wanted = ((point - here)[kept] * normal[kept]).sum(1)
+            weight = np.maximum(1.0 / (1.0 + (distance[kept] / (0.3 * reach * size)) ** 2), 0.05)
+            middle = moving.mean(0)
+            lever = moving - middle
+            rows = np.concatenate([np.cross(lever, along), along], 1)
+            wanted = ((goal - moving) * along).sum(1)
             scale = np.concatenate([np.full(3, np.sqrt((lever**2).sum(1).mean())), np.ones(3)])
             # A part that symmetry lets slide along itself is held where it is.
             heavy = (rows / scale) * weight[:, None]

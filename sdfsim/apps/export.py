@@ -185,11 +185,11 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     else:
         time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
         place = np.array([[body.position for body in scene.bodies]])
-    names, shapes = (_plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
+    names, shapes = (plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
     return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, place, turn)
 
 
-def _plain_names(names: list[str]) -> list[str]:
+def plain_names(names: list[str]) -> list[str]:
     """Unique names that every format takes, in place of `names`."""
     used: set[str] = set(RESERVED)
     plain = []
@@ -209,7 +209,7 @@ def _plain_names(names: list[str]) -> list[str]:
 def _joint_names(take: Take) -> dict[str, str]:
     """What every format takes, in place of the names of the joints."""
     names = [joint.name for joint in take.scene.joints]
-    return dict(zip(names, _plain_names(names), strict=True))
+    return dict(zip(names, plain_names(names), strict=True))
 
 
 def _inertia(body: Body, shape: Shape) -> np.ndarray:
@@ -485,7 +485,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     scene, left_out = take.scene, _missing(take)
     sampled = take.collide == "sdf"
     seen, cut = _write_assets(take, out, lambda body: not sampled, on_progress)
-    root = XML("mujoco", model=_plain_names([out.stem])[0])
+    root = XML("mujoco", model=plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
     _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
     _add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.apps.export import plain_names
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.mesh import Mesh, convex_hull, is_closed, joined, signed_volume
@@ -151,9 +152,11 @@ def write_scene(
         scene.add(FLOOR, plane={}, friction=1.0, restitution=0.0)
     partners = _partners(whole, [shape for shape, *_ in made], poses, floor, notes)
     folders: list[Path] = []
+    names = [link.name for link in whole.links]
+    files = dict(zip(names, plain_names(names), strict=True))
     for link, (shape, keys, _, mass), pose, touches in zip(whole.links, made, poses, partners, strict=True):
         if "asset" in keys and shape is not None:
-            folders.append(shape.save(folder / keys["asset"]))
+            folders.append(shape.save(folder / files[link.name]))
             keys = keys | {"asset": folders[-1]}
         surface = {"friction": _round(link.friction), "restitution": _round(link.restitution)}
         if "plane" in keys:
@@ -170,7 +173,6 @@ def write_scene(
             link.name, **keys, position=_round(pose[:3, 3] + lift), **turned, **motion, **surface,
             **({} if touches is None else {"collides_with": touches}),
         )  # fmt: skip
-    names = [link.name for link in whole.links]
     for joint in whole.joints:
         _join(scene, joint, names, lift)
     return [scene.save(out), *folders], notes
@@ -387,8 +389,6 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
             shape = replace(shape, com=com, inertia=tensor * shape.volume / held)
     if shape.skin is not None:
         keys = {"asset": link.name}
-    if "asset" in keys:
-        keys["asset"] = "".join(c if c.isalnum() or c in "-_." else "_" for c in link.name)
     return shape, keys, frame, mass
 
 

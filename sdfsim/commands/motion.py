@@ -1,5 +1,5 @@
-"""The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train, evaluate;
-tradeoff, stress."""
+"""The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train,
+evaluate; tradeoff, stress."""
 
 from __future__ import annotations
 
