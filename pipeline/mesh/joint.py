@@ -88,9 +88,7 @@ def find_joint(one: Mesh, other: Mesh, *, seed: int = 0) -> FoundJoint:
         back = np.linalg.inv(motion)
         return max(_off(part[0], motion, on[1], FAR * size), _off(there[0], back, on[0], FAR * size)), motion
 
-    few = [
-        (some[0][:: max(1, len(some[0]) // FEW)], some[1][:: max(1, len(some[0]) // FEW)]) for some in (part, there)
-    ]
+    few = [(some[0][:: max(1, len(some[0]) // FEW)], some[1][:: max(1, len(some[0]) // FEW)]) for some in (part, there)]
     rough = [tried(_laid(few[0], few[1], start, on, size)) for start in _starts(part[0], there[0])]
     rough.sort(key=lambda entry: entry[0])
     found, mid = [], part[0].mean(0)

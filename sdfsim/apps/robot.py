@@ -17,7 +17,7 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.mesh import Mesh, convex_hull, is_closed, joined, signed_volume
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import WORLD
-from sdfsim.shape.make import analytic_shape, mesh_shape
+from sdfsim.shape.make import analytic_shape, fit_pieces, mesh_shape
 from sdfsim.shape.shape import Shape
 
 FLOOR = "floor"
@@ -422,14 +422,14 @@ def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
         if closed and abs(signed_volume(mesh)) >= (1.0 - CONVEX) * signed_volume(hull):
             convex.append(hull)
         meshes.append(mesh)
+    if len(convex) == len(parts) > 1:
+        return fit_pieces(convex, name=link.name, kind="grid")
     try:
         shape = mesh_shape(joined(meshes), name=link.name, kind="mesh")
     except SdfsimError as error:
         notes.append(f"link {link.name}: its convex hull stands for it ({error.message})")
         hulls = [convex_hull(mesh.vertices) for mesh in meshes]
-        convex, shape = hulls, mesh_shape(joined(hulls), name=link.name, kind="mesh")
-    if len(convex) == len(parts) > 1:
-        shape = replace(shape, pieces=tuple(mesh.vertices for mesh in convex))
+        shape = fit_pieces(hulls, name=link.name, kind="grid")
     source = {key: value for key, value in shape.source.items() if key != "notes"}
     return replace(shape, source=source)
 
