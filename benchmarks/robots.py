@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,8 +142,10 @@ def _set(mujoco, model, data, joints, known: dict[str, Joint], rng: np.random.Ge
 
 
 def _bare(source: Path) -> str:
-    """A URDF without geometry: MuJoCo finds no meshes by ROS paths, and masses and joints do not need them."""
-    root = ElementTree.fromstring(source.read_bytes().lstrip())
+    """A URDF without geometry: MuJoCo finds no meshes by ROS paths, and masses and joints do not need them. Without
+    what no XML has around it, and with ROS' defaults in place of variables of the environment."""
+    text = source.read_bytes().decode(errors="replace").strip(" \t\r\n\0")
+    root = ElementTree.fromstring(re.sub(r"\$\(optenv +\w+([^()]*)\)", r"\1", text).encode())
     for link in root.findall("link"):
         for tag in ("visual", "collision"):
             for child in link.findall(tag):
