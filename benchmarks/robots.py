@@ -92,10 +92,11 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     start = _set(mujoco, model, data, joints, by_name, None)
     places, turns = poses(scene, start)
     first = [(data.xmat[k].reshape(3, 3).copy(), turns[i]) for k, i in both]
+    axes = {k: ours.T @ theirs for (k, _), (theirs, ours) in zip(both, first, strict=True)}
     apart = turned = 0.0
     # MuJoCo holds the roots of a URDF in the origin, and a scene has free roots where they are.
     for trial in range(tries + 1):
-        values = start if trial == 0 else _set(mujoco, model, data, joints, by_name, rng)
+        values = start if trial == 0 else _set(mujoco, model, data, joints, by_name, rng, axes)
         places, turns = poses(scene, values)
         for (k, i), (theirs, ours) in zip(both, first, strict=True):
             apart = max(apart, float(np.linalg.norm(data.xipos[k] - places[i])))
@@ -119,8 +120,12 @@ def _named(model, j: int) -> str:
     return f"{model.body(body).name or f'body_{body}'}_joint" + (f"_{count}" if count else "")
 
 
-def _set(mujoco, model, data, joints, known: dict[str, Joint], rng: np.random.Generator | None) -> dict:
-    """Set joints to where the scene starts, or at random within limits, and return their positions."""
+def _set(
+    mujoco, model, data, joints, known: dict[str, Joint], rng: np.random.Generator | None,
+    shape_axes: dict[int, np.ndarray] | None = None,
+) -> dict:  # fmt: skip
+    """Set joints to where the scene starts, or at random within limits, and return their positions; `shape_axes` by
+    body carry from the axes of its link to those of its shape."""
     mujoco.mj_resetData(model, data)
     values: dict[str, float | np.ndarray] = {}
     for j, name in joints.items():
@@ -130,7 +135,9 @@ def _set(mujoco, model, data, joints, known: dict[str, Joint], rng: np.random.Ge
         if kind == mujoco.mjtJoint.mjJNT_BALL:
             turn = np.zeros(3) if rng is None else rng.normal(size=3)
             data.qpos[at : at + 4] = np.roll(Rotation.from_rotvec(turn).as_quat(), 1)
-            values[name] = Rotation.from_quat(known[name].quat_xyzw[1]).inv().apply(turn)
+            # MuJoCo turns about the link's axes, which need not be those of the shape that stands for it.
+            own = Rotation.from_quat(known[name].quat_xyzw[0]).inv()
+            values[name] = own.apply(shape_axes[int(model.jnt_bodyid[j])] @ turn) if shape_axes else turn
             continue
         low, high = model.jnt_range[j] if model.jnt_limited[j] else (-FREE, FREE)
         value = float(data.qpos[at]) if rng is None else float(rng.uniform(low, high))
