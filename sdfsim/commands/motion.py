@@ -1,5 +1,5 @@
-"""The commands on scenes and motion: simulate, plan, view, render, export, identify, info; dataset, train, evaluate;
-tradeoff, stress."""
+"""The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train,
+evaluate; tradeoff, stress."""
 
 from __future__ import annotations
 
@@ -13,10 +13,6 @@ from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, tell_fa
 from sdfsim.base.console import Session, columns, duration
 from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
-_PACKAGES = (
-    *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
-    *("pydantic", "pybullet"),
-)
 SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
@@ -126,7 +122,7 @@ def view(
         viewer.screenshot(recording, picture, at=at)
         session.report({"screenshot": picture})
     else:
-        viewer.show(recording, web=web)
+        viewer.show(recording, web=web, say=session.say)
         session.report({"recording": recording})
 
 
@@ -198,6 +194,38 @@ def export(
 
 
 @command
+def import_(
+    session: Session,
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="Ends in .urdf, .xml or .mjcf.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="FILE", help="The scene.yaml to write.", show_default=False)
+    ],
+    packages: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of the packages that package:// names (URDF); may be given again."),
+    ] = None,
+    fixed: Annotated[bool, typer.Option("--fixed", help="The root never moves (URDF).")] = False,
+    floor: Annotated[bool, typer.Option("--floor", help="Add a floor at z = 0, and stand all on it.")] = False,
+    key: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The keyframe that is the start (MJCF; default: start).")
+    ] = None,
+) -> None:
+    """URDF or MJCF -> scene.yaml with joints (docs/import.md)."""
+    from sdfsim.apps import import_robot as room
+
+    report = room.import_robot(
+        source, out, packages=packages or [], fixed=fixed, floor=floor, key=key, on_progress=session.stage_progress
+    )
+    lines = [
+        f"links {report['links']}, joints {report['joints']}",
+        f"wrote {report['files'][0]}" + (f" and {n} shapes beside it" if (n := len(report["files"]) - 1) else ""),
+        *report["notes"],
+        *(f"not in it: {line}" for line in report["left_out"]),
+    ]
+    session.report(report, lines)
+
+
+@command
 def identify(
     session: Session,
     recordings: Annotated[
@@ -231,24 +259,11 @@ def identify(
 
 @command
 def info(session: Session) -> None:
-    """Versions, devices and bundled models."""
-    import platform
-    from importlib import metadata
+    """Versions, devices and bundled models; what is missing here, and how to get it."""
+    from sdfsim.apps.about import about, about_lines
 
-    import torch
-
-    from sdfsim.base.version import __version__
-    from sdfsim.learned.model import model_names
-
-    versions = {"sdfsim": __version__, "python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "missing"
-    gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
-    threads = {"cpu_threads": torch.get_num_threads()}
-    session.report({"versions": versions, "devices": ["cpu", *gpus], **threads, "models": model_names()})
+    report = about()
+    session.report(report, about_lines(report))
 
 
 @command
@@ -297,11 +312,21 @@ def dataset(
 def train(
     session: Session,
     data: Annotated[
-        list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
+        list[Path],
+        typer.Option(
+            help="Dataset folder; several are trained on together. With --scene: recordings of it, as `identify` reads "
+            "them.",
+            show_default=False,
+        ),
     ],
     out: Out,
+    scene: Annotated[
+        Path | None, typer.Option(help="The scene of recordings, best as `identify -o` wrote it.", show_default=False)
+    ] = None,
     preset: Annotated[
-        Literal["small", "alone", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        Literal[
+            "small", "alone", "impacts", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"
+        ],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
@@ -310,10 +335,10 @@ def train(
     ] = 0,
     device: str = "auto",
 ) -> None:
-    """Train a model on datasets."""
+    """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device}
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene}
     session.report(run_training(data, out, **how, on_progress=session.progress))
 
 

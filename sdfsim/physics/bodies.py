@@ -12,7 +12,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import joints as jointed
 from sdfsim.physics import pose
 from sdfsim.physics.joints import Joints
-from sdfsim.physics.motion import Motion, Rows
+from sdfsim.physics.motion import MOTION, Motion, Rows
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.sdf.sdf import Sdf
@@ -46,6 +46,15 @@ class Units:
     def energy(self) -> float:
         """J in one model unit of energy."""
         return self.mass * self.velocity**2
+
+    def in_si(self, motion: Motion) -> dict[str, np.ndarray]:
+        """The arrays of a motion in model units, in metres and seconds."""
+        return {name: getattr(motion, name) * unit for name, unit in self.motion.items()}
+
+    @property
+    def motion(self) -> dict[str, float]:
+        """Metres and seconds in one model unit of each array of a `Motion`."""
+        return dict(zip(MOTION, (self.length, 1.0, self.velocity, 1.0 / self.time), strict=True))
 
 
 @dataclass(frozen=True)

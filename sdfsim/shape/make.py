@@ -23,6 +23,8 @@ from sdfsim.geometry.mesh_io import GLTF, load_mesh
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.fit import FIT_VERSION, Recipe
+from sdfsim.sdf.fit.certificate import certify_grid
+from sdfsim.sdf.grid import sample_grid
 from sdfsim.sdf.reference import MeshDistance, PiecesDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.shape import DEFAULT_RESOLUTION, FORMAT_VERSION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
@@ -172,12 +174,12 @@ def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
 
 def mesh_shape(
     mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
-    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
+    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent, coarse: int = 1,
 ) -> Shape:  # fmt: skip
-    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
-    Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
+    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it (see `sample_grid`), nodes and mass
+    as a fit has them. Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
     solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
-    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress, coarse)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
     source = {"kind": "mesh"} | note | ({"notes": list(solid.notes)} if solid.notes else {})
     return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), certificate, source)
@@ -255,8 +257,10 @@ def fit_pieces(
     name: str,
     display: Mesh | None = None,
     nodes: int = DEFAULT_COUNT,
+    kind: Literal["mlp", "grid"] = "mlp",
 ) -> Shape:
-    """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
+    """Fit the compact SDF network to the union of convex pieces, or sample that on a grid (`kind` "grid", in a second):
+    the body that a rigid-body engine collides.
 
     At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
     contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface. Mass
@@ -278,12 +282,17 @@ def fit_pieces(
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
         return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
-    from sdfsim.sdf.fit.train import fit_sdf
+    if kind == "grid":
+        sdf: Sdf = sample_grid(oracle, oracle.bounds, DEFAULT_RESOLUTION)
+        points, certificate = pick(sdf), certify_grid(sdf, oracle)
+        source: dict[str, Any] = {"kind": "pieces", "sdf": "grid", "resolution": DEFAULT_RESOLUTION}
+    else:
+        from sdfsim.sdf.fit.train import fit_sdf
 
-    sdf, points, certificate = fit_sdf(oracle, "default", None, 0, pick, silent, "cpu")
+        sdf, points, certificate = fit_sdf(oracle, "default", None, 0, pick, silent, "cpu")
+        source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle, oracle.bounds)
     mesh = display if display is not None else clean(oracle.surface, name=name)
-    source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
     hulls = tuple(piece.vertices for piece in pieces)
     return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)

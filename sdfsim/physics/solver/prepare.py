@@ -36,6 +36,7 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 # Penetration that is left as it is, so that what rests has contacts that do not come and go: model lengths, and less in
 # inner steps below the usual 4 ms, which scenes of slender bodies have.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
+ROUNDS, TEACHERS = 100, 50  # of sequential impulses in an inner step at most, and of the teacher
 CROWD = 64  # bodies that move, from which on pairs may be looked at in threads
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
@@ -214,10 +215,13 @@ def nodes_near(
 def compiled_rules(options: Options) -> compiled.Rules:
     """The options of a run as the compiled step wants them."""
     gravity, inner = options.gravity, options.dt / options.substeps
+    # What is met in the course of an inner step is found before it is. The teacher looks at poses alone.
+    ahead = 0.0 if options.adds and not (options.record and inner > COARSE) else inner
+    rounds = TEACHERS if options.adds else ROUNDS
     return compiled.Rules(
         gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,
         options.restitution, options.rotation, options.sleep, options.margin, options.adds, options.cone,
-        options.record, ahead=inner if options.record and inner > COARSE else 0.0, slop=min(SLOP, SLOP_A_TIME * inner),
+        options.record, ahead=ahead, slop=min(SLOP, SLOP_A_TIME * inner), rounds=rounds,
     )  # fmt: skip
 
 
