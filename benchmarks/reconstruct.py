@@ -9,10 +9,11 @@ gave, and times. A folder of photos without
 `transforms.json` and `truth.ply` gets the report only.
 
     python benchmarks/reconstruct.py touching -o DIR
-    python benchmarks/reconstruct.py shelf -o DIR
+    python benchmarks/reconstruct.py shelf -o DIR [--kind clicks]
 
-render a set with truth of tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies and
-without, and print the errors of every body.
+render a set with truth of tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies, without
+(`plain`) and with one clicked place for each (`clicks`: the middle of where a photo shows most of it), or in one of
+these ways, and print the errors of every body.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
 RENDERED = ("touching", "shelf")
+KINDS = ("masks", "plain", "clicks")
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
 
 
@@ -250,8 +252,22 @@ def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
     return found
 
 
-def rendered(name: str, out: Path, **options: Any) -> dict[str, Any]:
-    """Renders a set of `photo_sets`, reconstructs it with masks and without; notes and errors of the bodies of both."""
+def clicked(photos: Path) -> dict[str, list[str]]:
+    """A place on each body of a rendered set: the middle of where a photo shows most of it."""
+    from PIL import Image
+
+    found = {}
+    for folder in sorted((photos / "masks").iterdir()):
+        masks = {path.stem: np.argwhere(np.asarray(Image.open(path)) > 0) for path in sorted(folder.iterdir())}
+        name = max(masks, key=lambda name: len(masks[name]))
+        at = masks[name]
+        row, column = at[np.linalg.norm(at - at.mean(0), axis=1).argmin()]
+        found[folder.name] = [f"{name}.jpg:{column + 0.5},{row + 0.5}"]
+    return found
+
+
+def rendered(name: str, out: Path, kind: str | None, **options: Any) -> dict[str, Any]:
+    """Renders a set of `photo_sets` and reconstructs it in each way, or in one; notes and errors of the bodies."""
     from pipeline.stages import reconstruct
     from tests.pipeline import photo_sets
 
@@ -259,9 +275,15 @@ def rendered(name: str, out: Path, **options: Any) -> dict[str, Any]:
     if not photos.exists():
         photo_sets.shoot_bodies(photos, getattr(photo_sets, name))
         shutil.copytree(photos / "images", out / "plain")
-    for kind, given in (("masks", photos / "images"), ("plain", out / "plain")):
-        report = reconstruct(given, out / f"run_{kind}", until_stage="mesh", **options)
-        result[kind] = {"notes": report["notes"], "bodies": body_errors(out / f"run_{kind}", photos)}
+    for way in KINDS if kind is None else [kind]:
+        given = photos / "images" if way == "masks" else out / "plain"
+        run = out / f"run_{way}"
+        if way == "clicks":
+            options["body"] = clicked(photos)
+            if (out / "run_plain").exists() and not run.exists():
+                shutil.copytree(out / "run_plain", run)  # only the last stage differs
+        report = reconstruct(given, run, until_stage="mesh", **options)
+        result[way] = {"notes": report["notes"], "bodies": body_errors(run, photos), "seconds": report["seconds"]}
     return result
 
 
@@ -270,6 +292,7 @@ def main(
     *,
     out: Path,
     capture: str | None = None,
+    kind: str | None = None,
     preset: str = "quick",
     size: float | None = None,
     distance: list[str] | None = None,
@@ -280,7 +303,9 @@ def main(
     options: dict[str, Any] = {"preset": preset, "budget": None if budget is None else 60 * budget}
     with Session(as_json=True) as session:
         if str(photos) in RENDERED:
-            session.report(rendered(str(photos), out, **options, progress=session.stage_progress))
+            if kind not in (None, *KINDS):
+                raise SdfsimError(f"--kind: {kind}: is none of {', '.join(KINDS)}")
+            session.report(rendered(str(photos), out, kind, **options, progress=session.stage_progress))
             return
         options |= {"size": size, "distance": distance and [*distance[:2], float(distance[2])]}
         given = captured(capture, out) if capture else photos

@@ -49,7 +49,7 @@ def options(*names: str, kept: bool = False) -> Callable[[Callable[..., None]], 
 
 
 @command
-@options("preset", "size", "distance", "crop", "drop", "material")
+@options("preset", "size", "distance", "crop", "body", "drop", "material", "sdf")
 def reconstruct(
     session: Session,
     photos: Photos,
@@ -108,7 +108,7 @@ def distill(
 
 
 @command
-@options("preset", "size", "distance", "crop", kept=True)
+@options("preset", "size", "distance", "crop", "body", kept=True)
 def mesh(
     session: Session,
     folder: Annotated[Path, typer.Argument(help="Folder that distill has written.", show_default=False)],
@@ -125,7 +125,7 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 
 
 @command
-@options("recipe", kept=True)
+@options("recipe", "sdf", kept=True)
 def fit(
     session: Session,
     sources: Annotated[
@@ -162,6 +162,9 @@ def fit(
             raise SdfsimError("--cap, --thicken, --units and --cluster go with -o", exit_code=EXIT_USAGE)
         _run_stage(session, "fit", sources[0], then="scene", budget=budget, device=device, **options)
         return
+    if options["sdf"] == "grid":
+        message = "--sdf grid goes without -o: a scene samples a mesh file itself (sdf: grid)"
+        raise SdfsimError(message, exit_code=EXIT_USAGE)
     from sdfsim.apps import fit as fitting
     from sdfsim.base.parallel import cluster as working_on
 

@@ -11,6 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from pipeline.materials import materials_of
+from pipeline.naming import NAMING, can_be_named
 from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
 COMMAND = "reconstruct"
@@ -48,6 +49,11 @@ class Options(BaseModel):
         None, ["fit"],
         "How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says).",
     )  # fmt: skip
+    # None: a grid for the preset quick, where no recipe is given
+    sdf: Literal["grid", "mlp"] | None = option(
+        None, ["fit"],
+        "What distances become: samples on a grid, or a fitted network (a reconstruction: as its preset says).",
+    )  # fmt: skip
     distance: tuple[str, str, float] | None = option(
         None, ["mesh"],
         "A distance that you know. A place is PHOTO:X,Y, what that pixel shows, or PHOTO, the camera itself.",
@@ -57,6 +63,12 @@ class Options(BaseModel):
     crop: tuple[float, float, float, float, float, float] | None = option(
         None, ["mesh"], "Corners of the box to keep, metres, the lower one first.",
         kind=tuple[str, str] | None, metavar="X,Y,Z X,Y,Z",
+    )  # fmt: skip
+    # by body, places PHOTO:X,Y that show it
+    body: dict[str, list[str]] = option(
+        dict, ["mesh"],
+        "A body that you point at: cup=041.jpg:300,200 is what that pixel shows. Can be repeated, also for one body.",
+        kind=list[str] | None, metavar="NAME=PHOTO:X,Y",
     )  # fmt: skip
     drop: Literal["box", "ball", "none"] = option("box", ["scene"], "What falls onto the scene.")
     # by body, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall
@@ -96,6 +108,21 @@ class Options(BaseModel):
             found[body] = material
         return found
 
+    @field_validator("body", mode="before")
+    @classmethod
+    def _read_bodies(cls, given: Any) -> Any:
+        """Places by body from a list of `NAME=PHOTO:X,Y`, as they are on the command line."""
+        if not isinstance(given, list):
+            return given
+        found: dict[str, list[str]] = {}
+        for text in given:
+            name, _, spot = text.partition("=")
+            if not name or not spot:
+                message = f"--body takes NAME=PHOTO:X,Y, such as cup=041.jpg:300,200 (got {text})"
+                raise SdfsimError(message, exit_code=EXIT_USAGE)
+            found.setdefault(name, []).append(spot)
+        return found
+
     @field_validator("size", "distance")
     @classmethod
     def _check_length(cls, given: Any, info: ValidationInfo) -> Any:
@@ -114,6 +141,11 @@ class Options(BaseModel):
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             got = list(self.crop)
             raise SdfsimError(f"crop: the second corner must lie beyond the first in x, y and z (got {got})")
+        for name, spots in self.body.items():
+            if not can_be_named(name):
+                raise SdfsimError(f"body: no body can be called {name!r}", NAMING)
+            if not spots:
+                raise SdfsimError(f"body: {name} has no place", "write PHOTO:X,Y")
         materials_of(self.material)
         return self
 
@@ -126,7 +158,7 @@ class Options(BaseModel):
 
     def of_stage(self, stage: str) -> dict[str, Any]:
         """The values, ready for JSON, on which the result of a stage depends."""
-        values = self.model_dump(mode="json") | {"recipe": self.fit_recipe()}
+        values = self.model_dump(mode="json") | {"recipe": self.fit_recipe(), "sdf": self.shape_sdf()}
         return {name: values[name] for name in names_of(stage)}
 
     def longer(self) -> str:
@@ -139,6 +171,11 @@ class Options(BaseModel):
     def fit_recipe(self) -> str:
         """The recipe of the fit, see `fit_mesh`: quick for the preset quick, else the default, where none is given."""
         return self.recipe or ("quick" if self.preset == "quick" else "default")
+
+    def shape_sdf(self) -> Literal["grid", "mlp"]:
+        """What the distances of shapes become: a grid for the preset quick, else a network, as whoever gives a recipe
+        wants one."""
+        return self.sdf or ("grid" if self.preset == "quick" and self.recipe is None else "mlp")
 
 
 def form_of(name: str) -> dict[str, Any]:

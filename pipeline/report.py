@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.cameras import Similarity, camera_up, frame_of, load_poses, load_views
 from pipeline.inputs.photos import load_photos
 from pipeline.materials import SCENERY
+from pipeline.mesh.hollows import hollow_line
 from pipeline.options import Options
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json, write_text
@@ -27,8 +28,6 @@ RECORDING = "reconstruction.rrd"
 NAMED = 10  # photos left out that the notes name; the page has them all
 PROPOSED = (255, 40, 200)  # RGB of the cameras that are proposed
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
-# What is below a hollow is its floor if it is thinner than this share of the hollow's depth.
-FLOOR = 0.3
 GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
 
 
@@ -126,14 +125,21 @@ def mesh_notes(mesh: dict) -> list[str]:
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
-    how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
+    how = {
+        "masks": "split where their masks end",
+        "clicks": "split where photos show a border between the places that you gave",
+        "shape": "split along a seam by shape; give masks to be sure",
+    }
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
-    lines += [f"no surface was found for the masks of {name}" for name in mesh.get("masks_without_surface", [])]
+    lines += [f"no body was found for {name}, which {by} name" for by in ("masks", "places")
+              for name in mesh.get(f"{by}_without_surface", [])]  # fmt: skip
     lines += [f"{name}: its surface was not moved all the way to where the photos agree: {why}"
               for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
-    lines += [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
+    lines += [hollow_line(name, found) for name, found in mesh.get("hollows", {}).items()]
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
+    lines += [f"{area:.2g} m^2 of a level surface without texture were completed as a plane, from what is seen around: "
+              "nothing measured its height there" for area in mesh.get("completed_m2", [])]  # fmt: skip
     if mesh.get("left_out_m"):
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
@@ -145,13 +151,6 @@ def mesh_notes(mesh: dict) -> list[str]:
         lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
                      f"all from nearly one direction{more}")  # fmt: skip
     return lines
-
-
-def hollow_line(name: str, depth: float, below: float) -> str:
-    """What the report says about a hollow body, from what `hollow` gives."""
-    if below < FLOOR * depth:
-        return f"{name}: hollow, {depth:.2g} m deep below its rim, on a floor {below:.2g} m thick"
-    return f"{name}: hollow to {depth:.2g} m below its rim as far as photos see; the {below:.2g} m below that are solid"
 
 
 def material_line(body: dict) -> str:

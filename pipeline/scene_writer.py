@@ -7,39 +7,44 @@ import itertools
 import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
 
 from pipeline.materials import SCENERY, Choice
 from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
-from pipeline.mesh.placement import Placement, load_placement
+from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
 from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.files import write_text
-from sdfsim.geometry.mesh import Mesh, joined
+from sdfsim.geometry.mesh import Mesh, face_normals, joined
 from sdfsim.geometry.mesh_io import load_mesh, read_glb
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
+from sdfsim.sdf.far_field import BOX
 
+SAMPLES, BLOCK = (65, 193), 4  # fewest and most along a side of a grid; cells a side of what is sampled as a whole
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily
 LEVEL = 10.0  # degrees; far below what friction holds, as learned contacts creep on slopes
 BUMP = 0.06  # how far a level place may stick out of its plane, as a share of the side
-FLOOR = "motion: static, plane: {normal: [0, 0, 1], offset: 0.0}"
+BELOW = 0.001  # of the scenery's widest side: so far the added floor lies below the lowest of the scenery's own
+OWN_FLOOR, DENTS = 0.01, 0.02  # of that side: how far a floor is from 0 at most; share of it that may lie lower
 UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
 GAP = 0.3  # of the fall, as a share of the side
 
 
-def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
-              device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
-    `folder_of` names, and those that are there already are kept. Returns a certificate for each of `shapes`, and
-    `passed`, `reason` and `caveats` for all of them."""
+def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default",
+              sdf: Literal["grid", "mlp"] = "mlp", seed: int = 0, device: str = "cpu",
+              on_progress: Progress = quiet) -> dict:  # fmt: skip
+    """Fits a compact SDF to the scenery and to every body within the budget, s, or samples their distances on a grid;
+    each is a Shape folder in `out` that `folder_of` names, and those that are there already are kept. Returns a
+    certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.sdf.baked_grid import grid_certificate
-    from sdfsim.shape.make import fit_mesh
+    from sdfsim.shape.make import fit_mesh, mesh_shape
     from sdfsim.shape.shape import load_shape
 
     parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)
@@ -55,10 +60,16 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
             certificates[name] = load_shape(folder).certificate
             continue
         solid, shown = meshes_of(mesh_folder, name)
-        shape = fit_mesh(
-            solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
-            budget=None if budget is None else budget * share, on_progress=report, device=device,
-        )  # fmt: skip
+        if sdf == "grid":
+            side = samples_of(solid, parts["cell"])
+            shape = mesh_shape(
+                solid, name=name, kind="grid", cap=True, resolution=side, coarse=BLOCK, on_progress=report
+            )
+        else:
+            shape = fit_mesh(
+                solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
+                budget=None if budget is None else budget * share, on_progress=report, device=device,
+            )  # fmt: skip
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
         # The folder appears complete or not at all: a run that goes on keeps those that are there.
         shutil.rmtree(partial, ignore_errors=True)
@@ -68,6 +79,14 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+
+
+def samples_of(mesh: Mesh, cell: float) -> int:
+    """Samples along a side of the grid of a mesh from a field with cells of so many m: two a cell, as far as `SAMPLES`
+    allow."""
+    wide = 2 * BOX * float(np.ptp(mesh.vertices, axis=0).max())
+    blocks = np.clip(np.ceil(2 * wide / cell / BLOCK), *((np.array(SAMPLES) - 1) // BLOCK))
+    return int(blocks) * BLOCK + 1
 
 
 def folder_of(name: str) -> str:
@@ -119,7 +138,9 @@ def write_scene(
             notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
     origins = {name: origin_of(mesh) for name, mesh in solids.items()}
     materials = materials or {}
-    text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials, seed=seed)
+    floor = floor_height(load_mesh(mesh_folder / "shown.ply")) if parts["scenery"] else 0.0
+    text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials, seed=seed,
+                      floor=floor)  # fmt: skip
     scene = load_scene(scene_file, text=text, allow_outside=True)
     names = [body.name for body in scene.bodies]
     for name in materials:
@@ -140,6 +161,19 @@ def write_scene(
     }  # fmt: skip
 
 
+def floor_height(shown: Mesh) -> float:
+    """Height, m, of the floor that is added to a scenery: 0, or just below the scenery's own level surface there. In
+    one plane with it, it would cover it."""
+    normals, areas = face_normals(shown)
+    height = shown.vertices[shown.faces][:, :, 2].mean(1)
+    width = float(np.ptp(shown.vertices, axis=0).max())
+    own = (normals[:, 2] > LEVEL_NORMAL) & (np.abs(height) < OWN_FLOOR * width)
+    if areas[own].sum() < MIN_FLOOR * areas.sum():
+        return 0.0
+    lowest = np.quantile(height[own], DENTS, weights=areas[own], method="inverted_cdf")
+    return min(float(lowest), 0.0) - BELOW * width
+
+
 def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
     """What the report says of each body that can move or has a material: `material`, `friction`, `restitution`; of
     those that can move also `density` kg/m^3, `wall` m (None: solid), `volume` m^3 of what has mass, `mass` kg."""
@@ -156,9 +190,10 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
 
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
-               drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
-    """The text of scene.yaml: a floor, the scenery, the bodies that were found at their origins [3] m, and one dropped
-    from above where there is a slab."""
+               drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0
+               ) -> str:  # fmt: skip
+    """The text of scene.yaml: a floor at a height, m, the scenery, the bodies that were found at their origins [3] m,
+    and one dropped from above where there is a slab."""
     assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
     shapes: list[str] = []
@@ -177,10 +212,13 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
         bodies.append(f"  # {known if name in made else 'assumed: photos do not show the material (give --material)'}")
         bodies.append(f"  - {{name: {name}, {keys}, {density}{surface}}}")
 
+    plane = f"motion: static, plane: {{normal: [0, 0, 1], offset: {float(rounded(floor)):g}}}"
+    if floor:
+        bodies.append("  # just below the floor that the photos show")
     if "floor" in made:
-        add("floor", FLOOR)
+        add("floor", plane)
     else:
-        bodies.append(f"  - {{name: floor, {FLOOR}}}")
+        bodies.append(f"  - {{name: floor, {plane}}}")
     if scenery:
         add(SCENERY, "motion: static", {"asset": f"assets/{folder_of(SCENERY)}"})
     for name, origin in origins.items():

@@ -64,13 +64,14 @@ def do_photos(project: Project, work: Path) -> dict:
 
 def do_poses(project: Project, work: Path) -> dict:
     from pipeline.inputs.photos import load_photos
-    from pipeline.mesh.placement import check_distance
+    from pipeline.mesh.placement import check_bodies, check_distance
     from pipeline.sfm.poses import solve
 
     folder = project.place("photos")
     photos = load_photos(folder)
-    if project.options.distance is not None:
-        check_distance(project.options.distance, photos)  # rather than after minutes of poses and training
+    if project.options.distance is not None:  # rather than after minutes of poses and training
+        check_distance(project.options.distance, photos)
+    check_bodies(project.options.body, photos)
     return solve(photos, folder, work, seed=project.options.seed, on_progress=project.progress_of("poses"))
 
 
@@ -110,8 +111,9 @@ def do_fit(project: Project, work: Path) -> dict:
     if budget is None and project.options.budget is not None:
         budget = max(10.0, FIT_SHARE * project.options.budget)
     return fit_parts(
-        project.place("mesh"), work, budget=budget, recipe=project.options.fit_recipe(), seed=project.options.seed,
-        device=project.device(), on_progress=project.progress_of("fit"),
+        project.place("mesh"), work, budget=budget, recipe=project.options.fit_recipe(),
+        sdf=project.options.shape_sdf(), seed=project.options.seed, device=project.device(),
+        on_progress=project.progress_of("fit"),
     )  # fmt: skip
 
 
@@ -139,11 +141,11 @@ class Stage:
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
-    "poses": Stage(do_poses, "poses", version=5),
-    "distill": Stage(do_distill, "distill", version=5),
-    "mesh": Stage(do_mesh, "mesh", version=10),
-    "fit": Stage(do_fit, "assets"),
-    "scene": Stage(do_scene, "scene", version=4),
+    "poses": Stage(do_poses, "poses", version=6),
+    "distill": Stage(do_distill, "distill", version=7),
+    "mesh": Stage(do_mesh, "mesh", version=12),
+    "fit": Stage(do_fit, "assets", version=2),
+    "scene": Stage(do_scene, "scene", version=5),
 }
 
 

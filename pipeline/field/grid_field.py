@@ -7,15 +7,18 @@ outside it is a background of its own on contracted coordinates (Barron et al., 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.field.interpolation import interpolate
+from pipeline.field.interpolation import BRICK, interpolate, interpolate_bricks, near_bricks
+
+if TYPE_CHECKING:
+    from pipeline.stereo.fusion import Fused
 
 
 @dataclass(frozen=True)
@@ -26,16 +29,28 @@ class FieldSize:
     channels: tuple[int, ...] = (4, 4, 4, 2)  # features a level
     width: int = 64  # hidden width of both small networks
     background: int = 64  # grid points a side of the background
+    finer: tuple[int, ...] = (2,)  # how many cells there are for one of the last level, in bricks near the surface
+    finer_channels: tuple[int, ...] = (4,)  # features there
+
+    @property
+    def steps(self) -> list[float]:
+        """Widths of the cells of all levels, coarse to fine, normalised units."""
+        return [2.0 / (side - 1) for side in (*self.levels, *self.sides)]
+
+    @property
+    def sides(self) -> list[int]:
+        """Grid points a side of the levels in bricks."""
+        return [times * (self.levels[-1] - 1) + 1 for times in self.finer]
 
     @property
     def finest(self) -> float:
         """Width of a cell of the finest level, normalised units."""
-        return level_step(self.levels, len(self.levels))
+        return self.steps[-1]
 
     @property
     def sampling(self) -> float:
-        """Distance of samples that show all detail, normalised units: a cell, as all is linear between its corners."""
-        return self.finest
+        """Distance of samples along rays, normalised units: a cell of the last level that is everywhere."""
+        return self.steps[len(self.levels) - 1]
 
 
 BACKGROUND_SAMPLES = 12
@@ -113,13 +128,61 @@ class Field(nn.Module, ABC):
         return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
 
 
-class GridField(Field):
-    """SDF and colour in the unit sphere, and a background outside; the SDF starts as a sphere of `start_radius`."""
+class Bricks(nn.Module):
+    """A level of a field that is there near the surface only."""
 
-    def __init__(self, size: FieldSize, seed: int = 0, start_radius: float = 0.5) -> None:
+    places: Tensor  # [B, 3] int16 (z, y, x) of its bricks
+    numbers: Tensor  # [m, m, m] int32, which brick is where; -1 for none
+    # [B * 64, 4] what the distance has more at the start than without the level, and RGB there, less a middle grey
+    start: Tensor
+
+    def __init__(self, side: int, channels: int) -> None:
+        super().__init__()
+        self.side, self.channels, self.started = side, channels, False
+        count = -(-side // BRICK)
+        self.register_buffer("places", torch.zeros(0, 3, dtype=torch.int16))
+        self.register_buffer("numbers", torch.full((count,) * 3, -1, dtype=torch.int32), persistent=False)
+        self.register_buffer("start", torch.zeros(0, 4))
+        self.values = nn.Parameter(torch.zeros(0, channels))
+
+    def add(self, places: Tensor, start: Tensor | None = None) -> None:
+        """Puts bricks [B, 3] (z, y, x) where there are none yet; features are 0 there, and so is `start` unless it is
+        given."""
+        where = places.to(self.numbers.device).long()
+        new = self.numbers[tuple(where.t())] < 0
+        where, before = where[new], len(self.places)
+        self.started |= start is not None
+        if len(where):
+            self.numbers[tuple(where.t())] = torch.arange(
+                before, before + len(where), dtype=torch.int32, device=where.device
+            )
+        rows = len(where) * BRICK**3
+        given = self.start.new_zeros(rows, 4)
+        if start is not None:
+            given = start.view(-1, BRICK**3, 4)[new.cpu()].reshape(-1, 4)
+        self.places = torch.cat([self.places, where.to(torch.int16)])
+        self.start = torch.cat([self.start, given.to(self.start)])
+        self.values = nn.Parameter(torch.cat([self.values.detach(), self.values.new_zeros(rows, self.channels)]))
+
+    def at(self, points: Tensor) -> Tensor:
+        """Features [P, C] at points [P, 3]; 0 where there are no bricks."""
+        return interpolate_bricks(self.values, self.numbers, self.side, points)
+
+    def start_at(self, points: Tensor) -> Tensor:
+        """What the distance has more at the start, and RGB less a middle grey, [P, 4] at points [P, 3]."""
+        return interpolate_bricks(self.start, self.numbers, self.side, points)
+
+
+class GridField(Field):
+    """SDF and colour in the unit sphere, and a background outside. The SDF starts as a sphere of `start_radius`, or as
+    what depth maps show."""
+
+    start: Tensor  # [n, n, n, 1] SDF at the start, of no places where it is a sphere
+
+    def __init__(self, size: FieldSize, seed: int = 0, start_radius: float = 0.5, fused: Fused | None = None) -> None:
         super().__init__()
         self.size, self.start_radius = size, start_radius
-        self.active = len(size.levels)
+        self.active = len(size.steps)
         rng = torch.Generator().manual_seed(seed)
 
         def uniform(*shape: int, bound: float) -> nn.Parameter:
@@ -128,7 +191,12 @@ class GridField(Field):
         self.grids = nn.ParameterList(
             [uniform(n, n, n, c, bound=1e-3) for n, c in zip(size.levels, size.channels, strict=True)]
         )
-        inputs, width = 3 + sum(size.channels), size.width
+        self.bricks = nn.ModuleList(
+            [Bricks(side, channels) for side, channels in zip(size.sides, size.finer_channels, strict=True)]
+        )
+        self.register_buffer("start", torch.zeros(0, 0, 0, 1))
+        seen_features = sum(size.channels) + sum(size.finer_channels)
+        inputs, width = 3 + seen_features, size.width
 
         def layer(count: int, outputs: int, gain: float = 1.0) -> nn.Linear:
             linear = nn.Linear(count, outputs)
@@ -141,24 +209,73 @@ class GridField(Field):
         self.head = layer(width, 1 + GEOMETRY, gain=0.2)
         with torch.no_grad():
             self.head.weight[0] *= 0.1
-        seen = GEOMETRY + 8 + sum(size.channels)
+        seen = GEOMETRY + 8 + seen_features
         self.color = nn.Sequential(layer(seen, width), nn.ReLU(), layer(width, 3, gain=0.3))
         n = size.background
         self.background = uniform(n, n, n, 4, bound=1e-2)
+        if fused is not None:
+            self.start = torch.from_numpy(fused.coarse)[..., None].contiguous()
+            with torch.no_grad():  # A network that knows nothing yet must not bend what is known.
+                self.head.weight[0] *= 0.05
+                if fused.behind is not None:
+                    self.background += torch.from_numpy(fused.behind)
+            for level, side in zip(self.bricks, size.sides, strict=True):
+                if side == fused.side:
+                    given = torch.from_numpy(np.concatenate([fused.fine[:, None], fused.color - 0.5], 1))
+                    level.add(torch.from_numpy(fused.bricks), given)  # type: ignore[operator]
+                else:
+                    level.add(torch.from_numpy(near_bricks(fused.coarse, side)))  # type: ignore[operator]
+
+    def refine(self, cache: Tensor) -> list[Tensor]:
+        """Puts bricks wherever a cached SDF [n, n, n, 1] has its surface and there are none yet. Returns the features
+        that they replace, level by level."""
+        before: list[Tensor] = []
+        for level in self.bricks:
+            assert isinstance(level, Bricks)
+            before.append(level.values)
+            level.add(torch.from_numpy(near_bricks(cache[..., 0].cpu().numpy(), level.side)))
+        return before
+
+    def load_state_dict(self, state_dict: Any, *more: Any, **options: Any) -> Any:
+        for number, level in enumerate(self.bricks):
+            assert isinstance(level, Bricks)
+            level.add(state_dict[f"bricks.{number}.places"])
+            level.started = bool(state_dict[f"bricks.{number}.start"].any())
+        self.start = torch.zeros_like(state_dict["start"], device=self.start.device)
+        return super().load_state_dict(state_dict, *more, **options)
 
     def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """SDF [P], geometry features [P, 13] and grid features [P, F] at points [P, 3] of normalised space."""
         found = [interpolate(grid, points) for grid in list(self.grids)[: self.active]]
-        if missing := sum(self.size.channels[self.active :]):  # levels that are not active yet
+        for number, level in enumerate(self.bricks, len(self.grids)):
+            if number < self.active:
+                found.append(level.at(points))  # type: ignore[operator]
+        channels = (*self.size.channels, *self.size.finer_channels)
+        if missing := sum(channels[self.active :]):  # levels that are not active yet
             found.append(points.new_zeros(len(points), missing))
         features = torch.cat(found, 1)
         hidden = self.head(self.geometry(torch.cat([points, features], 1)))
-        base = points.norm(dim=1) - self.start_radius
-        return base + hidden[:, 0], hidden[:, 1:], features
+        start, color = self.start_of(points)
+        return start + hidden[:, 0], hidden[:, 1:], torch.cat([features, color], 1)
+
+    def start_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The SDF [P] that training started from, and RGB [P, 3] less a middle grey, at points [P, 3]."""
+        if not self.start.numel():
+            return points.norm(dim=1) - self.start_radius, torch.zeros_like(points)
+        found, color = interpolate(self.start, points)[:, 0], torch.zeros_like(points)
+        for level in self.bricks:
+            assert isinstance(level, Bricks)
+            if level.started:
+                more = level.start_at(points)
+                found, color = found + more[:, 0], color + more[:, 1:]
+        return found, color
 
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
+        features, start = features[:, :-3], features[:, -3:]
         seen_along = self.view_dependence * direction_features(directions)
-        return torch.sigmoid(self.color(torch.cat([geometry, features, seen_along], 1)))
+        # What the photos show there on average, and what the network knows better.
+        usual = torch.logit((start + 0.5).clamp(0.02, 0.98))
+        return torch.sigmoid(usual + self.color(torch.cat([geometry, features, seen_along], 1)))
 
 
 def stencil(points: Tensor, step: float) -> Tensor:
@@ -173,8 +290,3 @@ def differences(values: Tensor, step: float) -> tuple[Tensor, Tensor]:
     3)."""
     gradient = (values[:, :3] - values[:, 3:6]) / (2 * step)
     return gradient, (values[:, :6].sum(1) - 6 * values[:, 6]) / (step * step)
-
-
-def level_step(levels: Sequence[int], active: int) -> float:
-    """Width of a cell of the finest active level, in normalised units."""
-    return 2.0 / (levels[active - 1] - 1)

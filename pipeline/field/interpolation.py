@@ -9,14 +9,28 @@ from __future__ import annotations
 from typing import Any
 
 import numba
+import numpy as np
 import torch
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn import functional
 
 from sdfsim.physics import solver as kernels
 
+NEAR = 2.0  # cells from a surface within which all bricks are there
+
 with kernels.kept():
-    from pipeline.field.trilinear import gather, gather_with_threads, scatter, scatter_with_threads
+    from pipeline.field.trilinear import (
+        BRICK,
+        gather,
+        gather_bricks,
+        gather_bricks_with_threads,
+        gather_with_threads,
+        scatter,
+        scatter_bricks,
+        scatter_bricks_with_threads,
+        scatter_with_threads,
+    )
 
 
 def interpolate(grid: Tensor, points: Tensor) -> Tensor:
@@ -25,6 +39,40 @@ def interpolate(grid: Tensor, points: Tensor) -> Tensor:
     if grid.is_cuda:
         return by_rows(grid, points)
     return _OnCpu.apply(grid, points.detach().contiguous())  # type: ignore[no-any-return]
+
+
+def interpolate_bricks(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
+    """The same as `interpolate` for a grid [side, side, side, C] that is there in bricks only: rows of a table [R, C]
+    by `bricks` [m, m, m] int32 (z, y, x order), the numbers of those that are there, else -1; elsewhere it is 0."""
+    if table.is_cuda:
+        return bricks_by_rows(table, bricks, side, points)
+    return _BricksOnCpu.apply(table, bricks, side, points.detach().contiguous())  # type: ignore[no-any-return]
+
+
+def bricks_by_rows(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
+    """What `interpolate_bricks` gives, in torch alone, for any device."""
+    place, weights = _corners(side, points)
+    x, y, z = place % side, place // side % side, place // side**2
+    number = bricks[z // BRICK, y // BRICK, x // BRICK].long()
+    rows = number * BRICK**3 + ((z % BRICK) * BRICK + y % BRICK) * BRICK + x % BRICK
+    return _WeightedRows.apply(table, rows.clamp_min(0), weights * (number >= 0))  # type: ignore[no-any-return]
+
+
+def near_bricks(distance: np.ndarray, side: int) -> np.ndarray:
+    """Bricks [B, 3] int16 (z, y, x) of a grid with `side` places a side that hold places within `NEAR` cells of the
+    zero level of a signed distance [n, n, n] over [-1, 1]^3."""
+    cell, step = 2 / (side - 1), BRICK * 2 / (side - 1)
+    middles = (np.arange(-(-side // BRICK)) + 0.5) * step - 0.5 * cell - 1
+    at = (middles + 1) * (len(distance) - 1) / 2
+    found = map_coordinates(distance, np.stack(np.meshgrid(at, at, at, indexing="ij")), order=1, mode="nearest")
+    reach = NEAR * cell + 0.5 * 3**0.5 * (BRICK - 1) * cell
+    return np.argwhere(np.abs(found) < reach).astype(np.int16)
+
+
+def places_of(bricks: np.ndarray) -> np.ndarray:
+    """The places [B * 64, 3] int (z, y, x) of bricks [B, 3] in their grid, in the order of their rows."""
+    inner = np.stack(np.meshgrid(*[np.arange(BRICK)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    return (BRICK * bricks[:, None].astype(np.int64) + inner).reshape(-1, 3)
 
 
 class _OnCpu(torch.autograd.Function):
@@ -55,6 +103,34 @@ class _OnCpu(torch.autograd.Function):
         return gradient, None
 
 
+class _BricksOnCpu(torch.autograd.Function):
+    """The same for a grid in bricks."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
+        """[P, C] from a table [R, C] at points [P, 3], see `interpolate_bricks`."""
+        ctx.save_for_backward(bricks, points)
+        ctx.shape, ctx.side = table.shape, side
+        found = table.new_empty(len(points), table.shape[1])
+        given = table.detach().contiguous().numpy(), bricks.numpy(), side, points.numpy(), found.numpy()
+        if torch.get_num_threads() == 1:
+            gather_bricks(*given, 0, len(points))
+        else:
+            _with_threads(gather_bricks_with_threads, *given)
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
+        bricks, points = ctx.saved_tensors
+        gradient = grads[0].new_zeros(ctx.shape)
+        given = gradient.numpy(), bricks.numpy(), ctx.side, points.numpy(), grads[0].contiguous().numpy()
+        if torch.get_num_threads() == 1:
+            scatter_bricks(*given, 1, 0)
+        else:
+            _with_threads(scatter_bricks_with_threads, *given)
+        return gradient, None, None, None
+
+
 def _with_threads(work: Any, *given: Any) -> None:
     """Compiled work on as many threads as torch uses, if there are so many. Not for one: threads do not survive a
     fork."""
@@ -67,7 +143,13 @@ def _with_threads(work: Any, *given: Any) -> None:
 
 def by_rows(grid: Tensor, points: Tensor) -> Tensor:
     """What `interpolate` gives, in torch alone, for any device."""
-    side = grid.shape[0]
+    rows, weights = _corners(grid.shape[0], points)
+    return _WeightedRows.apply(grid.reshape(-1, grid.shape[3]), rows, weights)  # type: ignore[no-any-return]
+
+
+def _corners(side: int, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the cells that points [P, 3] are in, of a grid with so many places a side: the eight corners as numbers in z,
+    y, x order, and their weights, both [P, 8]."""
     place = ((points.detach().t() + 1) * (0.5 * (side - 1))).clamp(0, side - 1)
     cell = place.long().clamp_max(side - 2)
     x1, y1, z1 = place - cell
@@ -75,8 +157,7 @@ def by_rows(grid: Tensor, points: Tensor) -> Tensor:
     first = cell[0] + side * cell[1] + side * side * cell[2]
     steps = [x + side * y + side * side * z for z in (0, 1) for y in (0, 1) for x in (0, 1)]
     weights = torch.stack([face * x for face in (z0 * y0, z0 * y1, z1 * y0, z1 * y1) for x in (x0, x1)], 1)
-    rows = first[:, None] + torch.tensor(steps, device=points.device)
-    return _WeightedRows.apply(grid.reshape(-1, grid.shape[3]), rows, weights)  # type: ignore[no-any-return]
+    return first[:, None] + torch.tensor(steps, device=points.device), weights
 
 
 class _WeightedRows(torch.autograd.Function):

@@ -14,6 +14,7 @@ from torch import Tensor
 from pipeline.cameras import PosedPhotos, Similarity, Sparse, View, nearest_to_axes
 from pipeline.field.interpolation import interpolate
 from pipeline.inputs.photos import Photo
+from pipeline.stereo.depth import DepthMap
 from sdfsim.base.errors import SdfsimError
 
 # In cells of the field's finest grid, as the field cannot follow a surface more closely:
@@ -23,7 +24,8 @@ CLEARANCE = 1.27  # that free space asks for at most, and the shortest line of s
 FILLED, JUST_EMPTY = -0.254, 0.127
 # Clearance as a share of the way to the point, which may be on a grazed plane.
 SLOPE = 0.1
-DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor, that are used
+DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor or of stereo, that are used
+STEREO_POINTS = 20_000  # of a photo
 NOISES = 5.0  # median errors of the depth before which its lines of sight end: a line through the surface erodes it
 APART = 0.2  # A scale that differs by more than this share means other units, or another photo's depth.
 USUAL = 0.01  # share by which a phone's depth is off, where nothing is known better
@@ -91,6 +93,20 @@ def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
         message = f"depth: the cameras' distances are {scale:.3g} times those of the depth files"
         raise SdfsimError(message, "give its unit (depth_unit_scale_factor, metres a count), or leave it out")
     return {"scale": scale, "spread": float(np.median(np.abs(ratio / scale - 1))), "points": len(ratio)}
+
+
+def stereo_points(maps: Sequence[DepthMap], poses: PosedPhotos) -> DepthPoints:
+    """At most `STEREO_POINTS` places that each depth map shows. The maps are in the space of the poses, the result is
+    in the world that these were moved from."""
+    names, back = [view.name for view in poses.views], poses.moved_by.inverse()
+    rng, xyz, index = np.random.default_rng(0), [np.zeros((0, 3))], [np.zeros(0, np.int32)]
+    for one in maps:
+        points = one.points()
+        some = rng.permutation(len(points))[:STEREO_POINTS]
+        xyz.append(back.points(points[some]))
+        index.append(np.full(len(some), names.index(one.view.name), np.int32))
+    found = np.concatenate(xyz)
+    return DepthPoints(found, np.zeros((len(found), 2)), np.concatenate(index))
 
 
 @dataclass(frozen=True)

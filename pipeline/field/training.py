@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from pipeline.cameras import PosedPhotos, Similarity, View
-from pipeline.field.grid_field import Field, FieldSize, GridField, differences, level_step, stencil
+from pipeline.field.exposure import Exposure, color_error, matched
+from pipeline.field.grid_field import Field, FieldSize, GridField, differences, stencil
 from pipeline.field.mlp_field import MlpField, MlpSize
 from pipeline.field.rendering import (
     BACKGROUND_SAMPLES,
@@ -36,22 +37,36 @@ from pipeline.field.supervision import (
     Supervision,
     depth_points,
     depth_scale,
+    stereo_points,
     supervision_of,
     unit_sphere_of,
 )
 from pipeline.inputs.images import BACKDROP, reduced
 from pipeline.inputs.photos import load_photos
 from pipeline.progress import Progress, quiet, share_of
+from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
+from pipeline.stereo.fusion import Fused, behind, fuse
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
 from sdfsim.base.parallel import choose_threads
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
+REFINED = 0.4  # of the training is done when bricks are put wherever the surface is
+# Share of the training by which all levels are in use, from a sphere and from fused depth; and the scale of the density
+# that training from fused depth starts with, in cells of the last level that is everywhere: the surface is there.
+ALL_LEVELS, ALL_LEVELS_FUSED, FUSED_BETA = 0.45, 0.15, 1.5
 HOLLOWS = 0.25  # of the training is done before filled free space is looked for
+EXPOSURE_RATE = 0.004  # Adam's, of the photos' gains and offsets, at the start
+# Standard deviation of the gains from which on photos that were not trained on are compared at an exposure of their
+# own; in rendered sets of one exposure it was below 0.01.
+VARIED = 0.03
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
 PACE = 25  # steps between looks at the clock
+# Pixels along each side of a held-out photo of which one is rendered, where that leaves so many on the long side.
+SCORED, LEAST_SCORED = 3, 100
+STEREO = 0.2  # of the progress that is shown
 HELD_OUT = "held_out"  # folder of the renders of photos that were not trained on
 EMPTY = 0.9  # grey of their pixels whose ray misses the trained sphere
 
@@ -63,10 +78,11 @@ class Settings:
     # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25  # of the ball that training starts from; small, as shadowed parts are hardly carved away
-    iterations: int = 2800  # steps of Adam; 4000 are no better on the bundled set
+    iterations: int = 900  # steps of Adam
     rays: int = 512  # a step
     samples: int = 32  # along a ray inside the sphere
     long_side: int = 480  # of the photos used, px
+    stereo: int = 640  # px of the longer side for depth from stereo; 0: none, training starts from a ball
     beta: tuple[float, float] = (0.1, 0.004)  # density scale at the start and at the end
     rate: float = 0.02  # Adam's rate for the grids at the start (the networks use a quarter of it)
     eikonal: float = 0.1  # weight of (|grad| - 1)^2
@@ -75,21 +91,22 @@ class Settings:
     depth: float = 0.3  # weight of |sdf| at the points of a depth sensor, at the start
     free: float = 1.0  # weight of what is solid between a camera and a point that it sees
     mask: float = 0.3  # weight of the opacity loss where photos have masks
+    exposure: float = 0.02  # weight of what draws the photos' exposures together; 0: they are alike
     surface_points: int = 512  # points of the eikonal loss
 
 
 PRESETS = {
     "quick": Settings(),
-    "standard": Settings(iterations=7500, rays=768, samples=40, long_side=800, beta=(0.1, 0.0025)),
+    "standard": Settings(iterations=7500, rays=768, samples=40, long_side=800, stereo=800, beta=(0.1, 0.0025)),
     "fine": Settings(
-        size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96),
+        size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96), stereo=1280,
         iterations=20000, rays=1024, samples=48, long_side=1280, beta=(0.1, 0.0015),
     ),
     # The paper's (section 4, appendix B): L1 colour, eikonal 0.1, Adam 5e-4, 1024 rays of 64 samples. Its beta is
     # learned; sparse points, which the paper did without, get little weight.
     "volsdf": Settings(
         size=MlpSize(), iterations=100_000, rays=1024, samples=64, long_side=1600, rate=5e-4, eikonal=0.1,
-        curvature=0.0, sparse=0.1, free=0.0, surface_points=2048,
+        curvature=0.0, sparse=0.1, free=0.0, exposure=0.0, surface_points=2048, stereo=0,
     ),
 }  # fmt: skip
 
@@ -187,10 +204,13 @@ def held_out(count: int) -> list[int]:
 
 
 class Trainer:
-    """One training run of the grids; rays, sparse points and lines of sight are in the space of the unit sphere."""
+    """One training run of the grids; rays, sparse points, lines of sight and fused depth, from which it starts where
+    there is some, are in the space of the unit sphere."""
 
-    def __init__(self, settings: Settings, rays: Rays, supervision: Supervision, seed: int, device: str = "cpu"):
+    def __init__(self, settings: Settings, rays: Rays, supervision: Supervision, seed: int, device: str = "cpu",
+                 fused: Fused | None = None):  # fmt: skip
         self.settings, self.rays, self.seed, self.device = settings, rays.to(device), seed, device
+        self.fused, self.refined = fused, False
         self.points, self.point_weights = (
             torch.tensor(values, dtype=torch.float32, device=device)
             for values in (supervision.points, supervision.weights)
@@ -198,18 +218,33 @@ class Trainer:
         self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
         sight = supervision.sight if settings.free else supervision.sight[:0]
         self.free = FreeSpace(sight, settings.size.finest, device)
-        self.field, self.optimizer = self.fresh()
-        self.iteration, self.iterations, self.seconds = 0, settings.iterations, 0.0
+        self.begin()
         self.cache: Tensor | None = None
 
-    def fresh(self) -> tuple[Field, torch.optim.Adam]:
-        """An untrained field and its optimiser."""
+    def begin(self) -> None:
+        """Makes everything as it is before the first step."""
+        self.field = self.fresh()
+        self.exposure = Exposure(len(self.rays.center)).to(self.device) if self.settings.exposure else None
+        self.optimizer = self.optimizer_of(self.field)
+        self.iteration, self.iterations, self.seconds, self.refined = 0, self.settings.iterations, 0.0, False
+
+    def fresh(self) -> Field:
+        """An untrained field."""
         settings = self.settings
         assert isinstance(settings.size, FieldSize)
-        field = GridField(settings.size, self.seed, settings.start_radius).to(self.device)
-        networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "background"))]
-        groups = _groups(([*field.grids, field.background], settings.rate), (networks, settings.rate / 4))
-        return field, torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+        return GridField(settings.size, self.seed, settings.start_radius, self.fused).to(self.device)
+
+    def optimizer_of(self, field: Field) -> torch.optim.Adam:
+        """What trains a field, from its first step on."""
+        assert isinstance(field, GridField)
+        networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "bricks", "background"))]
+        features = [*field.grids, *(level.values for level in field.bricks), field.background]
+        groups = _groups((features, self.settings.rate), (networks, self.settings.rate / 4), self.exposures())
+        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+
+    def exposures(self) -> tuple[list, float]:
+        """The photos' gains and offsets, where they are learned, and their rate."""
+        return [] if self.exposure is None else [*self.exposure.parameters()], EXPOSURE_RATE
 
     @property
     def fraction(self) -> float:
@@ -221,6 +256,8 @@ class Trainer:
         """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays. With
         a gradient where it is learned."""
         start, end = self.settings.beta
+        if self.fused is not None:
+            start = max(end, min(start, FUSED_BETA * self.settings.size.sampling))
         return start * (end / start) ** min(1.0, self.fraction / 0.85)
 
     def rate_factor(self) -> float:
@@ -236,13 +273,32 @@ class Trainer:
     def refresh(self) -> None:
         """Brings the cached SDF and the active levels up to date."""
         assert isinstance(self.settings.size, FieldSize)
-        # Two levels at first, the others one after the other until 45 % of training.
-        levels = len(self.settings.size.levels)
-        self.field.active = min(levels, 2 + int((levels - 2) * self.fraction / 0.45 + 0.4))
+        # Two levels at first, the others one after the other.
+        levels = len(self.settings.size.steps)
+        until = ALL_LEVELS if self.fused is None else ALL_LEVELS_FUSED
+        self.field.active = min(levels, 2 + int((levels - 2) * self.fraction / until + 0.4))
         # Colour does not change with direction at first, or a wrong surface is painted right.
         self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
         self.cache = sdf_cache(self.field, self.settings.size.sampling)
+        if self.fraction >= REFINED and not self.refined:
+            self.refine()
         self.find_filled()
+
+    def refine(self) -> None:
+        """Puts bricks wherever the surface is now; the optimiser goes on with the features that were there before."""
+        assert isinstance(self.field, GridField) and self.cache is not None
+        self.refined = True
+        for before, level in zip(self.field.refine(self.cache), self.field.bricks, strict=True):
+            now = level.values
+            assert isinstance(now, torch.nn.Parameter)
+            for group in self.optimizer.param_groups:
+                group["params"] = [now if p is before else p for p in group["params"]]
+            state = self.optimizer.state.pop(before, {})
+            for key, value in state.items():
+                if value.shape == before.shape:
+                    state[key] = torch.cat([value, value.new_zeros(len(now) - len(before), now.shape[1])])
+            if state:
+                self.optimizer.state[now] = state
 
     def find_filled(self) -> None:
         """Finds free space that the cached SDF fills, once the field is fine enough to have room for a hollow."""
@@ -274,7 +330,7 @@ class Trainer:
 
     def _cell(self) -> float:
         assert isinstance(self.settings.size, FieldSize)
-        return level_step(self.settings.size.levels, self.field.active)
+        return self.settings.size.steps[self.field.active - 1]
 
     def step(self) -> dict[str, float]:
         """One step of Adam; returns the losses."""
@@ -298,7 +354,13 @@ class Trainer:
             values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
         )
         out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.beta, behind)
-        losses = {"color": (out["rgb"] - truth).abs().mean()}
+        rgb = out["rgb"]
+        if self.exposure is not None:
+            opacity = None if self.rays.mask is None else out["opacity"]
+            rgb = self.exposure(rgb, opacity, BACKDROP, self.rays.view[index].long())
+        losses = {"color": color_error(rgb, truth)}
+        if self.exposure is not None:
+            losses["exposure"] = self.exposure.penalty() * settings.exposure
         if self.rays.mask is not None:
             wanted = self.rays.mask[index].float() / 255
             opacity = out["opacity"].clamp(1e-4, 1 - 1e-4)
@@ -311,8 +373,8 @@ class Trainer:
         if len(empty):
             losses["free"] = torch.relu(clearance - sdf[3]).mean() * settings.free
         if len(measured):
-            # It gives the shape early on. Later, colours see finer than the sensor's noise.
-            fade = max(0.03, 1 - self.fraction / 0.5)
+            # It gives the shape early on. Later, colours see finer than the sensor's noise, though not than stereo.
+            fade = max(0.03, 1 - self.fraction / 0.5) if self.fused is None else 1.0
             losses["depth"] = sdf[4].abs().clamp_max(0.1).mean() * settings.depth * fade
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()
@@ -339,9 +401,11 @@ class Trainer:
                 tensors[f"adam.{number}.{key}"] = torch.as_tensor(value).detach().contiguous()
         if self.cache is not None:
             tensors["cache"] = self.cache
+        if self.exposure is not None:
+            tensors["exposure"] = self.exposure.change.detach().contiguous()
         about = {
             "iteration": self.iteration, "iterations": self.iterations, "seconds": self.seconds,
-            "active": self.field.active, "view_dependence": self.field.view_dependence,
+            "active": self.field.active, "view_dependence": self.field.view_dependence, "refined": self.refined,
             "size": str(self.settings.size),
         }  # fmt: skip
         # As bytes: safetensors' own writer does not raise OSError where the disk is full.
@@ -359,16 +423,18 @@ class Trainer:
                     raise ValueError("it is of another field")
                 tensors = {key: file.get_tensor(key).to(self.device) for key in file.keys()}
             self.field.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("field.")})
+            if self.exposure is not None:
+                self.exposure.load_state_dict({"change": tensors["exposure"]})
+            self.optimizer = self.optimizer_of(self.field)
             for number, parameter in enumerate(self._parameters()):
                 names = [k for k in tensors if k.startswith(f"adam.{number}.")]
                 if names:
                     self.optimizer.state[parameter] = {k.split(".")[2]: tensors[k] for k in names}
             self.iteration, self.iterations = int(about["iteration"]), int(about["iterations"])
             self.seconds, self.field.active = float(about["seconds"]), int(about["active"])
-            self.field.view_dependence = float(about["view_dependence"])
+            self.field.view_dependence, self.refined = float(about["view_dependence"]), bool(about["refined"])
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            self.field, self.optimizer = self.fresh()
-            self.iteration, self.iterations, self.seconds = 0, self.settings.iterations, 0.0
+            self.begin()
             raise SdfsimError(f"{path.name} cannot be read ({' '.join(str(error).split())[:80]})") from error
         self.cache = tensors.get("cache")
         self.find_filled()
@@ -385,13 +451,14 @@ class MlpTrainer(Trainer):
     field: MlpField
     converged = 0.0  # share of the last step's rays whose opacity is bounded
 
-    def fresh(self) -> tuple[Field, torch.optim.Adam]:
-        settings = self.settings
-        assert isinstance(settings.size, MlpSize)
-        field = MlpField(settings.size, self.seed, settings.start_radius).to(self.device)
+    def fresh(self) -> Field:
+        assert isinstance(self.settings.size, MlpSize)
+        return MlpField(self.settings.size, self.seed, self.settings.start_radius).to(self.device)
+
+    def optimizer_of(self, field: Field) -> torch.optim.Adam:
         networks = [p for name, p in field.named_parameters() if name != "background"]
-        groups = _groups((networks, settings.rate), ([field.background], BACKGROUND_RATE))
-        return field, torch.optim.Adam(groups)
+        groups = _groups((networks, self.settings.rate), ([field.background], BACKGROUND_RATE), self.exposures())
+        return torch.optim.Adam(groups)
 
     @property
     def beta(self) -> Tensor:
@@ -457,13 +524,28 @@ def train(
     test = held_out(len(local.views))
     training = [view for number, view in enumerate(local.views) if number not in test]
     rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
-    depth, agreed = None, {}
+    depth, agreed, noise = None, {}, 0.0
+    fused: Fused | None = None
+    paired: dict[str, Any] = {}
     if any(photo.depth for photo in photos):
         agreed = depth_scale(poses, depth_points(poses.views, photos, photos_folder))
-        depth = depth_points(poses.views, photos, photos_folder, scale=agreed["scale"])
-    supervision = supervision_of(local, settings.size.finest, depth, agreed.get("spread", 0.0))
+        depth, noise = depth_points(poses.views, photos, photos_folder, scale=agreed["scale"]), agreed["spread"]
+    if settings.stereo and isinstance(settings.size, FieldSize):
+        begun = time.monotonic()
+        seen = only(local, [number for number in range(len(local.views)) if number not in test])
+        maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
+        carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
+        fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
+        if fused is not None and not masked:
+            fused = replace(fused, behind=behind(maps, settings.size.background, photos_folder))
+        spent = time.monotonic() - begun
+        paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
+        budget = None if budget is None else budget - spent
+        if fused is not None and depth is None:
+            depth, noise = stereo_points(maps, local), paired["spread"]
+    supervision = supervision_of(local, settings.size.finest, depth, noise)
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
-    trainer = make(settings, rays, supervision, seed, device)
+    trainer = make(settings, rays, supervision, seed, device, fused)
     checkpoint = out / "checkpoint.safetensors"
     resumed, notes = False, []
     try:
@@ -471,10 +553,11 @@ def train(
     except SdfsimError as error:  # Nothing else can come of what is left of the killed run.
         notes = [f"what a killed run had trained is lost: {error.message}; training began again"]
         on_progress(0.0, notes[0])
-    per_step = calibrate(make(settings, trainer.rays, supervision, seed, device), threads)
+    per_step = calibrate(make(settings, trainer.rays, supervision, seed, device, fused), threads)
     if budget is not None and not resumed:
         trainer.iterations = min(settings.iterations, max(FEWEST_STEPS, int(budget / per_step)))
     left = None if budget is None else budget - trainer.seconds
+    first_share = STEREO if paired else 0.0
     saved = started = time.monotonic()
     first, before = trainer.iteration, trainer.seconds
     smooth: dict[str, float] = {}
@@ -491,7 +574,8 @@ def train(
             trainer.save(checkpoint)
             saved = now
         if trainer.iteration % 10 == 0:
-            on_progress(0.92 * trainer.fraction, f"step {trainer.iteration} of {trainer.iterations}, "
+            done = first_share + (0.92 - first_share) * trainer.fraction
+            on_progress(done, f"step {trainer.iteration} of {trainer.iterations}, "
                         f"colour error {smooth['color']:.4f}")  # fmt: skip
     trainer.save(checkpoint)
     trainer.refresh()
@@ -503,7 +587,8 @@ def train(
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
-        "depth": agreed, "notes": notes,
+        "depth": agreed, "stereo": paired, "notes": notes,
+        "exposure_spread": round(trainer.exposure.spread(), 4) if trainer.exposure is not None else 0.0,
     }  # fmt: skip
     trained = Trained(trainer.field.cpu(), float(trainer.beta), to_unit, report)
     save_field(trained, out)
@@ -513,9 +598,10 @@ def train(
 
 def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
           on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """PSNR of held-out views, in normalised space, for the report, at a third of the training resolution (`psnr_px` on
-    the long side); empty where none shows anything of the unit sphere. Writes the renders to `out`/held_out."""
-    rays = load_rays(views, photos_folder, max(100, trainer.settings.long_side // 3), masks=False).to(trainer.device)
+    """PSNR of held-out views, in normalised space, for the report, at the training resolution (`psnr_px` on the long
+    side); empty where none shows anything of the unit sphere. Of large photos one pixel of `SCORED` along each side is
+    rendered; writes these pictures to `out`/held_out."""
+    rays = load_rays(views, photos_folder, trainer.settings.long_side, masks=False).to(trainer.device)
     shown: list[int] = rays.view.unique().tolist()
     if not shown:
         return {}
@@ -536,9 +622,11 @@ def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *
 
 @torch.no_grad()
 def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) -> tuple[float, np.ndarray]:
-    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere."""
+    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere; of large photos
+    one of `SCORED` along each side."""
     assert trainer.cache is not None
-    index = torch.nonzero(rays.view == number)[:, 0]
+    every = SCORED if rays.sizes.max() >= SCORED * LEAST_SCORED else 1
+    index = torch.nonzero((rays.view == number) & (rays.pixel % every == every // 2).all(1))[:, 0]
     parts = []
     for part in index.split(4096):
         origins, directions = rays.at(part)
@@ -546,11 +634,13 @@ def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) 
             render(trainer.field, trainer.cache, origins, directions, float(trainer.beta),
                    samples=trainer.settings.samples, backdrop=backdrop)["rgb"]
         )  # fmt: skip
-    rgb = torch.cat(parts)
-    error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())
-    width, height = (int(side) for side in rays.sizes[number])
+    rgb, truth = torch.cat(parts), rays.rgb[index].float() / 255
+    if backdrop is None and trainer.exposure is not None and trainer.exposure.spread() > VARIED:
+        rgb = matched(rgb, truth)
+    error = float(((rgb - truth) ** 2).mean())
+    width, height = (-(-(int(side) - every // 2) // every) for side in rays.sizes[number])
     picture = np.full((height, width, 3), EMPTY)
-    column, row = rays.pixel[index].cpu().numpy().T
+    column, row = rays.pixel[index].cpu().numpy().T // every
     picture[row, column] = rgb.cpu().numpy()
     return -10 * math.log10(max(error, 1e-10)), (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
 

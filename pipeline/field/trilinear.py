@@ -66,3 +66,66 @@ def scatter_with_threads(gradient: Any, points: Any, given: Any, threads: int) -
     """The same as `scatter`, a share a thread."""
     for t in prange(threads):
         scatter(gradient, points, given, threads, t)
+
+
+BRICK = 4  # places of a grid along each side of a brick
+
+
+@njit(cache=True, inline="always")
+def _row(bricks: Any, i: int, j: int, k: int) -> Any:
+    """The row of a place in the table of a grid that is there in bricks only; below 0 where there is none."""
+    brick = bricks[k // BRICK, j // BRICK, i // BRICK]
+    return brick * BRICK**3 + ((k % BRICK) * BRICK + j % BRICK) * BRICK + i % BRICK if brick >= 0 else -1
+
+
+@njit(cache=True)
+def gather_bricks(table: Any, bricks: Any, side: int, points: Any, found: Any, first: int, last: int) -> None:
+    """The same as `gather` for a grid of `side` places a side that is there in bricks only, the numbers of which are in
+    `bricks` [m, m, m], -1 for none: rows of a `table` [R, C], and 0 where there are none."""
+    channels = table.shape[1]
+    for p in range(first, last):
+        i, j, k, x, y, z = _cell(points, p, side)
+        for c in range(channels):
+            found[p, c] = 0
+        for corner in range(8):
+            a, b, d = corner & 1, (corner >> 1) & 1, corner >> 2
+            row = _row(bricks, i + a, j + b, k + d)
+            if row >= 0:
+                share = (x if a else 1 - x) * (y if b else 1 - y) * (z if d else 1 - z)
+                for c in range(channels):
+                    found[p, c] += share * table[row, c]
+
+
+@njit(cache=True)
+def scatter_bricks(gradient: Any, bricks: Any, side: int, points: Any, given: Any, shares: int, share: int) -> None:
+    """The same as `scatter` for `gather_bricks`, to `gradient` [R, C]."""
+    channels = gradient.shape[1]
+    for p in range(len(points)):
+        i, j, k, x, y, z = _cell(points, p, side)
+        for d in range(2):
+            if (k + d) % shares != share:
+                continue
+            for corner in range(4):
+                a, b = corner & 1, corner >> 1
+                row = _row(bricks, i + a, j + b, k + d)
+                if row >= 0:
+                    part = (x if a else 1 - x) * (y if b else 1 - y) * (z if d else 1 - z)
+                    for c in range(channels):
+                        gradient[row, c] += part * given[p, c]
+
+
+@njit(cache=True, parallel=True)
+def gather_bricks_with_threads(table: Any, bricks: Any, side: int, points: Any, found: Any, threads: int) -> None:
+    """The same as `gather_bricks` for all points."""
+    count = len(points)
+    for t in prange(threads):
+        gather_bricks(table, bricks, side, points, found, t * count // threads, (t + 1) * count // threads)
+
+
+@njit(cache=True, parallel=True)
+def scatter_bricks_with_threads(
+    gradient: Any, bricks: Any, side: int, points: Any, given: Any, threads: int
+) -> None:  # fmt: skip
+    """The same as `scatter_bricks`, a share a thread."""
+    for t in prange(threads):
+        scatter_bricks(gradient, bricks, side, points, given, threads, t)

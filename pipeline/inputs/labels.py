@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 from PIL import Image
 
 from pipeline.inputs.images import decoded, read_mask, turned_like
+from pipeline.naming import NAMING, can_be_named
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, visible
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes
 UNKNOWN = 255  # a pixel of which nothing is said
-# Names that a scene file holds already, or that of the folder of the scenery's shape.
-TAKEN = ("scenery", "scene", "floor", "box", "ball")
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 @dataclass(frozen=True)
@@ -86,10 +82,8 @@ def find_labels(photos: list[Path]) -> Labels:
             if folder == root / FOLDER:
                 images = {**found, **images}
                 continue
-            known = NAME.fullmatch(folder.name) and yaml.safe_load(folder.name) == folder.name  # "no" would be False
-            if found and (not known or folder.name in TAKEN):
-                raise SdfsimError(f"{folder}: no body can have this name",
-                                  f"use letters, digits, - and _, a letter first; not {', '.join(TAKEN)}")  # fmt: skip
+            if found and not can_be_named(folder.name):
+                raise SdfsimError(f"{folder}: no body can have this name", NAMING)
             for photo, path in found.items():
                 masks.setdefault(photo, {}).setdefault(folder.name, path)
     if images and masks:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from pipeline.cameras import PosedPhotos, frame_of
-from pipeline.inputs.labels import load_names
+from pipeline.inputs.labels import load_labels, load_names
+from pipeline.mesh.clicks import Scene, parts_by_clicks
 from pipeline.mesh.extraction import (
     FLOATER,
     LIFT,
@@ -41,6 +43,7 @@ from pipeline.mesh.seams import (
     solid_of,
 )
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
+from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals
 
@@ -60,9 +63,10 @@ SMALL_NOISE, BARE = 0.15, 0.05
 # In cells of the field's finest grid, which limits what can be separated:
 LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
 SMALLEST = 4.0  # what rises less stays part of what it stands on
-FINER = 1 / 3  # distance of a body's samples
+FINER = 2 / 3  # distance of a body's samples
 FILLET = 3.0  # contact layers sideways: what is so near a body's foot is taken away together with it
 FEWEST_SAMPLES = 8  # of a component: less is no body
+NOWHERE = np.zeros((0, 3))  # no points
 
 
 @dataclass(frozen=True)
@@ -132,8 +136,9 @@ class FoundBody:
         return value
 
 
-def find_level_planes(shown: Mesh, up: np.ndarray, width: float) -> list[LevelPlane]:
-    """Level planes of a surface, largest first; `up` [3] is unit, and faces within `width` belong to one plane."""
+def find_level_planes(shown: Mesh, up: np.ndarray, width: float, share: float = LEVEL_SHARE) -> list[LevelPlane]:
+    """Level planes of a surface, largest first, down to a `share` of that one's area; `up` [3] is unit, and faces
+    within `width` belong to one plane."""
     normals, areas = face_normals(shown)
     centers = shown.vertices[shown.faces].mean(1)
     flat = normals @ up > LEVEL_NORMAL
@@ -146,7 +151,7 @@ def find_level_planes(shown: Mesh, up: np.ndarray, width: float) -> list[LevelPl
         # A plane that lies across the border of two bins must not be missed.
         fullest = int(np.argmax(total + np.append(total[1:], 0)))
         member = (bins == fullest) | (bins == fullest + 1)
-        if levels and areas[member].sum() < LEVEL_SHARE * levels[0].area:
+        if levels and areas[member].sum() < share * levels[0].area:
             break
         middle = np.average(centers[member], axis=0, weights=areas[member])
         offset = centers[member] - middle
@@ -159,11 +164,12 @@ def find_level_planes(shown: Mesh, up: np.ndarray, width: float) -> list[LevelPl
 
 
 def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, smallest: float,
-                named: np.ndarray | None = None) -> list[FoundBody]:  # fmt: skip
+                named: np.ndarray | None = None, clicked: np.ndarray = NOWHERE) -> list[FoundBody]:  # fmt: skip
     """Bodies without names that stand on level planes, wholly within the trained space; those that touch are one.
 
     What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
-    What rises less than `smallest` above its plane stays part of it, unless its vertices are `named` [V] bool by masks.
+    What rises less than `smallest` above its plane stays part of it, unless its vertices are `named` [V] bool by masks,
+    or a point of it was `clicked` [K, 3].
     """
     volume = surface.volume
     solid = volume.values < 0
@@ -189,6 +195,7 @@ def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
             sides = volume.cell * np.array(mine.shape)
             place = Volume(mine.astype(np.float32), low, volume.cell)
             known = named is not None and _share_seen(place, vertices, surface.raw.vertices[named]) > SEEN_SHARE
+            known = known or bool(_near(place, clicked).any())
             if height[box][mine].max() < smallest and not known:
                 continue
             if any(_carries(place, other, volume.cell) for other in others) and not known:
@@ -202,6 +209,33 @@ def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
             standing = (label > 0) & ~crumbs[label]
             found.append(_body(volume, standing, box, mine, level, layer, float(sides.max())))
     return found
+
+
+def bodies_with(surface: FieldSurface, levels: list[LevelPlane], layer: float, smallest: float, clicked: np.ndarray
+                ) -> list[FoundBody]:  # fmt: skip
+    """`find_bodies` for points [K, 3] that were clicked. A level plane that is one of a body's own sides, as the cover
+    of a book is on which another lies, would make scenery of it: while a point is in no body, the smallest goes."""
+    most: list[FoundBody] = []
+    reached = -1
+    for count in range(len(levels), 0, -1):
+        found = find_bodies(surface, levels[:count], layer, smallest, None, clicked)
+        held = sum(any(_holds(surface, body, point) for body in found) for point in clicked)
+        if held > reached:
+            most, reached = found, held
+        if held == len(clicked):
+            break
+    return most
+
+
+def _holds(surface: FieldSurface, body: FoundBody, point: np.ndarray) -> bool:
+    """Whether a point [3] on the surface is one of a body."""
+    return bool(_near(Volume(_within(surface, body).astype(np.float32), body.low, body.cell), point[None])[0])
+
+
+def _near(place: Volume, points: np.ndarray) -> np.ndarray:
+    """Which points [P, 3] lie within two samples of those that are set."""
+    at = place.low + place.cell * np.argwhere(place.values > 0)
+    return KDTree(at).query(points)[0] < 2 * place.cell if len(points) and len(at) else np.zeros(len(points), bool)
 
 
 def _carries(place: Volume, other: LevelPlane, cell: float) -> bool:
@@ -301,29 +335,34 @@ class Parts:
     shown: Mesh | None  # what is displayed of it: its visible surface, and the places where bodies stood
     bodies: dict[str, Mesh]  # closed mesh of each body by name, with colours; the largest first
     smallest: float  # what rises less than this above its plane stayed part of the scenery
-    # names of two bodies that touch, and "masks" or "shape", which separated them
+    # names of two bodies that touch, and "masks", "clicks" or "shape", which separated them
     touching: list[tuple[str, str, str]] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)  # names of masks whose object has no surface of its own
+    missing: list[str] = field(default_factory=list)  # names of masks or clicks that no body has
     noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_are_noise`
     unrefined: dict[str, str] = field(default_factory=dict)  # by body, why it was not moved to where the photos agree
 
 
 def split(surface: FieldSurface, distance: Distance, finest: float, poses: PosedPhotos, photos_folder: Path,
-          up: np.ndarray, *, alone: bool) -> Parts:  # fmt: skip
-    """Finds bodies, takes them out of the scenery and separates those that touch.
+          up: np.ndarray, *, alone: bool, clicked: dict[str, np.ndarray] | None = None) -> Parts:  # fmt: skip
+    """Finds bodies, takes them out of the scenery and separates those that touch. Points [K, 3] of the surface that
+    were `clicked` give bodies their names. Raises SdfsimError where masks do so as well.
 
     All is in normalised space: the poses, `up` [3] and the signed distance that the surface is of; `finest` is the
     width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
     """
     smallest, layer, lift = SMALLEST * finest, LAYER * finest, LIFT * surface.volume.cell
-    names = load_names(photos_folder)
+    names, clicked = load_names(photos_folder), clicked or {}
+    if names and clicked:
+        message = f"body: the photos have masks of {', '.join(names)} already"
+        raise SdfsimError(message, "give either masks of bodies or --body")
+    names = names or list(clicked)
     if alone and not names:
         return Parts(None, None, whole_bodies(surface), smallest)
     blocking = Caster(surface.raw)
-    votes = None
-    if names:
-        sight = Visibility(surface.raw, lift, blocking)
-        votes = count_votes(sight, surface.raw.faces, poses.views, photos_folder, names)
+    sight = Visibility(surface.raw, lift, blocking)
+    scene, votes = Scene(surface.raw, blocking, sight, poses.views, photos_folder), None
+    if names and not clicked:
+        votes = count_votes(sight, surface.raw.faces, poses.views, partial(load_labels, photos_folder), names)
     if alone:
         whole = [_whole(surface, mesh, up, layer) for mesh in whole_bodies(surface).values()]
     else:
@@ -331,11 +370,14 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
         # Masks separate what lies on a body from it; the plane between them does not.
         plain = surface.shown if named is None else surface.shown & ~named[surface.raw.faces].any(1)
         levels = find_level_planes(keep_faces(surface.raw, plain), up, finest)
-        whole = find_bodies(surface, levels, layer, smallest, named)
+        if clicked:
+            whole = bodies_with(surface, levels, layer, smallest, np.concatenate(list(clicked.values())))
+        else:
+            whole = find_bodies(surface, levels, layer, smallest, named)
     pieces: list[FoundBody] = []
     touching: list[tuple[FoundBody, FoundBody, str]] = []
     for body in whole:
-        found, by, name = _parted(surface, body, votes, smallest)
+        found, by, name = _parted(surface, body, votes, smallest, clicked, scene)
         parts = [_piece(body, part, names[part.number - 1] if part.number else "") for part in found]
         touching += [(parts[k], parts[n], by) for k, part in enumerate(found) for n in part.neighbours if n > k]
         pieces += parts or [replace(body, name=name)]
@@ -368,17 +410,22 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     return Parts(solid, shown, meshes, smallest, pairs, missing, [body.size for body in noise], unrefined)
 
 
-def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smallest: float
-            ) -> tuple[list[Part], str, str]:  # fmt: skip
-    """The parts that a body is made of, none for a single one; what separates them, "masks" or "shape"; and the name
-    that masks give to a single one."""
+def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smallest: float,
+            clicked: dict[str, np.ndarray], scene: Scene) -> tuple[list[Part], str, str]:  # fmt: skip
+    """The parts that a body is made of, none for a single one; what separates them, "masks", "clicks" or "shape"; and
+    the name that masks or clicks give to a single one."""
     solid = _solid(surface, body)
+    assert surface.raw.colors is not None
+    points = {number: points[[_holds(surface, body, point) for point in points]]
+              for number, points in enumerate(clicked.values(), start=1)}  # fmt: skip
+    if points := {number: some for number, some in points.items() if len(some)}:
+        parts = parts_by_clicks(solid, surface.raw.colors[solid.index], points, scene, smallest)
+        return parts, "clicks", "" if parts else [*clicked][next(iter(points)) - 1]
     if votes is not None:
         parts, number = parts_by_votes(solid, votes)
         if parts or number:
             return parts, "masks", "" if parts else votes.names[number - 1]
     if np.isfinite(body.level.height):
-        assert surface.raw.colors is not None
         return parts_by_shape(solid, surface.raw.colors[solid.index], smallest), "shape", ""
     return [], "", ""
 
@@ -386,8 +433,13 @@ def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smalles
 def _solid(surface: FieldSurface, body: FoundBody) -> ConnectedSolid:
     """What is solid of a body above its contact layer."""
     around = Volume(surface.volume.values[body.part_of(surface.volume)], body.low, body.cell)
-    inside = body.own & (around.values < 0) & (body.level.above(around.points()) > body.layer)
-    return solid_of(around, inside, surface.raw)
+    return solid_of(around, _within(surface, body), surface.raw)
+
+
+def _within(surface: FieldSurface, body: FoundBody) -> np.ndarray:
+    """[X, Y, Z] bool, of the samples of `own` those within a body and above its contact layer."""
+    around = Volume(surface.volume.values[body.part_of(surface.volume)], body.low, body.cell)
+    return body.own & (around.values < 0) & (body.level.above(around.points()) > body.layer)
 
 
 def _piece(body: FoundBody, part: Part, name: str) -> FoundBody:

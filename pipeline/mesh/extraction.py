@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import PosedPhotos
 from pipeline.field.grid_field import Field
-from pipeline.mesh.visibility import Visibility, look, to_bytes
+from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
 from pipeline.progress import Progress, quiet
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
@@ -182,15 +182,17 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
 
 def surface_of(
     volume: Volume, field: Field, poses: PosedPhotos, photos_folder: Path, limit: Distance, *,
-    on_progress: Progress = quiet,
+    known: Callable[[np.ndarray], np.ndarray] | None = None, on_progress: Progress = quiet,
 ) -> FieldSurface:  # fmt: skip
     """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
-    poses are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
-    hardly any of it is in the photos."""
+    poses are in normalised space. Points [P, 3] that are `known` [P] count as seen, whoever sees them. Raises
+    SdfsimError (exit code 3) where the field has no surface, or hardly any of it is in the photos."""
     raw, cell = volume.mesh(), volume.cell
     found = look(Visibility(raw, LIFT * cell), poses.views, photos_folder, on_progress)
     far = KDTree(poses.sparse.xyz).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
     seen = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell) & ~far
+    completed = np.zeros(len(seen), bool) if known is None else known(raw.vertices)
+    seen |= completed
     faces_seen = seen[raw.faces].sum(1) >= 2
     kept, left_out = belonging(raw, faces_seen, FLOATER / 4, SPECK)
     shown = islands(raw, faces_seen & kept, FLOATER)
@@ -198,6 +200,8 @@ def surface_of(
         message = "mesh: hardly any of the surface is visible in the photos"
         raise SdfsimError(message, "check the poses", exit_code=EXIT_QUALITY)
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
+    if (unseen := completed & (found.weight == 0)).any():
+        rgb[unseen] = spread_colors(raw.vertices[unseen], raw.vertices[seen & ~unseen], rgb[seen & ~unseen])
     return FieldSurface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
 
 

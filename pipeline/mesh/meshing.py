@@ -18,10 +18,12 @@ from pipeline.inputs.photos import load_photos
 from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
-from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
+from pipeline.mesh.hollows import hollow
+from pipeline.mesh.placement import GRAVITY, Placement, Up, located_bodies, measured_scale, place
+from pipeline.mesh.supports import complete, on_any
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
-from pipeline.mesh.visibility import Visibility, hollow, to_bytes
+from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.options import Options
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import SdfsimError
@@ -31,7 +33,7 @@ from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
 
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
-RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "volsdf": 448}  # samples a side, by preset
+RESOLUTION = {"quick": 256, "standard": 320, "fine": 512, "volsdf": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 
@@ -50,16 +52,29 @@ def make_meshes(
     inner, limit = field_distance(field), ball
     inside = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
     volume = sample_volume(inside, RESOLUTION[options.preset], on_progress=share_of(on_progress, 0.0, 0.25))
-    surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
+    surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.2))
     scale = None
     if options.distance is not None:
         scale = measured_scale(options.distance, posed.views, load_photos(photos), Caster(surface.raw))
+    clicked = {}
+    if options.body:
+        clicked = located_bodies(options.body, posed.views, load_photos(photos), Caster(surface.raw))
     capture, up = load_capture(photos), None
     if capture is not None and capture.up is not None:
         up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
     if capture is not None and scale is None and options.size is None:
         scale = 1 / to_unit.scale, f"metres of {capture.app}"
     placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
+    level, known, completed = placement.to_metres.rotation[2], None, []
+    if not alone:
+        on_progress(0.45, "looking for level surfaces without texture")
+        completed = complete(surface, level, field.finest, posed, photos)
+    if completed:
+        for one in completed:
+            volume = one.filled(volume)
+        known = on_any(completed, volume.cell)
+        surface = surface_of(volume, field, posed, photos, limit, known=known,
+                             on_progress=share_of(on_progress, 0.45, 0.05))  # fmt: skip
     if options.crop is not None:
         limit = box_of(placement, np.reshape(options.crop, (2, 3)))
         volume = volume.limited(limit)
@@ -68,11 +83,12 @@ def make_meshes(
                 "crop: the box holds nothing",
                 "corners are in metres, in the axes of the mesh/mesh.ply of a run without --crop",
             )
-        surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
+        surface = surface_of(volume, field, posed, photos, limit, known=known,
+                             on_progress=share_of(on_progress, 0.5, 0.2))  # fmt: skip
         # Where a person has cut the surroundings away, what is left is what they want to move.
         alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
     on_progress(0.7, "looking for bodies")
-    parts = split(surface, inside, field.finest, posed, photos, placement.to_metres.rotation[2], alone=alone)
+    parts = split(surface, inside, field.finest, posed, photos, level, alone=alone, clicked=clicked)
     on_progress(0.8, "drawing objects.png")
     draw_names(parts, posed.views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
@@ -85,19 +101,20 @@ def make_meshes(
     ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
     on_progress(0.82, "asking how far each place can be trusted")
     evidence, trusted = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
-    write_parts(parts, surface.visible, placement, evidence, out)
+    write_parts(parts, surface.visible, placement, evidence, out, field.finest * metres)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     write_bytes(out / TEXTURED, write_glb(textures))
-    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
+    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres, evidence) for name in parts.bodies}
     return {
         "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
+        "completed_m2": [float(rounded(one.area * metres**2)) for one in completed],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from,
         "size_assumed": placement.size_assumed, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
-        "hollows_m": {name: rounded(found).tolist() for name, found in deep.items() if found is not None},
-        "masks_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
+        "hollows": {name: found.to_dict() for name, found in deep.items() if found is not None},
+        ("places" if clicked else "masks") + "_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
     }  # fmt: skip
 
 
@@ -137,8 +154,11 @@ def rounded(values: ArrayLike) -> np.ndarray:
     return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
 
 
-def write_parts(parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path) -> None:
-    """Writes meshes in metres with what the photos say about their vertices, `placement.json` and `parts.json`."""
+def write_parts(
+    parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path, cell: float
+) -> None:  # fmt: skip
+    """Writes meshes in metres with what the photos say about their vertices, `placement.json` and `parts.json`; the
+    latter also says how wide the field's cells are, m."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
@@ -155,7 +175,7 @@ def write_parts(parts: Parts, visible: Mesh, placement: Placement, evidence: Evi
         moved = write(f"objects/{name}.ply", mesh)
         low, high = moved.vertices.min(0), moved.vertices.max(0)
         objects.append({"name": name, "low": rounded(low).tolist(), "high": rounded(high).tolist()})
-    write_json(out / "parts.json", {"version": 1, "scenery": parts.solid is not None, "objects": objects})
+    write_json(out / "parts.json", {"version": 1, "scenery": parts.solid is not None, "cell": cell, "objects": objects})
     placement.save(out)
 
 

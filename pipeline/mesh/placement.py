@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.cameras import Similarity, Up, View, camera_up, frame_of
 from pipeline.inputs.photos import Photo
-from sdfsim.base.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.files import read_json, write_json
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals
@@ -27,6 +27,7 @@ LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a level face: 1
 MIN_FLOOR = 0.05  # share of the area that a floor has
 # A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
+FORMS = {"distance": "PHOTO:X,Y or PHOTO", "body": "NAME=PHOTO:X,Y"}  # of a place, by the option that takes it
 
 
 @dataclass(frozen=True)
@@ -183,12 +184,33 @@ def check_distance(distance: Sequence, photos: list[Photo]) -> None:
         _end(text, photos)
 
 
-def _locate(text: str, views: Sequence[View], photos: list[Photo], surface: Caster) -> np.ndarray:
-    """Position [3] of one end of a known distance."""
-    photo, pixel = _end(text, photos)
+def check_bodies(bodies: dict[str, list[str]], photos: list[Photo]) -> None:
+    """Checks what can be known of the places of bodies (see `Options`) before there are poses. Raises SdfsimError as
+    `_end` does, or for a place without a pixel."""
+    for text in (text for spots in bodies.values() for text in spots):
+        if _end(text, photos, "body")[1] is None:
+            raise SdfsimError(f"body: {text} has no pixel", "write PHOTO:X,Y")
+
+
+def located_bodies(
+    bodies: dict[str, list[str]], views: Sequence[View], photos: list[Photo], surface: Caster
+) -> dict[str, np.ndarray]:
+    """The points [K, 3] of the surface that the places of each body show. Raises SdfsimError as `measured_scale`."""
+    check_bodies(bodies, photos)
+    return {
+        name: np.array([_locate(text, views, photos, surface, "body") for text in spots])
+        for name, spots in bodies.items()
+    }
+
+
+def _locate(
+    text: str, views: Sequence[View], photos: list[Photo], surface: Caster, option: str = "distance"
+) -> np.ndarray:
+    """Position [3] of one end of a known distance, or of what another option points at."""
+    photo, pixel = _end(text, photos, option)
     view = next((view for view in views if view.name == photo.name), None)
     if view is None:
-        raise SdfsimError(f"distance: {photo.source} has no pose", "choose a place in another photo")
+        raise SdfsimError(f"{option}: {photo.source} has no pose", "choose a place in another photo")
     if pixel is None:
         return view.center
     turn = np.arange(8) * np.pi / 4
@@ -197,16 +219,19 @@ def _locate(text: str, views: Sequence[View], photos: list[Photo], surface: Cast
     rays = view.rays(spots[:, 0], spots[:, 1])
     away = surface.hits(view.center, rays)[0]
     if not np.isfinite(away).any():
-        raise SdfsimError(f"distance: {text} shows nothing of the surface", "choose a pixel on what was reconstructed")
+        raise SdfsimError(f"{option}: {text} shows nothing of the surface", "choose a pixel on what was reconstructed")
+    if option == "body":  # People point at the middle of it.
+        hit = int(np.isfinite(away).argmax())
+        return view.center + away[hit] * rays[hit]
     # People point at corners, which come out a little rounded, and just beside one is what lies far behind it: as far
     # away as the first pixel that shows none of that, but where they pointed.
     best = int((away < BEHIND * away.min()).argmax())
     return view.center + away[best] * rays[0]
 
 
-def _end(text: str, photos: list[Photo]) -> tuple[Photo, tuple[float, float] | None]:
-    """The photo that one end of a distance names, with or without its subfolder, and the pixel if one is given. Raises
-    SdfsimError for no such photo or several, or a pixel outside it."""
+def _end(text: str, photos: list[Photo], option: str = "distance") -> tuple[Photo, tuple[float, float] | None]:
+    """The photo that one end of a distance, or a place of another option, names, with or without its subfolder, and the
+    pixel if one is given. Raises SdfsimError for no such photo or several, or a pixel outside it."""
     match = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
     name, pixel = (match[1], (float(match[2]), float(match[3]))) if match else (text, None)
     name = Path(name).as_posix()  # with slashes on Windows too
@@ -214,8 +239,9 @@ def _end(text: str, photos: list[Photo]) -> tuple[Photo, tuple[float, float] | N
     if len(found) != 1:
         which = f"{len(found)} photos are" if found else "no photo is"
         such = ", ".join(photo.source for photo in (found or photos)[:3])
-        raise SdfsimError(f"distance: {which} called {name!r}", f"write PHOTO:X,Y or PHOTO; photos: {such}, ...")
+        meant = "" if found else nearest(name, [p.source for p in photos])
+        raise SdfsimError(f"{option}: {which} called {name!r}{meant}", f"write {FORMS[option]}; photos: {such}, ...")
     width, height = found[0].original
     if pixel is not None and not (pixel[0] <= width and pixel[1] <= height):
-        raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")
+        raise SdfsimError(f"{option}: {text} lies outside the photo ({width} x {height} px)")
     return found[0], pixel

@@ -7,9 +7,8 @@ inside belongs to the part whose surface is nearest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -20,7 +19,7 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import ConvexHull, KDTree
 
 from pipeline.cameras import View, frame_of
-from pipeline.inputs.labels import UNKNOWN, load_labels
+from pipeline.inputs.labels import UNKNOWN
 from pipeline.mesh.extraction import Volume
 from pipeline.mesh.visibility import Visibility
 from sdfsim.geometry.mesh import Mesh, vertex_normals
@@ -49,6 +48,9 @@ FLAT = 0.1
 MEET = 12
 # The samples fill grooves: their line is so many samples below the surface.
 FILLED = 0.45
+# A seam is laid into a surface that is parallel to it to this cosine, within so many samples of its plane, from so many
+# to so many samples outside its rim, that has at least this share of vertices for those of the rim, and faces one way.
+PARALLEL, COVER, BESIDE, AROUND, ONE_SIDED = 0.97, 1.2, (0.7, 5.0), 0.3, 0.8
 # A seam is marked out within so many samples of its plane, which no flood through the inside passes.
 WALL = 0.9
 
@@ -67,12 +69,13 @@ class Votes:
         return np.where(self.share.any(1), self.share.argmax(1), -1)
 
 
-def count_votes(sight: Visibility, faces: np.ndarray, views: Sequence[View], photos_folder: Path,
-                names: list[str]) -> Votes:  # fmt: skip
-    """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out."""
+def count_votes(sight: Visibility, faces: np.ndarray, views: Sequence[View],
+                labels_of: Callable[[str], np.ndarray | None], names: list[str]) -> Votes:  # fmt: skip
+    """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out.
+    `labels_of` gives them as `load_labels` does, by the name of the prepared photo."""
     votes = np.zeros((len(sight.vertices), len(names) + 1))
     for view in views:
-        labels = load_labels(photos_folder, view.name)
+        labels = labels_of(view.name)
         if labels is None:
             continue
         index, pixels, cosine = sight.of_view(view)
@@ -182,9 +185,18 @@ def part_of_name(solid: ConnectedSolid, votes: Votes, number: int) -> Part | Non
 
 
 def parts_by_shape(solid: ConnectedSolid, colors: np.ndarray, least: float) -> list[Part]:
-    """The parts of a solid that meet in a groove all along, and whose seam is narrow or whose colours [P, 3] differ;
-    none where it is a single body. Parts are at least `least` long in every direction."""
-    groove = _solid_around(solid) - 0.5
+    """The parts of a solid by `shape_labels`; none where it is a single body."""
+    label = shape_labels(solid, colors, least)
+    if not label.any():
+        return []
+    share = owners(solid.points, np.eye(label.max() + 1)[label], solid.volume.cell)
+    return cut(solid, label, seams(solid, share), [0] * (label.max() + 1))
+
+
+def shape_labels(solid: ConnectedSolid, colors: np.ndarray, least: float) -> np.ndarray:
+    """The part [P] of each vertex, from 0 on: parts meet in a groove all along, and their seam is narrow or their
+    colours [P, 3] differ. Parts are at least `least` long in every direction."""
+    groove = grooves(solid)
     label = np.zeros(len(groove), int)
     waiting = [0]
     while waiting:
@@ -195,24 +207,14 @@ def parts_by_shape(solid: ConnectedSolid, colors: np.ndarray, least: float) -> l
         if _apart(solid, trial, seams(solid, share), (number, new), colors, groove, least):
             label = trial
             waiting += [number, new]
-    if not label.any():
-        return []
-    share = owners(solid.points, np.eye(label.max() + 1)[label], solid.volume.cell)
-    return cut(solid, label, seams(solid, share), [0] * (label.max() + 1))
+    return label
 
 
 def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """One side [N] of the best division of some vertices [P] bool in two, through grooves and where colours change. The
     normalised cut of Shi and Malik (2000), from the second eigenvector of the surface's Laplacian."""
     place = np.cumsum(mine) - 1
-    ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
-    ends = ends[mine[ends].all(1)]
-    around = KDTree(solid.points).query_ball_point(solid.points, HUE * solid.volume.cell)
-    rows = np.repeat(np.arange(len(around)), [len(each) for each in around])
-    mean = coo_matrix((np.ones(len(rows)), (rows, np.concatenate(around)))).tocsr() @ colors.astype(float)
-    hue = _hue(mean / np.bincount(rows)[:, None])
-    deep = np.maximum(groove[ends].max(1), 0) / SOFT[0]
-    apart = np.linalg.norm(hue[ends[:, 0]] - hue[ends[:, 1]], axis=1) / SOFT[1]
+    ends, deep, apart = steps(solid, mine, groove, colors)
     weight = np.exp(-deep - apart) + 1e-3
     index = place[ends]
     count = int(mine.sum())
@@ -235,6 +237,25 @@ def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
         across = strength[side[row] != side[column]].sum() / 2
         costs.append(across / max(min(degree[side].sum(), degree[~side].sum()), 1e-9))
     return np.flatnonzero(mine)[whole[value > limits[int(np.argmin(costs))]]]
+
+
+def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """The edges [E, 2] between some vertices [P] bool of a solid, and what stands against crossing each: how deep a
+    `groove` [P] it lies in [E], and how its ends differ in colour [P, 3] [E]."""
+    ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
+    ends = ends[mine[ends].all(1)]
+    around = KDTree(solid.points).query_ball_point(solid.points, HUE * solid.volume.cell)
+    rows = np.repeat(np.arange(len(around)), [len(each) for each in around])
+    mean = coo_matrix((np.ones(len(rows)), (rows, np.concatenate(around)))).tocsr() @ colors.astype(float)
+    hue = _hue(mean / np.bincount(rows)[:, None])
+    deep = np.maximum(groove[ends].max(1), 0) / SOFT[0]
+    return ends, deep, np.linalg.norm(hue[ends[:, 0]] - hue[ends[:, 1]], axis=1) / SOFT[1]
+
+
+def grooves(solid: ConnectedSolid) -> np.ndarray:
+    """How deep a groove each vertex [P] lies in: 0 on a plane, 0.25 in a sharp right angle, less on an edge."""
+    return _solid_around(solid) - 0.5
 
 
 def _solid_around(solid: ConnectedSolid) -> np.ndarray:
@@ -274,7 +295,7 @@ def seams(solid: ConnectedSolid, share: np.ndarray) -> list[Seam]:
         for k in range(piece.max() + 1):
             rim, across = middle[piece == k], np.diff(solid.points[mine[piece == k]], axis=1)[:, 0].mean(0)
             if np.ptp(rim, axis=0).max() > 3 * solid.volume.cell:
-                found.append(_seam((int(a), int(b)), rim, across, solid.volume.cell))
+                found.append(_laid(solid, _seam((int(a), int(b)), rim, across, solid.volume.cell)))
     return found
 
 
@@ -289,8 +310,32 @@ def _seam(pair: tuple[int, int], rim: np.ndarray, across: np.ndarray, cell: floa
     point = rim.mean(0)
     off = np.sqrt(np.mean(((rim - point) @ normal) ** 2))
     flat = off < cell + FLAT * np.sqrt(spread[2])
-    sides = ConvexHull((rim - point) @ frame_of(normal)[:2].T, qhull_options="QJ").equations
-    return Seam(pair, rim, point, normal, bool(flat), sides)
+    return Seam(pair, rim, point, normal, bool(flat), _sides(rim, point, normal))
+
+
+def _sides(rim: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The lines [S, 3] around a rim [R, 3] in the plane through a point, see `Seam`."""
+    return ConvexHull((rim - point) @ frame_of(normal)[:2].T, qhull_options="QJ").equations
+
+
+def _laid(solid: ConnectedSolid, seam: Seam) -> Seam:
+    """The seam laid into the flat surface around it, where there is one: what lies on the cover of a book ends at the
+    cover, which is seen more exactly than the groove around what lies there."""
+    if not seam.flat:
+        return seam
+    cell = solid.volume.cell
+    near = np.abs(seam.beyond(solid.points)) < COVER * cell
+    near[near] = np.abs(solid.normals[near] @ seam.normal) > PARALLEL
+    outside = seam.outside(solid.points[near]) / cell
+    near[near] = (outside > BESIDE[0]) & (outside < BESIDE[1])
+    side = np.sign(solid.normals[near] @ seam.normal)
+    # Two round bodies face each other from both sides.
+    if near.sum() < AROUND * len(seam.rim) or abs(side.mean()) < ONE_SIDED:
+        return seam
+    normal = np.median(solid.normals[near] * side[:, None], axis=0)
+    normal /= np.linalg.norm(normal)
+    point = seam.point + np.median((solid.points[near] - seam.point) @ normal) * normal
+    return replace(seam, point=point, normal=normal, sides=_sides(seam.rim, point, normal))
 
 
 def _walled(solid: ConnectedSolid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,6 @@ from sdfsim.geometry.mesh import Mesh, vertex_normals
 # Cosines between normal and line of sight. At a flatter angle (85 degrees) a point does not count as seen; at 70
 # degrees a photo begins to help.
 FLATTEST, FAIR = 0.08, 0.35
-PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; that a hollow has
 
 
 @dataclass(frozen=True)
@@ -45,26 +44,6 @@ class Above:
         origin = np.insert(at.reshape(-1, 2), 2, self.top, axis=1)
         distance, _ = self.caster.hits(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
         return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
-
-
-def hollow(mesh: Mesh, least: float) -> tuple[float, float] | None:
-    """How deep a body, a closed mesh in metres with z up, is hollow below its rim, and how thick what is below the
-    hollow is, m; None where it holds no water, or none deeper than `least` m."""
-    from skimage.morphology import reconstruction
-
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    step = float((high - low)[:2].max()) / PLACES
-    axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in range(2)]
-    height = Above(mesh).heights(np.stack(np.meshgrid(*axes, indexing="ij"), -1))
-    through = np.isnan(height)
-    height = np.where(through, low[2], height)
-    water = reconstruction(np.where(through, height, height.max()), height, method="erosion")
-    depth = water - height
-    deep = depth > 0.5 * depth.max()
-    found = float(np.median(depth[deep])) if depth.max() > 0 else 0.0
-    if found < least or deep.sum() < FEWEST:
-        return None
-    return found, float(np.median(height[deep]) - low[2])
 
 
 class Visibility:

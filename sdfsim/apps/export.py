@@ -136,7 +136,7 @@ def export(
     if collide != "pieces" and FORMATS[kind] is not _mjcf:
         raise SdfsimError(f"--collide {collide}: is for MuJoCo", "leave it out; USD has it for bodies without pieces")
     if fps is not None and (FORMATS[kind] in (_mjcf, _urdf) or not 0.0 < fps <= 1e4):
-        told = f"--fps {fps:g}: " + ("must be above 0, at most 10,000" if fps <= 0 or fps > 1e4 else "no motion in it")
+        told = f"--fps {fps:g}: " + ("no motion in it" if 0.0 < fps <= 1e4 else "must be above 0, at most 10,000")
         raise SdfsimError(told, "it goes with " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf)))
     if FORMATS[kind] is _usd:
         _extra("pxr.Usd")  # before shapes are fitted for minutes
@@ -163,7 +163,7 @@ def _extra(module: str) -> Any:
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
     progress = partial(on_progress, "shapes")
-    run, source = None, find_scene(source)
+    run, source = None, source if source.exists() else find_scene(source)
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:

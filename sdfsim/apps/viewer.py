@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import webbrowser
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -41,8 +42,8 @@ def stream_to_viewer(playback: Playback, kind: str) -> str:
     if kind == "native":
         return ""
     atexit.register(_end, viewer)
-    page = f"http://localhost:{page_port}?url=rerun%2Bhttp://localhost:{port}/proxy"
-    if _has_screen():
+    page = _page(page_port, port)
+    if has_screen():
         webbrowser.open(page)
     return page
 
@@ -51,8 +52,12 @@ def _address(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
+def _page(page_port: int, port: int) -> str:
+    return f"http://localhost:{page_port}?url=rerun%2Bhttp://localhost:{port}/proxy"
+
+
 def _command(port: int, options: list[str]) -> list[str]:
-    return [_executable(), *options, "--bind", LOOPBACK, "--port", str(port)]
+    return [viewer_program(), *options, "--bind", LOOPBACK, "--port", str(port)]
 
 
 def _launch(port: int, options: list[str]) -> subprocess.Popen:
@@ -64,20 +69,27 @@ def _launch(port: int, options: list[str]) -> subprocess.Popen:
 
 def check_screen(kind: str) -> None:
     """Raises SdfsimError when a window (`native`) is wanted where there is no screen."""
-    if kind == "native" and not _has_screen():
-        raise SdfsimError("--viewer native: there is no screen here", "use --viewer web, or --viewer file")
+    if kind == "native" and not has_screen():
+        raise SdfsimError("there is no screen here for a window", "watch it in the browser, --viewer web or view --web")
 
 
-def _has_screen() -> bool:
+def has_screen() -> bool:
+    """Whether a window can be shown."""
     return bool(sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def show(recording: Path, *, web: bool = False) -> None:
-    """Open a recording, and wait until the viewer is closed. Raises SdfsimError for no such recording, or where it
-    fails."""
+def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lambda line: None) -> None:
+    """Open a recording, and wait until the viewer is closed; `say` is told the address of a page in the browser
+    (`web`). Raises SdfsimError for no such recording, no screen for a window, or where it fails."""
     _check_recording(recording)
-    options = ["--web-viewer", "--web-viewer-port", str(_free_port(_WEB_PORT))] if web else []
-    code = subprocess.run(_command(_free_port(_GRPC_PORT), [str(recording), *options]), check=False).returncode
+    port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
+    if web:
+        say(f"watch it at {_page(page_port, port)}")
+        say("the page stays up until Ctrl-C")
+    else:
+        check_screen("native")
+    options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
+    code = subprocess.run(_command(port, [str(recording), *options]), check=False).returncode
     if code not in (0, -signal.SIGINT, 130, _WINDOWS_CTRL_C):
         raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")
 
@@ -141,7 +153,7 @@ def _check_recording(file: Path) -> None:
         raise SdfsimError(f"{file}: no such recording", "give a rollout.rrd that simulate has written")
 
 
-def _executable() -> str:
+def viewer_program() -> str:
     """The viewer in the package of rerun itself: its script `rerun` only starts it, and need not be on the PATH, nor
     end what it started. Another one may be named by RERUN_CLI_PATH, as that script does."""
     package = find_spec("rerun_cli")

@@ -13,10 +13,6 @@ from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, tell_fa
 from sdfsim.base.console import Session, columns, duration
 from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
-_PACKAGES = (
-    *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
-    *("pydantic", "pybullet"),
-)
 SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
@@ -126,7 +122,7 @@ def view(
         viewer.screenshot(recording, picture, at=at)
         session.report({"screenshot": picture})
     else:
-        viewer.show(recording, web=web)
+        viewer.show(recording, web=web, say=session.say)
         session.report({"recording": recording})
 
 
@@ -263,24 +259,11 @@ def identify(
 
 @command
 def info(session: Session) -> None:
-    """Versions, devices and bundled models."""
-    import platform
-    from importlib import metadata
+    """Versions, devices and bundled models; what is missing here, and how to get it."""
+    from sdfsim.apps.about import about, about_lines
 
-    import torch
-
-    from sdfsim.base.version import __version__
-    from sdfsim.learned.model import model_names
-
-    versions = {"sdfsim": __version__, "python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "missing"
-    gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
-    threads = {"cpu_threads": torch.get_num_threads()}
-    session.report({"versions": versions, "devices": ["cpu", *gpus], **threads, "models": model_names()})
+    report = about()
+    session.report(report, about_lines(report))
 
 
 @command
@@ -329,11 +312,21 @@ def dataset(
 def train(
     session: Session,
     data: Annotated[
-        list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
+        list[Path],
+        typer.Option(
+            help="Dataset folder; several are trained on together. With --scene: recordings of it, as `identify` reads "
+            "them.",
+            show_default=False,
+        ),
     ],
     out: Out,
+    scene: Annotated[
+        Path | None, typer.Option(help="The scene of recordings, best as `identify -o` wrote it.", show_default=False)
+    ] = None,
     preset: Annotated[
-        Literal["small", "alone", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        Literal[
+            "small", "alone", "impacts", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"
+        ],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
@@ -342,10 +335,10 @@ def train(
     ] = 0,
     device: str = "auto",
 ) -> None:
-    """Train a model on datasets."""
+    """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device}
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene}
     session.report(run_training(data, out, **how, on_progress=session.progress))
 
 

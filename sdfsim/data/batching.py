@@ -13,7 +13,7 @@ from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.learned.model import SOLVER, Model
 from sdfsim.physics.bodies import Bodies, State, Units
-from sdfsim.physics.motion import MOTION
+from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import SUBSTEPS, Options
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
@@ -137,22 +137,14 @@ def _rolled(
     start = stepper.began(start, bodies, options)
     _, carry = stepper.advance(start, stepper.init(bodies, start, options), steps, keep=True)
     frames = cast("Frames", carry.frames)
-    position, quat, velocity, angular = (
-        np.concatenate([getattr(start, name)[None], getattr(frames, name)]) for name in MOTION
-    )
-    broken = (~np.isfinite(np.concatenate([position, quat], -1)).all(-1)).sum(1)
+    whole = Motion(*(np.concatenate([getattr(start, name)[None], getattr(frames, name)]) for name in MOTION))
+    broken = (~np.isfinite(np.concatenate([whole.position, whole.orientation], -1)).all(-1)).sum(1)
     if broken.any():
         step = int((broken > 0).argmax())
         raise SdfsimError(f"step {step}: {broken[step]} bodies are not finite", exit_code=EXIT_QUALITY)
-    ends = np.cumsum([t.position.shape[1] for t in group])
+    moved, ends = units.in_si(whole), np.cumsum([t.position.shape[1] for t in group])
     return [
-        replace(
-            t,
-            position=position[:, mine] * units.length,
-            orientation=quat[:, mine],
-            velocity=velocity[:, mine] * units.velocity,
-            angular_velocity=angular[:, mine] / units.time,
-        )
+        replace(t, **{name: values[:, mine] for name, values in moved.items()})
         for t, mine in zip(group, map(slice, [0, *ends[:-1]], ends), strict=True)
     ]
 

@@ -98,11 +98,11 @@ def still(scene: Scene, seconds: float, broke: str = "") -> Ran:
 def scene_rollout(scene: Scene, motion: Trajectory, units: Units = SI) -> Rollout:
     """An engine's motion from a `start_of_scene` in `units` as a rollout of the scene in SI units, without contacts."""
     steps, solid = len(motion.position), solid_bodies(scene)
-    arrays: dict[str, Any] = {name: np.zeros((steps, len(solid), 4 if name == "orientation" else 3)) for name in MOTION}
+    arrays: dict[str, Any] = {}
     planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
-    own = {"position": units.length, "velocity": units.velocity, "angular_velocity": 1.0 / units.time}
-    for name, values in arrays.items():
-        values[:, solid] = own.get(name, 1.0) * getattr(motion, name)
+    for name, values in units.in_si(motion).items():
+        arrays[name] = np.zeros((steps, len(solid), values.shape[2]))
+        arrays[name][:, solid] = values
     for k, plane in zip(np.flatnonzero(~solid), planes, strict=True):
         arrays["position"][:, k], arrays["orientation"][:, k] = plane.position, plane.quat_xyzw
         arrays["position"][:, solid, 2] += plane.position[2]

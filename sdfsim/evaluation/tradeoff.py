@@ -20,7 +20,7 @@ from sdfsim.base.files import locked, write_json, write_text
 from sdfsim.base.parallel import StageProgress
 from sdfsim.base.version import __version__
 from sdfsim.data.batching import every, first_frames, roll_out, scene_of
-from sdfsim.data.dataset import Trajectory, check_alike, conditions_of
+from sdfsim.data.dataset import Trajectory, at_instants, check_alike, conditions_of, engine_substep
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Engine, Start, Timing, centred_mesh, dataset_urdf, start_of_scene, timed
@@ -101,17 +101,17 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
     most = MOST_QUICK if quick else MOST
     # The engine starts again from its own velocities, others from those at the instants of the positions.
     recorded, shapes = load_recorded(data, "test", most=most, as_recorded=True)
-    starts, _ = load_recorded(data, "test", most=most)
     check_alike(str(data), recorded)
     longest = min(STEPS_QUICK if quick else STEPS, *(len(t.position) - 1 for t in recorded))
+    recorded, substep = [first_frames(t, longest + 1) for t in recorded], engine_substep(data)
     urdfs = {}
     for name in shapes:
         with suppress(SdfsimError):  # the engines are points that say so
             urdfs[name] = dataset_urdf(data, name)
     conditions = conditions_of(data)
     return Cases(
-        recorded=[first_frames(t, longest + 1) for t in recorded],
-        starts=[first_frames(t, longest + 1) for t in starts],
+        recorded=recorded,
+        starts=[at_instants(t, substep) for t in recorded],
         shapes={name: replace(shape, com=np.zeros(3)) for name, shape in shapes.items()},
         urdfs=urdfs,
         solids=exact_solids(data, shapes),

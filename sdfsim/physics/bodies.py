@@ -12,7 +12,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import joints as jointed
 from sdfsim.physics import pose
 from sdfsim.physics.joints import Joints
-from sdfsim.physics.motion import Motion, Rows
+from sdfsim.physics.motion import MOTION, Motion, Rows
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.sdf.sdf import Sdf
@@ -46,6 +46,15 @@ class Units:
     def energy(self) -> float:
         """J in one model unit of energy."""
         return self.mass * self.velocity**2
+
+    def in_si(self, motion: Motion) -> dict[str, np.ndarray]:
+        """The arrays of a motion in model units, in metres and seconds."""
+        return {name: getattr(motion, name) * unit for name, unit in self.motion.items()}
+
+    @property
+    def motion(self) -> dict[str, float]:
+        """Metres and seconds in one model unit of each array of a `Motion`."""
+        return dict(zip(MOTION, (self.length, 1.0, self.velocity, 1.0 / self.time), strict=True))
 
 
 @dataclass(frozen=True)
@@ -190,7 +199,9 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         sdfs=tuple(scene.shapes[k].sdf for k in touched),
         contact=tuple(scene.shapes[k].contact for k in touched),
         tracks=_tracks(paths, com, length=units.length, time=units.time),
-        joints=jointed.joints_of(scene.joints, com, units) if scene.joints else None,
+        joints=jointed.joints_of(scene.joints, com, length=units.length, time=units.time, mass=units.mass)
+        if scene.joints
+        else None,
     )
     orientation = array([b.quat_xyzw for b in scene.bodies])
     origin = array([b.position for b in scene.bodies]) / units.length

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,9 +35,6 @@ from sdfsim.physics.joint_columns import (
 )
 from sdfsim.scene.scene import Joint
 
-if TYPE_CHECKING:
-    from sdfsim.physics.bodies import Units
-
 
 @dataclass(frozen=True)
 class Joints:
@@ -56,34 +52,36 @@ class Joints:
         return len(self.body)
 
 
-def joints_of(joints: Sequence[Joint], com: np.ndarray, units: Units) -> Joints:
-    """Those of a scene; `com` [N, 3] are the centres of mass from the shapes' origins, model units."""
+def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: float, mass: float) -> Joints:
+    """Those of a scene; `com` [N, 3] are the centres of mass from the shapes' origins in model units, of which one is
+    `length` m, `time` s and `mass` kg."""
     count = len(joints)
     number, target = np.zeros((count, NUMBERS)), np.zeros(count)
     number[:, LOW], number[:, HIGH], number[:, LENGTH] = -np.inf, np.inf, -1.0
-    force, torque = units.mass * units.acceleration, units.energy
+    force = mass * length / time**2
+    torque = force * length
     for row, joint, k in zip(number, joints, range(count), strict=True):
         turns = joint.kind in ("hinge", "ball")
-        length, effort = (1.0, torque) if turns else (units.length, force)
+        unit, effort = (1.0, torque) if turns else (length, force)
         if joint.limits is not None:
             one_sided = joint.kind in ("ball", "distance")
-            row[LOW] = -np.inf if one_sided else joint.limits[0] / length
-            row[HIGH] = joint.limits[1] / length
+            row[LOW] = -np.inf if one_sided else joint.limits[0] / unit
+            row[HIGH] = joint.limits[1] / unit
         row[BOUNCE] = joint.restitution
-        row[DAMPING] = joint.damping / (effort / length * units.time)
+        row[DAMPING] = joint.damping / (effort / unit * time)
         row[DRAG] = joint.friction / effort
         if joint.spring is not None:
-            row[STIFFNESS], row[REST] = joint.spring.stiffness * length / effort, joint.spring.rest / length
+            row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
         if (motor := joint.motor) is not None:
-            row[MOST], row[TIME] = motor.most / effort, motor.time / units.time
+            row[MOST], row[TIME] = motor.most / effort, motor.time / time
             row[MOTOR] = TO_PLACE if motor.speed is None else TO_SPEED
-            aim = motor.position if motor.speed is None else motor.speed * units.time
-            target[k] = (aim or 0.0) / length
+            aim = motor.position if motor.speed is None else motor.speed * time
+            target[k] = (aim or 0.0) / unit
         if joint.length is not None:
-            row[LENGTH] = joint.length / units.length
+            row[LENGTH] = joint.length / length
         row[FORCE], row[TORQUE] = joint.breaks_force / force, joint.breaks_torque / torque
     body = np.array([joint.bodies for joint in joints], np.int64).reshape(count, 2)
-    anchor = np.array([joint.anchor for joint in joints], np.float64).reshape(count, 2, 3) / units.length
+    anchor = np.array([joint.anchor for joint in joints], np.float64).reshape(count, 2, 3) / length
     anchor -= np.where(body[:, :, None] >= 0, com[body], 0.0)
     turned = pose.to_matrix(np.array([joint.quat_xyzw for joint in joints], np.float64).reshape(-1, 4))
     axes = np.ascontiguousarray(turned.reshape(count, 2, 3, 3).swapaxes(2, 3))
@@ -147,7 +145,8 @@ class Order:
 
 
 def ordered(joints: Joints, moves: np.ndarray) -> Order:
-    """Eliminate what has the fewest neighbours first: bodies that move, and joints once one of their bodies is gone.
+    """Eliminate what has the fewest neighbours first: bodies that move, and joints once one of their bodies is gone,
+    or both where what is gone already is held by the world or in a loop, and so cannot give way in all directions.
     Trees are solved in a time that grows with their size, whatever their form."""
     ends: list[list[int]] = [[int(b) for b in row if b >= 0 and moves[b]] for row in joints.body]
     near: dict[int, set[int]] = {}
@@ -172,26 +171,61 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
     node: list[int] = []
     fill: dict[int, list[int]] = {}
     comp = [0]
+    own: dict[int, int] = {}  # of every body that is gone one that stands for all it is connected to among these
+    firm: set[int] = set()  # those of them that the world or a loop holds
+    waiting: dict[int, list[int]] = {}  # bodies that are not gone, and what joints that are hold to them
+    pinned: set[int] = set()  # what is held so: as long as that lasts
+
+    def whose(n: int) -> int:
+        while own[n] != n:
+            n = own[n]
+        return n
+
+    def ready(n: int) -> bool:
+        if n >= 0:
+            return True
+        gone = {whose(b) for b in ends[-1 - n] if b in own}
+        whole = all(b in own for b in ends[-1 - n])
+        return bool(gone) and not gone & pinned and (whole or not gone & firm)
+
     for found in comps:
-        ready = {n for n in found if n >= 0}
-        queue = [(len(near[n]), n) for n in ready]
+        queue = [(len(near[n]), n) for n in found if n >= 0]
         heapq.heapify(queue)
-        gone: set[int] = set()
+        taken: set[int] = set()
         while queue:
             degree, n = heapq.heappop(queue)
-            if n in gone or degree != len(near[n]):
+            if n in taken or degree != len(near[n]) or not ready(n):
                 continue
-            gone.add(n)
+            taken.add(n)
             node.append(n)
             around = near[n]
             fill[n] = list(around)
             for m in around:
                 near[m] |= around
                 near[m] -= {n, m}
-                if n >= 0 and m < 0:
-                    ready.add(m)
-            for m in around & ready:
+            if n >= 0:
+                own[n] = n
+                for one in waiting.pop(n, []):
+                    pinned.discard(one)
+                    if one in firm or whose(one) == n:
+                        firm.add(n)
+                    own[one] = n
+            else:
+                gone = [whose(b) for b in ends[-1 - n] if b in own]
+                if len(gone) < len(ends[-1 - n]):
+                    (left,) = [b for b in ends[-1 - n] if b not in own]
+                    waiting.setdefault(left, []).append(gone[0])
+                    pinned.add(gone[0])
+                elif len(gone) == 1 or gone[0] == gone[1]:
+                    firm.add(gone[0])
+                else:
+                    own[gone[0]] = gone[1]
+                    if gone[0] in firm:
+                        firm.add(gone[1])
+            for m in around:
                 heapq.heappush(queue, (len(near[m]), m))
+            if not queue:
+                queue = [(len(near[m]), m) for m in found if m not in taken]
         comp.append(len(node))
     place = {n: k for k, n in enumerate(node)}
     below, row, start, target = [0], [], [0], []

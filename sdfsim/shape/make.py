@@ -174,12 +174,12 @@ def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
 
 def mesh_shape(
     mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
-    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
+    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent, coarse: int = 1,
 ) -> Shape:  # fmt: skip
-    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
-    Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
+    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it (see `sample_grid`), nodes and mass
+    as a fit has them. Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
     solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
-    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress, coarse)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
     source = {"kind": "mesh"} | note | ({"notes": list(solid.notes)} if solid.notes else {})
     return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), certificate, source)

@@ -277,13 +277,13 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 
 
 def sdf_of_mesh(
-    mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent
+    mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent, coarse: int = 1
 ) -> tuple[Sdf, dict, dict]:
-    """A mesh's exact SDF or a grid of it, its entries of a shape's `source`, and its certificate."""
+    """A mesh's exact SDF or a grid of it, see `sample_grid`; its entries of a shape's `source`, and its certificate."""
     if kind == "mesh":
         return MeshSdf(mesh), {"sdf": "mesh"}, {}
     oracle = MeshDistance(mesh)
-    grid = sample_grid(oracle, oracle.bounds, resolution, on_progress)
+    grid = sample_grid(oracle, oracle.bounds, resolution, on_progress, coarse)
     return grid, {"sdf": "grid", "resolution": resolution}, certify_grid(grid, oracle)
 
 

@@ -339,19 +339,17 @@ class Simulator(LiveScene):
     def si_state(self) -> State:
         """Motion and time of the current state, in metres and seconds."""
         u, state = self.units, self.state
-        units = dict(zip(MOTION, (u.length, 1.0, u.velocity, 1.0 / u.time), strict=True))
 
         def whole(state: State) -> State:
-            return State(
-                **{name: getattr(state, name) * unit for name, unit in units.items()}, time=state.time * u.time
-            )
+            moved: dict[str, Any] = u.in_si(state)
+            return State(**moved, time=state.time * u.time)
 
         if (parts := state.parts) is None:
             return whole(state)
         before, rows, changed = parts
         if self._si is None or self._si[0] is not before:
             self._si = before, whole(before)
-        moved = {name: changed[name] * unit for name, unit in units.items()}
+        moved = {name: changed[name] * unit for name, unit in u.motion.items()}
         return self._si[1].with_rows(rows, moved, time=state.time * u.time)
 
     def _advance(self, count: int, *, keep: bool = False) -> None:
@@ -416,10 +414,7 @@ class Simulator(LiveScene):
         }
         return Rollout(
             time=np.arange(self.steps_done - k + 1, self.steps_done + 1) * self.dt,
-            position=frames.position * u.length,
-            orientation=frames.orientation,
-            velocity=frames.velocity * u.velocity,
-            angular_velocity=frames.angular_velocity / u.time,
+            **u.in_si(frames),
             contact_count=frames.touching,
             contact_point=frames.point * u.length,
             contact_body=frames.pair,

@@ -24,7 +24,7 @@ from sdfsim.physics.bodies import Bodies, State, Units, awake
 from sdfsim.physics.free_flight import driven, fly, with_history
 from sdfsim.physics.joint_columns import COORD, PULL, STATE
 from sdfsim.physics.joints import stored
-from sdfsim.physics.motion import MOTION
+from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import SUBSTEPS, Options
 from sdfsim.physics.units import scene_units
 from sdfsim.physics.validity import NO_LIMITS, Fault, first_fault, limits
@@ -35,9 +35,9 @@ if TYPE_CHECKING:  # numba and torch take their time to load
     import torch
 
     from sdfsim.learned.families import Family
+    from sdfsim.learned.impulse import ImpulseNetwork
     from sdfsim.learned.near import Contacts, Pairs
     from sdfsim.learned.tensors import BodyTensors
-    from sdfsim.physics.solver.impulse import Weights
     from sdfsim.physics.solver.prepare import Compiled, Steps
     from sdfsim.physics.solver.record import Edges
 
@@ -59,14 +59,10 @@ PHASES = {
 }
 
 
-@dataclass
-class Frames:
+@dataclass(frozen=True)
+class Frames(Motion):
     """What a recording keeps of each of K steps, model units."""
 
-    position: np.ndarray  # [K, N, 3]
-    orientation: np.ndarray  # [K, N, 4]
-    velocity: np.ndarray  # [K, N, 3]
-    angular_velocity: np.ndarray  # [K, N, 3]
     energy: np.ndarray  # [K, 3] kinetic and potential; what pulls have given in the step
     depth: np.ndarray  # [K] the deepest penetration
     touching: np.ndarray  # [K] int64, points where bodies touch
@@ -92,7 +88,7 @@ class Carry:
     scene: Compiled | None = None  # the bodies for compiled code, if the stepper calls any
     # Weights of a network on the solve, for compiled code; the bodies as tensors, for a network on surface nodes. Both
     # also depend on the options.
-    weights: Weights | None = None
+    weights: ImpulseNetwork | None = None
     tensors: BodyTensors | None = None
     edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
     near: Contacts | Pairs | None = None  # where a network on surface nodes saw bodies near each other
@@ -273,13 +269,13 @@ class OnSolver(Solver):
         solved, edges = super()._step(state, carry), cast("Edges", carry.edges)
         if not (asked and len(edges.pair)):
             return solved
-        from sdfsim.learned.inference import corrected, packed, terms_of
+        from sdfsim.learned.inference import corrected, doubled
 
         with carry.timed("network_ms"):
             if carry.weights is None:
-                carry.weights = packed(cast("Any", self.model.network), friction=carry.options.friction)
-            terms, world = terms_of(carry.options, self.model.dt, self.trust), cast("Compiled", carry.scene).world
-            after = corrected(carry.weights, world, state, solved, edges, terms)
+                carry.weights = doubled(self.model.network)
+            known = self.model.dt, self.trust
+            after = corrected(carry.weights, carry.bodies, state, solved, edges, carry.options, *known)
         carry.counts |= {"nodes": len(np.unique(edges.pair)), "edges": len(edges.pair)}
         return after
 

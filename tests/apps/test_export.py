@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
-from sdfsim import Rollout, Simulator, load_scene
+from sdfsim import Rollout, SdfsimError, Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.observed import load_recordings
 from sdfsim.geometry.mesh import Mesh
@@ -193,6 +193,52 @@ def test_a_texture_lies_where_it_lay(tmp_path):
     np.testing.assert_allclose(found.visual.uv, uv * [1, -1] + [0, 1], atol=1e-6)
     tree, _ = chunks(tmp_path / "shape.glb")
     assert tree["images"][0]["mimeType"] == "image/jpeg"
+    # Lamps and shadows of other programs fall on it.
+    assert "extensionsUsed" not in tree and "extensions" not in tree["materials"][0]
+
+
+def test_a_glb_says_what_its_numbers_are_for(dropped):
+    """The validator of Khronos hints at buffers of vertices and corners that do not say so."""
+    tree, _ = chunks(dropped.export("run.glb"))
+    for mesh in tree["meshes"]:
+        (drawn,) = mesh["primitives"]
+        told = {
+            tree["bufferViews"][tree["accessors"][k]["bufferView"]].get("target") for k in drawn["attributes"].values()
+        }
+        assert told == {34962}
+        assert tree["bufferViews"][tree["accessors"][drawn["indices"]]["bufferView"]]["target"] == 34963
+    for sampler in tree["animations"][0]["samplers"]:
+        assert "target" not in tree["bufferViews"][tree["accessors"][sampler["input"]]["bufferView"]]
+
+
+@pytest.mark.parametrize("fps", [24, 29.97, 1000])
+def test_motion_has_the_rate_that_was_asked_for(dropped, tmp_path, fps):
+    """Whole frames of an editing program, where a run has a step of its own; the poses are those of the run."""
+    export(dropped.folder, tmp_path / "run.glb", fps=fps, allow_outside=True)
+    tree, binary = chunks(tmp_path / "run.glb")
+    (animation,) = tree["animations"]
+    time = values(tree, binary, animation["samplers"][0]["input"])[:, 0]
+    end = dropped.rollout.time[-1]
+    np.testing.assert_allclose(time, np.arange(len(time)) / fps, atol=1e-6)
+    assert end - 1 / fps < time[-1] <= end + 1e-6
+    node = next(k for k, n in enumerate(tree["nodes"]) if n["name"] == "ball")
+    channel = next(c for c in animation["channels"] if c["target"] == {"node": node, "path": "translation"})
+    place = values(tree, binary, animation["samplers"][channel["sampler"]]["output"])
+    true = dropped.rollout.position[:, dropped.index("ball")]  # the centre of a ball is its origin
+    for axis in range(3):
+        np.testing.assert_allclose(place[:, axis], np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
+
+
+def test_options_that_a_format_has_no_use_for_are_refused(dropped, tmp_path):
+    for ending, options, told in (
+        ("xml", {"fps": 24}, "--fps 24: no motion in it"),
+        ("glb", {"fps": 0}, "--fps 0: must be above 0"),
+        ("glb", {"fps": float("nan")}, "--fps nan: must be above 0"),
+        ("usda", {"collide": "sdf"}, "--collide sdf: is for MuJoCo"),
+    ):
+        with pytest.raises(SdfsimError, match=told):
+            export(dropped.folder, tmp_path / f"run.{ending}", allow_outside=True, **options)
+    assert not list(tmp_path.iterdir())
 
 
 # --- USD ---
@@ -248,6 +294,24 @@ def test_usd_colliders_are_exact_forms_hulls_or_triangles(dropped):
     np.testing.assert_allclose(box, np.ptp(own, axis=0), atol=1e-6)
 
 
+def test_usd_samples_distances_of_a_body_without_pieces(tmp_path):
+    """As PhysX (Isaac Sim, ManiSkill) and Newton read it; the former needs a resolution above 0, the latter one that
+    eight divides."""
+    from pxr import Usd, UsdPhysics
+
+    ring = mesh_shape(load_shape(SHAPES / "ring").mesh, name="hoop", kind="grid")
+    ring.save(tmp_path / "hoop")
+    export(tmp_path / "hoop", tmp_path / "hoop.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "hoop.usda"))
+    (collider,) = [prim for prim in stage.Traverse() if prim.HasAPI(UsdPhysics.MeshCollisionAPI)]
+    assert UsdPhysics.MeshCollisionAPI(collider).GetApproximationAttr().Get() == "sdf"
+    applied = collider.GetPrimTypeInfo().GetAppliedAPISchemas() + collider.GetMetadata("apiSchemas").GetAppliedItems()
+    assert {"PhysxSDFMeshCollisionAPI", "NewtonSDFCollisionAPI"} <= set(applied)
+    assert collider.GetAttribute("physxSDFMeshCollision:sdfResolution").Get() == 256
+    cells = collider.GetAttribute("newton:sdfMaxResolution").Get()
+    assert cells > 0 and cells % 8 == 0
+
+
 def test_usd_groups_keep_apart_what_collides_with_does(dropped):
     from pxr import Usd, UsdPhysics
 
@@ -297,6 +361,22 @@ def test_mujoco_rests_where_we_do(dropped):
     for name in RESTING:
         there = data.body("_1_box" if name == "1 box" else name.replace(" ", "_")).xipos
         assert_rests(there, dropped.centre(name), name)
+
+
+def test_mujoco_rests_where_we_do_on_distances_too(dropped, tmp_path):
+    """Without convex pieces: MuJoCo samples the mesh itself, and a ball comes to rest in the hollow of the bowl."""
+    import mujoco
+
+    export(dropped.file, tmp_path / "scene.xml", collide="sdf", allow_outside=True)
+    assert len(list(tmp_path.rglob("*.obj"))) == 3  # the ring, the cone and the bowl, uncut
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_SDF).sum() == 3
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    while data.time < SECONDS:
+        mujoco.mj_step(model, data)
+    for name in ("the ring", "cone", "ball"):
+        assert_rests(data.body(name.replace(" ", "_")).xipos, dropped.centre(name), name)
 
 
 def test_pybullet_rests_where_we_do(dropped):

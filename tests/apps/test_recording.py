@@ -137,9 +137,9 @@ def blueprint(path) -> str:
     """What rerun's own program prints of a recording."""
     import subprocess
 
-    from sdfsim.apps.viewer import _executable
+    from sdfsim.apps.viewer import viewer_program
 
-    command = [_executable(), "rrd", "print", "-vvv", str(path)]
+    command = [viewer_program(), "rrd", "print", "-vvv", str(path)]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 

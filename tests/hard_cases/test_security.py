@@ -192,7 +192,7 @@ def test_the_live_viewer_listens_on_this_machine_only(home, monkeypatch):
     from sdfsim.apps import viewer
     from sdfsim.apps.recording import Playback
 
-    monkeypatch.setattr(viewer, "_has_screen", lambda: False)
+    monkeypatch.setattr(viewer, "has_screen", lambda: False)
     playback = Playback(load_scene(scene_in(home, "")))
     page = viewer.stream_to_viewer(playback, "web")
     ports = [int(part.split("?")[0].split("/")[0]) for part in page.split(":") if part[:1].isdigit()]
@@ -209,6 +209,8 @@ def test_every_viewer_is_told_where_to_listen(tmp_path, monkeypatch, web):
     fake = tmp_path / "rerun"
     fake.write_text(f'#!/bin/sh\necho "$@" > {told}\n')
     fake.chmod(0o755)
-    monkeypatch.setattr(viewer, "_executable", lambda: str(fake))
+    monkeypatch.setattr(viewer, "viewer_program", lambda: str(fake))
+    monkeypatch.setattr(viewer, "has_screen", lambda: True)
     done = CliRunner().invoke(cli.app, ["view", str(tmp_path / "a.rrd"), *(["--web"] if web else [])])
     assert done.exit_code == 0 and "--bind 127.0.0.1 " in told.read_text()
+    assert ("watch it at http://localhost:" in done.stderr) == web

@@ -44,7 +44,8 @@ def linked(built: Scene, slopes: np.ndarray, size: tuple[float, float, float], m
     ends = np.concatenate([np.zeros((1, 3)), np.cumsum(way, 0)])
     for k, slope in enumerate(slopes):
         place, turn = 0.5 * (ends[k] + ends[k + 1]), (0, -math.degrees(slope), 0)
-        built.add(f"link{k}", box={"size": size}, position=place, euler_xyz_deg=turn, mass=mass, friction=0.8)
+        form = {"shape": "link0"} if k else {"box": {"size": size}}  # a shape of its own each would take longer
+        built.add(f"link{k}", **form, position=place, euler_xyz_deg=turn, mass=mass, friction=0.8)
     for k in range(count + 1):
         one, other = (f"link{k}", f"link{k - 1}") if k < count else (f"link{k - 1}", "world")
         built.join(f"joint{k}", kind, one, "world" if k == 0 else other, anchor=ends[k], **keys)
@@ -67,7 +68,7 @@ def test_a_chain_that_is_let_go_aside_falls_into_its_equilibrium():
     slopes, _ = hanging(30, 0.1, 2.2)
     built = scene()
     bent = np.where(np.arange(30) < 15, -1.0, 1.0) * math.acos(2.2 / 3.0)
-    linked(built, bent, (0.1, 0.02, 0.02), 0.1, "ball", damping=0.02)
+    linked(built, bent, (0.1, 0.02, 0.02), 0.1, "ball", damping=0.08)
     rollout = Simulator(built).run(20.0)
     way = 0.1 * np.stack([np.cos(slopes), np.zeros(30), np.sin(slopes)], 1)
     middle = np.cumsum(way, 0) - 0.5 * way
@@ -82,8 +83,9 @@ def test_a_bridge_of_forty_planks_carries_a_tonne():
     built.add("tonne", box={"size": (1.0, 1.0, 0.6)}, position=(4.8, 0, lowest + 0.36), mass=1000.0, friction=0.8)
     simulator = Simulator(built)
     rollout = simulator.run(6.0)
-    ends = [simulator.joint(f"joint{k}").force for k in (0, 40)]
-    assert ends[0][2] + ends[1][2] == pytest.approx((40 * 12.5 + 1000) * G, rel=1e-2)
+    later = rollout.time > 3.0  # a mean, as it still swings a little
+    carried = rollout.joint_force[later, 0, 2].mean() - rollout.joint_force[later, 40, 2].mean()
+    assert carried == pytest.approx((40 * 12.5 + 1000) * G, rel=1e-2)
     assert rollout.position[-1, -1, 2] == pytest.approx(rollout.position[-50, -1, 2], abs=2e-3)
     assert not judged(simulator.scene, rollout, every=10).broken
 
@@ -107,14 +109,15 @@ def test_a_cradle_throws_off_as_many_balls_as_come_in():
 
 
 def test_gears_turn_as_their_teeth_count():
-    built = scene(gravity=(0, 0, 0))
+    built, built_tooth = scene(gravity=(0, 0, 0)), False
     for name, teeth, pitch, x, first in (("small", 8, 0.2, 0.0, 0.0), ("large", 12, 0.3, 0.5, math.pi)):
         hub = {"cylinder": {"radius": pitch - 0.08, "height": 0.1}}
         built.add(name, **hub, position=(x, 0, 0), mass=1.0)
         for k in range(teeth):
             angle = first + 2.0 * math.pi * (k + (0.5 if name == "large" else 0.0)) / teeth
             place = np.array([x, 0, 0]) + (pitch - 0.005) * np.array([math.cos(angle), math.sin(angle), 0.0])
-            tooth = {"box": {"size": (0.09, 0.05, 0.1)}, "euler_xyz_deg": (0, 0, math.degrees(angle))}
+            tooth = {"shape": "small 0"} if built_tooth else {"box": {"size": (0.09, 0.05, 0.1)}}
+            tooth, built_tooth = tooth | {"euler_xyz_deg": (0, 0, math.degrees(angle))}, True
             built.add(f"{name} {k}", **tooth, position=place, mass=0.1, friction=0.1, restitution=0.0)
             built.join(f"{name} tooth {k}", "fixed", f"{name} {k}", name)
     motor = {"speed": 2.0, "most": 50.0}
@@ -127,7 +130,7 @@ def test_gears_turn_as_their_teeth_count():
     assert simulator.joint("driven").angle == pytest.approx(-turned * 8 / 12, abs=0.2)
 
 
-@pytest.mark.parametrize("rate", [7.0, 9.0])
+@pytest.mark.parametrize("rate", [9.0, 11.0])
 def test_the_balls_of_watts_governor_rise_as_its_speed_says(rate: float):
     """Arms and rods of one length from the spindle to two balls and on to a sleeve: w^2 h = g (m + M) / m."""
     length, ball, sleeve = 0.4, 1.0, 1.5
@@ -182,13 +185,13 @@ def test_a_joint_breaks_at_its_load_and_not_before():
 
 
 def test_what_a_joint_holds_does_not_touch_but_where_it_is_asked_to():
-    for collide, lowest in (("off", -0.5), ("on", -0.05)):
+    for collide, passes in (("off", True), ("on", False)):
         built = scene()
         built.add("base", box={"size": (0.4, 0.4, 0.1)}, motion="static", position=(0, 0, -0.05))
         built.add("flap", box={"size": (0.5, 0.2, 0.04)}, position=(0.25, 0, 0.03), mass=1.0)
         built.join("edge", "hinge", "flap", "base", anchor=(0, 0, 0.03), axis=(0, -1, 0), collide=collide)
         rollout = Simulator(built).run(0.6)
-        assert (rollout.position[:, 1, 2].min() < -0.05) is (collide == "off"), lowest
+        assert bool(rollout.position[:, 1, 2].min() < 0.0) == passes
 
 
 def test_a_damped_pendulum_falls_asleep_and_wakes_when_it_is_pushed():

@@ -32,6 +32,29 @@ def test_a_value_that_makes_no_sense_is_one_line_with_its_option(values, name, g
     assert message.startswith(f"{name}: ") and f"(got {got})" in message and "\n" not in message
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (["cup"], "takes NAME=PHOTO:X,Y, such as"),
+        (["=a.jpg:1,2"], "takes NAME=PHOTO:X,Y, such as"),
+        (["cup="], r"\(got cup=\)"),
+        (["my cup=a.jpg:1,2"], "body: no body can be called 'my cup'"),
+        (["floor=a.jpg:1,2"], "body: no body can be called 'floor'"),
+        (["no=a.jpg:1,2"], "body: no body can be called 'no'"),
+    ],
+)
+def test_a_body_that_cannot_be_pointed_at_is_one_line(given, says):
+    with pytest.raises(SdfsimError, match=says) as caught:
+        options_of(body=given)
+    assert "\n" not in caught.value.message
+
+
+def test_places_of_one_body_are_put_together():
+    given = options_of(body=["cup=a.jpg:1,2", "vase=b=c.jpg:3,4.5", "cup=d/e.jpg:5,6"])
+    assert given.body == {"cup": ["a.jpg:1,2", "d/e.jpg:5,6"], "vase": ["b=c.jpg:3,4.5"]}
+    assert options_of(**given.model_dump()) == given and "body" in names_of("mesh")
+
+
 def test_an_option_that_does_not_exist_is_named_with_those_that_do():
     with pytest.raises(SdfsimError, match="colour") as caught:
         options_of(colour="red")

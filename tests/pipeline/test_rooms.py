@@ -14,7 +14,7 @@ MODULES = {
 }  # fmt: skip
 # From the ground up. What lies in no folder is a room of its own.
 FLOORS = (
-    ("progress", "materials", "cameras"), ("options",), ("inputs",), ("sfm",), ("field",), ("mesh",),
+    ("progress", "materials", "naming", "cameras"), ("options",), ("inputs",), ("sfm",), ("field",), ("mesh",),
     ("scene_writer", "report"), ("stages",), ("commands",),
 )  # fmt: skip
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

@@ -251,7 +251,7 @@ def test_a_filled_hollow_is_emptied_by_its_lines_of_sight(radius):
     ("preset", "side", "reads"), [("quick", 129, 96), ("standard", 129, 96), ("fine", 225, 168), ("volsdf", 125, 93)]
 )
 def test_a_field_is_sampled_as_finely_as_it_has_detail(preset, side, reads, monkeypatch):
-    """At least once in each cell of its finest grid; three times in four cells along a ray."""
+    """At least once in each cell of the finest grid that is everywhere; three times in four cells along a ray."""
     size, asked = PRESETS[preset].size, []
     ball = SimpleNamespace(background=torch.zeros(1), sdf=lambda points: points.norm(dim=1) - 0.5)
     cache = sdf_cache(ball, size.sampling)  # type: ignore[arg-type]
@@ -264,8 +264,9 @@ def test_a_field_is_sampled_as_finely_as_it_has_detail(preset, side, reads, monk
     assert asked == [reads]
 
 
-def test_lengths_of_the_quick_preset_are_those_its_figures_were_measured_with():
+def test_lengths_are_in_cells_of_what_a_field_can_follow():
+    """Of *quick* in the unit sphere: half as long as when its finest grid had cells twice as wide."""
     cell = PRESETS["quick"].size.finest
-    known = {GAP: 0.015, CLEARANCE: 0.02, FILLED: -0.004, JUST_EMPTY: 0.002}
+    known = {GAP: 0.0075, CLEARANCE: 0.01, FILLED: -0.002, JUST_EMPTY: 0.001}
     assert [cells * cell for cells in known] == pytest.approx(list(known.values()), rel=1e-12)
     assert GAP * PRESETS["fine"].size.finest < 0.6 * GAP * cell

@@ -10,7 +10,7 @@ import pytest
 from pipeline.cameras import View
 from pipeline.inputs.known_cameras import Lens
 from pipeline.inputs.photos import Photo
-from pipeline.mesh.placement import check_distance, measured_scale
+from pipeline.mesh.placement import check_bodies, check_distance, located_bodies, measured_scale
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import joined
@@ -88,6 +88,32 @@ def test_photos_and_pixels_that_are_none_are_named_before_there_are_poses(photos
     check_distance(("photo0.jpg", "photo1.jpg:1280,960", 1.0), photos)
     with pytest.raises(SdfsimError, match=says):
         check_distance(("photo0.jpg", end, 1.0), photos)
+
+
+@pytest.mark.parametrize(
+    ("spot", "says"),
+    [
+        ("photo9.jpg:1,1", r"body: no photo is called 'photo9\.jpg' \(did you mean 'photo\d\.jpg'\?\)"),
+        ("photo1.jpg:2000,1", r"body: photo1.jpg:2000,1 lies outside the photo \(1280 x 960 px\)"),
+        ("photo1.jpg:-1,1", r"body: no photo is called 'photo1.jpg:-1,1'"),
+        ("photo1.jpg", "body: photo1.jpg has no pixel"),
+    ],
+)
+def test_places_of_bodies_that_are_none_are_named_before_there_are_poses(photos, spot, says):
+    check_bodies({"cup": ["photo0.jpg:1,1", "photo1.jpg:1280,960"]}, photos)
+    with pytest.raises(SdfsimError, match=says):
+        check_bodies({"cup": ["photo0.jpg:1,1", spot]}, photos)
+
+
+def test_places_of_bodies_are_where_their_pixels_meet_the_surface(views, photos):
+    at = np.array([[0.3, 0.2, 0.5], [-0.2, 0.1, 0.5]])
+    given = {"cup": [place(views[1], at[0]), place(views[4], at[1])]}
+    found = located_bodies(given, views, photos, Caster(cube(1.0)))
+    np.testing.assert_allclose(found["cup"], at, atol=1e-3)
+    with pytest.raises(SdfsimError, match=r"body: photo0\.jpg has no pose"):
+        located_bodies({"cup": ["photo0.jpg:1,1"]}, views[1:], photos, Caster(cube(1.0)))
+    with pytest.raises(SdfsimError, match=r"body: photo0\.jpg:1,1 shows nothing of the surface"):
+        located_bodies({"cup": ["photo0.jpg:1,1"]}, views, photos, Caster(cube(1.0)))
 
 
 def test_a_pixel_is_followed_through_the_lens(views, photos):

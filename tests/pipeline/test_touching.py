@@ -13,12 +13,14 @@ from PIL import Image
 
 from pipeline.cameras import PosedPhotos, Similarity, View
 from pipeline.inputs.labels import FOLDER, NAMES
+from pipeline.inputs.photos import Photo
 from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
-from pipeline.mesh.visibility import hollow
-from pipeline.report import hollow_line
+from pipeline.mesh.placement import located_bodies
+from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json
+from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from tests.helpers.sparse import NOTHING
 from tests.pipeline import photo_sets
@@ -125,8 +127,15 @@ class Scene:
         # What the field is between its samples is that of the samples: exact distances take minutes.
         self.distance = lambda points: volume.at(points).astype(np.float32)
 
-    def split(self, folder: Path, masks: Sequence[str] = (), *, alone: bool = False) -> Parts:
-        """What is found, with masks of the bodies of these names; meshes in metres."""
+    def split(
+        self,
+        folder: Path,
+        masks: Sequence[str] = (),
+        *,
+        alone: bool = False,
+        clicked: dict[str, list[str]] | None = None,
+    ) -> Parts:
+        """What is found, with masks of the bodies of these names, or places that were clicked; meshes in metres."""
         (folder / "images").mkdir(parents=True)
         labels = photo_sets.shoot_labels(self.make, self.parts, self.poses, len(self.names)) if masks else []
         number = np.array([0, *(list(masks).index(name) + 1 if name in masks else 0 for name in self.names)], np.uint8)
@@ -138,11 +147,38 @@ class Scene:
         if masks:
             write_json(folder / FOLDER / NAMES, {"names": list(masks)})
         poses, up = PosedPhotos(tuple(self.views), NOTHING.sparse), np.array([0, 0, 1.0])
-        found = split(self.surface, self.distance, FINEST, poses, folder, up, alone=alone)
+        points = {}
+        if clicked:
+            for view, picture in zip(self.views, self.pictures(), strict=True):
+                Image.fromarray(picture).save(folder / "images" / view.name, quality=95)
+            photos = [Photo(v.name, v.source, 480, 360, (480, 360), None, None, "", False, 0.4) for v in self.views]
+            points = located_bodies(clicked, self.views, photos, Caster(self.surface.raw))
+        found = split(self.surface, self.distance, FINEST, poses, folder, up, alone=alone, clicked=points)
         back = self.to_unit.inverse()
         return replace(found, bodies={
             name: Mesh(back.points(mesh.vertices), mesh.faces) for name, mesh in found.bodies.items()
         })  # fmt: skip
+
+    def labels(self) -> list[np.ndarray]:
+        """Which body, from 1 on, each pixel of each photo shows; 0 for none."""
+        return photo_sets.shoot_labels(self.make, self.parts, self.poses, len(self.names))
+
+    def pictures(self) -> list[np.ndarray]:
+        """Photos of flat colours, with noise."""
+        rng = np.random.default_rng(0)
+        colors = 255 * np.array([[0.5] * 3, *(part.texture.mean((0, 1)) for part in self.parts[: len(self.names)])])
+        return [
+            np.clip(colors[label] + rng.normal(0, 12, (*label.shape, 3)), 0, 255).astype(np.uint8)
+            for label in self.labels()
+        ]
+
+    def click(self, name: str, number: int = 0) -> str:
+        """A place on the body of this name, in the photo that shows most of it, or the next ones by `number`."""
+        shown = [label == self.names.index(name) + 1 for label in self.labels()]
+        view = int(np.argsort([-mask.sum() for mask in shown])[number])
+        at = np.argwhere(shown[view])
+        row, column = at[np.linalg.norm(at - at.mean(0), axis=1).argmin()]
+        return f"{self.views[view].source}:{column + 0.5},{row + 0.5}"
 
     def check(self, found: Parts, called: dict[str, str], size: float, share: float) -> None:
         """Holds bodies to the truth: extents within `size` m, volumes within `share`."""
@@ -206,13 +242,39 @@ def test_a_jug_of_two_colours_stays_whole(tmp_path):
     assert len(Scene(two_colours, ("lower", "upper"), 0.4, 65, fill=0.01).split(tmp_path / "p").bodies) == 1
 
 
-@pytest.mark.slow
-def test_books_in_a_stack_come_apart_by_their_masks(tmp_path):
-    books = Scene(photo_sets.touching, BOOKS, 0.4, 129)
+@pytest.fixture(scope="module")
+def books() -> Scene:
+    return Scene(photo_sets.touching, BOOKS, 0.4, 129)
+
+
+def test_books_in_a_stack_come_apart_by_their_masks(books, tmp_path):
     found = books.split(tmp_path / "p", BOOKS)
     assert set(found.bodies) == set(BOOKS)
     assert found.touching == [("book1", "book2", "masks"), ("book2", "book3", "masks")]
     books.check(found, {name: name for name in BOOKS}, 1.2 * CELL, 0.02)
+
+
+def test_books_in_a_stack_come_apart_where_photos_show_borders_between_clicked_places(books, tmp_path):
+    found = books.split(tmp_path / "p", clicked={name: [books.click(name)] for name in BOOKS})
+    assert set(found.bodies) == set(BOOKS) and found.missing == []
+    assert {(*sorted(names), by) for *names, by in found.touching} == {
+        ("book1", "book2", "clicks"), ("book2", "book3", "clicks"),
+    }  # fmt: skip
+    books.check(found, {name: name for name in BOOKS}, 1.2 * CELL, 0.03)
+
+
+def test_several_places_of_one_body_and_the_shape_where_nothing_was_clicked(pair, tmp_path):
+    found = pair.split(tmp_path / "p", clicked={"cup": [pair.click("cup"), pair.click("cup", 1)]})
+    assert list(found.bodies) == ["object1", "cup"]
+    pair.check(found, {"cup": "cup", "object1": "vase"}, 0.5 * CELL, 0.02)
+
+
+def test_a_place_on_the_floor_names_no_body_and_masks_beside_places_are_refused(pair, tmp_path):
+    floor = f"{pair.views[0].source}:240.0,350.0"
+    found = pair.split(tmp_path / "p", clicked={"rug": [floor]})
+    assert found.missing == ["rug"] and len(found.bodies) == 2
+    with pytest.raises(SdfsimError, match="body: the photos have masks of cup already"):
+        pair.split(tmp_path / "q", ("cup",), clicked={"cup": [pair.click("cup")]})
 
 
 def mug(make) -> tuple[list, list[str]]:
@@ -248,18 +310,6 @@ def test_what_stands_apart_on_a_board_is_three_whole_bodies(tmp_path):
     for name, true in zip(found.bodies, ("torus", "jug", "carton"), strict=True):
         sides = np.ptp(shelf.parts[["torus", "carton", "jug"].index(true)].vertices, axis=0)
         np.testing.assert_allclose(np.ptp(found.bodies[name].vertices, axis=0), sides, rtol=0.01)
-
-
-def test_a_hollow_has_a_depth_and_what_is_below_it_is_floor_or_filling():
-    make = photo_sets.studio()
-    cup = Mesh(*make.lathe(np.array([(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.03), (0, 0.03)])))
-    depth, below = hollow(cup, 0.01) or (0, 0)
-    assert (depth, below) == (pytest.approx(0.13, abs=1e-3), pytest.approx(0.03, abs=1e-3))
-    assert hollow_line("cup", depth, below) == "cup: hollow, 0.13 m deep below its rim, on a floor 0.03 m thick"
-    filled = Mesh(*make.lathe(np.array([(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.12), (0, 0.12)])))
-    line = hollow_line("cup", *(hollow(filled, 0.01) or (0, 0)))
-    assert line == "cup: hollow to 0.04 m below its rim as far as photos see; the 0.12 m below that are solid"
-    assert hollow(filled, 0.05) is None and hollow(Mesh(*photo_sets.ring((0, 0, 0.05), 0.1, 0.04)), 0.01) is None
 
 
 def test_without_scenery_a_connected_pair_comes_apart_by_masks(tmp_path):

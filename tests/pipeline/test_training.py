@@ -12,12 +12,13 @@ import torch
 from PIL import Image
 
 from pipeline.cameras import PosedPhotos, Sparse, View
-from pipeline.field import training
+from pipeline.field import supervision, training
+from pipeline.field.exposure import Exposure, color_error
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
 from pipeline.inputs.photos import save_photos
 from pipeline.report import notes
-from tests.helpers.fields import SMALL, posed_noise
+from tests.helpers.fields import SMALL, posed_noise, toy_rays
 from tests.helpers.photos import photo
 
 RED, SIDE = (200, 30, 30), 40
@@ -130,7 +131,7 @@ def trainer(iteration: int, iterations: int) -> SimpleNamespace:
         (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
         (500, 1000, 30.0, 1100),  # faster
         (500, 1000, 101.0, 500),  # over: ends at once
-        (2700, 2790, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
+        (850, 890, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
     ],
 )
 def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
@@ -192,5 +193,74 @@ def test_what_a_killed_run_had_trained_is_not_lost_in_silence(tmp_path, clock):
     report = train(poses, tmp_path, tmp_path, settings=replace(SETTINGS, iterations=20),
                    on_progress=lambda fraction, message: told.append(message)).report  # fmt: skip
     assert not report["resumed"] and report["iterations"] == 20
-    assert "what a killed run had trained is lost: checkpoint.safetensors cannot be read" in told[0]
-    assert notes({"distill": report}) == report["notes"] == told[:1]
+    lost = [message for message in told if "a killed run" in message]
+    assert "what a killed run had trained is lost: checkpoint.safetensors cannot be read" in lost[0]
+    assert notes({"distill": report}) == report["notes"] == lost[:1]
+
+
+def painted_ball(view: View, gain: np.ndarray) -> np.ndarray:
+    """A photo [H, W, 3] uint8 of a ball of radius 0.5 whose colour changes from place to place, in front of grey."""
+    column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
+    rays = view.rays(column.ravel(), row.ravel())
+    along = -(rays @ view.center)
+    inside = along**2 - (view.center @ view.center) + 0.25
+    at = view.center + (along - np.sqrt(np.maximum(inside, 0)))[:, None] * rays
+    color = np.where(inside[:, None] > 0, 0.4 + 0.2 * np.sin(9 * at + [0, 1, 2]), 0.35)
+    return (255 * np.clip(gain * color, 0, 1) + 0.5).astype(np.uint8).reshape(SIDE, SIDE, 3)
+
+
+def test_photos_of_other_exposure_and_white_balance_train_as_those_of_one(tmp_path, one_thread):
+    """Gains of up to one stop more or less, in photos that are coded with a gamma of 2.2, and tints."""
+    rng = np.random.default_rng(1)
+    ring = [replace(view, name=f"{k}.png") for k, view in enumerate(views(12))]
+    varied = 2 ** (rng.uniform(-1, 1, (12, 1)) / 2.2) * rng.uniform(0.9, 1.1, (12, 3))
+    (tmp_path / "images").mkdir()
+    nothing = supervision.Supervision(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 6)))
+    around = np.stack([np.cos(np.linspace(0, 6, 50)), 0 * np.linspace(0, 6, 50), np.sin(np.linspace(0, 6, 50))], 1)
+    surface = torch.tensor(0.5 * around, dtype=torch.float32)
+
+    def trained(gains: np.ndarray, weight: float) -> tuple[Trainer, float, float]:
+        """The trainer, its last colour errors' mean, and how far the surface lies off in the median."""
+        for view, gain in zip(ring, gains, strict=True):
+            Image.fromarray(painted_ball(view, gain)).save(tmp_path / "images" / view.name)
+        rays = load_rays(ring, tmp_path, SIDE, masks=False)
+        settings = replace(PRESETS["quick"], size=SMALL, rays=256, samples=24, iterations=400, surface_points=64,
+                           exposure=weight)  # fmt: skip
+        run = Trainer(settings, rays, nothing, 0)
+        errors = [run.step()["color"] for _ in range(settings.iterations)]
+        with torch.no_grad():
+            return run, float(np.mean(errors[-50:])), float(run.field.sdf(surface).abs().median())
+
+    plain, error, off = trained(np.ones((12, 3)), 0.02)
+    run, error_varied, off_varied = trained(varied, 0.02)
+    _, error_without, _ = trained(varied, 0.0)
+    assert plain.exposure is not None and plain.exposure.spread() < training.VARIED / 2
+    assert error_varied < 1.3 * error < 0.5 * error_without
+    assert off_varied < off + 0.01
+    assert run.exposure is not None
+    # Of the colours that there are, as a gain and an offset can stand in for each other.
+    gain, offset = (values.detach().numpy() for values in run.exposure.of_photos())
+    ratio = (gain * 0.38 + offset) / 0.38 / varied
+    assert np.abs(ratio / ratio.mean(0) - 1).max() < 0.08
+
+
+def test_exposures_come_back_with_a_checkpoint_and_clipped_pixels_ask_for_no_less(tmp_path):
+    rays = toy_rays(64)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=10, surface_points=16)
+    nothing = supervision.Supervision(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 6)))
+    first, second = (Trainer(settings, rays, nothing, 0) for _ in range(2))
+    for _ in range(5):
+        first.step()
+    first.save(tmp_path / "checkpoint.safetensors")
+    assert second.load(tmp_path / "checkpoint.safetensors") and first.exposure is not None and second.exposure
+    assert torch.equal(first.exposure.change, second.exposure.change) and first.exposure.change.any()
+    white = torch.ones(1, 3)
+    assert color_error(1.3 * white, white) == 0 and color_error(0.9 * white, white) == pytest.approx(0.1)
+
+
+def test_a_backdrop_that_masks_put_there_keeps_its_colour():
+    exposure = Exposure(2)
+    exposure.change.data = torch.tensor([[[0.5] * 3, [0.1] * 3], [[-0.5] * 3, [-0.1] * 3]])
+    rgb, opacity = torch.tensor([[0.5] * 3, [0.3] * 3]), torch.tensor([0.0, 1.0])
+    seen = exposure(rgb, opacity, 0.5, torch.tensor([0, 1]))
+    torch.testing.assert_close(seen, torch.tensor([[0.5] * 3, [0.5 * 0.3 - 0.1] * 3]))

@@ -191,7 +191,7 @@ def test_what_the_file_says_wins(scene):
 def test_every_effect_says_why_and_what_would_change_it(scene):
     for made in (scene(), scene(effects=Effects(contact="off", sleep="on")), scene(gravity=np.zeros(3))):
         effects = plan(made).effects()
-        assert len(effects) == 9 and all(e.why and e.field for e in effects.values())
+        assert len(effects) == 10 and all(e.why and e.field for e in effects.values())
     assert "off saves nothing" in plan(scene()).restitution.why
     assert plan(scene(effects=Effects(sleep="on"))).sleep.on
     assert not plan(scene(gravity=np.zeros(3))).gravity.on

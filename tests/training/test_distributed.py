@@ -40,6 +40,7 @@ def test_the_parts_losses_add_up_to_the_whole_batchs_loss(ball_data):
     assert sum(loss for loss, _ in parts) == pytest.approx(whole[0], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_gradients_of_one(ball_data, tmp_path):
     """After one step an optimiser's momentum is a multiple of the gradient. Weights would not do: they move by as much
     where a gradient is next to zero, in a direction that rounding decides."""

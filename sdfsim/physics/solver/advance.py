@@ -38,7 +38,7 @@ from sdfsim.physics.solver.vectors import (
 )
 
 
-@njit(**FAST)
+@njit(**FAST, inline="always")  # where it is called, and not once more by itself
 def advance(shapes, world, work, motion, rules, manifolds, held):
     """Advance `motion` by one step, in place, and what is known of the joints that hold bodies; time is that of
     the bodies that go, however many others there are.

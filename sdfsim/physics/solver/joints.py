@@ -218,8 +218,9 @@ class Bounded(NamedTuple):
     see: np.ndarray  # [R, R] or [0, 0]: what a unit of impulse does along all rows, through the joints
 
 
-@njit(**BARE)
+@njit(**FAST)
 def _moving(world, work, motion):
+    """Not one of `BARE`: these do not count the references to arrays that they return."""
     return Moving(
         world.moves, world.isotropic, world.inverse_mass, world.inertia, world.inverse_inertia, motion.position,
         motion.orientation, motion.velocity, motion.angular, work.matrix, work.inverse, work.free, work.change,
@@ -463,7 +464,7 @@ def _springs(bodies, rules, each, lines, j):
         lines.wanted[j, e] = before - h * (stiff * away + damping * before) / give
 
 
-@njit(**BARE)
+@njit(**FAST)
 def assemble(world, work, motion, rules, held, springs):
     """Write the rows of all joints that are awake, and factor what they make of velocities. Where rows do not hold,
     bodies are moved. `springs`: whether these are among them."""
@@ -1395,7 +1396,7 @@ def _kick(bodies, rules, graph, each, lines, c, share):
                         bodies.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
 
 
-@njit(**BARE)
+@njit(**FAST)
 def begin_step(world, work, motion, rules, held):
     """Velocities at an instant become those of the inner step before it, see `advance._shifted`. Where nothing is known
     of impulses they are found first."""

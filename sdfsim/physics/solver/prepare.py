@@ -12,7 +12,7 @@ import numpy as np
 from sdfsim.base.compiling import warn_compiling
 from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
-from sdfsim.physics.bodies import Bodies, State, Touch, Tracks, Units
+from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
 from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver import distance as kinds
@@ -36,6 +36,7 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 # Penetration that is left as it is, so that what rests has contacts that do not come and go: model lengths, and less in
 # inner steps below the usual 4 ms, which scenes of slender bodies have.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
+ROUNDS, TEACHERS = 100, 50  # of sequential impulses in an inner step at most, and of the teacher
 CROWD = 64  # bodies that move, from which on pairs may be looked at in threads
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
@@ -214,10 +215,13 @@ def nodes_near(
 def compiled_rules(options: Options) -> compiled.Rules:
     """The options of a run as the compiled step wants them."""
     gravity, inner = options.gravity, options.dt / options.substeps
+    # What is met in the course of an inner step is found before it is. The teacher looks at poses alone.
+    ahead = 0.0 if options.adds and not (options.record and inner > COARSE) else inner
+    rounds = TEACHERS if options.adds else ROUNDS
     return compiled.Rules(
         gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,
         options.restitution, options.rotation, options.sleep, options.margin, options.adds, options.cone,
-        options.record, ahead=inner if options.record and inner > COARSE else 0.0, slop=min(SLOP, SLOP_A_TIME * inner),
+        options.record, ahead=ahead, slop=min(SLOP, SLOP_A_TIME * inner), rounds=rounds,
     )  # fmt: skip
 
 
@@ -355,7 +359,7 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
 def held_by(bodies: Bodies) -> Held:
     """The joints of a scene, with room for what an inner step makes of them."""
     empty = np.zeros((0, 3))
-    joints = bodies.joints or jointed.joints_of((), empty, Units(1.0, 1.0, 1.0))
+    joints = bodies.joints or jointed.joints_of((), empty, length=1.0, time=1.0, mass=1.0)
     order = jointed.ordered(joints, bodies.moves)
     j, k, f = len(joints), len(order.node), len(order.row)
     n = len(bodies) if j else 0

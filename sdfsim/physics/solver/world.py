@@ -140,7 +140,7 @@ class Rules(NamedTuple):
     erp: float = 0.08  # the share of a penetration that an inner step resolves, through velocity
     slop: float = 5e-4  # penetration that is left as it is
     split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
-    rounds: int = 50  # of sequential impulses at most
+    rounds: int = 100  # of sequential impulses at most
     exact: float = 2e-5  # they end when no impulse changes a velocity by more
     apart: float = 0.03  # points of a manifold are at least so far from each other
     # stray, rest: who stays within `stray` for `rest` steps falls asleep, if its forces are so nearly in balance that

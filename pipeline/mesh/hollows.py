@@ -1,0 +1,100 @@
+"""What is hollow about a body: how deep it is, whether photos see so deep, and how thick its wall is."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from pipeline.mesh.trust import FEW, Evidence
+from pipeline.mesh.visibility import Above
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, vertex_normals
+
+PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; that a hollow has
+# What is below a hollow is its floor if it is thinner than this share of the hollow's depth.
+FLOOR = 0.3
+UPRIGHT = 0.5  # largest part upwards of the normal of a wall
+KNOWN = 0.5  # share of a wall that photos have to see from both sides before its thickness counts as known
+
+
+@dataclass(frozen=True)
+class Hollow:
+    """The hollow of a body, upright as it stands."""
+
+    depth: float  # m below its rim
+    below: float  # m, how thick what is below the hollow is
+    seen: int  # photos that see its bottom: the median over it, by rays
+    wall: float | None  # m, the median thickness of the wall around it; None where there is none
+    wall_seen: float  # share of the wall, by vertices, of which photos see both sides
+
+    def to_dict(self) -> dict:
+        """Plain values for the report, lengths to a hundredth of a millimetre in a body of a metre."""
+        digits = 5 - int(np.floor(np.log10(self.depth + self.below)))
+        return {key: round(value, digits) if isinstance(value, float) else value for key, value in asdict(self).items()}
+
+
+def hollow(mesh: Mesh, least: float, evidence: Evidence | None = None) -> Hollow | None:
+    """The hollow of a body, a closed mesh in metres with z up; None where it holds no water, or none deeper than
+    `least` m. `evidence` is what photos say about the vertices; without it nothing counts as seen."""
+    from skimage.morphology import reconstruction
+
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    step = float((high - low)[:2].max()) / PLACES
+    axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in range(2)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    height = Above(mesh).heights(places)
+    through = np.isnan(height)
+    height = np.where(through, low[2], height)
+    water = reconstruction(np.where(through, height, height.max()), height, method="erosion")
+    depth = water - height
+    deep = depth > 0.5 * depth.max()
+    found = float(np.median(depth[deep])) if depth.max() > 0 else 0.0
+    if found < least or deep.sum() < FEWEST:
+        return None
+    bottom = np.concatenate([places[deep], height[deep][:, None]], 1)
+    seen = 0 if evidence is None else int(np.median(evidence.nearest(bottom).views))
+    wall, wall_seen = _wall(mesh, float(np.median(water[deep])), bottom, evidence)
+    return Hollow(found, float(np.median(height[deep]) - low[2]), seen, wall, wall_seen)
+
+
+def _wall(mesh: Mesh, rim: float, bottom: np.ndarray, evidence: Evidence | None) -> tuple[float | None, float]:
+    """The median thickness of the wall around a hollow, m, and the share of it that photos see from both sides."""
+    normals, middle = vertex_normals(mesh), bottom.mean(0)
+    inwards = middle[:2] - mesh.vertices[:, :2]
+    upright = np.abs(normals[:, 2]) < UPRIGHT
+    between = (mesh.vertices[:, 2] < rim) & (mesh.vertices[:, 2] > bottom[:, 2].max())
+    inner = np.flatnonzero(upright & between & ((normals[:, :2] * inwards).sum(1) > 0))
+    if not len(inner):
+        return None, 0.0
+    # Through the wall, and out of it on the other side.
+    skin = 1e-4 * float(np.ptp(mesh.vertices, axis=0).max())
+    start = mesh.vertices[inner] - skin * normals[inner]
+    away = Caster(mesh).hits(start, -normals[inner])[0]
+    through = np.isfinite(away)
+    # A line that meets the hollow again has left no wall there.
+    if not through.any():
+        return None, 0.0
+    thick = float(np.median(away[through]) + skin)
+    if evidence is None:
+        return thick, 0.0
+    outer = start[through] - away[through][:, None] * normals[inner[through]]
+    both = np.minimum(evidence.nearest(mesh.vertices[inner[through]]).views, evidence.nearest(outer).views) >= FEW
+    return thick, float(both.mean())
+
+
+def hollow_line(name: str, found: dict) -> str:
+    """What the report says about the hollow of a body, from `Hollow.to_dict`."""
+    depth, below, seen = found["depth"], found["below"], found["seen"]
+    photos = f"{seen} photos see its bottom" if seen > 1 else f"{('no', 'one')[seen]} photo sees its bottom"
+    if below < FLOOR * depth:
+        line = f"{name}: hollow, {depth:.2g} m deep below its rim, on a floor {below:.2g} m thick; {photos}"
+    elif seen < FEW:
+        line = f"{name}: hollow to {depth:.2g} m below its rim or deeper; {photos}, the {below:.2g} m below are a guess"
+    else:
+        line = f"{name}: hollow to {depth:.2g} m below its rim; {photos}, and the {below:.2g} m below that are solid"
+    if found["wall"] is None:
+        return line
+    if found["wall_seen"] < KNOWN:
+        return f"{line}; how thick its wall is, is unknown: photos see both sides of {found['wall_seen']:.0%} of it"
+    return f"{line}; its wall is {1000 * found['wall']:.2g} mm thick"

@@ -1,0 +1,208 @@
+"""Level surfaces without texture: a table top of one colour has nothing that photos could be matched by, so the field
+sinks or bulges there. Where photos allow it, its plane goes on from what is seen of it.
+
+Everything here is in normalised space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from pipeline.cameras import PosedPhotos, View, frame_of
+from pipeline.inputs.images import reduced
+from pipeline.mesh.bodies import LevelPlane, find_level_planes
+from pipeline.mesh.extraction import MIN_SEEN, RIM, FieldSurface, Volume
+from pipeline.mesh.visibility import bilinear, framed
+from sdfsim.geometry.bvh import Caster
+
+# Chosen by hand on rendered sets; nothing derives them. In samples of the volume:
+ON = 1.5  # distance of a plane up to which a surface is the plane's
+STEP = 1.0  # side of the squares into which a plane is divided
+PATCH, NARROW = 2.0, 0.5  # half of the width of what is looked at around a square, and of the square alone
+SLAB = 4.0  # thickness of what is completed
+BULGE = 24.0  # height of what is taken away above it at most
+# Of colours, 0 to 255: spread within a patch of a photo, and between photos; more is texture, or another surface.
+PLAIN, SAME = 9.0, 16.0
+LIFTED = 0.02  # normalised units above a plane, from where it is asked whether a photo is in sight
+CROSSED = 2  # lines of sight through a square to points below it: the plane is not there
+RIM_SQUARES = 12  # beside what is seen of the plane that a region needs
+SUPPORTS = 0.04  # of the largest level plane's area: what is seen of another one that is completed, as of a mat
+LEAST = 0.05  # of the area that is seen of the plane: less is not worth the change
+POINTS = 30  # sparse points that tell how bright a photo is
+LONG_SIDE = 480  # px of the photos that are looked at
+
+
+@dataclass(frozen=True)
+class Completed:
+    """Where one level plane was completed."""
+
+    level: LevelPlane
+    corner: np.ndarray  # [2] of the first square, in the axes of `frame_of` the plane's normal
+    step: float  # side of a square
+    squares: np.ndarray  # [A, B] bool
+
+    @property
+    def area(self) -> float:
+        """In normalised units."""
+        return float(self.squares.sum()) * self.step**2
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [P, 3] lie in the columns of the squares [P]."""
+        index = np.floor((points @ frame_of(self.level.normal)[:2].T - self.corner) / self.step).astype(int)
+        inside = np.flatnonzero(((index >= 0) & (index < self.squares.shape)).all(1))
+        result = np.zeros(len(points), bool)
+        result[inside] = self.squares[tuple(index[inside].T)]
+        return result
+
+    def on(self, points: np.ndarray, width: float) -> np.ndarray:
+        """Whether points [P, 3] are within `width` of what was completed [P]."""
+        return (np.abs(self.level.above(points)) < width) & self.covers(points)
+
+    def filled(self, volume: Volume) -> Volume:
+        """The samples with a slab below the squares, and nothing that the field piled up on them."""
+        height = volume.along(self.level.normal) - self.level.height
+        band = (height > -SLAB * volume.cell) & (height < BULGE * volume.cell)
+        index = np.argwhere(band)
+        mine = self.covers(volume.low + volume.cell * index)
+        index, values = index[mine], volume.values.copy()
+        at, away = tuple(index.T), height[tuple(index.T)]
+        # A field piles up what it cannot see only so far; what lies higher is left as it is.
+        over = np.minimum(away, (BULGE * volume.cell - away) / 2)
+        values[at] = np.where(away > 0, np.maximum(values[at], over), np.minimum(values[at], away))
+        near = np.abs(away) < ON * volume.cell  # between samples the surface is where the two nearest say
+        values[tuple(index[near].T)] = away[near]
+        return replace(volume, values=values.astype(np.float32))
+
+
+def complete(surface: FieldSurface, up: np.ndarray, finest: float, poses: PosedPhotos, photos_folder: Path
+             ) -> list[Completed]:  # fmt: skip
+    """Where level planes go on beyond what is seen of them: in plain squares that hang together with it, look alike
+    from everywhere, are hidden by nothing, and through which no photo sees a point below. `up` [3] is unit, `finest`
+    the width of a cell of the field's finest grid."""
+    levels = find_level_planes(surface.visible, up, finest, SUPPORTS)
+    pictures = _pictures(poses, photos_folder)
+    blocking = Caster(surface.visible)
+    found = [_complete(surface, level, poses, pictures, blocking) for level in levels]
+    return [one for one in found if one is not None]
+
+
+def on_any(completed: Sequence[Completed], width: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Whether points [P, 3] lie within `width` of any of these."""
+    return lambda points: np.any([one.on(points, width) for one in completed], axis=0)
+
+
+def _complete(surface: FieldSurface, level: LevelPlane, poses: PosedPhotos, pictures: list[tuple[View, np.ndarray]],
+              blocking: Caster) -> Completed | None:  # fmt: skip
+    cell = surface.volume.cell
+    frame, step = frame_of(level.normal), STEP * cell
+    count = int(np.ceil(2 * RIM / step))
+    corner = np.full(2, -count * step / 2)
+
+    def squares(points: np.ndarray, least: int = 1) -> np.ndarray:
+        """Those [A, B] bool below or above at least so many points [P, 3]."""
+        index = np.floor((points @ frame[:2].T - corner) / step).astype(int)
+        index = index[((index >= 0) & (index < count)).all(1)]
+        return np.bincount(index[:, 0] * count + index[:, 1], minlength=count * count).reshape(count, count) >= least
+
+    shown = surface.raw.vertices[np.unique(surface.raw.faces[surface.shown])]
+    height = level.above(shown)
+    known = np.asarray(ndimage.binary_closing(squares(shown[np.abs(height) < ON * cell])), bool)
+    taken = squares(shown[(height >= ON * cell) & (height < BULGE * cell)])
+    middle = corner + step * (np.indices((count, count)).reshape(2, -1).T + 0.5)
+    points = middle @ frame[:2] + level.height * level.normal
+    there = (np.linalg.norm(points, axis=1) < RIM - 2 * cell).reshape(count, count)
+    open_ = there & ~known & ~taken & ~squares(_crossings(level, poses, ON * cell), CROSSED)
+    index = np.flatnonzero(open_)
+    if len(index) * step**2 < LEAST * level.area:
+        return None
+
+    def alike(patch: float) -> tuple[np.ndarray, np.ndarray]:
+        """Squares [A, B] bool by `_alike`, and their colours [A, B, 3]."""
+        plain, color = np.zeros(count * count, bool), np.zeros((count * count, 3))
+        plain[index], color[index] = _alike(points[index], level, patch * cell, pictures, blocking)
+        return plain.reshape(count, count), color.reshape(count, count, 3)
+
+    plain, color = alike(PATCH)
+    plain = np.asarray(ndimage.binary_opening(plain)) & open_
+    region = np.empty(plain.shape, np.int32)
+    number = int(ndimage.label(plain, output=region))  # type: ignore[arg-type]
+    around = np.asarray(ndimage.binary_dilation(known, iterations=2), bool) & plain
+    beside = np.bincount(region[around], minlength=number + 1)
+    beside[0] = 0
+    core = (beside >= RIM_SQUARES)[region]
+    if core.sum() * step**2 < LEAST * level.area:
+        return None
+    # A patch reaches past the edge of what is plain: there it is the square alone that has to look the same.
+    narrow, own = alike(NARROW)
+    nearest = np.empty((2, count, count), np.int32)
+    ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True, indices=nearest)
+    same = narrow & (np.abs(own - color[tuple(nearest)]).max(2) < SAME)
+    grown = ndimage.binary_dilation(core, iterations=int(PATCH) + 1, mask=core | (same & open_))
+    return Completed(level, corner, step, np.asarray(grown, bool))
+
+
+def _crossings(level: LevelPlane, poses: PosedPhotos, clear: float) -> np.ndarray:
+    """Points [C, 3] of a plane at which lines of sight, to sparse points more than `clear` below it, go through."""
+    sparse = poses.sparse
+    centers = np.array([view.center for view in poses.views]).reshape(-1, 3)
+    start, end = centers[sparse.view_of], sparse.xyz[sparse.point_of]
+    high, low = level.above(start), level.above(end)
+    through = (high > 0) & (low < -clear)
+    share = (high / np.maximum(high - low, 1e-9))[through, None]
+    return (1 - share) * start[through] + share * end[through]
+
+
+def _pictures(poses: PosedPhotos, folder: Path) -> list[tuple[View, np.ndarray]]:
+    """Photos [H, W, 3] float, with cameras of their size; as bright as the sparse points, which are means of photos."""
+    found, sparse = [], poses.sparse
+    for number, view in enumerate(poses.views):
+        with Image.open(folder / "images" / view.name) as image:
+            size = reduced(image.size, LONG_SIDE)
+            pixels = np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX), np.float32)
+        sx, sy = size[0] / view.width, size[1] / view.height
+        small = replace(view, width=size[0], height=size[1], focal=view.focal * (sx + sy) / 2, cx=view.cx * sx,
+                        cy=view.cy * sy)  # fmt: skip
+        mine = sparse.point_of[sparse.view_of == number]
+        if len(mine) >= POINTS:
+            shown = bilinear(pixels, small.project(sparse.xyz[mine])[0] - 0.5)
+            pixels = pixels * np.median((sparse.rgb[mine] + 8.0) / (shown + 8.0), axis=0).astype(np.float32)
+        found.append((small, pixels))
+    return found
+
+
+def _alike(points: np.ndarray, level: LevelPlane, reach: float, pictures: list[tuple[View, np.ndarray]],
+           blocking: Caster) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Whether a plane is plain and of one colour within `reach` of points [P, 3] in the photos that show them [P], and
+    that colour [P, 3]."""
+    colors = np.full((len(pictures), len(points), 3), np.nan, np.float32)
+    spread = np.full((len(pictures), len(points)), np.nan, np.float32)
+    for number, (view, picture) in enumerate(pictures):
+        pixels, inside = framed(view, points)
+        towards = view.center - points
+        inside &= towards @ level.normal > 0.1 * np.linalg.norm(towards, axis=1)
+        index = np.flatnonzero(inside)
+        index = index[~blocking.blocked(points[index] + LIFTED * level.normal, view.center)]
+        if not len(index):
+            continue
+        # A patch of the plane is as many pixels wide as its distance says.
+        away = float(np.median(view.project(points[index])[1]))
+        width = 2 * max(1, round(reach * view.focal / away)) + 1
+        mean = ndimage.uniform_filter(picture, width, axes=(0, 1))
+        square = ndimage.uniform_filter(picture**2, width, axes=(0, 1))
+        rough = np.sqrt(np.maximum(square - mean**2, 0)).mean(2, keepdims=True)
+        read = bilinear(np.concatenate([mean, rough], 2), pixels[index] - 0.5)
+        colors[number, index], spread[number, index] = read[:, :3], read[:, 3]
+    seen = np.isfinite(spread).sum(0) >= MIN_SEEN
+    plain, middle = np.zeros(len(points), bool), np.zeros((len(points), 3))
+    if seen.any():
+        colors, spread = colors[:, seen], spread[:, seen]
+        middle[seen] = np.nanmedian(colors, axis=0)
+        off = np.nanmedian(np.abs(colors - middle[seen]).max(2), axis=0)
+        plain[seen] = (np.nanmedian(spread, axis=0) < PLAIN) & (off < SAME)
+    return plain, middle

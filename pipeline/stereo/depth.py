@@ -1,0 +1,303 @@
+"""Depth from photos alone: for every pixel, how far away what it shows is, by comparing it with neighbouring photos.
+
+Planes are swept through the scene at a small size of the photos. Around what that found, places are tried again at the
+full size, along the surface as it was found; so windows follow slopes, which planes before the camera do not. A pixel
+counts where other photos agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from pipeline.cameras import PosedPhotos, View, focus
+from pipeline.inputs.images import reduced
+from pipeline.progress import Progress, quiet
+from pipeline.stereo.compiled import agreeing, sweep
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import threads
+
+COARSE = 320  # px of the longer side while planes are swept
+LARGER = 1.5  # times, from round to round
+NEIGHBOURS = 4  # photos that one is compared with
+ASKED = 8  # photos that have to agree on its depth, or see nothing there
+# Degrees between lines of sight at which two photos match best, and how fast they match less below and above.
+BEST_ANGLE, NARROWER, WIDER = 9.0, 4.0, 9.0
+APART = 0.7  # How much less a neighbour counts that lies in the direction of one that was chosen before.
+PLACES = 300  # sparse points by which neighbours are chosen
+PLANES = (48, 128)  # fewest and most
+STEP = 1.25  # px that what a plane shows moves to the next one, in the photo farthest away
+FINER, TRIED = 0.5, 4  # px between the places that are tried again, and how many of them to either side
+HALF = 3  # px from the middle of a window to its sides
+AGREE = 0.01  # share by which inverse depths differ at most
+FEWEST = 2  # photos that agree, where it is certain enough
+ALIKE = 0.4  # correlation below which nothing is known
+BEYOND = 1e-3  # inverse depth of what is empty as far as counts
+MARGIN = 1.25  # by which the nearest and farthest sparse points of a photo are exceeded
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A small grey photo without distortion. Pixel centres are at whole numbers."""
+
+    view: View  # of the photo itself
+    grey: np.ndarray  # [H, W] float32, mean 0
+    matrix: np.ndarray  # [3, 3] from camera axes to its pixels
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """What one photo shows, as far as others agree."""
+
+    view: View  # of the photo itself
+    matrix: np.ndarray  # [3, 3] from camera axes to pixels, whose centres are at whole numbers
+    inverse: np.ndarray  # [H, W] float32, 1 / depth along the optical axis; 0 where nothing is known
+    certain: np.ndarray  # [H, W] float32, 0 to 1
+
+    @property
+    def rays(self) -> np.ndarray:
+        """Directions [H, W, 3] in the world through the pixels, 1 long along the optical axis."""
+        row, column = np.indices(self.inverse.shape)
+        pixels = np.stack([column, row, np.ones_like(row)], -1)
+        return pixels @ np.linalg.inv(self.matrix).T @ self.view.rotation
+
+    def points(self) -> np.ndarray:
+        """Places [P, 3] of the pixels of which something is known."""
+        known = self.inverse > 0
+        return self.view.center + self.rays[known] / self.inverse[known][:, None]
+
+
+def stereo(
+    poses: PosedPhotos, photos_folder: Path, long_side: int, *, on_progress: Progress = quiet
+) -> list[DepthMap]:  # fmt: skip
+    """Depth of every photo in the space of the poses, no larger than `long_side` px, for what lies in the unit sphere
+    and behind it. Raises SdfsimError where a photo is missing. None where there are fewer than three photos."""
+    views = poses.views
+    if len(views) <= FEWEST:
+        return []
+    order = neighbours(poses)
+    spans = [span(poses, number) for number in range(len(views))]
+    inverse: list[np.ndarray] = [np.zeros((0, 0))] * len(views)
+    score, counts = list(inverse), list(inverse)
+    sides = [min(COARSE, long_side)]
+    while sides[-1] < long_side or len(sides) == 1:
+        sides.append(min(round(LARGER * sides[-1]), long_side))
+    done, total = 0, 2 * len(sides) * len(views)
+
+    def each(function, jobs: Sequence[tuple], words: str) -> list:
+        nonlocal done
+        found: list = [None] * len(jobs)
+        for number, result in threads(function, jobs):
+            found[number] = result
+            done += 1
+            on_progress(done / total, f"stereo: {words}, {number + 1} of {len(jobs)} photos")
+        return found
+
+    pictures: list[Pinhole] = []
+    for side in sides:
+        first = side is sides[0]
+        pictures = [pinhole(view, photos_folder, side) for view in views]
+        jobs = []
+        for number in range(len(views)):
+            near = [pictures[k] for k in order[number][:NEIGHBOURS]]
+            start = None if first else filled(inverse[number], (counts[number] >= FEWEST) & (score[number] > ALIKE))
+            jobs.append((_search, pictures[number], near, spans[number], start))
+        found = each(lambda search, *job: search(*job), jobs, "planes" if first else "places")
+        inverse, score = (list(part) for part in zip(*found, strict=True))
+        jobs = [(pictures, inverse, number, order[number][:ASKED]) for number in range(len(views))]
+        counts = each(_agreement, jobs, "agreement")
+    maps = []
+    for number, picture in enumerate(pictures):
+        good = (counts[number] >= FEWEST) & (score[number] > ALIKE)
+        certain = np.where(good, (score[number] - ALIKE) / (1 - ALIKE) * np.minimum(counts[number] / 4, 1), 0)
+        known = np.where(good, inverse[number], 0).astype(np.float32)
+        maps.append(DepthMap(picture.view, picture.matrix, known, certain.astype(np.float32)))
+    return maps
+
+
+def only(poses: PosedPhotos, index: Sequence[int]) -> PosedPhotos:
+    """Some of the photos, and what they observe of the sparse points."""
+    sparse, place = poses.sparse, np.full(len(poses.views), -1)
+    place[index] = np.arange(len(index))
+    view_of = place[sparse.view_of]
+    there = view_of >= 0
+    left = replace(sparse, point_of=sparse.point_of[there], view_of=view_of[there])
+    return replace(poses, views=tuple(poses.views[k] for k in index), sparse=left)
+
+
+def outside_mask(depth: DepthMap, photos_folder: Path) -> DepthMap:
+    """The same where nothing but a masked object is there: what the photo's mask leaves out is empty, far beyond."""
+    try:
+        with Image.open(Path(photos_folder) / "masks" / f"{depth.view.name}.png") as image:
+            mask = np.asarray(image.convert("L").resize(depth.inverse.shape[::-1], Image.Resampling.BOX))
+    except OSError as error:
+        raise SdfsimError(f"{photos_folder}: no mask of {depth.view.name}", "run the photos stage again") from error
+    empty = np.logical_not(ndimage.binary_dilation(mask > 0, iterations=2))
+    inverse = np.where(empty, np.float32(BEYOND), np.where(mask > 127, depth.inverse, 0))
+    return replace(depth, inverse=inverse, certain=np.where(empty, np.float32(1), depth.certain))
+
+
+def stereo_summary(maps: Sequence[DepthMap], poses: PosedPhotos) -> dict[str, float]:
+    """For the report: the share of pixels with depth (`valid`), and the median share by which it differs from the
+    sparse points of the same pixels (`spread`)."""
+    off = []
+    for number, one in enumerate(maps):
+        seen = poses.sparse.xyz[poses.sparse.point_of[poses.sparse.view_of == number]]
+        local = (seen @ one.view.rotation.T + one.view.translation) @ one.matrix.T
+        at = np.round(local[:, :2] / np.maximum(local[:, 2:], 1e-9)).astype(int)
+        inside = (local[:, 2] > 0) & (at >= 0).all(1) & (at < one.inverse.shape[::-1]).all(1)
+        inverse = one.inverse[at[inside, 1], at[inside, 0]]
+        off.append(np.abs(inverse * local[inside, 2] - 1)[inverse > 0])
+    found = np.concatenate([np.zeros(0), *off])
+    valid = float(np.mean([(one.inverse > 0).mean() for one in maps])) if maps else 0.0
+    return {"valid": round(valid, 3), "spread": round(float(np.median(found)), 5) if len(found) else AGREE}
+
+
+def pinhole(view: View, photos_folder: Path, long_side: int) -> Pinhole:
+    """The photo of a view, grey, made smaller and straight. Raises SdfsimError where it is missing."""
+    grey, matrix = straightened(view, photos_folder, long_side, "L")
+    return Pinhole(view, np.ascontiguousarray(grey - grey.mean(), np.float32), matrix)
+
+
+def straightened(view: View, photos_folder: Path, long_side: int, mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """The photo of a view, made smaller and straight, in a mode of PIL: [H, W] float32 (grey, L) or [H, W, 3] uint8
+    (RGB), and the matrix [3, 3] from camera axes to its pixels, whose centres are at whole numbers. Raises SdfsimError
+    where it is missing."""
+    import cv2
+
+    try:
+        with Image.open(Path(photos_folder) / "images" / view.name) as image:
+            size = reduced(image.size, long_side)
+            pixels = np.asarray(image.convert(mode).resize(size, Image.Resampling.BOX))
+    except OSError as error:
+        raise SdfsimError(f"{photos_folder}: cannot read {view.name}", "run the photos stage again") from error
+    pixels = pixels.astype(np.float32) if mode == "L" else pixels
+    sx, sy = size[0] / view.width, size[1] / view.height
+    matrix = np.array([[view.focal * sx, 0, view.cx * sx - 0.5], [0, view.focal * sy, view.cy * sy - 0.5], [0, 0, 1]])
+    if view.k:
+        column, row = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+        local = np.stack([column, row, np.ones_like(row)], -1).reshape(-1, 3) @ np.linalg.inv(matrix).T
+        bent = 1 + view.k * (local[:, :2] ** 2).sum(1)
+        at = (local[:, :2] * bent[:, None] * np.diag(matrix)[:2] + matrix[:2, 2]).astype(np.float32)
+        maps = (at[:, 0].reshape(row.shape), at[:, 1].reshape(row.shape))
+        pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return pixels, matrix
+
+
+def neighbours(poses: PosedPhotos) -> list[list[int]]:
+    """Of each view the others that match it best, the best first: those that show the same sparse points from an angle
+    that is neither too narrow nor too wide, the first few to different sides."""
+    views, sparse = poses.views, poses.sparse
+    middle = focus(views)[0]
+    centers = np.array([view.center for view in views])
+    rng = np.random.default_rng(0)
+    found = []
+    for number, view in enumerate(views):
+        mine = np.unique(sparse.point_of[sparse.view_of == number])
+        points = sparse.xyz[rng.permutation(mine)[:PLACES]] if len(mine) else middle[None]
+        towards = points[None] - centers[:, None]
+        towards /= np.linalg.norm(towards, axis=2, keepdims=True)
+        angle = np.degrees(np.arccos(np.clip((towards * towards[number]).sum(2), -1, 1)))
+        width = np.where(angle < BEST_ANGLE, NARROWER, WIDER)
+        fit = np.exp(-(((angle - BEST_ANGLE) / width) ** 2) / 2)
+        for other, there in enumerate(views):
+            pixels, depth = there.project(points)
+            shown = (depth > 0) & (pixels > 0).all(1) & (pixels < [there.width, there.height]).all(1)
+            fit[other] *= shown
+        worth = fit.mean(1)
+        worth[number] = -1
+        side = (centers - view.center) @ view.rotation[:2].T
+        side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
+        chosen: list[int] = []
+        while len(chosen) < min(ASKED, len(views) - 1):
+            alike = side @ side[chosen].T if chosen else np.zeros((len(views), 1))
+            reduced_worth = worth * (1 - APART * np.clip(alike.max(1), 0, 1) ** 2)
+            reduced_worth[[number, *chosen]] = -2
+            chosen.append(int(reduced_worth.argmax()))
+        found.append(chosen)
+    return found
+
+
+def span(poses: PosedPhotos, number: int) -> tuple[float, float]:
+    """Smallest and largest inverse depth that is looked for in a photo: the unit sphere, and what lies behind it."""
+    view, sparse = poses.views[number], poses.sparse
+    seen = sparse.xyz[sparse.point_of[sparse.view_of == number]]
+    depth = seen @ view.rotation[2] + view.translation[2]
+    depth = depth[depth > 0]
+    away = float(np.linalg.norm(view.center))
+    nearest, farthest = max(away - 1, 0.05), away + 1
+    if len(depth):
+        low, high = np.quantile(depth, [0.01, 0.99])
+        nearest, farthest = max(nearest, low / MARGIN / MARGIN), max(farthest, high * MARGIN)
+    return 1 / farthest, 1 / min(nearest, 0.9 * farthest)
+
+
+def relation(first: Pinhole | DepthMap, second: Pinhole | DepthMap) -> tuple[np.ndarray, np.ndarray]:
+    """What leads from pixels of one photo to those of another: [3, 3] and [3], see `sweep`."""
+    turn = second.view.rotation @ first.view.rotation.T
+    shift = second.view.translation - turn @ first.view.translation
+    return second.matrix @ turn @ np.linalg.inv(first.matrix), second.matrix @ shift
+
+
+def _search(picture: Pinhole, near: list[Pinhole], limits: tuple[float, float], start: np.ndarray | None
+            ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Inverse depth and score [H, W] of a photo, by planes, or around a `start` [h, w]."""
+    import cv2
+
+    rows, columns = picture.grey.shape
+    turns, shifts = (np.array(part) for part in zip(*(relation(picture, other) for other in near), strict=True))
+    row, column = np.mgrid[0 : rows - 1 : 5j, 0 : columns - 1 : 5j]
+    pixels = np.stack([column.ravel(), row.ravel(), np.ones(25)], 1)
+
+    def shown(inverse: float) -> np.ndarray:
+        at = pixels @ turns.transpose(0, 2, 1) + inverse * shifts[:, None]
+        return at[..., :2] / np.maximum(at[..., 2:], 1e-6)
+
+    middle = (limits[0] * limits[1]) ** 0.5 if start is None else float(np.median(start))
+    slope = np.linalg.norm(shown(1.01 * middle) - shown(middle), axis=2) / (0.01 * middle)  # px a unit of inverse depth
+    fastest = max(float(np.median(slope, axis=1).max()), 1e-9)
+    if start is None:
+        count = int(np.clip((limits[1] - limits[0]) * fastest / STEP, *PLANES))
+        base, offsets = np.zeros((rows, columns), np.float32), np.linspace(*limits, count)
+    else:
+        base = cv2.resize(start.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+        offsets = np.arange(-TRIED, TRIED + 1) * FINER / fastest
+    others, sizes = stacked([other.grey for other in near])
+    return sweep(
+        picture.grey, others, sizes, turns.astype(np.float32), shifts.astype(np.float32), base,
+        offsets.astype(np.float32), HALF,
+    )  # fmt: skip
+
+
+def _agreement(pictures: list[Pinhole], inverse: list[np.ndarray], number: int, asked: list[int]) -> np.ndarray:
+    """How many of some photos agree [H, W] with the inverse depth of one."""
+    turns, shifts = zip(*(relation(pictures[number], pictures[k]) for k in asked), strict=True)
+    others, sizes = stacked([inverse[k] for k in asked])
+    return agreeing(inverse[number], others, sizes, np.array(turns), np.array(shifts), AGREE)
+
+
+def stacked(pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures [N, h, w] float32 of different sizes in one array, and their heights and widths [N, 2]."""
+    sizes = np.array([picture.shape for picture in pictures])
+    if (sizes == sizes[0]).all():
+        return np.array(pictures, np.float32), sizes
+    whole = np.zeros((len(pictures), *sizes.max(0)), np.float32)
+    for number, picture in enumerate(pictures):
+        whole[number, : picture.shape[0], : picture.shape[1]] = picture
+    return whole, sizes
+
+
+def filled(inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Inverse depth [H, W] where it is `known` [H, W], without specks, and elsewhere that of the nearest such pixel."""
+    import cv2
+
+    if not known.any():
+        return inverse
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    whole = inverse[tuple(np.asarray(nearest))].astype(np.float32)
+    return cv2.medianBlur(whole, 5)
