@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ from pipeline.inputs.images import BACKDROP, reduced
 from pipeline.inputs.photos import load_photos
 from pipeline.progress import Progress, quiet, share_of
 from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
-from pipeline.stereo.fusion import Fused, fuse
+from pipeline.stereo.fusion import Fused, behind, fuse
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
 from sdfsim.base.parallel import choose_threads
@@ -78,7 +78,7 @@ class Settings:
     # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25  # of the ball that training starts from; small, as shadowed parts are hardly carved away
-    iterations: int = 2800  # steps of Adam; 4000 are no better on the bundled set
+    iterations: int = 900  # steps of Adam
     rays: int = 512  # a step
     samples: int = 32  # along a ray inside the sphere
     long_side: int = 480  # of the photos used, px
@@ -535,7 +535,9 @@ def train(
         seen = only(local, [number for number in range(len(local.views)) if number not in test])
         maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
         carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
-        fused = fuse(carved, settings.size.levels[-1]) if maps else None
+        fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
+        if fused is not None and not masked:
+            fused = replace(fused, behind=behind(maps, settings.size.background, photos_folder))
         spent = time.monotonic() - begun
         paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
         budget = None if budget is None else budget - spent

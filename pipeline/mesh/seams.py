@@ -214,8 +214,8 @@ def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
     """One side [N] of the best division of some vertices [P] bool in two, through grooves and where colours change. The
     normalised cut of Shi and Malik (2000), from the second eigenvector of the surface's Laplacian."""
     place = np.cumsum(mine) - 1
-    ends, effort = steps(solid, mine, groove, colors)
-    weight = np.exp(-effort) + 1e-3
+    ends, deep, apart = steps(solid, mine, groove, colors)
+    weight = np.exp(-deep - apart) + 1e-3
     index = place[ends]
     count = int(mine.sum())
     link = coo_matrix((np.tile(weight, 2), (np.r_[index[:, 0], index[:, 1]], np.r_[index[:, 1], index[:, 0]])),
@@ -240,9 +240,9 @@ def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
 
 
 def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray
-          ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """The edges [E, 2] between some vertices [P] bool of a solid, and how much stands against crossing each [E]: how
-    deep a `groove` [P] it lies in, and how its ends differ in colour [P, 3]."""
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """The edges [E, 2] between some vertices [P] bool of a solid, and what stands against crossing each: how deep a
+    `groove` [P] it lies in [E], and how its ends differ in colour [P, 3] [E]."""
     ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
     ends = ends[mine[ends].all(1)]
     around = KDTree(solid.points).query_ball_point(solid.points, HUE * solid.volume.cell)
@@ -250,7 +250,7 @@ def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
     mean = coo_matrix((np.ones(len(rows)), (rows, np.concatenate(around)))).tocsr() @ colors.astype(float)
     hue = _hue(mean / np.bincount(rows)[:, None])
     deep = np.maximum(groove[ends].max(1), 0) / SOFT[0]
-    return ends, deep + np.linalg.norm(hue[ends[:, 0]] - hue[ends[:, 1]], axis=1) / SOFT[1]
+    return ends, deep, np.linalg.norm(hue[ends[:, 0]] - hue[ends[:, 1]], axis=1) / SOFT[1]
 
 
 def grooves(solid: ConnectedSolid) -> np.ndarray:

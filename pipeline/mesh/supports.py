@@ -33,7 +33,7 @@ LIFTED = 0.02  # normalised units above a plane, from where it is asked whether 
 CROSSED = 2  # lines of sight through a square to points below it: the plane is not there
 RIM_SQUARES = 12  # beside what is seen of the plane that a region needs
 SUPPORTS = 0.04  # of the largest level plane's area: what is seen of another one that is completed, as of a mat
-LEAST = 0.01  # of the area that is seen of the plane: less is not worth the change
+LEAST = 0.05  # of the area that is seen of the plane: less is not worth the change
 POINTS = 30  # sparse points that tell how bright a photo is
 LONG_SIDE = 480  # px of the photos that are looked at
 

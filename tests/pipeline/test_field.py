@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from pipeline.cameras import View
 from pipeline.field.grid_field import (
+    Bricks,
     FieldSize,
     GridField,
     contract,
@@ -299,7 +300,8 @@ def ball_fused(side: int = 24) -> Fused:
     place = places_of(bricks)
     true = np.linalg.norm(place * 2 / (2 * side - 2) - 1, axis=1) - 0.5
     rest = true - map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
-    return Fused(coarse.astype(np.float32), 2 * side - 1, bricks, rest.astype(np.float32))
+    color = np.broadcast_to(np.float32([0.8, 0.5, 0.2]), (len(place), 3))
+    return Fused(coarse.astype(np.float32), 2 * side - 1, bricks, rest.astype(np.float32), color)
 
 
 def test_training_starts_from_fused_depth_and_half_a_cell_finer_than_without_bricks():
@@ -310,9 +312,12 @@ def test_training_starts_from_fused_depth_and_half_a_cell_finer_than_without_bri
     points = torch.randn(4000, 3, generator=rng)
     points = points / points.norm(dim=1, keepdim=True) * (0.5 + 0.02 * torch.randn(4000, 1, generator=rng))
     with torch.no_grad():
-        off = (field.start_of(points) - (points.norm(dim=1) - 0.5)).abs().mean()
+        off = (field.start_of(points)[0] - (points.norm(dim=1) - 0.5)).abs().mean()
         rough = (interpolate(field.start, points)[:, 0] - (points.norm(dim=1) - 0.5)).abs().mean()
-        assert (field.sdf(points) - field.start_of(points)).abs().mean() < 0.005
+        assert (field.sdf(points) - field.start_of(points)[0]).abs().mean() < 0.005
+        _, geometry, features = field.geometry_at(points)
+        color = field.color_of(geometry, features, points)
+    np.testing.assert_allclose(color.mean(0), [0.8, 0.5, 0.2], atol=0.1)
     assert off < 0.35 * rough  # the error of linear interpolation goes with the square of the cell
 
 
@@ -320,8 +325,8 @@ def test_bricks_are_added_once_and_features_stay_what_they_were():
     fused = ball_fused()
     field = GridField(FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,)), 0, fused=fused)
     level, count = field.bricks[0], len(fused.bricks)
-    with torch.no_grad():
-        level.values += torch.arange(len(level.values))[:, None]
+    assert isinstance(level, Bricks)
+    level.values.data += torch.arange(len(level.values))[:, None]
     before = level.values.detach().clone()
     line = torch.linspace(-1, 1, 24)
     cache = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1)
@@ -351,7 +356,9 @@ def test_a_run_that_goes_on_has_the_bricks_of_an_undisturbed_one(tmp_path, one_t
     assert second.load(tmp_path / "c.safetensors") and second.refined == (killed > 16)
     for _ in range(20 - killed):
         second.step()
-    assert whole.refined and len(whole.field.bricks[0].places) >= len(ball_fused().bricks)
+    assert whole.refined and isinstance(whole.field, GridField)
+    level = whole.field.bricks[0]
+    assert isinstance(level, Bricks) and len(level.places) >= len(ball_fused().bricks)
     for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
         assert torch.equal(a, b)
 

@@ -131,7 +131,7 @@ def trainer(iteration: int, iterations: int) -> SimpleNamespace:
         (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
         (500, 1000, 30.0, 1100),  # faster
         (500, 1000, 101.0, 500),  # over: ends at once
-        (2700, 2790, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
+        (850, 890, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
     ],
 )
 def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
