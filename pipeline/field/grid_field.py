@@ -217,6 +217,7 @@ class GridField(Field):
             self.start = torch.from_numpy(fused.coarse)[..., None].contiguous()
             with torch.no_grad():  # A network that knows nothing yet must not bend what is known.
                 self.head.weight[0] *= 0.05
+                self.color[-1].weight *= 0.1
                 if fused.behind is not None:
                     self.background += torch.from_numpy(fused.behind)
             for level, side in zip(self.bricks, size.sides, strict=True):
