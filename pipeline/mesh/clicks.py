@@ -26,11 +26,12 @@ from sdfsim.geometry.mesh import Mesh
 
 # Chosen by hand on the rendered sets; nothing derives them.
 SEED = 1.5  # samples around a clicked point that surely are its body's
+LONGEST = 7.0  # how much grooves and changes of colour count as long ways at most, as a power of e
 SURE = 0.5  # of the way to the next clicked body: what is nearer than this share of it is sure
 PHOTOS, SIDE = 12, 320  # that are asked for borders, and their px
 VIEWED = 3  # photos that should see each place
-ROUNDS = 4  # of GrabCut
-LEAST = 60  # pixels of a body in a photo, and of the others: with fewer it says nothing of their border
+PASSES, AGREED = 2, 0.9  # in which photos are asked for borders; share of votes from which on the second is sure
+SAMPLES, LEAST = 20_000, 60  # pixels at most and at least from which the colours of bodies are known
 OUTSIDE = (255, 0, 255)  # colour of what is not looked at: it takes one of GrabCut's colour models, and no more
 
 
@@ -70,26 +71,32 @@ def parts_by_clicks(solid: ConnectedSolid, colors: np.ndarray, clicked: dict[int
 def divided(solid: ConnectedSolid, mine: np.ndarray, colors: np.ndarray, seeds: list[np.ndarray], scene: Scene
             ) -> np.ndarray:  # fmt: skip
     """Which of some bodies, by the vertices of their seeds, each vertex [P] of those `mine` [P] bool belongs to."""
-    ends, effort = steps(solid, mine, grooves(solid), colors)
-    length = np.linalg.norm(np.diff(solid.points[ends], axis=1)[:, 0], axis=1) * (1 + np.minimum(np.exp(effort), 1e3))
+    ends, deep, apart = steps(solid, mine, grooves(solid), colors)
+    length = np.linalg.norm(np.diff(solid.points[ends], axis=1)[:, 0], axis=1)
+    length *= 1 + np.exp(np.minimum(deep + apart, LONGEST))
     graph = coo_matrix((length, (ends[:, 0], ends[:, 1])), shape=(len(mine), len(mine)))
     away = np.array([_away(graph, solid.points, some) for some in seeds])
-    first = away.argmin(0)
+    label = away.argmin(0)
     order = np.sort(away, 0)
     sure = order[0] <= SURE * order[1]
+    sight = scene.sight.at(solid.index[mine])
+    chosen = _chosen(sight, scene.views)
+    place = np.cumsum(mine) - 1
+    faces = place[solid.faces[mine[solid.faces].all(1)]]
+    names = [str(number) for number in range(1, len(seeds) + 1)]
     # Per vertex of the whole surface: the body from 1 on, 0 for what is not looked at.
     whole, certain = np.zeros(len(scene.mesh.vertices), int), np.zeros(len(scene.mesh.vertices), bool)
-    whole[solid.index[mine]], certain[solid.index[mine]] = first[mine] + 1, sure[mine]
-    sight = scene.sight.at(solid.index[mine])
-    labels = {view.name: _borders(view, whole, certain, len(seeds), scene) for view in _chosen(sight, scene.views)}
-    place = np.cumsum(mine) - 1
-    faces = solid.faces[mine[solid.faces].all(1)]
-    names = [str(number) for number in range(1, len(seeds) + 1)]
-    share = count_votes(sight, place[faces], scene.views, labels.get, names).share[:, 1:]
-    share[~share.any(1)] = np.eye(len(seeds))[first[mine]][~share.any(1)]
-    result = np.zeros(len(mine), int)
-    result[mine] = share.argmax(1)
-    return result
+    for _ in range(PASSES):
+        whole[solid.index[mine]], certain[solid.index[mine]] = label[mine] + 1, sure[mine]
+        labels = borders([_cut_out(view, whole, certain, scene) for view in chosen], len(seeds))
+        share = count_votes(sight, faces, chosen, labels.get, names).share[:, 1:]
+        if not share.any():
+            break
+        # What no photo tells of goes with what is beside it.
+        label, sure = label.copy(), sure.copy()
+        label[mine] = owners(solid.points[mine], share, solid.volume.cell).argmax(1)
+        sure[mine] = share.max(1) > AGREED
+    return label
 
 
 def _away(graph: coo_matrix, points: np.ndarray, seed: np.ndarray) -> np.ndarray:
@@ -119,16 +126,31 @@ def _chosen(sight: Visibility, views: Sequence[View]) -> list[View]:
     return [views[number] for number in chosen]
 
 
-def _borders(view: View, label: np.ndarray, certain: np.ndarray, count: int, scene: Scene) -> np.ndarray:
-    """Which of `count` bodies, from 1 on, each pixel [H, W] uint8 of a photo shows; `UNKNOWN` where it does not say.
-    `label` [V] and whether it is `certain` [V] are what is known of the vertices of the surface so far."""
-    import cv2
+@dataclass(frozen=True)
+class CutOut:
+    """The part of a photo that shows some bodies."""
 
-    result = np.full((view.height, view.width), UNKNOWN, np.uint8)
+    view: View
+    low: np.ndarray  # [2] px of the photo, column and row of its first pixel
+    size: np.ndarray  # [2] px of the photo, width and height
+    picture: np.ndarray  # [H, W, 3] uint8, smaller, `OUTSIDE` where it shows something else
+    body: np.ndarray  # [H, W] as far as is known, from 1 on; 0 for something else
+    sure: np.ndarray  # [H, W] bool, where that is sure
+
+    def labels(self, found: np.ndarray) -> np.ndarray:
+        """What is found [H, W] uint8 in the cut-out as labels of the photo; `UNKNOWN` around it."""
+        result = np.full((self.view.height, self.view.width), UNKNOWN, np.uint8)
+        wide = np.asarray(Image.fromarray(found).resize(tuple(self.size.tolist()), Image.Resampling.NEAREST))
+        start, end = np.maximum(self.low, 0), np.minimum(self.low + self.size, [self.view.width, self.view.height])
+        inner = wide[start[1] - self.low[1] : end[1] - self.low[1], start[0] - self.low[0] : end[0] - self.low[0]]
+        result[start[1] : end[1], start[0] : end[0]] = inner
+        return result
+
+
+def _cut_out(view: View, label: np.ndarray, certain: np.ndarray, scene: Scene) -> CutOut:
+    """What a photo shows of the vertices with a label [V] above 0, some of which are `certain` [V] bool."""
     pixels, inside = framed(view, scene.mesh.vertices)
     corner = pixels[inside & (label > 0)]
-    if not len(corner):
-        return result
     low = np.floor(corner.min(0)).astype(int)
     size = np.ceil(corner.max(0)).astype(int) - low + 1
     shrink = min(1.0, SIDE / size.max())
@@ -138,33 +160,40 @@ def _borders(view: View, label: np.ndarray, certain: np.ndarray, count: int, sce
     hit, face = scene.caster.hits(view.center, view.rays(column.ravel(), row.ravel()))
     nearest = scene.mesh.faces[np.where(np.isfinite(hit), face, 0)]
     corners = np.where(np.isfinite(hit)[:, None], label[nearest], 0)
-    found = corners[:, 0].reshape(height, width)
+    body = corners[:, 0].reshape(height, width)
     sure = (certain[nearest].all(1) & (corners == corners[:, :1]).all(1)).reshape(height, width)
     with Image.open(scene.photos / "images" / view.name) as image:
         box = (*low.tolist(), *(low + size).tolist())
-        picture = np.array(image.convert("RGB").resize((width, height), Image.Resampling.BOX, box=box))
-    picture[found == 0] = OUTSIDE
-    claims = np.zeros((count + 1, height, width), bool)
-    there = [number for number in range(1, count + 1) if (found == number).sum() >= LEAST]
-    for number in there[:1] if len(there) == 2 else there:
-        mask = np.where(found == number, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
-        mask[sure] = np.where(found == number, cv2.GC_FGD, cv2.GC_BGD)[sure]
-        mask[found == 0] = cv2.GC_BGD
-        mask = mask.astype(np.uint8)
-        cv2.setRNGSeed(0)
+        picture = np.array(image.convert("RGB").crop(box).resize((width, height), Image.Resampling.BOX))
+    picture[body == 0] = OUTSIDE
+    return CutOut(view, low, size, picture, body, sure)
+
+
+def borders(shown: list[CutOut], count: int) -> dict[str, np.ndarray]:
+    """Which of `count` bodies, from 1 on, each pixel [H, W] uint8 of each photo shows, by its name; `UNKNOWN` where
+    that is not clear. The colours of each body are those of what is sure in all photos together."""
+    import cv2
+
+    color = np.concatenate([one.picture[one.sure & (one.body > 0)] for one in shown])
+    body = np.concatenate([one.body[one.sure & (one.body > 0)] for one in shown])
+    some = np.random.default_rng(0).permutation(len(color))[:SAMPLES]
+    color = np.concatenate([color[some], np.full((SAMPLES // 10, 3), OUTSIDE, np.uint8)])
+    body = np.concatenate([body[some], np.zeros(SAMPLES // 10, int)])
+    claims = [np.zeros((count + 1, *one.body.shape), bool) for one in shown]
+    there = [number for number in range(1, count + 1) if (body == number).sum() >= LEAST]
+    nothing = (0, 0, 1, 1)
+    for number in there if len(there) > 1 else []:
         models = np.zeros((1, 65)), np.zeros((1, 65))
-        cv2.grabCut(picture, mask, (0, 0, 1, 1), *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
-        claims[number] = ((mask == cv2.GC_FGD) | (mask == cv2.GC_PR_FGD)) & (found > 0)
-    if len(there) == 2:
-        claims[there[1]] = (found > 0) & ~claims[there[0]]
-    said = claims.sum(0) == 1
-    known = np.where(said, claims.argmax(0), UNKNOWN).astype(np.uint8)
-    if len(there) == 1:
-        return result
-    big = Image.fromarray(known).resize(tuple(size.tolist()), Image.Resampling.NEAREST)
-    clip = np.clip(low, 0, None)
-    end = np.minimum(low + size, [view.width, view.height])
-    result[clip[1] : end[1], clip[0] : end[0]] = np.asarray(big)[
-        clip[1] - low[1] : end[1] - low[1], clip[0] - low[0] : end[0] - low[0]
-    ]
-    return result
+        known = np.where(body == number, cv2.GC_FGD, cv2.GC_BGD).astype(np.uint8)
+        cv2.setRNGSeed(0)
+        cv2.grabCut(color[None], known[None], nothing, *models, 1, cv2.GC_INIT_WITH_MASK)
+        for claim, one in zip(claims, shown, strict=True):
+            mask = np.where(one.body == number, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
+            mask[one.sure] = np.where(one.body == number, cv2.GC_FGD, cv2.GC_BGD)[one.sure]
+            mask = np.where(one.body == 0, cv2.GC_BGD, mask).astype(np.uint8)
+            cv2.grabCut(one.picture, mask, nothing, *(model.copy() for model in models), 1, cv2.GC_EVAL_FREEZE_MODEL)
+            claim[number] = ((mask == cv2.GC_FGD) | (mask == cv2.GC_PR_FGD)) & (one.body > 0)
+    return {
+        one.view.name: one.labels(np.where(claim.sum(0) == 1, claim.argmax(0), UNKNOWN).astype(np.uint8))
+        for one, claim in zip(shown, claims, strict=True)
+    }

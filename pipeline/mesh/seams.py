@@ -214,8 +214,8 @@ def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
     """One side [N] of the best division of some vertices [P] bool in two, through grooves and where colours change. The
     normalised cut of Shi and Malik (2000), from the second eigenvector of the surface's Laplacian."""
     place = np.cumsum(mine) - 1
-    ends, effort = steps(solid, mine, groove, colors)
-    weight = np.exp(-effort) + 1e-3
+    ends, deep, apart = steps(solid, mine, groove, colors)
+    weight = np.exp(-deep - apart) + 1e-3
     index = place[ends]
     count = int(mine.sum())
     link = coo_matrix((np.tile(weight, 2), (np.r_[index[:, 0], index[:, 1]], np.r_[index[:, 1], index[:, 0]])),
@@ -240,9 +240,9 @@ def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
 
 
 def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray
-          ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """The edges [E, 2] between some vertices [P] bool of a solid, and how much stands against crossing each [E]: how
-    deep a `groove` [P] it lies in, and how its ends differ in colour [P, 3]."""
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """The edges [E, 2] between some vertices [P] bool of a solid, and what stands against crossing each: how deep a
+    `groove` [P] it lies in [E], and how its ends differ in colour [P, 3] [E]."""
     ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
     ends = ends[mine[ends].all(1)]
     around = KDTree(solid.points).query_ball_point(solid.points, HUE * solid.volume.cell)
@@ -250,7 +250,7 @@ def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
     mean = coo_matrix((np.ones(len(rows)), (rows, np.concatenate(around)))).tocsr() @ colors.astype(float)
     hue = _hue(mean / np.bincount(rows)[:, None])
     deep = np.maximum(groove[ends].max(1), 0) / SOFT[0]
-    return ends, deep + np.linalg.norm(hue[ends[:, 0]] - hue[ends[:, 1]], axis=1) / SOFT[1]
+    return ends, deep, np.linalg.norm(hue[ends[:, 0]] - hue[ends[:, 1]], axis=1) / SOFT[1]
 
 
 def grooves(solid: ConnectedSolid) -> np.ndarray:
@@ -323,19 +323,25 @@ def _laid(solid: ConnectedSolid, seam: Seam) -> Seam:
     cover, which is seen more exactly than the groove around what lies there."""
     if not seam.flat:
         return seam
-    cell = solid.volume.cell
-    near = np.abs(seam.beyond(solid.points)) < COVER * cell
-    near[near] = np.abs(solid.normals[near] @ seam.normal) > PARALLEL
-    outside = seam.outside(solid.points[near]) / cell
-    near[near] = (outside > BESIDE[0]) & (outside < BESIDE[1])
-    side = np.sign(solid.normals[near] @ seam.normal)
-    # Two round bodies face each other from both sides.
-    if near.sum() < AROUND * len(seam.rim) or abs(side.mean()) < ONE_SIDED:
-        return seam
-    normal = np.median(solid.normals[near] * side[:, None], axis=0)
-    normal /= np.linalg.norm(normal)
-    point = seam.point + np.median((solid.points[near] - seam.point) @ normal) * normal
-    return replace(seam, point=point, normal=normal, sides=_sides(seam.rim, point, normal))
+    cell, laid = solid.volume.cell, seam
+    for _ in range(2):  # The second time from all that lies in the plane which the first found.
+        near = np.abs(laid.beyond(solid.points)) < COVER * cell
+        near[near] = np.abs(solid.normals[near] @ laid.normal) > PARALLEL
+        outside = laid.outside(solid.points[near]) / cell
+        near[near] = (outside > BESIDE[0]) & (outside < BESIDE[1])
+        side = np.sign(solid.normals[near] @ laid.normal)
+        # Two round bodies face each other from both sides.
+        if near.sum() < AROUND * len(seam.rim) or abs(side.mean()) < ONE_SIDED:
+            return laid
+        middle = np.median(solid.points[near], axis=0)
+        spread, axes = np.linalg.eigh(np.cov((solid.points[near] - middle).T))
+        normal = np.median(solid.normals[near] * side[:, None], axis=0)
+        if spread[1] > (BESIDE[1] * cell) ** 2:  # It goes around the seam, which tells more than normals do.
+            normal = axes[:, 0] * np.sign(axes[:, 0] @ normal)
+        normal = normal / np.linalg.norm(normal)
+        point = seam.point + np.median((solid.points[near] - seam.point) @ normal) * normal
+        laid = replace(seam, point=point, normal=normal, sides=_sides(seam.rim, point, normal))
+    return laid
 
 
 def _walled(solid: ConnectedSolid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,5 @@
-"""The commands on scenes and motion: simulate, plan, view, render, export, identify, info; dataset, train, evaluate;
-tradeoff, stress."""
+"""The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train,
+evaluate; tradeoff, stress."""
 
 from __future__ import annotations
 
@@ -187,6 +187,38 @@ def export(
     lines = [
         f"bodies {report['bodies']}, frames {report['frames']}",
         f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
+        *report["notes"],
+        *(f"not in it: {line}" for line in report["left_out"]),
+    ]
+    session.report(report, lines)
+
+
+@command
+def import_(
+    session: Session,
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="Ends in .urdf, .xml or .mjcf.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="FILE", help="The scene.yaml to write.", show_default=False)
+    ],
+    packages: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of the packages that package:// names (URDF); may be given again."),
+    ] = None,
+    fixed: Annotated[bool, typer.Option("--fixed", help="The root never moves (URDF).")] = False,
+    floor: Annotated[bool, typer.Option("--floor", help="Add a floor at z = 0, and stand all on it.")] = False,
+    key: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The keyframe that is the start (MJCF; default: start).")
+    ] = None,
+) -> None:
+    """URDF or MJCF -> scene.yaml with joints (docs/import.md)."""
+    from sdfsim.apps import import_robot as room
+
+    report = room.import_robot(
+        source, out, packages=packages or [], fixed=fixed, floor=floor, key=key, on_progress=session.stage_progress
+    )
+    lines = [
+        f"links {report['links']}, joints {report['joints']}",
+        f"wrote {report['files'][0]}" + (f" and {n} shapes beside it" if (n := len(report["files"]) - 1) else ""),
         *report["notes"],
         *(f"not in it: {line}" for line in report["left_out"]),
     ]
