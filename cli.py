@@ -46,6 +46,7 @@ COMMANDS += [motion.simulate, motion.samples, motion.plan, motion.view, motion.r
 COMMANDS += [motion.dataset, motion.train, motion.evaluate, motion.tradeoff, motion.stress, motion.info]
 for command in COMMANDS:
     app.command()(command)
+app.command("import")(motion.import_)
 
 if __name__ == "__main__":
     app()

@@ -1,15 +1,20 @@
 """Errors on recorded MOVi-B scenes, with what ignoring all contact gives and what chaos allows: RESULTS.md.
 
     python benchmarks/movi_b.py DATA
+    python benchmarks/movi_b.py DATA --contacts
 
 DATA is a MOVi-B dataset; its test split is rolled out. Written `error [95 % interval over trajectories]`. Then the
 same at the steps next to the instants of which HOPNet reports errors. Its recordings have 240 frames a second
 (`frame_rate` in samples/MOVi-B/*/metadata.json of github.com/AmauryWEI/hopnet), so its frame 100 is 0.417 s.
+
+`--contacts` says instead which contacts differ: of DATA's test split every recorded frame is stepped once, so that no
+error of one step is handed to the next.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +22,32 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, write_section
-from sdfsim.data.dataset import Trajectory
+from sdfsim.data.batching import roll_out
+from sdfsim.data.dataset import Trajectory, conditions_of, engine_substep
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import markdown, number
+from sdfsim.learned.model import load_model
+from sdfsim.physics.motion import MOTION
+from sdfsim.shape.shape import Shape
+from sdfsim.training.contact_cache import inner_steps
 
 COMMAND = "python benchmarks/movi_b.py DATA"
 STEPS = ("50", "100")
 FLOWN = 1e-3  # m from free flight: what is farther has met something
+# m/s that contacts give a body in a step: more than the first is an impact, no more than the second is none
+HIT, UNTOUCHED = 0.4, 1e-3
+LESS = 0.25  # of an impact's change of velocity: who has less has not had this impact in this step
+RESTS = 0.05  # m/s, below which a body that touches rests, and else slides or rolls
+BESIDE = 0.02  # m between the balls around two bodies, up to which one is beside the other
 # HOPNet's frames -> metres and degrees there, as Dou et al. 2026 (arXiv 2605.09196) quote it on its own recordings
 RATE, HOPNET = 240, {50: (0.047, None), 75: (0.101, None), 100: (0.176, 17.9)}
 
 
-def main(data: Path) -> None:
-    """Write both sections."""
+def main(data: Path, *, contacts: bool = False) -> None:
+    """Write the sections of errors, or the one of contacts."""
+    if contacts:
+        differing(data)
+        return
     horizons(data)
     instants(data)
 
@@ -72,6 +90,71 @@ def instants(data: Path) -> None:
         columns[f"at {step * recorded[0].dt:.2f} s"] = cells
     rows = [("", *columns), *((name, *(cells[name] for cells in columns.values())) for name in cells)]
     write_section("instants", COMMAND, markdown(rows))
+
+
+def differing(data: Path) -> None:
+    """Write the section: squared errors of velocities after one step from each recorded frame, by kinds of contact."""
+    recorded, shapes = load_recorded(data, "test")
+    conditions, model = conditions_of(data), load_model("solver")
+    inner = inner_steps(recorded[0].dt, engine_substep(data))
+    found: dict[str, list[np.ndarray]] = {}
+    for t in recorded:
+        starts = [replace(t, **{n: getattr(t, n)[k : k + 2] for n in MOTION}) for k in range(len(t.position) - 1)]
+        ends = roll_out(
+            model, starts, shapes, 1, substeps=inner, as_teacher=conditions.by_teacher, floor=conditions.floor
+        )
+        for start, end in zip(starts, ends, strict=True):
+            kinds, errors = contact_kinds(start, end, shapes)
+            for kind in set(kinds):
+                found.setdefault(kind, []).append(errors[[k == kind for k in kinds]])
+    errors = {kind: np.concatenate(some) for kind, some in found.items()}
+    total = sum((np.square(some).sum(0) for some in errors.values()), np.zeros(2))
+    count = sum(map(len, errors.values()))
+    order = sorted(errors, key=lambda kind: -np.square(errors[kind][:, 0]).sum())
+    rows: list[tuple[str, ...]] = [
+        ("contacts of", "of all", "of the squared error, m/s", "rad/s", "root mean square, m/s", "rad/s")
+    ]
+    for kind in order:
+        square = np.square(errors[kind])
+        shares = (f"{100 * len(square) / count:.2g} %", *(f"{100 * s:.2g} %" for s in square.sum(0) / total))
+        rows.append((kind, *shares, *(number(float(r)) for r in np.sqrt(square.mean(0)))))
+    worst = np.sort(np.square(np.concatenate([some[:, 0] for some in errors.values()])))[::-1]
+    share = worst[: len(worst) // 100].sum() / worst.sum()
+    told = f"{count:,} contacts of {len(recorded)} trajectories; 1 % of them has {100 * share:.0f} % of the error."
+    write_section("MOVi-B contacts", f"{COMMAND} --contacts", f"{markdown(rows)}\n{told}")
+
+
+def contact_kinds(recorded: Trajectory, ours: Trajectory, shapes: dict[str, Shape]) -> tuple[list[str], np.ndarray]:
+    """Of one step [2 frames] the kind of contact of each body that something touched in either motion, and the errors
+    of its velocities at the end, [B, 2] m/s and rad/s."""
+    given = [np.linalg.norm(np.diff(t.velocity, axis=0)[0] - t.gravity * t.dt, axis=1) for t in (recorded, ours)]
+    errors = np.stack(
+        [
+            np.linalg.norm(getattr(ours, n)[1] - getattr(recorded, n)[1], axis=1)
+            for n in ("velocity", "angular_velocity")
+        ],
+        axis=1,
+    )
+    radius = np.array([np.linalg.norm(np.ptp(shapes[str(n)].sdf.bounds, axis=0)) / 2 for n in recorded.shape])
+    radius = radius * recorded.scale
+    away = np.linalg.norm(recorded.position[0][:, None] - recorded.position[0], axis=2) - radius[:, None] - radius
+    np.fill_diagonal(away, np.inf)
+    touched = np.flatnonzero(~recorded.static & (np.maximum(*given) > UNTOUCHED))
+    kinds = []
+    for b in touched:
+        theirs, mine = given[0][b], given[1][b]
+        if max(theirs, mine) <= HIT:
+            slides = np.linalg.norm(recorded.velocity[0, b]) > RESTS
+            what = "sliding or rolling" if slides else "resting"
+        elif mine < LESS * theirs:
+            what = "impact that ours has not had yet"
+        elif theirs < LESS * mine:
+            what = "impact that only ours has had"
+        else:
+            what = "impact in both"
+        body = "several pieces" if len(shapes[str(recorded.shape[b])].pieces) > 1 else "one hull"
+        kinds.append(f"{body}, {'beside another' if away[b].min() < BESIDE else 'on the floor alone'}: {what}")
+    return kinds, errors[touched]
 
 
 def cell(found: dict) -> str:

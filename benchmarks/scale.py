@@ -6,6 +6,8 @@
         heaps, shoes and knots to the end on all cores, each with a movie
     python benchmarks/scale.py many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
+    python benchmarks/scale.py roofline
+        what a distance and a row of impulses cost, beside what the machine could do: docs/scale.md
 
 Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
 holds is not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
@@ -19,15 +21,18 @@ import subprocess
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
+from threadpoolctl import threadpool_limits
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import progress, script, write_section
+from benchmarks.results import ROOT, progress, script, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
@@ -39,10 +44,16 @@ from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, m
 from sdfsim.evaluation.penetration import depths
 from sdfsim.evaluation.runs import Ran, scene_rollout
 from sdfsim.learned.model import load_model
+from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.solver.distance import distances
+from sdfsim.physics.solver.impulses import IMPULSE, MASS, WANTED, WIDTH, System, _balance
+from sdfsim.physics.solver.prepare import compiled_rules, compiled_shapes
+from sdfsim.physics.solver.world import Rules
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import load_shape
 from sdfsim.simulate.simulator import SimulationError, Simulator, join
 from sdfsim.simulate.steppers import stepper_of
 
@@ -215,5 +226,105 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {scenes}", markdown(rows))
 
 
+# Operations (a product, a sum, a comparison or a root each) and bytes of one distance and one row, counted in
+# `physics/solver/distance.py` (`_grid`) and `physics/solver/impulses.py` (`_relax`): eight samples and the number of a
+# brick, and the columns of the table of shapes; a row, and the changes of two bodies' velocities, read and written.
+DISTANCE, ROW = (95, 8 * 4 + 8 + 15 * 8), (52, 17 * 8 + 2 * 2 * 6 * 8 + 4 * 8)
+PLACES, ROWS, ISLAND, SWEEPS = 200_000, 4096, 64, 50
+
+
+def roofline() -> None:
+    """Write the section of docs/scale.md: the machine's bandwidth and arithmetic on one thread, and ours."""
+    flops, bandwidth, latency = arithmetic(), memory(), chain()
+    rows: list[tuple[str, ...]] = [
+        ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "of the arithmetic", "of the bandwidth")
+    ]
+    for name, (operations, moved), seconds in (
+        ("the machine: products of matrices", (1, 0), 1 / flops),
+        ("the machine: sums that wait for each other", (1, 0), latency),
+        ("the machine: copies of 256 MiB", (0, 1), 1 / bandwidth),
+        ("a distance of a grid, places in turn", DISTANCE, distance_time(scattered=False)),
+        ("a distance of a grid, places anywhere", DISTANCE, distance_time(scattered=True)),
+        ("a row of impulses, and its change", ROW, row_time()),
+    ):
+        rate, speed = operations / seconds, moved / seconds
+        told = ((operations, rate / 1e9, rate / flops), (moved, speed / 1e9, speed / bandwidth))
+        first, second = ([number(v) for v in some] if some[0] else ["-"] * 3 for some in told)
+        rows.append((name, first[0], second[0], number(1e9 * seconds), first[1], second[1], first[2], second[2]))
+    write_section("roofline", "python benchmarks/scale.py roofline", markdown(rows), ROOT / "docs" / "scale.md")
+
+
+def best(call: Callable[[], object], rounds: int = 7) -> float:
+    """s that a call takes at least, of several."""
+    call()
+    took = []
+    for _ in range(rounds):
+        started = time.perf_counter()
+        call()
+        took.append(time.perf_counter() - started)
+    return min(took)
+
+
+def arithmetic() -> float:
+    """Operations a second in double precision, of what keeps all units of a core busy."""
+    size = 768
+    a, b = np.random.default_rng(0).random((2, size, size))
+    with threadpool_limits(1):
+        return 2 * size**3 / best(lambda: a @ b)
+
+
+def memory() -> float:
+    """Bytes a second, read and written, of copies that no cache holds."""
+    a = np.zeros(2**25)
+    b = np.ones_like(a)
+    return 2 * a.nbytes / best(lambda: np.copyto(b, a))
+
+
+@njit(error_model="numpy")
+def _summed(count: int, value: float) -> float:
+    total = value
+    for _ in range(count):
+        total = total * value + value  # the next one waits for it
+    return total
+
+
+def chain() -> float:
+    """s of an operation whose result the next one waits for: two in each turn."""
+    count = 10_000_000
+    return best(lambda: _summed(count, 0.999)) / (2 * count)
+
+
+def distance_time(*, scattered: bool) -> float:
+    """s of a distance with its gradient near the surface of the sample vase."""
+    shape = load_shape(ROOT / "samples" / "shapes" / "vase")
+    table = compiled_shapes([shape.contact])
+    generator = np.random.default_rng(0)
+    places = shape.nodes[np.arange(PLACES) % len(shape.nodes)]
+    places = places + generator.uniform(-0.01, 0.01, places.shape)
+    places = places[generator.permutation(PLACES) if scattered else np.lexsort(np.round(places, 2).T)]
+    return best(lambda: distances(table.table, table.brick, table.sample, 0, places)) / PLACES
+
+
+@njit(error_model="numpy")
+def _swept(mass: np.ndarray, rules: Rules, system: System, change: np.ndarray, islands: int) -> None:
+    for i in range(islands):
+        _balance(mass, rules, system, change, i)
+
+
+def row_time() -> float:
+    """s of a row of impulses in a sweep, in islands of `ISLAND` contacts of bodies in a chain that never agree."""
+    generator, bodies = np.random.default_rng(0), ROWS + 1
+    row = generator.uniform(-1.0, 1.0, (ROWS, 3, WIDTH))
+    row[:, :, MASS], row[:, :, WANTED], row[:, :, IMPULSE] = 0.01, 1.0, 0.0
+    first = np.arange(ROWS)
+    where = np.stack([first, np.zeros_like(first), first, first + 1], axis=1)
+    zero = np.zeros(ROWS)
+    start = np.arange(0, ROWS + 1, ISLAND)
+    system = System(where, row, zero, zero.copy(), zero.copy(), np.zeros((ROWS, 3)), start, first)
+    rules = compiled_rules(Options(np.array([0.0, 0.0, -10.0]), 0.1, 5))._replace(rounds=SWEEPS, exact=0.0)
+    change = np.zeros((bodies, 6))
+    return best(lambda: _swept(np.ones(bodies), rules, system, change, len(start) - 1)) / (ROWS * SWEEPS)
+
+
 if __name__ == "__main__":
-    script(__doc__, growth, large, many)
+    script(__doc__, growth, large, many, roofline)

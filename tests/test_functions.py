@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHELL = {"as_json", "verbose", "device", "photos", "sources", "scene", "source", "out", "cluster"}
 OTHERWISE = {"first": "from_stage", "last": "until_stage"}
 OWN = {("export", "scene"): "scene_file"}
+FOLDERS = {("fit", "sdf")}  # of folders that `mesh` has written, which `run_stage` does
 
 
 @pytest.mark.parametrize("name", ["reconstruct", "fit", "simulate", "export"])
@@ -28,6 +31,7 @@ def test_a_function_takes_what_its_command_takes(name):
     assert info.callback is not None
     command = typer.main.get_command_from_info(info, pretty_exceptions_short=True, rich_markup_mode=None)
     asked = {OTHERWISE.get(p.name, p.name) for p in command.params if p.name} - SHELL - {"help"}
+    asked -= {option for of, option in FOLDERS if of == name}
     asked |= {own for (of, shell), own in OWN.items() if of == name and any(p.name == shell for p in command.params)}
     known = set(inspect.signature(getattr(sdfsim, name)).parameters)
     if name == "reconstruct":
@@ -83,3 +87,35 @@ def test_a_handle_knows_its_inertia():
     axes = Rotation.from_euler("xyz", [30, 40, 50], degrees=True).as_matrix()
     turned = handle.angular_velocity - before
     np.testing.assert_allclose(axes @ handle.inertia @ axes.T @ turned, np.cross(arm, impulse), atol=1e-9)
+
+
+def test_the_tour_runs_and_leaves_pictures(tmp_path):
+    command = [sys.executable, str(ROOT / "samples" / "tour.py")]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    slid = [float(line.split()[-2]) for line in done.stdout.splitlines() if line.startswith("friction")]
+    assert len(slid) == 5 and slid == sorted(slid, reverse=True)  # the rougher, the shorter
+    assert {file.name for file in (tmp_path / "tour").iterdir()} == {
+        *("tour-0.png", "tour-0.25.png", "tour-1.5.png", "tour.glb", "tour.npz", "tour.yaml")
+    }
+
+
+def test_the_types_of_users_are_checked(tmp_path):
+    """Names that load lazily have types too: pyright finds what is wrong, and nothing else."""
+    good = "import sdfsim\nsimulator = sdfsim.Simulator(sdfsim.load_scene('pile'))\nx: float = simulator['ball'].mass\n"
+    good += "report = sdfsim.simulate('pile', 'run', seconds=1.0)\nsdfsim.fit('a.obj', 'a', units='cm')\n"
+    good += "sdfsim.export('run', 'run.glb', fps=24)\nsdfsim.reconstruct('photos', 'room', preset='quick')\n"
+    bad = "import sdfsim\nsdfsim.simulate('pile', 'run', secnds=1.0)\nsdfsim.fit('a.obj', 'a', units='miles')\n"
+    bad += "x: str = sdfsim.Simulator(sdfsim.load_scene('pile'))['ball'].mass\n"
+    (tmp_path / "good.py").write_text(good)
+    (tmp_path / "bad.py").write_text(bad)
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(ROOT)], "typeCheckingMode": "basic"}))
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    found = json.loads(done.stdout)["generalDiagnostics"]
+    lines = sorted(
+        (Path(one["file"]).name, one["range"]["start"]["line"]) for one in found if one["severity"] == "error"
+    )
+    assert lines == [("bad.py", 1), ("bad.py", 2), ("bad.py", 3)]

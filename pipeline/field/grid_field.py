@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -132,7 +133,8 @@ class Bricks(nn.Module):
 
     places: Tensor  # [B, 3] int16 (z, y, x) of its bricks
     numbers: Tensor  # [m, m, m] int32, which brick is where; -1 for none
-    start: Tensor  # [B * 64] what the distance has more at the start than without the level
+    # [B * 64, 4] what the distance has more at the start than without the level, and RGB there, less a middle grey
+    start: Tensor
 
     def __init__(self, side: int, channels: int) -> None:
         super().__init__()
@@ -140,7 +142,7 @@ class Bricks(nn.Module):
         count = -(-side // BRICK)
         self.register_buffer("places", torch.zeros(0, 3, dtype=torch.int16))
         self.register_buffer("numbers", torch.full((count,) * 3, -1, dtype=torch.int32), persistent=False)
-        self.register_buffer("start", torch.zeros(0))
+        self.register_buffer("start", torch.zeros(0, 4))
         self.values = nn.Parameter(torch.zeros(0, channels))
 
     def add(self, places: Tensor, start: Tensor | None = None) -> None:
@@ -155,7 +157,9 @@ class Bricks(nn.Module):
                 before, before + len(where), dtype=torch.int32, device=where.device
             )
         rows = len(where) * BRICK**3
-        given = self.start.new_zeros(rows) if start is None else start.view(-1, BRICK**3)[new.cpu()].view(-1)
+        given = self.start.new_zeros(rows, 4)
+        if start is not None:
+            given = start.view(-1, BRICK**3, 4)[new.cpu()].reshape(-1, 4)
         self.places = torch.cat([self.places, where.to(torch.int16)])
         self.start = torch.cat([self.start, given.to(self.start)])
         self.values = nn.Parameter(torch.cat([self.values.detach(), self.values.new_zeros(rows, self.channels)]))
@@ -165,8 +169,8 @@ class Bricks(nn.Module):
         return interpolate_bricks(self.values, self.numbers, self.side, points)
 
     def start_at(self, points: Tensor) -> Tensor:
-        """What the distance has more at the start [P] at points [P, 3]."""
-        return interpolate_bricks(self.start[:, None], self.numbers, self.side, points)[:, 0]
+        """What the distance has more at the start, and RGB less a middle grey, [P, 4] at points [P, 3]."""
+        return interpolate_bricks(self.start, self.numbers, self.side, points)
 
 
 class GridField(Field):
@@ -213,18 +217,22 @@ class GridField(Field):
             self.start = torch.from_numpy(fused.coarse)[..., None].contiguous()
             with torch.no_grad():  # A network that knows nothing yet must not bend what is known.
                 self.head.weight[0] *= 0.05
+                if fused.behind is not None:
+                    self.background += torch.from_numpy(fused.behind)
             for level, side in zip(self.bricks, size.sides, strict=True):
                 if side == fused.side:
-                    level.add(torch.from_numpy(fused.bricks), torch.from_numpy(fused.fine))  # type: ignore[operator]
+                    given = torch.from_numpy(np.concatenate([fused.fine[:, None], fused.color - 0.5], 1))
+                    level.add(torch.from_numpy(fused.bricks), given)  # type: ignore[operator]
                 else:
                     level.add(torch.from_numpy(near_bricks(fused.coarse, side)))  # type: ignore[operator]
 
     def refine(self, cache: Tensor) -> list[Tensor]:
         """Puts bricks wherever a cached SDF [n, n, n, 1] has its surface and there are none yet. Returns the features
         that they replace, level by level."""
-        before = [level.values for level in self.bricks]
+        before: list[Tensor] = []
         for level in self.bricks:
             assert isinstance(level, Bricks)
+            before.append(level.values)
             level.add(torch.from_numpy(near_bricks(cache[..., 0].cpu().numpy(), level.side)))
         return before
 
@@ -247,22 +255,27 @@ class GridField(Field):
             found.append(points.new_zeros(len(points), missing))
         features = torch.cat(found, 1)
         hidden = self.head(self.geometry(torch.cat([points, features], 1)))
-        return self.start_of(points) + hidden[:, 0], hidden[:, 1:], features
+        start, color = self.start_of(points)
+        return start + hidden[:, 0], hidden[:, 1:], torch.cat([features, color], 1)
 
-    def start_of(self, points: Tensor) -> Tensor:
-        """The SDF [P] that training started from, at points [P, 3]."""
+    def start_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The SDF [P] that training started from, and RGB [P, 3] less a middle grey, at points [P, 3]."""
         if not self.start.numel():
-            return points.norm(dim=1) - self.start_radius
-        found = interpolate(self.start, points)[:, 0]
+            return points.norm(dim=1) - self.start_radius, torch.zeros_like(points)
+        found, color = interpolate(self.start, points)[:, 0], torch.zeros_like(points)
         for level in self.bricks:
             assert isinstance(level, Bricks)
             if level.started:
-                found = found + level.start_at(points)
-        return found
+                more = level.start_at(points)
+                found, color = found + more[:, 0], color + more[:, 1:]
+        return found, color
 
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
+        features, start = features[:, :-3], features[:, -3:]
         seen_along = self.view_dependence * direction_features(directions)
-        return torch.sigmoid(self.color(torch.cat([geometry, features, seen_along], 1)))
+        # What the photos show there on average, and what the network knows better.
+        usual = torch.logit((start + 0.5).clamp(0.02, 0.98))
+        return torch.sigmoid(usual + self.color(torch.cat([geometry, features, seen_along], 1)))
 
 
 def stencil(points: Tensor, step: float) -> Tensor:

@@ -44,8 +44,13 @@ def interpolate(grid: Tensor, points: Tensor) -> Tensor:
 def interpolate_bricks(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
     """The same as `interpolate` for a grid [side, side, side, C] that is there in bricks only: rows of a table [R, C]
     by `bricks` [m, m, m] int32 (z, y, x order), the numbers of those that are there, else -1; elsewhere it is 0."""
-    if not table.is_cuda:
-        return _BricksOnCpu.apply(table, bricks, side, points.detach().contiguous())  # type: ignore[no-any-return]
+    if table.is_cuda:
+        return bricks_by_rows(table, bricks, side, points)
+    return _BricksOnCpu.apply(table, bricks, side, points.detach().contiguous())  # type: ignore[no-any-return]
+
+
+def bricks_by_rows(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
+    """What `interpolate_bricks` gives, in torch alone, for any device."""
     place, weights = _corners(side, points)
     x, y, z = place % side, place // side % side, place // side**2
     number = bricks[z // BRICK, y // BRICK, x // BRICK].long()

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ from pipeline.inputs.images import BACKDROP, reduced
 from pipeline.inputs.photos import load_photos
 from pipeline.progress import Progress, quiet, share_of
 from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
-from pipeline.stereo.fusion import Fused, fuse
+from pipeline.stereo.fusion import Fused, behind, fuse
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
 from sdfsim.base.parallel import choose_threads
@@ -64,7 +64,8 @@ VARIED = 0.03
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
 PACE = 25  # steps between looks at the clock
-SCORED = 3  # pixels along each side of a held-out photo of which one is rendered
+# Pixels along each side of a held-out photo of which one is rendered, where that leaves so many on the long side.
+SCORED, LEAST_SCORED = 3, 100
 STEREO = 0.2  # of the progress that is shown
 HELD_OUT = "held_out"  # folder of the renders of photos that were not trained on
 EMPTY = 0.9  # grey of their pixels whose ray misses the trained sphere
@@ -77,7 +78,7 @@ class Settings:
     # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25  # of the ball that training starts from; small, as shadowed parts are hardly carved away
-    iterations: int = 2800  # steps of Adam; 4000 are no better on the bundled set
+    iterations: int = 900  # steps of Adam
     rays: int = 512  # a step
     samples: int = 32  # along a ray inside the sphere
     long_side: int = 480  # of the photos used, px
@@ -534,7 +535,9 @@ def train(
         seen = only(local, [number for number in range(len(local.views)) if number not in test])
         maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
         carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
-        fused = fuse(carved, settings.size.levels[-1]) if maps else None
+        fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
+        if fused is not None and not masked:
+            fused = replace(fused, behind=behind(maps, settings.size.background, photos_folder))
         spent = time.monotonic() - begun
         paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
         budget = None if budget is None else budget - spent
@@ -596,7 +599,7 @@ def train(
 def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
           on_progress: Progress = quiet) -> dict:  # fmt: skip
     """PSNR of held-out views, in normalised space, for the report, at the training resolution (`psnr_px` on the long
-    side); empty where none shows anything of the unit sphere. Of their pixels, one of `SCORED` along each side is
+    side); empty where none shows anything of the unit sphere. Of large photos one pixel of `SCORED` along each side is
     rendered; writes these pictures to `out`/held_out."""
     rays = load_rays(views, photos_folder, trainer.settings.long_side, masks=False).to(trainer.device)
     shown: list[int] = rays.view.unique().tolist()
@@ -619,10 +622,11 @@ def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *
 
 @torch.no_grad()
 def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) -> tuple[float, np.ndarray]:
-    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere, one of `SCORED`
-    along each side."""
+    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere; of large photos
+    one of `SCORED` along each side."""
     assert trainer.cache is not None
-    index = torch.nonzero((rays.view == number) & (rays.pixel % SCORED == SCORED // 2).all(1))[:, 0]
+    every = SCORED if rays.sizes.max() >= SCORED * LEAST_SCORED else 1
+    index = torch.nonzero((rays.view == number) & (rays.pixel % every == every // 2).all(1))[:, 0]
     parts = []
     for part in index.split(4096):
         origins, directions = rays.at(part)
@@ -634,9 +638,9 @@ def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) 
     if backdrop is None and trainer.exposure is not None and trainer.exposure.spread() > VARIED:
         rgb = matched(rgb, truth)
     error = float(((rgb - truth) ** 2).mean())
-    width, height = (-(-(int(side) - SCORED // 2) // SCORED) for side in rays.sizes[number])
+    width, height = (-(-(int(side) - every // 2) // every) for side in rays.sizes[number])
     picture = np.full((height, width, 3), EMPTY)
-    column, row = rays.pixel[index].cpu().numpy().T // SCORED
+    column, row = rays.pixel[index].cpu().numpy().T // every
     picture[row, column] = rgb.cpu().numpy()
     return -10 * math.log10(max(error, 1e-10)), (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
 

@@ -63,7 +63,7 @@ SMALL_NOISE, BARE = 0.15, 0.05
 # In cells of the field's finest grid, which limits what can be separated:
 LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
 SMALLEST = 4.0  # what rises less stays part of what it stands on
-FINER = 1 / 3  # distance of a body's samples
+FINER = 2 / 3  # distance of a body's samples
 FILLET = 3.0  # contact layers sideways: what is so near a body's foot is taken away together with it
 FEWEST_SAMPLES = 8  # of a component: less is no body
 NOWHERE = np.zeros((0, 3))  # no points

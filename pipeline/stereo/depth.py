@@ -137,7 +137,7 @@ def outside_mask(depth: DepthMap, photos_folder: Path) -> DepthMap:
             mask = np.asarray(image.convert("L").resize(depth.inverse.shape[::-1], Image.Resampling.BOX))
     except OSError as error:
         raise SdfsimError(f"{photos_folder}: no mask of {depth.view.name}", "run the photos stage again") from error
-    empty = ~ndimage.binary_dilation(mask > 0, iterations=2)
+    empty = np.logical_not(ndimage.binary_dilation(mask > 0, iterations=2))
     inverse = np.where(empty, np.float32(BEYOND), np.where(mask > 127, depth.inverse, 0))
     return replace(depth, inverse=inverse, certain=np.where(empty, np.float32(1), depth.certain))
 
@@ -160,14 +160,23 @@ def stereo_summary(maps: Sequence[DepthMap], poses: PosedPhotos) -> dict[str, fl
 
 def pinhole(view: View, photos_folder: Path, long_side: int) -> Pinhole:
     """The photo of a view, grey, made smaller and straight. Raises SdfsimError where it is missing."""
+    grey, matrix = straightened(view, photos_folder, long_side, "L")
+    return Pinhole(view, np.ascontiguousarray(grey - grey.mean(), np.float32), matrix)
+
+
+def straightened(view: View, photos_folder: Path, long_side: int, mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """The photo of a view, made smaller and straight, in a mode of PIL: [H, W] float32 (grey, L) or [H, W, 3] uint8
+    (RGB), and the matrix [3, 3] from camera axes to its pixels, whose centres are at whole numbers. Raises SdfsimError
+    where it is missing."""
     import cv2
 
     try:
         with Image.open(Path(photos_folder) / "images" / view.name) as image:
             size = reduced(image.size, long_side)
-            grey = np.asarray(image.convert("L").resize(size, Image.Resampling.BOX), np.float32)
+            pixels = np.asarray(image.convert(mode).resize(size, Image.Resampling.BOX))
     except OSError as error:
         raise SdfsimError(f"{photos_folder}: cannot read {view.name}", "run the photos stage again") from error
+    pixels = pixels.astype(np.float32) if mode == "L" else pixels
     sx, sy = size[0] / view.width, size[1] / view.height
     matrix = np.array([[view.focal * sx, 0, view.cx * sx - 0.5], [0, view.focal * sy, view.cy * sy - 0.5], [0, 0, 1]])
     if view.k:
@@ -176,8 +185,8 @@ def pinhole(view: View, photos_folder: Path, long_side: int) -> Pinhole:
         bent = 1 + view.k * (local[:, :2] ** 2).sum(1)
         at = (local[:, :2] * bent[:, None] * np.diag(matrix)[:2] + matrix[:2, 2]).astype(np.float32)
         maps = (at[:, 0].reshape(row.shape), at[:, 1].reshape(row.shape))
-        grey = cv2.remap(grey, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return Pinhole(view, np.ascontiguousarray(grey - grey.mean(), np.float32), matrix)
+        pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return pixels, matrix
 
 
 def neighbours(poses: PosedPhotos) -> list[list[int]]:
@@ -278,8 +287,8 @@ def stacked(pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     if (sizes == sizes[0]).all():
         return np.array(pictures, np.float32), sizes
     whole = np.zeros((len(pictures), *sizes.max(0)), np.float32)
-    for place, picture in zip(whole, pictures, strict=True):
-        place[: picture.shape[0], : picture.shape[1]] = picture
+    for number, picture in enumerate(pictures):
+        whole[number, : picture.shape[0], : picture.shape[1]] = picture
     return whole, sizes
 
 

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
 from pipeline.field.interpolation import near_bricks, places_of
 from pipeline.progress import Progress, quiet
-from pipeline.stereo.compiled import carve
-from pipeline.stereo.depth import DepthMap, stacked
+from pipeline.stereo.compiled import carve, paint
+from pipeline.stereo.depth import BEYOND, DepthMap, stacked, straightened
 from sdfsim.base.parallel import threads
 
 FRONT, BACK = 3.0, 2.0  # cells before and behind a surface within which its distance counts
 SEEN = 0.3  # weight, that of one certain pixel is 1, from which on a place is known
+DENSE = 0.4  # density, before it is made positive, of what lies behind the sphere
 EDGE = 0.05  # share of inverse depth by which neighbouring pixels on one surface differ at most
 LEAST_TILT = 0.15  # cosine of the flattest angle that counts
 BATCH = 1 << 18  # places fused at once
@@ -33,11 +35,17 @@ class Fused:
     side: int  # fine samples along a side, 2 n - 1
     bricks: np.ndarray  # [B, 3] int16 (z, y, x), see `places_of`
     fine: np.ndarray  # [B * 64] float32, what the fine samples of the bricks have more than the coarse ones
+    # [B * 64, 3] float32 RGB in 0..1, the mean of the photos that show the surface there; grey where none does
+    color: np.ndarray
+    # [m, m, m, 4] float32 (z, y, x) on [-1, 1]^3: what lies behind the sphere, see `behind`; None: nothing is known
+    behind: np.ndarray | None = None
 
 
-def fuse(maps: Sequence[DepthMap], side: int, *, on_progress: Progress = quiet) -> Fused | None:
+def fuse(
+    maps: Sequence[DepthMap], side: int, photos_folder: Path, *, on_progress: Progress = quiet
+) -> Fused | None:  # fmt: skip
     """Fuses depth maps in the space of the unit sphere, `side` samples along each side and twice as many near the
-    surface; None where they show no surface."""
+    surface, and the colours of their photos there; None where they show no surface."""
     given = _prepared(maps)
     line = np.linspace(-1, 1, side, dtype=np.float32)
     cell = float(line[1] - line[0])
@@ -56,7 +64,60 @@ def fuse(maps: Sequence[DepthMap], side: int, *, on_progress: Progress = quiet) 
     # Where less is known than that, the coarse distance goes on.
     share = np.clip(weight / SEEN, 0, 1) * (np.abs(start) < 1.5 * cell)
     fine = np.clip(share * (value - start), -cell, cell)
-    return Fused(coarse, 2 * side - 1, bricks, fine.astype(np.float32))
+    color = _painted(maps, given, place, coarse, start + fine, cell, photos_folder)
+    return Fused(coarse, 2 * side - 1, bricks, fine.astype(np.float32), color)
+
+
+def behind(maps: Sequence[DepthMap], side: int, photos_folder: Path) -> np.ndarray:
+    """What depth maps in the space of the unit sphere show outside of it, on the contracted coordinates of a field's
+    background [side, side, side, 4]: the density is `DENSE` where something is and 0 elsewhere, colours (a tenth of
+    their logits) are the mean of the photos there, elsewhere those of the nearest such place."""
+    total, count = np.zeros((side**3, 3)), np.zeros(side**3)
+    for one in maps:
+        known = one.inverse > BEYOND
+        points = one.view.center + one.rays[known] / one.inverse[known][:, None]
+        picture = straightened(one.view, photos_folder, max(one.inverse.shape), "RGB")[0][known]
+        radius = np.linalg.norm(points, axis=1)
+        outside = radius > 1
+        radius = radius[outside, None]
+        at = points[outside] / radius * (2 - 1 / radius) / 2
+        index = np.round((at[:, ::-1] + 1) / 2 * (side - 1)).astype(int)
+        number = np.ravel_multi_index(tuple(index.T), (side,) * 3)
+        count += np.bincount(number, minlength=side**3)
+        for c in range(3):
+            total[:, c] += np.bincount(number, picture[outside, c], side**3)
+    found = np.zeros((side, side, side, 4), np.float32)
+    seen = (count > 0).reshape((side,) * 3)
+    if not seen.any():
+        return found
+    color = np.clip(total / np.maximum(count, 1)[:, None] / 255, 0.02, 0.98).reshape(*seen.shape, 3)
+    nearest = np.asarray(ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True))
+    color = color[tuple(nearest)]
+    # Rays are sampled a little more coarsely than the grid is.
+    found[..., 0] = DENSE * ndimage.binary_dilation(seen)
+    found[..., 1:] = np.log(color / (1 - color)) / 10
+    return found
+
+
+def _painted(maps: Sequence[DepthMap], given: tuple[np.ndarray, ...], place: np.ndarray, coarse: np.ndarray,
+             value: np.ndarray, cell: float, photos_folder: Path) -> np.ndarray:  # fmt: skip
+    """Colours [R, 3] of the surface nearest to fine samples at `place` [R, 3] (z, y, x), with distances `value` [R]."""
+    inverse, sizes, _, trust, lines, _ = given
+    colors = np.zeros((*inverse.shape, 3), np.uint8)
+    for n, one in enumerate(maps):
+        picture = straightened(one.view, photos_folder, max(one.inverse.shape), "RGB")[0]
+        colors[n, : picture.shape[0], : picture.shape[1]] = picture
+    slope = np.stack([ndimage.map_coordinates(part, place.T / 2, order=1, mode="nearest")
+                      for part in np.gradient(coarse, cell)], 1)  # fmt: skip
+    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 0.5)
+    surface = ((cell / 2 * place - 1 - value[:, None] * slope)[:, ::-1]).astype(np.float32)
+    total, weight = np.zeros((len(place), 3), np.float32), np.zeros(len(place), np.float32)
+    parts = [slice(start, start + BATCH) for start in range(0, len(place), BATCH)]
+    jobs = [(np.ascontiguousarray(surface[part]), colors, inverse, sizes, trust, lines, BACK * cell, total[part],
+             weight[part]) for part in parts]  # fmt: skip
+    for _ in threads(paint, jobs):
+        pass
+    return np.where(weight[:, None] > 0, total / np.maximum(weight[:, None], 1e-9) / 255, 0.5).astype(np.float32)
 
 
 def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:

@@ -174,6 +174,36 @@ def agreeing(inverse: Any, others: Any, sizes: Any, turns: Any, shifts: Any, wit
 
 
 @njit(cache=True, nogil=True)
+def paint(places: Any, colors: Any, inverse: Any, sizes: Any, trust: Any, lines: Any, within: float,
+          total: Any, weight: Any) -> None:  # fmt: skip
+    """Adds the colours that photos [N, h, w, 3] uint8 show of places [P, 3] to sums [P, 3] and weights [P], where the
+    places are as far away as their depth maps say, to a distance `within`; the other arguments are as of `carve`."""
+    for n in range(len(inverse)):
+        line, height, width = lines[n], sizes[n, 0], sizes[n, 1]
+        for p in range(len(places)):
+            x, y, z = places[p, 0], places[p, 1], places[p, 2]
+            depth = line[2, 0] * x + line[2, 1] * y + line[2, 2] * z + line[2, 3]
+            if depth < 1e-6:
+                continue
+            u = (line[0, 0] * x + line[0, 1] * y + line[0, 2] * z + line[0, 3]) / depth
+            v = (line[1, 0] * x + line[1, 1] * y + line[1, 2] * z + line[1, 3]) / depth
+            if u < 0 or v < 0 or u >= width - 1 or v >= height - 1:
+                continue
+            there = inverse[n, int(v + 0.5), int(u + 0.5)]
+            if there <= 0 or abs(1 / there - depth) > within:
+                continue
+            i, j = int(u), int(v)
+            a, b = u - i, v - j
+            # Straight and near looks show more.
+            share = (trust[n, int(v + 0.5), int(u + 0.5)] / depth) ** 2
+            for c in range(3):
+                low = colors[n, j, i, c] * (1 - a) + colors[n, j, i + 1, c] * a
+                high = colors[n, j + 1, i, c] * (1 - a) + colors[n, j + 1, i + 1, c] * a
+                total[p, c] += share * (low * (1 - b) + high * b)
+            weight[p] += share
+
+
+@njit(cache=True, nogil=True)
 def carve(places: Any, inverse: Any, sizes: Any, slopes: Any, trust: Any, lines: Any, tilts: Any,
           front: float, back: float, total: Any, weight: Any) -> None:  # fmt: skip
     """Adds what depth maps say about places [P, 3] to the sums of distances and weights [P].

@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.apps import export_joints as jointed
 from sdfsim.apps.observed import COLUMNS
 from sdfsim.apps.recording import body_colors, framed, shown, sunk, with_normals
 from sdfsim.apps.run import read_run
@@ -54,7 +55,7 @@ SOFT = 4.0  # steps, over 2 pi: the time in which a contact of MuJoCo swings
 MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
 MOST_GROUPS = 31  # MuJoCo's bit masks
 # Names of ours, of MuJoCo's own, and of devices, which no file may have on Windows.
-RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "con", "prn", "aux", "nul")
+RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "joints", "con", "prn", "aux", "nul")
 RESERVED += tuple(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))
 XML = ElementTree.Element
 
@@ -162,7 +163,7 @@ def _extra(module: str) -> Any:
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
     progress = partial(on_progress, "shapes")
-    run, source = None, find_scene(source)
+    run, source = None, source if source.exists() else find_scene(source)
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:
@@ -184,11 +185,11 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     else:
         time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
         place = np.array([[body.position for body in scene.bodies]])
-    names, shapes = (_plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
+    names, shapes = (plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
     return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, place, turn)
 
 
-def _plain_names(names: list[str]) -> list[str]:
+def plain_names(names: list[str]) -> list[str]:
     """Unique names that every format takes, in place of `names`."""
     used: set[str] = set(RESERVED)
     plain = []
@@ -203,6 +204,12 @@ def _plain_names(names: list[str]) -> list[str]:
 
 
 # --- what several formats need ---
+
+
+def _joint_names(take: Take) -> dict[str, str]:
+    """What every format takes, in place of the names of the joints."""
+    names = [joint.name for joint in take.scene.joints]
+    return dict(zip(names, plain_names(names), strict=True))
 
 
 def _inertia(body: Body, shape: Shape) -> np.ndarray:
@@ -399,12 +406,15 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         for other in np.flatnonzero(~allowed[g]):
             made.CreateFilteredGroupsRel().AddTarget(f"/World/groups/group_{other}")
 
+    left_out = _missing(take, motion=True)
+    if take.scene.joints:
+        left_out += jointed.usd_joints(stage, physics, gf, take.scene, take.names, _joint_names(take))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"stage{out.suffix.lower()}"  # OpenUSD chooses the format by the ending
         if not stage.GetRootLayer().Export(str(file)):
             raise SdfsimError(f"{file}: OpenUSD cannot write it")
         write_bytes(out, file.read_bytes())
-    return [out], _missing(take, motion=True)
+    return [out], left_out
 
 
 def _usd_apply(prim: Any, schema: str, **values: Any) -> None:
@@ -475,7 +485,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     scene, left_out = take.scene, _missing(take)
     sampled = take.collide == "sdf"
     seen, cut = _write_assets(take, out, lambda body: not sampled, on_progress)
-    root = XML("mujoco", model=_plain_names([out.stem])[0])
+    root = XML("mujoco", model=plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
     _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
     _add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
@@ -489,8 +499,10 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         left_out.append(f"collides_with: {len(allowed)} groups of bodies (MuJoCo knows {MOST_GROUPS})")
         group, allowed = np.zeros_like(group), np.ones((1, 1), dtype=bool)
     meshes: set[str] = set()
-    geoms: list[list[str]] = []
-    places, speeds = [], []
+    geoms: list[list[str]] = [[] for _ in take.names]
+    places, speeds, controls = [], [], []
+    tree, joint_names = jointed.trees(scene), _joint_names(take)
+    nodes: dict[int, XML] = {-1: world}
 
     def mesh_of(file: Path, scale: float) -> str:
         name = file.stem + ("" if scale == 1.0 else f"-x{scale:.9g}")
@@ -501,17 +513,27 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             _add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
         return name
 
-    for k, (name, body, shape, color) in enumerate(take.each()):
-        quat = body.quat_xyzw
-        node = _add(world, "body", name=name, pos=_numbers(body.position), quat=_numbers(_wxyz(quat)))
+    every = list(take.each())
+    for k in tree.order:
+        (name, body, shape, color), quat, above = every[k], every[k][1].quat_xyzw, tree.above.get(k)
+        place, turned = jointed.mjcf_pose(scene, tree, k)
+        node = _add(nodes[above.parent if above else -1], "body", name=name, pos=_numbers(place))
+        node.set("quat", _numbers(_wxyz(turned)))
+        nodes[k] = node
         if body.motion == "kinematic":
             node.set("mocap", "true")
         elif body.motion == "dynamic":
-            _add(node, "freejoint", name=f"{name}_free")
+            if above:
+                start, moving = jointed.mjcf_joint(node, scene, above, k, joint_names[above.joint.name])
+                places += [_numbers(start)] * (len(start) > 0)
+                speeds += [_numbers(moving)] * (len(moving) > 0)
+            else:
+                _add(node, "freejoint", name=f"{name}_free")
             com, tensor = body.scale * shape.com, _inertia(body, shape)
             full = _numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
             _add(node, "inertial", pos=_numbers(com), mass=_numbers(body.mass), fullinertia=full)
-            turn = Rotation.from_quat(quat)
+        if body.motion == "dynamic" and not above:
+            com, turn = body.scale * shape.com, Rotation.from_quat(quat)
             # Of the body's own origin, in world axes; and of its turning, in its own axes.
             speed = body.velocity - np.cross(body.angular_velocity, turn.apply(com))
             places.append(_numbers(body.position, _wxyz(quat)))
@@ -530,18 +552,20 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         mates = sum(1 << g for g in np.flatnonzero(allowed[group[k]]))
         surface = {"condim": "3", "contype": f"{1 << group[k]}", "conaffinity": f"{mates}"}
         surface |= _mjcf_surface(body.friction**2, body.restitution**2)
-        geoms.append([f"{name}-{i}" for i in range(len(solids))])
-        for solid, label in zip(solids, geoms[-1], strict=True):
+        geoms[k] = [f"{name}-{i}" for i in range(len(solids))]
+        for solid, label in zip(solids, geoms[k], strict=True):
             _add(node, "geom", name=label, **solid, **surface)
 
     # Between bodies of one material the square is the product. Other pairs are written one by one, while they are few:
     # those of few geoms first, since the floor is one.
-    pairs = []
+    pairs, apart = [], {frozenset(joint.bodies) for joint in scene.joints if not joint.collides}
     surfaces = [(b.friction, b.restitution) for b in scene.bodies]
     order = sorted(range(len(geoms)), key=lambda k: len(geoms[k])) if len(set(surfaces)) > 1 else []
     for i, j in combinations(order, 2):
         one, other = scene.bodies[i], scene.bodies[j]
         if surfaces[i] == surfaces[j] or "dynamic" not in (one.motion, other.motion) or not allowed[group[i], group[j]]:
+            continue
+        if frozenset((i, j)) in apart:
             continue
         if len(pairs) + len(geoms[i]) * len(geoms[j]) > MOST_PAIRS:
             left_out.append("friction and restitution of some unlike bodies: the larger friction of the two counts")
@@ -551,8 +575,15 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     contact = _add(root, "contact") if pairs else root
     for pair in pairs:
         _add(contact, "pair", **pair)
+    if scene.joints:
+        ends = [nodes[k] for k in range(len(take.names))] + [world]
+        controls, told = jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names)
+        left_out += told
     if places:
-        _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
+        start = {"qpos": " ".join(places), "qvel": " ".join(speeds)} | (
+            {"ctrl": _numbers(controls)} if controls else {}
+        )
+        _add(_add(root, "keyframe"), "key", name="start", **start)
     _write_xml(out, root)
     return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
 
@@ -578,42 +609,66 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     seen, cut = _write_assets(take, out, lambda body: body.motion != "static", on_progress)
     files: list[Path] = []
     single = len(take.names) == 1 and take.scene.path is None
-    for name, body, shape, color in take.each():
-        root = XML("robot", name=name)
+    tree, joint_names, every = jointed.trees(take.scene), _joint_names(take), list(take.each())
+    links = dict(enumerate(take.names)) | {-1: "world"}
+    robots: dict[int, tuple[XML, Path]] = {}  # by the bodies in them
+    for k in tree.order:
+        (name, body, shape, color), above = every[k], tree.above.get(k)
+        if above is None or above.parent < 0:
+            robots[k] = XML("robot", name=name), out if single else out.with_name(f"{out.stem}.{name}.urdf")
+            if above is not None:
+                _add(robots[k][0], "link", name="world")
+            files.append(robots[k][1])
+        else:
+            robots[k] = robots[above.parent]
+        root = robots[k][0]
         link = _add(root, "link", name=name)
+        # A link that is held has its origin where the joint is.
+        origin = np.zeros(3) if above is None else above.anchor
         surface = _add(link, "contact")
         _add(surface, "lateral_friction", value=_numbers(body.friction))
         _add(surface, "restitution", value=_numbers(body.restitution))
         moves = body.motion == "dynamic"
         inertial = _add(link, "inertial")
-        _add(inertial, "origin", xyz=_numbers(body.scale * shape.com), rpy="0 0 0")
+        _add(inertial, "origin", xyz=_numbers(body.scale * shape.com - origin), rpy="0 0 0")
         _add(inertial, "mass", value=_numbers(body.mass if moves else 0.0))
         tensor = _inertia(body, shape) if moves else np.zeros((3, 3))
         sides = {f"i{'xyz'[a]}{'xyz'[b]}": _numbers(tensor[a, b]) for a in range(3) for b in range(a, 3)}
         _add(inertial, "inertia", **sides)
 
+        def part(tag: str, link: XML = link, origin: np.ndarray = origin, **keys: str) -> XML:
+            made = _add(link, tag, **keys)
+            if np.any(origin):
+                _add(made, "origin", xyz=_numbers(-origin), rpy="0 0 0")
+            return made
+
         def mesh(element: XML, file: Path, scale: float = body.scale) -> None:
             path = f"{file.parent.name}/{file.name}"
             _add(_add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
 
-        visual = _add(link, "visual")
         if body.shape not in seen:
             if isinstance(shape.sdf, PlaneSdf):  # PyBullet draws none
+                visual = _add(link, "visual")
                 _add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
                 _add(_add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
             else:
+                visual = part("visual")
                 _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
-            _urdf_form(_add(_add(link, "collision"), "geometry"), shape.sdf, body.scale)
+            _urdf_form(_add(part("collision"), "geometry"), shape.sdf, body.scale)
         else:
+            visual = part("visual")
             mesh(visual, seen[body.shape])
             if body.motion == "static":  # triangles as they are, which PyBullet knows of what never moves
-                mesh(_add(link, "collision", concave="yes"), seen[body.shape])
+                mesh(part("collision", concave="yes"), seen[body.shape])
             for file in cut[body.shape] if body.motion != "static" else []:
-                mesh(_add(link, "collision"), file)
+                mesh(part("collision"), file)
         rgba = _rgba(shape, color)
         _add(_add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
-        files.append(out if single else out.with_name(f"{out.stem}.{name}.urdf"))
-        _write_xml(files[-1], root)
+        if above is not None:
+            held_at = tree.above[above.parent].anchor if above.parent in tree.above else np.zeros(3)
+            jointed.urdf_joint(root, above, k, joint_names, links, held_at)
+    for root, file in dict((id(root), (root, file)) for root, file in robots.values()).values():
+        _write_xml(file, root)
     assets = [*seen.values(), *(file for found in cut.values() for file in found)]
     if single:
         return [*files, *assets], []
@@ -621,6 +676,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
     _csv(start, poses, on_progress)
     left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_missing(take)]
+    left_out += jointed.urdf_left_out(take.scene, tree)
     return [*files, poses, *assets], left_out
 
 

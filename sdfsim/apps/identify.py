@@ -26,12 +26,14 @@ from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
-from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.bodies import Bodies, State, largest_extent
+from sdfsim.physics.joint_columns import DAMPING, DRAG
+from sdfsim.physics.joints import initial
 from sdfsim.physics.options import STEP, SUBSTEPS, Options
 from sdfsim.physics.solver.world import FIRST
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import read_scene
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Joint, Scene
 from sdfsim.simulate.batch import placed, side_by_side
 from sdfsim.simulate.steppers import Frames, stepper_of
 
@@ -44,7 +46,9 @@ FAR = 0.3  # of a body's size: a motion that is farther off counts as so far, by
 WEAK = 1e-3  # how strongly parameters that nothing shows are held to the scene's
 # Of a parameter's width, for differences: contacts come and go, and impacts are found to an inner step, so that smaller
 # ones tell nothing.
-NUDGE = {"friction": 0.02, "restitution": 0.02, "mass": 0.02, "inertia": 0.1, "size": 0.2, "height": 0.2, "tilt": 0.1}
+NUDGE = {"friction": 0.02, "restitution": 0.02, "mass": 0.02, "inertia": 0.1, "size": 0.2, "height": 0.2, "tilt": 0.1,
+         "joint_friction": 0.05, "joint_damping": 0.05}  # fmt: skip
+GRAVITY = 9.81  # m/s^2, by which joints of scenes without any are measured
 SURE = 1.96  # standard deviations in an interval of 95 %
 SHOWN = 0.25  # of its width: how well the windows have to tell a parameter, noise being `OUTLIER`
 IMPACT = 3.0  # times what gravity makes in a frame: changes of a velocity that weight and friction do not make
@@ -57,12 +61,22 @@ CROWD, ROUNDS, AROUND = 24, 14, 0.15  # of the search between them: points, roun
 # How far parameters are looked for from the scene's: logarithms of factors, model lengths, rad.
 WIDTH = {
     "friction": 1.0, "restitution": 1.0, "mass": 3.0, "inertia": 0.5, "size": 0.1, "height": 0.05, "tilt": 0.05,
+    "joint_friction": 0.05, "joint_damping": 0.05,
 }  # fmt: skip
-FARTHEST = {"mass": 7.0, "inertia": 0.5, "size": 0.15, "height": 0.15, "tilt": 0.15}
+FARTHEST = {
+    "joint_friction": 0.5,
+    "joint_damping": 0.5,
+    "mass": 7.0,
+    "inertia": 0.5,
+    "size": 0.15,
+    "height": 0.15,
+    "tilt": 0.15,
+}
 SHELL = (
     5.0 / 3.0
 )  # of the inertia of a solid cube or ball has a hollow one: with its mass inside, no such body has more
 FACTORS = ("mass", "inertia", "size")
+OF_JOINTS = {"joint_friction": DRAG, "joint_damping": DAMPING}  # in weights of a joint's lighter body, see `heft`
 
 
 @dataclass(frozen=True)
@@ -75,7 +89,7 @@ class Parameter:
     start: float = 0.0  # as the scene has it; factors by their logarithms
     low: float = -math.inf
     high: float = math.inf
-    axis: int = 0  # of a tilt
+    axis: int = 0  # of a tilt; of a joint its number
 
     @property
     def width(self) -> float:
@@ -111,6 +125,7 @@ class Identified:
     held_out: dict[str, Any]  # errors of whole motions that the fit has not seen; of all, where `recordings` is 0
     notes: list[str]
     scene_values: dict[str, dict[str, Any]] = field(default_factory=dict)
+    joint_values: dict[str, dict[str, Any]] = field(default_factory=dict)  # joint -> key -> value
 
     def report(self) -> dict[str, Any]:
         """By kind and name."""
@@ -120,23 +135,25 @@ class Identified:
             told[e.kind][e.name] = {"value": e.value, "interval": e.interval}
         return told | {
             "windows": self.windows, "error_m": self.error_m, "held_out": self.held_out, "notes": self.notes,
-            "scene": self.scene_values,
+            "scene": self.scene_values, "joints": self.joint_values,
         }  # fmt: skip
 
 
 HEADS = {
     "friction": "friction, product", "restitution": "restitution, product", "own_friction": "friction of its own",
     "own_restitution": "restitution of its own", "mass": "mass", "inertia": "inertia, factor", "size": "size, factor",
-    "height": "moved along its normal", "tilt": "tilted",
+    "height": "moved along its normal", "tilt": "tilted", "joint_friction": "friction of a joint",
+    "joint_damping": "damping of a joint",
 }  # fmt: skip
 UNITS = {"mass": " kg", "height": " m", "tilt": " degrees"}
+OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}  # of hinges and balls, and others
 
 
 def report_lines(found: Identified) -> list[str]:
     """What was found, for people."""
     lines = []
     for e in found.estimates:
-        digits = 5 if e.kind == "height" else 3
+        digits = 5 if e.kind == "height" or e.kind in OF_JOINTS else 3
         seen = "not shown by these recordings"
         if e.interval:
             low, high = e.interval
@@ -163,6 +180,7 @@ class Problem:
         self.scene, self.recordings = scene, list(recordings)
         self.moving, self.fixed = movers(scene), [b for b in scene.bodies if b.motion == "static"]
         self.bodies, self.units = [*self.moving, *self.fixed], scene_units(scene)
+        self.joints = scene.joints if scene.effects.joints != "off" else ()
         self.parameters: list[Parameter] = []
         self.ground: dict[int, Ground] = {}
         if any(b.motion == "kinematic" for b in scene.bodies):
@@ -188,10 +206,11 @@ class Problem:
             raise SdfsimError("the recordings are too short, or nowhere smooth", told)
         windows = self.windows(WINDOW, begin[:: -(-len(begin) // (2 * MOST))])
         touched = windows.touched()
-        if not touched:
+        if not touched and not self.joints:
             raise SdfsimError("nothing touches in the recordings", "friction and restitution show in contacts only")
         self._choose(touched)
-        rows = sorted({w for w, *_ in touched})
+        # Joints act all the time.
+        rows = range(len(windows.begin)) if self.joints else sorted({w for w, *_ in touched})
         return self.windows(WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
 
     def whole(self, chosen: Sequence[int]) -> Windows:
@@ -233,6 +252,10 @@ class Problem:
                 if rows[0] < many:
                     most = max(0.0, math.log(SHELL / self.inertia_factor(rows[0]))) if kind == "inertia" else None
                     self._add(kind, name, rows, high=most)
+        for j, joint in enumerate(self.joints):
+            for kind, start in (("joint_friction", joint.friction), ("joint_damping", joint.damping)):
+                if joint.kind not in ("fixed", "distance"):
+                    self._add(kind, joint.name, [], start / self.heft(joint, kind), 0.0, axis=j)
         for name, rows in static.items():
             if len(rows) == 1:  # copies lie on a grid
                 points = np.concatenate([p for _, _, b, p, _ in touched if b == rows[0]])
@@ -259,6 +282,26 @@ class Problem:
         if kind == "restitution" and any(max(pair) < len(self.moving) for pair in self.pairs):
             return 1.0  # what bodies do to each other fixes what is whose, and a scene has none above 1
         return high / known if known > 0.0 else high
+
+    def heft(self, joint: Joint, kind: str) -> float:
+        """N m or N, of a joint's friction: the weight of its lighter body, where it turns at an arm of the body's size;
+        and of damping this at the speed of a fall through that size. So parameters are about one at most."""
+        bodies = [b for b in (self.scene.bodies[k] for k in joint.bodies if k >= 0) if b.motion == "dynamic"]
+        body = min(bodies, key=lambda b: b.mass)
+        size = largest_extent(self.scene.shapes[body.shape]) * body.scale
+        pull = float(np.linalg.norm(self.scene.gravity)) or GRAVITY
+        rate = math.sqrt(pull / size) if kind == "joint_damping" else 1.0
+        if joint.kind in ("hinge", "ball"):
+            return body.mass * pull * size / rate
+        return body.mass * pull / (rate * size if kind == "joint_damping" else 1.0)
+
+    def row(self, body: int, window: int, windows: int) -> int:
+        """Where a body of the scene is in so many windows side by side; -1 for the world."""
+        if body < 0:
+            return -1
+        moves = self.scene.bodies[body].motion == "dynamic"
+        before = sum((b.motion == "dynamic") == moves for b in self.scene.bodies[:body])
+        return window * len(self.moving) + before if moves else windows * len(self.moving) + before
 
     def inertia_factor(self, body: int) -> float:
         """The scene's, of a moving body."""
@@ -313,6 +356,17 @@ class Problem:
         names = (*HIGH, "scale", "com", "inertia", "mass", "inverse_mass", "bounds", "size", "radius")
         new = {name: getattr(bodies, name).copy() for name in names}
         position, orientation = state.position.copy(), state.orientation.copy()
+        joints = bodies.joints
+        dragged = [(p, v) for p, v in zip(self.parameters, values, strict=True) if p.kind in OF_JOINTS]
+        if joints is not None and dragged:
+            number, u = joints.number.copy(), self.units
+            for p, value in dragged:
+                turns = self.joints[p.axis].kind in ("hinge", "ball")
+                unit, speed = (u.energy, 1.0) if turns else (u.mass * u.acceleration, u.length)
+                unit *= u.time / speed if p.kind == "joint_damping" else 1.0
+                found = value * self.heft(self.joints[p.axis], p.kind) / unit
+                number[p.axis :: len(self.joints), OF_JOINTS[p.kind]] = found
+            bodies = replace(bodies, joints=replace(joints, number=number))
         for p, value in zip(self.parameters, values, strict=True):
             for k in p.bodies:
                 rows: Any = slice(k, total, many) if k < many else total + k - many
@@ -415,7 +469,13 @@ class _Part:
         ends = [min(self.length, len(r.known) - 1 - t) for r, (_, t) in zip(some, begin, strict=True)]
         self.length = max(ends)
         many, count = len(problem.moving), len(begin)
-        whole = replace(problem.scene, bodies=tuple([*problem.moving] * count + problem.fixed))
+        joints = tuple(
+            replace(j, name=f"{j.name} {w}", bodies=tuple(problem.row(b, w, count) for b in j.bodies))
+            for w in range(count)
+            for j in problem.joints
+        )
+        bodies = tuple([*problem.moving] * count + problem.fixed)
+        whole = replace(problem.scene, bodies=bodies, joints=joints)
         world = [*np.repeat(np.arange(count), many), *[-1] * len(problem.fixed)]
         self.bodies, start = side_by_side(whole, world, u)
         first = [
@@ -423,6 +483,9 @@ class _Part:
             for name in ("position", "orientation", "velocity", "angular_velocity")
         ]
         self.start = placed(start, first[0] / u.length, first[1], first[2] / u.velocity, first[3] * u.time)
+        if self.bodies.joints is not None:
+            known = initial(self.bodies.joints, self.start.position, self.start.orientation)
+            self.start = replace(self.start, joints=known)
         inner = max(1, math.ceil(dt / (STEP / SUBSTEPS) - 0.01))
         self.options = Options(np.asarray(problem.scene.gravity) / u.acceleration, dt, inner)
         self.goal = np.full((self.length, count, many, 7), np.nan)
@@ -541,7 +604,7 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
 
     # First what contacts do, with the bodies and the ground as the scene has them; then all.
     every = np.arange(len(width))
-    usual = np.flatnonzero([p.kind in (*HIGH, "mass") for p in problem.parameters])
+    usual = np.flatnonzero([p.kind in (*HIGH, "mass", *OF_JOINTS) for p in problem.parameters])
     best = settled(short, tried[int(np.argmin(costs))], usual, TRIES[0])
     best = settled(short, best, every, TRIES[1])
     last, longer, scatter = short, problem.whole(fit), np.zeros((len(best), len(best)))
@@ -561,6 +624,7 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
     return Identified(
         found, len(short.begin),
         error * math.sqrt(3.0) * problem.units.length, confirmed, _notes(recordings), _scene_values(problem, best),
+        _joint_values(problem, best),
     )  # fmt: skip
 
 
@@ -649,6 +713,11 @@ def _estimates(
     for i, (p, value) in enumerate(zip(parameters, values, strict=True)):
         if p.kind in HIGH:
             found.append(estimate(f"own_{p.kind}", p.name, value, {i: 1.0}))
+        elif p.kind in OF_JOINTS:
+            joint = problem.joints[p.axis]
+            heft = problem.heft(joint, p.kind)
+            unit = OF_TURNS[p.kind][0 if joint.kind in ("hinge", "ball") else 1]
+            found.append(replace(estimate(p.kind, p.name, heft * value, {i: heft}), unit=unit))
         elif p.kind in FACTORS:
             factor = math.exp(value) * (problem.bodies[p.bodies[0]].mass if p.kind == "mass" else 1.0)
             found.append(estimate(p.kind, p.name, factor, {i: factor}))
@@ -684,6 +753,8 @@ def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, A
     found: dict[str, dict[str, Any]] = {}
     many = len(problem.moving)
     for p, value in zip(problem.parameters, values, strict=True):
+        if p.kind in OF_JOINTS:
+            continue
         b = problem.bodies[p.bodies[0]]
         name = re.sub(r"\[\d+\]$", "", b.name)
         entry = found.setdefault(name, {})
@@ -716,6 +787,16 @@ def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, A
     return found
 
 
+def _joint_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, Any]]:
+    """Joint -> key of the scene file -> value."""
+    found: dict[str, dict[str, Any]] = {}
+    for p, value in zip(problem.parameters, values, strict=True):
+        if p.kind in OF_JOINTS:
+            key = p.kind.removeprefix("joint_")
+            found.setdefault(p.name, {})[key] = float(value) * problem.heft(problem.joints[p.axis], p.kind)
+    return found
+
+
 INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
 
 
@@ -731,6 +812,10 @@ def write_scene(found: Identified, scene_file: Path, out: Path) -> list[str]:
             _set(plane, "offset", float(normal @ place))
         for key, value in values.items():
             entry.value = [(k, v) for k, v in entry.value if k.value not in INSTEAD.get(key, ())]
+            _set(entry, key, value)
+    joints = _value(root, "joints")
+    for entry in joints.value if joints is not None else ():
+        for key, value in found.joint_values.get(_value(entry, "name").value, {}).items():
             _set(entry, key, value)
     if out.resolve().parent != scene_file.resolve().parent:
         shapes = _value(root, "shapes")

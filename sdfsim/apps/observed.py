@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.apps.observed_joints import held_together, jointed
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, visible
@@ -268,9 +269,10 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
     through all of a flight, elsewhere (a slide, a roll, rest) by a polynomial through the frames nearby. Those of a run
     are known."""
     bodies = movers(scene)
-    inertia = from_scene(replace(scene, bodies=tuple(bodies)), scene_units(scene))[0].inertia
+    inertia = from_scene(replace(scene, bodies=tuple(bodies), joints=()), scene_units(scene))[0].inertia
     size = [largest_extent(scene.shapes[b.shape]) * b.scale for b in bodies]
     gravity, done, flights = np.asarray(scene.gravity), [], []
+    bound = jointed(scene)
     for r in recordings:
         if r.known.any():
             done.append(r)
@@ -283,6 +285,7 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
             noise.append(sigma)
             fitted, fits, flies = _nearby(p, q, r.seen[:, d], r.dt, gravity, sigma)
             smooth[:, d] = fits
+            flies &= not bound[d]
             for whole, values in zip(arrays, fitted, strict=True):
                 whole[fits, d] = values[fits]
             most = max(BEYOND * sigma[0], min(ROUGH * size[d], SMOOTHED * sigma[0]))
@@ -299,7 +302,13 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
             )
         )  # fmt: skip
     _rotations(done, flights, inertia)
-    return done
+    return [r if given.known.any() else _held(r, scene) for r, given in zip(done, recordings, strict=True)]
+
+
+def _held(r: Recording, scene: Scene) -> Recording:
+    arrays = r.position, r.orientation, r.velocity, r.angular_velocity
+    place, turn, speed, spin = held_together(arrays, scene) if scene.joints else arrays
+    return replace(r, position=place, orientation=turn, velocity=speed, angular_velocity=spin)
 
 
 def _noise(x: np.ndarray, seen: np.ndarray, least: float) -> float:

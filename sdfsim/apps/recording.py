@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sdfsim.apps.recording_joints import AXIS_COLOR, ends, marks, shown_joints
 from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
 from sdfsim.geometry.primitives import plane
@@ -29,6 +30,7 @@ if TYPE_CHECKING:  # these take their time to load
 
 WORLD = "world"
 CONTACTS = "world/contacts"
+JOINTS = "world/joints"
 FORCES = "world/forces"
 STILL = "world/still"
 # What is plotted: the counters of a view by their legends.
@@ -85,6 +87,7 @@ class Playback:
         crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
         paths = [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
         self._alone = [(k, path) for k, path in enumerate(paths) if k not in crowded]
+        self._ropes = [joint for joint in shown_joints(scene) if joint.kind == "distance"]
         self.stream = rr.RecordingStream("sdfsim")
 
     def blueprint(self) -> rrb.Blueprint:
@@ -137,6 +140,15 @@ class Playback:
                 centre = body.position + _turned(com, body.quat_xyzw)
                 pose = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
                 self.stream.log(path, pose, static=True)
+        for joint in shown_joints(scene):
+            for number, mark in enumerate(marks(scene, joint)):
+                home = JOINTS if mark.body < 0 else dict(self._alone)[mark.body]
+                path = f"{home}/{rr.escape_entity_path_part(f'joint {joint.name}')}/{number}"
+                lines = rr.LineStrips3D(mark.strips, colors=mark.color, radii=rr.Radius.ui_points(1.5))
+                self.stream.log(path, lines, static=True)
+        if self._ropes:
+            style = rr.LineStrips3D.from_fields(colors=AXIS_COLOR, radii=rr.Radius.ui_points(1.5))
+            self.stream.log(f"{JOINTS}/ropes", style, static=True)
         style = rr.Points3D.from_fields(colors=_CONTACT_COLOR, radii=rr.Radius.ui_points(4))
         self.stream.log(CONTACTS, style, static=True)
         style = rr.Arrows3D.from_fields(colors=_FORCE_COLOR, radii=rr.Radius.ui_points(2))
@@ -164,6 +176,10 @@ class Playback:
             if self._scene.bodies[i].motion != "static":
                 motion = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
                 self.stream.send_columns(path, times, motion)
+        if self._ropes:
+            strips = ends(self._ropes, chunk.position, chunk.orientation, self._scene)
+            lines = rr.LineStrips3D.columns(strips=strips.reshape(-1, 2, 3).astype(np.float32))
+            self.stream.send_columns(f"{JOINTS}/ropes", times, lines.partition(np.full(frames, len(self._ropes))))
         points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)
         self.stream.send_columns(CONTACTS, times, points)
         self._log_forces(chunk, times)
@@ -211,11 +227,12 @@ class Crowd(NamedTuple):
 
 
 def _crowds(scene: Scene) -> list[Crowd]:
-    """The crowds of a scene; bodies in none of them are drawn one by one."""
+    """The crowds of a scene; bodies in none of them are drawn one by one, and so are those whose joints are shown."""
     import rerun as rr
 
     found = []
     shape = np.array([b.shape if b.motion != "static" else -1 for b in scene.bodies])
+    shape[[k for joint in shown_joints(scene) for k in joint.bodies if k >= 0]] = -1
     for number, name in enumerate(s.name for s in scene.shapes):
         members = np.flatnonzero(shape == number)
         for k in range(COLORS if len(members) >= MANY else 0):

@@ -1,5 +1,5 @@
-"""The commands on scenes and motion: simulate, plan, view, render, export, identify, info; dataset, train, evaluate;
-tradeoff, stress."""
+"""The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train,
+evaluate; tradeoff, stress."""
 
 from __future__ import annotations
 
@@ -194,6 +194,38 @@ def export(
 
 
 @command
+def import_(
+    session: Session,
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="Ends in .urdf, .xml or .mjcf.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="FILE", help="The scene.yaml to write.", show_default=False)
+    ],
+    packages: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of the packages that package:// names (URDF); may be given again."),
+    ] = None,
+    fixed: Annotated[bool, typer.Option("--fixed", help="The root never moves (URDF).")] = False,
+    floor: Annotated[bool, typer.Option("--floor", help="Add a floor at z = 0, and stand all on it.")] = False,
+    key: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The keyframe that is the start (MJCF; default: start).")
+    ] = None,
+) -> None:
+    """URDF or MJCF -> scene.yaml with joints (docs/import.md)."""
+    from sdfsim.apps import import_robot as room
+
+    report = room.import_robot(
+        source, out, packages=packages or [], fixed=fixed, floor=floor, key=key, on_progress=session.stage_progress
+    )
+    lines = [
+        f"links {report['links']}, joints {report['joints']}",
+        f"wrote {report['files'][0]}" + (f" and {n} shapes beside it" if (n := len(report["files"]) - 1) else ""),
+        *report["notes"],
+        *(f"not in it: {line}" for line in report["left_out"]),
+    ]
+    session.report(report, lines)
+
+
+@command
 def identify(
     session: Session,
     recordings: Annotated[
@@ -280,11 +312,21 @@ def dataset(
 def train(
     session: Session,
     data: Annotated[
-        list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
+        list[Path],
+        typer.Option(
+            help="Dataset folder; several are trained on together. With --scene: recordings of it, as `identify` reads "
+            "them.",
+            show_default=False,
+        ),
     ],
     out: Out,
+    scene: Annotated[
+        Path | None, typer.Option(help="The scene of recordings, best as `identify -o` wrote it.", show_default=False)
+    ] = None,
     preset: Annotated[
-        Literal["small", "alone", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        Literal[
+            "small", "alone", "impacts", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"
+        ],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
@@ -293,10 +335,10 @@ def train(
     ] = 0,
     device: str = "auto",
 ) -> None:
-    """Train a model on datasets."""
+    """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device}
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene}
     session.report(run_training(data, out, **how, on_progress=session.progress))
 
 

@@ -6,7 +6,7 @@ the prediction turns with the scene and does not depend on the choice of units.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -49,6 +49,12 @@ class ContactGraph:
     friction: Tensor
     restitution: Tensor
     dt: float  # the step
+
+
+def in_single(graph: ContactGraph) -> ContactGraph:
+    """The graph in single precision."""
+    tensors = {n: v for n, v in vars(graph).items() if isinstance(v, Tensor) and v.is_floating_point()}
+    return replace(graph, **{name: value.float() for name, value in tensors.items()})
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from sdfsim.learned.contact_graph import EDGE_FEATURES, ContactGraph, EdgeFrames
 # Model units, relative speeds of two surfaces before the step: up to the first what they do is left to the solve, from
 # the second on the network has its full say. So what rests, rolls or stands in a tower does what the solve knows.
 CALM, LIVELY = 0.05, 0.5
+LEVER = 0.5  # of the way from a centre of mass to a contact: how far off the contact an impact may act
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,14 @@ class ImpulseConfig:
     # 1 for a network that is given where contacts are but not what the solve makes of them, and that nothing bounds:
     # what learning alone gives, for comparison
     alone: int = 0
+    # 1 for one that acts where surfaces strike each other, and turns bodies there too, see `struck`
+    impacts: int = 0
 
     def __post_init__(self) -> None:
         if min(self.width, self.rounds) < 1:
             raise ValueError(f"width and rounds must be at least 1 (got {self.width} and {self.rounds})")
+        if self.alone and self.impacts:
+            raise ValueError("a network that is alone has no solve whose impacts it could change")
 
 
 @dataclass(frozen=True)
@@ -62,19 +67,24 @@ def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
 class Round(nn.Module):
     """One round: edges read both bodies and the current relative velocities, then push and inform them."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, moments: bool = False) -> None:
         super().__init__()
         self.normalise = nn.LayerNorm(width)
-        self.edge = nn.Sequential(nn.Linear(3 * width + 6, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        self.edge = nn.Sequential(
+            nn.Linear(3 * width + (12 if moments else 6), width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+        )
         self.latent = nn.Linear(width, width)
         self.message = nn.Linear(width, 2 * width)
         self.body = mlp(2 * width, width, width)
         self.attention = nn.Linear(width, 1)
         self.normal_impulse = nn.Linear(width, 2)
         self.tangent_impulse = nn.Linear(width, 4)
-        for head in (self.normal_impulse, self.tangent_impulse):
-            nn.init.normal_(head.weight, std=0.01)
-            nn.init.zeros_(head.bias)
+        # what turns both bodies by itself, as a contact does that is a patch and no point
+        self.moment = nn.Linear(width, 6) if moments else None
+        for head in (self.normal_impulse, self.tangent_impulse, self.moment):
+            if head is not None:
+                nn.init.normal_(head.weight, std=0.001 if moments else 0.01)
+                nn.init.zeros_(head.bias)
 
     def read(self, body: Tensor, edge: Tensor, first: Tensor, second: Tensor, relative: Tensor) -> Tensor:
         """[E, width] of the edges' own latents, those of their bodies, and [E, 6] what is seen of their motion."""
@@ -85,7 +95,10 @@ class Round(nn.Module):
         change = self.normal_impulse(hidden)[:, None]
         if not friction:
             return change
-        return torch.cat([change, self.tangent_impulse(hidden).reshape(-1, 2, 2).mT], 1)
+        change = torch.cat([change, self.tangent_impulse(hidden).reshape(-1, 2, 2).mT], 1)
+        if self.moment is None:
+            return change
+        return torch.cat([change, self.moment(hidden).reshape(-1, 3, 2)], 1)
 
     def update(
         self, edge: Tensor, body: Tensor, hidden: Tensor, weight: Tensor, graph: ContactGraph
@@ -105,7 +118,7 @@ class ImpulseNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.encode = mlp(EDGE_FEATURES, config.width, config.width)
-        self.rounds = nn.ModuleList(Round(config.width) for _ in range(config.rounds))
+        self.rounds = nn.ModuleList(Round(config.width, config.impacts > 0) for _ in range(config.rounds))
 
     def forward(
         self,
@@ -121,13 +134,19 @@ class ImpulseNetwork(nn.Module):
         graph = without_solve(graph) if alone else graph
         frames = edge_frames(graph, mirrored=mirrored)
         edge = self.encode(frames.start)
+        if self.config.impacts:
+            frames = with_moments(graph, frames)
         body = edge.new_zeros(len(graph.inverse_mass), self.config.width)
         end = torch.cat([graph.solved_velocity, graph.solved_angular], -1)
         mean = torch.cat([graph.mean_velocity, graph.mean_angular], -1)
         start = twist = torch.stack([end, mean], -1)
-        added = edge.new_zeros(len(edge), 3 if friction else 1, 2)
+        axes = (6 if self.config.impacts else 3) if friction else 1
+        added = edge.new_zeros(len(edge), axes, 2)
         for number, layer in enumerate(cast("Iterable[Round]", self.rounds), start=1):
-            seen = (relative(graph, frames, twist) / frames.speed[..., None]).mT.flatten(1)
+            seen = relative(graph, frames, twist) / frames.speed[..., None]
+            if self.config.impacts:
+                seen = torch.cat([seen[:, :3], seen[:, 3:] * _arm(graph)[:, None, None]], 1)
+            seen = seen.mT.flatten(1)
             hidden = layer.read(body, edge, graph.first, graph.second, seen)
             weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
             change = layer.impulse(hidden, friction) * weight[..., None]
@@ -135,7 +154,9 @@ class ImpulseNetwork(nn.Module):
             twist = pushed(graph, frames, added, start)
             if number < len(self.rounds):  # the last round's latents are not read
                 edge, body = layer.update(edge, body, hidden, weight, graph)
-        if not alone:
+        if self.config.impacts:
+            twist = pushed(graph, frames, struck(graph, frames, added, start, trust), start)
+        elif not alone:
             twist = pushed(graph, frames, bounded(graph, frames, added, start, trust), start)
         end, mean = twist.unbind(-1)
         return Velocities(end[:, :3], end[:, 3:], mean[:, :3], mean[:, 3:])
@@ -195,6 +216,68 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
     end = torch.cat(ends, 1)
     end = end * _energy_share(graph, frames, end, seen[..., 0], start)[:, None]
     return torch.stack([end, _shortened(added[..., 1], most)], -1)
+
+
+def with_moments(graph: ContactGraph, frames: EdgeFrames) -> EdgeFrames:
+    """Frames with three more axes: of moments on the first bodies, opposite on the second, about the edges' axes. Their
+    mass makes the change of an angular velocity that of a speed at the end of the lever."""
+    axes = frames.jacobian_first[..., :3]
+    axes = axes * torch.linalg.det(axes)[:, None, None]  # a mirror image turns the other way round
+    none = torch.zeros_like(axes)
+    about = torch.cat([none, axes], -1)
+    turn_first, turn_second = (
+        torch.cat([none, axes @ graph.inverse_inertia[body].mT], -1).mT for body in (graph.first, graph.second)
+    )
+    turning = LEVER * _arm(graph) * frames.mass[:, 0]
+    known = turning * (frames.mass[:, 1] > 0)
+    return replace(
+        frames,
+        mass=torch.cat([frames.mass, torch.stack([turning, known, known], -1)], -1),
+        jacobian_first=torch.cat([frames.jacobian_first, about], 1),
+        jacobian_second=torch.cat([frames.jacobian_second, about], 1),
+        response_first=torch.cat([frames.response_first, turn_first], -1),
+        response_second=torch.cat([frames.response_second, -turn_second], -1),
+    )
+
+
+def _arm(graph: ContactGraph) -> Tensor:
+    """[E] how far a contact is from the centre of mass of the body that moves, or of the nearer one."""
+    far = torch.full_like(graph.gap, torch.inf)
+    ways = [
+        torch.where(graph.inverse_mass[body] > 0, arm.norm(dim=-1), far)
+        for body, arm in ((graph.first, graph.arm_first), (graph.second, graph.arm_second))
+    ]
+    return torch.minimum(*ways)
+
+
+def struck(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor, trust: float) -> Tensor:
+    """What may be added to the solve where surfaces strike each other, of what the network would add: impulses and
+    moments [E, axis, 2]. `start` are twists [N, 6, 2] from the solve, `trust` is 0 to 1.
+
+    - Only between bodies that approach each other at one of their edges, see `CALM`.
+
+    - Solve and network together rebound with a restitution of 0 to 1, keep to the friction cone, and turn bodies as a
+    push does that acts off the contact, by `LEVER` of the arm at most.
+
+    - No more kinetic energy than the solve took, island by island.
+    """
+    push, drag = frames.solved[:, 0], frames.solved[:, 1:3]
+    lively = ((-frames.slip[:, 0] - CALM) / (LIVELY - CALM)).clamp(0.0, 1.0) * trust
+    lively = lively.new_zeros(graph.pairs).scatter_reduce(0, graph.pair, lively, "amax")[graph.pair]
+    wanted = added[..., 0] * lively[:, None]
+    least = push / (1.0 + graph.restitution)
+    normal = torch.maximum(torch.minimum(push + wanted[:, 0], 2.0 * least), least)
+    ends = [(normal - push)[:, None]]
+    if wanted.shape[1] > 1:
+        grip = torch.where(push > 0.0, drag.norm(dim=-1) / push.clamp_min(1e-12), 0.0)
+        hold = torch.maximum(graph.friction, grip) * normal
+        ends += [
+            _shortened(drag + wanted[:, 1:3], hold) - drag,
+            _shortened(wanted[:, 3:], LEVER * _arm(graph) * normal),
+        ]
+    end = torch.cat(ends, 1)
+    end = end * _energy_share(graph, frames, end, relative(graph, frames, start)[..., 0], start)[:, None]
+    return torch.stack([end, end * (1.0 - graph.when)[:, None]], -1)
 
 
 def _shortened(vector: Tensor, most: Tensor) -> Tensor:

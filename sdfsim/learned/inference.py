@@ -1,98 +1,116 @@
-"""The *impulse* network on the CPU: its weights and a solved step as the compiled code wants them."""
+"""The *impulse* network in a simulation: the graph of a solved step, and the step with what the network adds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from copy import deepcopy
 from dataclasses import replace
-from functools import cache
-from typing import cast
 
 import numpy as np
 import torch
-from threadpoolctl import ThreadpoolController
-from torch import Tensor, nn
+from torch import Tensor
 
-from sdfsim.base.compiling import warn_compiling
-from sdfsim.learned.contact_graph import REST_SPEED
-from sdfsim.learned.impulse import CALM, LIVELY, ImpulseNetwork, Round
-from sdfsim.physics import solver as kernels
-from sdfsim.physics.bodies import State
+from sdfsim.learned.contact_graph import ContactGraph, number_pairs
+from sdfsim.learned.impulse import ImpulseNetwork, Velocities
+from sdfsim.physics import pose
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.free_flight import torque_free
 from sdfsim.physics.motion import MOTION
-from sdfsim.physics.solver.record import Edges
-from sdfsim.physics.solver.world import World
-
-with kernels.kept():
-    from sdfsim.physics.solver import impulse as compiled
 from sdfsim.physics.options import Options
+from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, Edges
 
 
-def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:
-    """Copies of the weights of a network."""
-    warn_compiling(compiled.correct, "the network", "half a minute")
-    rounds = list(cast("Iterable[Round]", network.rounds))
+def doubled(network: ImpulseNetwork) -> ImpulseNetwork:
+    """A copy in double precision: what it adds then keeps momentum to the last digits of a state."""
+    return deepcopy(network).cpu().double()
 
-    def layer(*modules: Iterable[nn.Linear | nn.LayerNorm]) -> compiled.Layer:
-        """Of every round the modules side by side."""
-        each = list(zip(*modules, strict=True))
-        weight = [torch.cat([m.weight.mT if m.weight.ndim == 2 else m.weight for m in some], -1) for some in each]
-        return compiled.Layer(_array(weight), _array([torch.cat([m.bias for m in some]) for some in each]))
 
-    def linear(sequences: list[nn.Module]) -> tuple[compiled.Layer, ...]:
-        return tuple(layer(cast("Iterable[nn.Linear]", ms)) for ms in zip(*map(_linear, sequences), strict=True))
+def step_graph(
+    bodies: Bodies, before: State, solved: State, edges: Edges, options: Options, known: float
+) -> tuple[np.ndarray, ContactGraph]:
+    """The bodies [A] int64 that met somebody in a solved step with these `edges`, and their graph in double precision:
+    in units in which the step lasts `known` (a network knows no other) and gravity is what it is, masses relative to
+    the heaviest."""
+    rows, inside = np.unique(edges.pair, return_inverse=True)
+    inside = inside.reshape(edges.pair.shape)
+    time = options.dt / known
+    length, moves = time * time, bodies.moves[rows]
+    heaviest = float(bodies.mass[rows].max()) or 1.0
+    start, spin = before.orientation[rows], before.angular_velocity[rows]
+    turn, still = pose.to_matrix(start), ~moves[:, None]
+    inertia = bodies.inertia[rows]
+    inverse = turn @ np.linalg.inv(inertia) @ turn.swapaxes(-1, -2) * (moves & options.rotation)[:, None, None]
+    free = np.where(still, spin, torque_free(start, spin, inertia, options.dt)[1]) if options.rotation else spin
+    fall = options.dt * np.asarray(options.gravity) * moves[:, None]
+    turned = pose.to_rotvec(pose.multiply(solved.orientation[rows], pose.conjugate(start)))
 
-    impulse = layer([r.normal_impulse for r in rounds])
-    if friction:
-        both = layer([r.normal_impulse for r in rounds], [r.tangent_impulse for r in rounds])
-        order = [0, 1, 2, 4, 3, 5]  # tangential columns have both axes together, here each axis has (end, mean)
-        impulse = compiled.Layer(*(np.ascontiguousarray(values[..., order]) for values in both))
-    return compiled.Weights(
-        encode=linear([network.encode]),  # type: ignore[arg-type]
-        normalise=layer([r.normalise for r in rounds]),
-        edge=linear([r.edge for r in rounds]),  # type: ignore[arg-type]
-        attention=layer([r.attention for r in rounds]),
-        impulse=impulse,
-        tell=layer([r.latent for r in rounds], [r.message for r in rounds]),
-        body=linear([r.body for r in rounds]),  # type: ignore[arg-type]
-        alone=bool(network.config.alone),
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values))
+
+    def edge(column: int) -> Tensor:
+        return tensor(edges.value[:, column : column + 3])
+
+    def product(own: np.ndarray, there: bool) -> Tensor:
+        return tensor(own[edges.pair].prod(1) * there)
+
+    first, second = torch.from_numpy(np.ascontiguousarray(inside.T))
+    pair, pairs = number_pairs(first, second, len(rows))
+    return rows, ContactGraph(
+        inverse_mass=tensor(bodies.inverse_mass[rows] * heaviest),
+        inverse_inertia=tensor(inverse * (heaviest * length**2)),
+        velocity=tensor(before.velocity[rows] / time),
+        angular=tensor(spin * time),
+        free_velocity=tensor((before.velocity[rows] + fall) / time),
+        free_angular=tensor(free * time),
+        solved_velocity=tensor(solved.velocity[rows] / time),
+        solved_angular=tensor(solved.angular_velocity[rows] * time),
+        mean_velocity=tensor((solved.position[rows] - before.position[rows]) / (options.dt * time)),
+        mean_angular=tensor(turned * (time / options.dt)),
+        first=first,
+        second=second,
+        pair=pair,
+        pairs=pairs,
+        normal=edge(AXIS),
+        arm_first=edge(ARM) / length,
+        arm_second=edge(OTHER) / length,
+        impulse=edge(GIVEN) / (heaviest * time),
+        gap=tensor(edges.value[:, APART] / length),
+        when=tensor(edges.value[:, WHEN]),
+        friction=product(bodies.friction, options.friction),
+        restitution=product(bodies.restitution, options.restitution),
+        dt=known,
     )
 
 
-def _linear(sequence: nn.Module) -> Iterator[nn.Module]:
-    return (m for m in sequence.children() if isinstance(m, nn.Linear))
-
-
-def _array(values: list[Tensor]) -> np.ndarray:
-    return np.ascontiguousarray(torch.stack(values).detach().cpu().float().numpy())
-
-
 def corrected(
-    weights: compiled.Weights, world: World, before: State, solved: State, edges: Edges, terms: compiled.Terms
+    network: ImpulseNetwork, bodies: Bodies, before: State, solved: State, edges: Edges, options: Options,
+    known: float, trust: float = 1.0,
 ) -> State:  # fmt: skip
-    """What the network makes of a step of the solve, whose `edges`, at least one, are its own; those of a pair of
-    bodies stand together."""
-    start, end = compiled.Poses(*_poses(before)), compiled.Poses(*(array.copy() for array in _poses(solved)))
-    with _blas().limit(limits=1):
-        compiled.correct(weights, world, start, end, edges.pair, edges.value, terms)
-    return replace(solved, **dict(zip(MOTION, end, strict=True)))
+    """What a network, which was trained on steps of `known`, makes of a step of the solve with these `edges`, at least
+    one; `trust` (0 to 1) scales what it adds."""
+    rows, graph = step_graph(bodies, before, solved, edges, options, known)
+    with torch.no_grad():
+        made = network(graph, friction=options.friction, trust=trust)
+    return changed(bodies, solved, rows, graph, made, options)
 
 
-@cache
-def _blas() -> ThreadpoolController:
-    """The matrix libraries that the compiled network calls. With layers as small as its own, a second thread of theirs
-    doubles the processor time and ends no sooner."""
-    import scipy.linalg.cython_blas  # noqa: F401  # numba's np.dot loads it when it first runs, too late to be listed
-
-    return ThreadpoolController().select(user_api="blas")
-
-
-def terms_of(options: Options, known: float, trust: float = 1.0) -> compiled.Terms:
-    """The terms of a step for a network that was trained on steps of `known`; `trust` (0 to 1) scales what it adds."""
-    return compiled.Terms(
-        gravity=options.gravity, dt=options.dt, known=known, friction=options.friction,
-        restitution=options.restitution, rotation=options.rotation, trust=trust, rest=REST_SPEED, calm=CALM,
-        lively=LIVELY,
-    )  # fmt: skip
-
-
-def _poses(state: State) -> list[np.ndarray]:
-    return [np.ascontiguousarray(getattr(state, name)) for name in MOTION]
+def changed(
+    bodies: Bodies, solved: State, rows: np.ndarray, graph: ContactGraph, made: Velocities, options: Options
+) -> State:
+    """The solved step with the velocities that a network has `made` of those of the bodies `rows`."""
+    time, moves = options.dt / graph.dt, bodies.moves[rows]
+    rows = rows[moves]
+    change = {
+        name: (getattr(made, name) - getattr(graph, of)).numpy()[moves].astype(np.float64)
+        for name, of in (
+            ("velocity", "solved_velocity"), ("angular", "solved_angular"),
+            ("mean_velocity", "mean_velocity"), ("mean_angular", "mean_angular"),
+        )
+    }  # fmt: skip
+    arrays = {name: getattr(solved, name).copy() for name in MOTION}
+    arrays["position"][rows] += change["mean_velocity"] * time * options.dt
+    arrays["velocity"][rows] += change["velocity"] * time
+    if options.rotation:
+        turn = pose.from_rotvec(change["mean_angular"] * graph.dt)
+        arrays["orientation"][rows] = pose.normalise(pose.multiply(turn, arrays["orientation"][rows]))
+        arrays["angular_velocity"][rows] += change["angular"] / time
+    return replace(solved, **arrays)

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
+from sdfsim.physics import joints as jointed
 from sdfsim.physics import pose
+from sdfsim.physics.joints import Joints
 from sdfsim.physics.motion import MOTION, Motion, Rows
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene, Waypoints
@@ -110,6 +112,7 @@ class Bodies:
     sdfs: tuple[Sdf, ...]  # signed distances of the shapes that may be touched
     contact: tuple[ContactGeometry, ...] = ()  # of each of these
     tracks: Tracks | None = None  # the paths of kinematic bodies, None where there are none
+    joints: Joints | None = None  # None where there are none
 
     def __len__(self) -> int:
         return len(self.shape)
@@ -139,6 +142,7 @@ class State(Motion):
     touch: Touch | None = None  # contacts and sleep of the solve; None before its first step
     # [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does
     load: np.ndarray | None = None
+    joints: np.ndarray | None = None  # [J, STATE] of the joints, see `sdfsim.physics.joints`; None where there are none
     time: float = 0.0  # since the start
 
 
@@ -195,14 +199,19 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         sdfs=tuple(scene.shapes[k].sdf for k in touched),
         contact=tuple(scene.shapes[k].contact for k in touched),
         tracks=_tracks(paths, com, length=units.length, time=units.time),
+        joints=jointed.joints_of(scene.joints, com, length=units.length, time=units.time, mass=units.mass)
+        if scene.joints
+        else None,
     )
     orientation = array([b.quat_xyzw for b in scene.bodies])
     origin = array([b.position for b in scene.bodies]) / units.length
+    position = origin + pose.rotate(orientation, bodies.com)
     state = State(
-        position=origin + pose.rotate(orientation, bodies.com),
+        position=position,
         orientation=orientation,
         velocity=array([b.velocity for b in scene.bodies]) / units.velocity,
         angular_velocity=array([b.angular_velocity for b in scene.bodies]) * units.time,
+        joints=None if bodies.joints is None else jointed.initial(bodies.joints, position, orientation),
     )
     return bodies, state
 

@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sdfsim.physics import pose
+from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
 from sdfsim.scene.collision_filter import contact_groups
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Joint, Scene
 from sdfsim.shape.shape import Shape
 
 DEEP = 0.01  # of the smaller thickness of two bodies: who is deeper in another is told
@@ -27,6 +28,7 @@ SHARE = 0.1  # of what lifts a body by its own size, that is in play at least
 FADE = 0.9  # of what was in play before is so much, whenever energy is lost
 PART, LEAST = 0.05, 0.1  # of a run's time that the surfaces may take, and s that they may take anyway
 FEW, MANY = 32, 4096  # pairs that are measured together at first, and at most
+LOOSE = 0.001  # of the size of the smaller body, by which a joint may be from holding
 FEW_BODIES = 64  # that move: of more, energy is accounted for together only
 
 
@@ -103,6 +105,12 @@ def judged(scene: Scene, rollout: Rollout, *, seconds: float = np.inf, every: in
     energy = energy_account(scene, rollout)
     overlap, floating, frames = _surfaces(scene, rollout, seconds, every)
     broken = []
+    loose = _loosest(scene, rollout)
+    if loose is not None and loose.part > LOOSE:
+        broken.append(
+            f"joint: {loose.first!r} is {loose.metres:.2g} m from holding at {loose.at_s:.2f} s, "
+            f"{100 * loose.part:.2g} % of the size of its smaller body"
+        )
     if overlap is not None and overlap.part > DEEP:
         broken.append(
             f"overlap: {overlap.first!r} and {overlap.second!r} are {overlap.metres:.2g} m in each other at "
@@ -153,10 +161,13 @@ def energy_account(scene: Scene, rollout: Rollout) -> Energy:
     dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
     driven = np.array([b.motion == "kinematic" for b in scene.bodies])
     work = rollout.counters.get("energy_given", np.zeros(steps + 1))
+    joined = held_bodies(scene)
     alone = 1 < dynamic.sum() and (dynamic | driven).sum() <= FEW_BODIES
     beside = _beside(scene, rollout) if alone or driven.any() else np.zeros((steps + 1, count, count), bool)
     led = np.asarray(beside[:, driven].any((1, 2)))
-    total = (kinetic + potential).sum(1)
+    if any(driven[b] for joint in _joints(scene) for b in joint.bodies if b >= 0):
+        led[:] = True
+    total = (kinetic + potential).sum(1) + _of_springs(scene, rollout)
     change = np.diff(total) - work[1:]
     change[led[1:]] = np.minimum(change[led[1:]], 0.0)
     change[np.abs(change) < 1e-12 * (np.abs(potential).max(initial=0.0) + kinetic.max(initial=0.0))] = 0.0
@@ -166,7 +177,7 @@ def energy_account(scene: Scene, rollout: Rollout) -> Energy:
     best = (float(climb_J[0]), float(climb[0]), "", float(rollout.time[when[0]]))
     if alone:
         rows = np.flatnonzero(dynamic)
-        shared = beside.any(2) | np.asarray(work != 0)[:, None]
+        shared = beside.any(2) | np.asarray(work != 0)[:, None] | joined
         climbs = _climb((kinetic + potential)[:, rows], kinetic[:, rows], SHARE * lift[rows], shared[:, rows])
         k = int(climbs[1].argmax())
         if climbs[1][k] > best[1]:
@@ -176,6 +187,61 @@ def energy_account(scene: Scene, rollout: Rollout) -> Energy:
     in_play = np.maximum.accumulate(kinetic.sum(1))[:-1] + float(lift.sum())
     part = np.divide(gain, in_play, out=np.zeros_like(gain), where=in_play > 0)
     return Energy(float(gain.sum()), float(part.max(initial=0.0)), float((part > MADE).mean()) if steps else 0.0, *best)
+
+
+def _joints(scene: Scene) -> tuple[Joint, ...]:
+    """The joints that are in play."""
+    return () if scene.effects.joints == "off" else scene.joints
+
+
+def held_bodies(scene: Scene) -> np.ndarray:
+    """[N] bool, the bodies that joints hold: these may push and pull, where nothing touches."""
+    held = np.zeros(len(scene.bodies), bool)
+    held[[b for joint in _joints(scene) for b in joint.bodies if b >= 0]] = True
+    return held
+
+
+def _of_springs(scene: Scene, rollout: Rollout) -> np.ndarray:
+    """[T+1] J, the energy of springs of joints."""
+    total = np.zeros(len(rollout.time))
+    for k, joint in enumerate(_joints(scene)):
+        if joint.spring is not None and rollout.joint_names:
+            total += 0.5 * joint.spring.stiffness * (rollout.joint_position[:, k] - joint.spring.rest) ** 2
+    return total
+
+
+def _loosest(scene: Scene, rollout: Rollout) -> Near | None:
+    """The joint that is farthest from holding, as a part of the size of the smaller body; those that can break are left
+    out."""
+    worst: Near | None = None
+    sizes = [body.scale * largest_extent(scene.shapes[body.shape]) for body in scene.bodies]
+    centre = [scene.shapes[body.shape].com * body.scale for body in scene.bodies]
+    for joint in _joints(scene):
+        if np.isfinite(joint.breaks_force) or np.isfinite(joint.breaks_torque):
+            continue
+        points, axes = [], []
+        for b, anchor, quat in zip(joint.bodies, joint.anchor, joint.quat_xyzw, strict=True):
+            if b < 0:
+                points.append(np.broadcast_to(anchor, (len(rollout.time), 3)))
+                axes.append(np.broadcast_to(pose.to_matrix(quat), (len(rollout.time), 3, 3)))
+            else:
+                turn = pose.to_matrix(rollout.orientation[:, b])
+                points.append(rollout.position[:, b] + turn @ (anchor - centre[b]))
+                axes.append(turn @ pose.to_matrix(quat))
+        way = points[0] - points[1]
+        if joint.kind == "slider":
+            way = way - (way * axes[1][:, :, 0]).sum(1)[:, None] * axes[1][:, :, 0]
+        apart = np.linalg.norm(way, axis=1)
+        if joint.kind == "distance":
+            apart = apart - (joint.length if joint.length is not None else np.inf)
+            if joint.length is None and joint.limits is not None:
+                apart = np.maximum(np.linalg.norm(way, axis=1) - joint.limits[1], 0.0)
+            apart = np.where(np.isfinite(apart), np.abs(apart), 0.0)
+        size = min(size for size in (sizes[b] for b in joint.bodies if b >= 0) if np.isfinite(size))
+        t = int(apart.argmax())
+        if worst is None or apart[t] / size > worst.part:
+            worst = Near(float(apart[t]), float(apart[t] / size), joint.name, "", float(rollout.time[t]))
+    return worst
 
 
 def _beside(scene: Scene, rollout: Rollout) -> np.ndarray:
@@ -259,7 +325,8 @@ def _surfaces(scene: Scene, rollout: Rollout, seconds: float, every: int) -> tup
     solids = [solid_of(shape) for shape in scene.shapes]
     dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
     group, allowed = contact_groups(scene.bodies)
-    course = _Course(scene, rollout, solids, dynamic, group, allowed, _pushed(scene, rollout, dynamic))
+    pushed = _pushed(scene, rollout, dynamic & ~held_bodies(scene))
+    course = _Course(scene, rollout, solids, dynamic, group, allowed, pushed)
     deepest: Near | None = None
     widest: Near | None = None
     done, chunk = 0, 1
@@ -354,6 +421,8 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
     one, other = pair.T
     kept = (course.dynamic[one] | course.dynamic[other]) & course.allowed[course.group[one], course.group[other]]
     kept &= ~(endless[one] & endless[other])
+    if joined := {b for joint in _joints(scene) if not joint.collides for b in (joint.bodies, joint.bodies[::-1])}:
+        kept &= np.array([(a, b) not in joined for a, b in pair.tolist()], bool)
     pair = pair[kept]
     one, other = pair.T
     slack = np.maximum(margin[one], margin[other])

@@ -31,6 +31,11 @@ class Rollout:
             the simulator counts. The penetration is how deep the deepest of an entry's
             contact points lies within the body it meets, by that body's distances; 0 where none does.
         names: N body names.
+        joint_names: J names of joints; none where joints are off.
+        joint_position: [T+1, J] the angle of hinges and balls in rad, the position of sliders and the length of
+            distances in m, 0 of what is fixed.
+        joint_force: [T+1, J, 3] N, world, on the joint's first body in the last inner step; joint_torque: [T+1, J, 3]
+            N m, about the joint's anchor.
         meta: model, seed, versions, dt s.
     """
 
@@ -45,6 +50,10 @@ class Rollout:
     counters: dict[str, np.ndarray] = field(default_factory=dict)
     names: tuple[str, ...] = ()
     meta: dict = field(default_factory=dict)
+    joint_names: tuple[str, ...] = ()
+    joint_position: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    joint_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    joint_torque: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     def __len__(self) -> int:
         """Number of steps, T."""
@@ -66,6 +75,10 @@ class Rollout:
     def save(self, path: Path | str) -> None:
         """Write `rollout.npz`."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("counters", "names", "meta")}
+        if self.joint_names:
+            arrays["joint_names"] = np.array(self.joint_names, dtype=str)
+        else:
+            arrays = {name: value for name, value in arrays.items() if not name.startswith("joint_")}
         arrays |= {f"counter_{k}": v for k, v in self.counters.items()}
         arrays |= {"names": np.array(self.names, dtype=str), "meta": np.array(json.dumps(self.meta))}
         write_arrays(Path(path), arrays)
@@ -77,13 +90,17 @@ class Rollout:
         try:
             counters = {k.removeprefix("counter_"): arrays.pop(k) for k in list(arrays) if k.startswith("counter_")}
             names = tuple(str(n) for n in arrays.pop("names"))
+            joints = tuple(str(n) for n in arrays.pop("joint_names", ()))
             meta = json.loads(str(arrays.pop("meta")))
-            return cls(**arrays, counters=counters, names=names, meta=meta)
+            return cls(**arrays, counters=counters, names=names, meta=meta, joint_names=joints)
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{path}: not a rollout of sdfsim ({error})") from error
 
 
-_PER_FRAME = ("time", "position", "orientation", "velocity", "angular_velocity", "contact_count")
+_PER_FRAME = (
+    "time", "position", "orientation", "velocity", "angular_velocity", "contact_count", "joint_position", "joint_force",
+    "joint_torque",
+)  # fmt: skip
 
 
 def join(frames: list[Rollout]) -> Rollout:

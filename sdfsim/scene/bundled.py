@@ -27,7 +27,7 @@ def find_scene(given: Path | str) -> Path:
     """The scene file that is meant: a path, or the name of a sample where there is no file of that name. Raises
     SdfsimError where it can be neither."""
     path = Path(given)
-    if path.suffix or len(path.parts) != 1 or path.exists():
+    if path.suffix or len(path.parts) != 1 or path.is_file():
         return path
     known = samples()
     if path.name not in known:

@@ -23,6 +23,8 @@ from sdfsim.geometry.mesh_io import GLTF, load_mesh
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.fit import FIT_VERSION, Recipe
+from sdfsim.sdf.fit.certificate import certify_grid
+from sdfsim.sdf.grid import sample_grid
 from sdfsim.sdf.reference import MeshDistance, PiecesDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.shape import DEFAULT_RESOLUTION, FORMAT_VERSION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
@@ -255,8 +257,10 @@ def fit_pieces(
     name: str,
     display: Mesh | None = None,
     nodes: int = DEFAULT_COUNT,
+    kind: Literal["mlp", "grid"] = "mlp",
 ) -> Shape:
-    """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
+    """Fit the compact SDF network to the union of convex pieces, or sample that on a grid (`kind` "grid", in a second):
+    the body that a rigid-body engine collides.
 
     At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
     contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface. Mass
@@ -278,12 +282,17 @@ def fit_pieces(
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
         return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
-    from sdfsim.sdf.fit.train import fit_sdf
+    if kind == "grid":
+        sdf: Sdf = sample_grid(oracle, oracle.bounds, DEFAULT_RESOLUTION)
+        points, certificate = pick(sdf), certify_grid(sdf, oracle)
+        source: dict[str, Any] = {"kind": "pieces", "sdf": "grid", "resolution": DEFAULT_RESOLUTION}
+    else:
+        from sdfsim.sdf.fit.train import fit_sdf
 
-    sdf, points, certificate = fit_sdf(oracle, "default", None, 0, pick, silent, "cpu")
+        sdf, points, certificate = fit_sdf(oracle, "default", None, 0, pick, silent, "cpu")
+        source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle, oracle.bounds)
     mesh = display if display is not None else clean(oracle.surface, name=name)
-    source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
     hulls = tuple(piece.vertices for piece in pieces)
     return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)

@@ -26,7 +26,18 @@ from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
-from sdfsim.simulate.steppers import COUNTS, PHASES, Carry, Frames, FreeFlight, energies_of, stacked, stepper_of
+from sdfsim.simulate.joint import JointHandle
+from sdfsim.simulate.steppers import (
+    COUNTS,
+    PHASES,
+    Carry,
+    Frames,
+    FreeFlight,
+    energies_of,
+    joint_frame,
+    stacked,
+    stepper_of,
+)
 
 if TYPE_CHECKING:
     from sdfsim.scene.builder import SceneBuilder
@@ -103,20 +114,28 @@ class Simulator(LiveScene):
         check_device(device)
         effects = plan(scene)
         model = model if model is not None else scene.model
+        jointed = effects.joints.on
         asked = effects.contact.on or free_flight == "learned"
         model = model if isinstance(model, Model) else load_model(model, weights=asked)
         self._asked = {"dt": dt, "free_flight": free_flight}
-        stepper = stepper_of(model, contact=effects.contact.on, free_flight=free_flight)
+        stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight)
+        if jointed and not stepper.forces:
+            raise SdfsimError("networks on surface nodes know no joints", "take the solver, or set effects.joints: off")
         self.device = str(pick_device(device)) if stepper.on_surfaces else "cpu"
         self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed
         self.units = stepper.units(scene, dt)
         self.dt = self.model.dt * self.units.time
         self.outside_training = stepper.unknown([scene], self.units)
-        worked_on = replace(scene, shapes=tuple(stepper.surface(shape) for shape in scene.shapes))
+        surfaces = tuple(stepper.surface(shape) for shape in scene.shapes)
+        worked_on = replace(scene, shapes=surfaces, joints=scene.joints if jointed else ())
         check_nodes(worked_on)
         self.bodies, state = from_scene(worked_on, self.units)
+        if jointed and not effects.contact.on:
+            self.bodies = replace(self.bodies, allowed=np.zeros_like(self.bodies.allowed))
         self._names = tuple(b.name for b in scene.bodies)
+        self._joint_names = tuple(joint.name for joint in scene.joints)
+        self._joint_unit = [1.0 if joint.kind in ("hinge", "ball") else self.units.length for joint in scene.joints]
         check_sizes(self.bodies, self._names, self.units.length)
         if effects.contact.on and self.model.ranges:
             self.outside_training += deep_starts(self.bodies, state, self._names, self.units.length)
@@ -230,6 +249,15 @@ class Simulator(LiveScene):
             raise SdfsimError(f"there is no body {name!r}{close}", f"there are {', '.join(self._names[:20])}")
         return BodyHandle(self, self._names.index(name))
 
+    def joint(self, name: str) -> JointHandle:
+        """A joint by its name. Raises SdfsimError where there is none of that name."""
+        names = [joint.name for joint in self.scene.joints]
+        if name not in names:
+            told = nearest(name, names)
+            known = f"there are {', '.join(names[:20])}" if names else "the scene has no joints"
+            raise SdfsimError(f"there is no joint {name!r}{told}", known)
+        return JointHandle(self, names.index(name))
+
     def contact_points(self) -> list[ContactPoint]:
         """Where bodies touch in the present state, as the last step of the contact solve has left it. Raises
         SdfsimError for networks on surface nodes, which have no impulses."""
@@ -304,6 +332,7 @@ class Simulator(LiveScene):
             pair=pairs,
             point=points,
             counts={name: np.array([value], float) for name, value in counts.items()},
+            joint=joint_frame(state)[None],
         )
         return self._rollout(frames, 0.0)
 
@@ -392,6 +421,10 @@ class Simulator(LiveScene):
             counters=counters,
             names=self._names,
             meta=self._meta,
+            joint_names=self._joint_names if frames.joint.shape[1] else (),
+            joint_position=frames.joint[:, :, 0] * self._joint_unit if frames.joint.shape[1] else frames.joint[:, :, 0],
+            joint_force=frames.joint[:, :, 1:4] * u.mass * u.acceleration,
+            joint_torque=frames.joint[:, :, 4:7] * u.energy,
         )
 
 

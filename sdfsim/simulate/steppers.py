@@ -22,6 +22,8 @@ from sdfsim.learned.model import SOLVER, SURFACE, Model
 from sdfsim.learned.training_ranges import outside_training
 from sdfsim.physics.bodies import Bodies, State, Units, awake
 from sdfsim.physics.free_flight import driven, fly, with_history
+from sdfsim.physics.joint_columns import COORD, PULL, STATE
+from sdfsim.physics.joints import stored
 from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import SUBSTEPS, Options
 from sdfsim.physics.units import scene_units
@@ -33,9 +35,9 @@ if TYPE_CHECKING:  # numba and torch take their time to load
     import torch
 
     from sdfsim.learned.families import Family
+    from sdfsim.learned.impulse import ImpulseNetwork
     from sdfsim.learned.near import Contacts, Pairs
     from sdfsim.learned.tensors import BodyTensors
-    from sdfsim.physics.solver.impulse import Weights
     from sdfsim.physics.solver.prepare import Compiled, Steps
     from sdfsim.physics.solver.record import Edges
 
@@ -67,6 +69,8 @@ class Frames(Motion):
     pair: np.ndarray  # [sum(touching), 2] int64, the bodies that touch there
     point: np.ndarray  # [sum(touching), 3]
     counts: dict[str, np.ndarray]  # [K] each, see `COUNTS` and `PHASES`
+    # [K, J, 7] of each joint its angle, position or length; force and torque on its first body, at its anchor
+    joint: np.ndarray
 
 
 @dataclass
@@ -84,7 +88,7 @@ class Carry:
     scene: Compiled | None = None  # the bodies for compiled code, if the stepper calls any
     # Weights of a network on the solve, for compiled code; the bodies as tensors, for a network on surface nodes. Both
     # also depend on the options.
-    weights: Weights | None = None
+    weights: ImpulseNetwork | None = None
     tensors: BodyTensors | None = None
     edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
     near: Contacts | Pairs | None = None  # where a network on surface nodes saw bodies near each other
@@ -207,7 +211,7 @@ class Solver(Stepper):
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
         from sdfsim.physics.solver.prepare import disturbed
 
-        return disturbed(super().announce(state, carry, changed), changed, gravity=gravity)
+        return disturbed(carry.bodies, super().announce(state, carry, changed), changed, gravity=gravity)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         from sdfsim.physics.solver.prepare import contact_points
@@ -259,19 +263,19 @@ class OnSolver(Solver):
         return replace(self, trust=0.0)
 
     def _step(self, state: State, carry: Carry) -> State:
-        # No network has seen forces in its training.
-        asked = self.trust > 0.0 and state.load is None
+        # No network has seen forces or joints in its training.
+        asked = self.trust > 0.0 and state.load is None and state.joints is None
         carry.options = replace(carry.options, record=asked)
         solved, edges = super()._step(state, carry), cast("Edges", carry.edges)
         if not (asked and len(edges.pair)):
             return solved
-        from sdfsim.learned.inference import corrected, packed, terms_of
+        from sdfsim.learned.inference import corrected, doubled
 
         with carry.timed("network_ms"):
             if carry.weights is None:
-                carry.weights = packed(cast("Any", self.model.network), friction=carry.options.friction)
-            terms, world = terms_of(carry.options, self.model.dt, self.trust), cast("Compiled", carry.scene).world
-            after = corrected(carry.weights, world, state, solved, edges, terms)
+                carry.weights = doubled(self.model.network)
+            known = self.model.dt, self.trust
+            after = corrected(carry.weights, carry.bodies, state, solved, edges, carry.options, *known)
         carry.counts |= {"nodes": len(np.unique(edges.pair)), "edges": len(edges.pair)}
         return after
 
@@ -384,7 +388,10 @@ def energies_of(bodies: Bodies, state: State, gravity: np.ndarray) -> tuple[floa
     from sdfsim.physics.solver.survey import energies
 
     moved = (np.ascontiguousarray(getattr(state, name)) for name in MOTION)
-    return energies(bodies.mass, bodies.inertia, gravity, *moved)
+    kinetic, potential = energies(bodies.mass, bodies.inertia, gravity, *moved)
+    if bodies.joints is not None and state.joints is not None:
+        potential += stored(bodies.joints, state.joints)
+    return kinetic, potential
 
 
 def stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: Bodies, options: Options) -> Frames:
@@ -405,7 +412,14 @@ def stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: B
         pair=np.concatenate([np.zeros((0, 2), np.int64), *pairs]),
         point=np.concatenate([np.zeros((0, 3)), *points]),
         counts=counts,
+        joint=np.stack([joint_frame(s) for s in states]) if states else joint_frame(like)[None][:0],
     )
+
+
+def joint_frame(state: State) -> np.ndarray:
+    """[J, 7], see `Frames.joint`."""
+    known = np.zeros((0, STATE)) if state.joints is None else state.joints
+    return np.concatenate([known[:, COORD, None], known[:, PULL : PULL + 6]], 1)
 
 
 def stepper_of(model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact") -> Stepper:

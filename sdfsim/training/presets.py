@@ -31,6 +31,10 @@ RADII = {"sdf-sim": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-la
 PRESETS = {
     "small": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "alone": Preset("impulse", LITTLE | {"alone": 1}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    # on the solve, for recordings of real motions
+    "impacts": Preset(
+        "impulse", {"width": 32, "rounds": 2, "impacts": 1}, steps=1_000, batch=32, rate=2e-3, matrix_rate=0.01
+    ),
     # SDF-Sim's graph with a network that a CPU keeps up with
     "sdf-sim-small": Preset(
         "sdf-sim", {"width": 64, "steps": 5}, 20_000, batch=32, rate=1e-3, reach=RADII["sdf-sim"], nodes=64, noise=0.003

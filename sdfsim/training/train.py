@@ -36,15 +36,20 @@ def train(
     device: str = "cpu",
     budget: float = math.inf,
     workers: int = 0,
+    scene: Path | None = None,
+    allow_outside: bool = False,
     on_progress: Progress = silent,
 ) -> dict:
-    """Train a preset on one dataset or several; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
+    """Train a preset on one dataset or several, or on recordings of a `scene`; write `model.safetensors`, `log.jsonl`
+    and a checkpoint under `out`.
 
-    Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. The preset is a
-    name in `PRESETS`, or one of your own, with other `steps` if given. `resume` goes on from the checkpoint in `out`,
-    with the result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after which it
-    stops early. So many `workers` draw batches ahead, in processes of their own, and the result is the same: a GPU
-    would wait for the contacts of networks on surface nodes, which the CPU searches. Returns paths, losses and
+    Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. Recordings are what
+    `sdfsim identify` reads, of one scene that says what they do not (best the one that it wrote); every sixth is held
+    out. They are trained on over several steps in a row, on the CPU, with the preset "impacts" or "alone". The preset
+    is a name in `PRESETS`, or one of your own, with other `steps` if given. `resume` goes on from the checkpoint in
+    `out`, with the result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after
+    which it stops early. So many `workers` draw batches ahead, in processes of their own, and the result is the same: a
+    GPU would wait for the contacts of networks on surface nodes, which the CPU searches. Returns paths, losses and
     processor time. Raises SdfsimError for unusable data, a checkpoint in `out` without `resume`, another run writing to
     it, or diverged training.
     """
@@ -60,13 +65,20 @@ def train(
     checkpoint = out / "checkpoint.npz"
     if checkpoint.exists() and not resume:
         raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
-    infos = [read_info(folder) for folder in folders]
-    team, device = gather_team(device)
+    _check_kind(plan, scene, workers)
+    infos = [read_info(folder) for folder in folders] if scene is None else []
+    team, device = gather_team("cpu" if scene else device)
     place = pick_device(device)
     with locked(out) if team.leads else nullcontext():
         with team.in_turn():  # the first finds contacts and caches them, the others read
-            task, held_out = _tasks(plan, folders, lambda _, message: on_progress(0.0, message))
-        made = [_made(*one) for one in zip(folders, infos, task.counts, held_out.counts, strict=True)]
+            if scene is None:
+                task, held_out = _tasks(plan, folders, lambda _, message: on_progress(0.0, message))
+                counts = zip(folders, infos, task.counts, held_out.counts, strict=True)
+                made = [_made(*one) for one in counts]
+            else:
+                task, held_out = _motion_tasks(folders, scene, on_progress, allow_outside=allow_outside)
+                counts = {"train": task.counts[0], "validation": held_out.counts[0]}
+                made = [{"scene": scene.name, "recordings": counts}]
         run = Run(plan, task, total, seed, place, team, workers)
         if checkpoint.exists():
             run.load(checkpoint)
@@ -115,6 +127,30 @@ def _tasks(plan: Preset, folders: Sequence[Path], tell: Progress):
         raise SdfsimError("networks on surface nodes train on one dataset", "give a single --data")
     data = folders[0]
     return SurfaceTask(data, "train", plan, noisy=True), SurfaceTask(data, "validation", plan)
+
+
+def _check_kind(plan: Preset, scene: Path | None, workers: int) -> None:
+    """Raise SdfsimError where a preset does not train on what is given."""
+    impacts, alone = (bool(plan.config.get(name)) for name in ("impacts", "alone"))
+    if scene is None and impacts:
+        raise SdfsimError("preset: impacts trains on recordings of real motions", "give them as --data, with --scene")
+    if scene is not None and workers:
+        raise SdfsimError("workers: batches of recordings are drawn in one process", "leave --workers out")
+    if scene is not None and not (impacts or alone):
+        raise SdfsimError("preset: on recordings of a scene impacts and alone are trained", "give --preset impacts")
+
+
+def _motion_tasks(paths: Sequence[Path], scene: Path, tell: Progress, *, allow_outside: bool):
+    """Training and held-out tasks of recordings of a scene."""
+    from sdfsim.apps.observed import load_recordings
+    from sdfsim.training.motion_task import HELD, LEAST, MotionTask
+
+    recordings, known = load_recordings(paths, scene, allow_outside=allow_outside, on_progress=tell)
+    if len(recordings) < LEAST:
+        raise SdfsimError(f"{len(recordings)} recordings (at least {LEAST} to train on)", "give more of the same scene")
+    held = [r for k, r in enumerate(recordings) if k % HELD == min(HELD, len(recordings)) - 1]
+    kept = [r for r in recordings if not any(r is other for other in held)]
+    return MotionTask(kept, known, noisy=True), MotionTask(held, known)
 
 
 def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progress) -> None:

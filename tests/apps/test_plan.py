@@ -47,7 +47,7 @@ def told(scene: Path, model: str) -> dict:
 
 def test_a_plan_reports_effects_pairs_and_costs(scene, model):
     report = told(scene, model)
-    assert [name for name, e in report["effects"].items() if not e["on"]] == ["restitution"]
+    assert [name for name, e in report["effects"].items() if not e["on"]] == ["restitution", "joints"]
     assert (report["static"], report["kinematic"]) == (["floor"], ["lift"]) and len(report["dynamic"]) == 3
     # 10 pairs: floor-lift is not driven, ghost meets the floor alone, and a plane is near to everybody.
     pairs = {name: report["pairs"][name] for name in ("total", "unmoved", "excluded", "possible", "near", "apart")}

@@ -15,7 +15,7 @@ version: 1
 duration: 0.1
 shapes:
   ball: {sphere: {radius: 0.1}}
-  ring: {primitive: {name: torus, size: 0.2}, sdf: mesh}
+  ring: {primitive: {name: box, size: 0.2}, sdf: mesh}
 bodies:
   - {name: floor, plane: {}}
   - {name: ball, shape: ball, position: [0, 0, 0.5], mass: 1, friction: 0.4}
@@ -25,7 +25,7 @@ SHAPES = {  # edits of what is shown
     "a radius": ("radius: 0.1", "radius: 0.2"),
     "a form": ("sphere: {radius: 0.1}", "box: {size: [0.2, 0.2, 0.2]}"),
     "a size": ("size: 0.2", "size: 0.25"),
-    "a mesh": ("name: torus", "name: cone"),
+    "a mesh": ("name: box", "name: cone"),
     "a shape": ("shape: ring", "shape: ball"),
     "a scale": ("shape: ball,", "shape: ball, scale: 1.01,"),
     "a motion": ("0.5], mass: 1}", "0.5], motion: static}"),
@@ -67,8 +67,6 @@ def test_a_scene_that_was_edited_is_refused(made, what):
     edited(file, *(SHAPES | OTHERS)[what])
     with pytest.raises(SdfsimError, match=r"rollout\.npz: .*scene\.yaml"):
         read_run(run)
-    file.write_text(SCENE)
-    assert len(read_run(run)[1]) > 0
 
 
 @pytest.mark.parametrize("what", HARMLESS)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from sdfsim import Scene, SdfsimError, load_scene
-from sdfsim.apps.export import _plain_names
+from sdfsim.apps.export import plain_names
 from sdfsim.base import files
 from sdfsim.base.files import LOCK, locked, path_from
 
@@ -130,7 +130,7 @@ def test_a_scene_that_names_files_with_backslashes_is_read(tmp_path):
 
 
 def test_no_exported_file_has_the_name_of_a_device():
-    assert _plain_names(["con", "NUL", "com1", "cup"]) == ["con_1", "NUL_1", "com1_1", "cup"]
+    assert plain_names(["con", "NUL", "com1", "cup"]) == ["con_1", "NUL_1", "com1_1", "cup"]
 
 
 def test_a_console_that_knows_few_characters_shows_the_others_escaped(tmp_path):

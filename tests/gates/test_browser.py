@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import shlex
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +16,12 @@ from PIL import ExifTags, Image, ImageDraw
 from pipeline.inputs.photos import prepare_photos
 from pipeline.measure import measure
 from pipeline.mesh.placement import check_distance
+from pipeline.options import options_of
+from sdfsim import Scene, Simulator
+from sdfsim.apps.recording import body_colors, save_rollout
 from tests.helpers.browser import Browser
 
+ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.gate
 RED, GREEN = (255, 0, 0), (0, 255, 0)
 # Where the dots are, px of the upright photo, by the photo.
@@ -73,7 +81,7 @@ def test_clicks_give_the_options_to_paste(photos, tmp_path):
         browser.value("document.getElementById('body').click(); document.getElementById('name').value = 'cup'")
         click_dot("<b>it's.png")
         *_, flag, body = option()
-        assert flag == "--body" and body.startswith("cup=")
+        assert flag == "--body" and options_of(body=[body]).body == {"cup": [body[4:]]}
         for text, name in ((first, "wide & big.jpg"), (second, "turned.jpg"), (body[4:], "<b>it's.png")):
             assert text.rpartition(":")[0] == name
             at = np.array(text.rpartition(":")[2].split(","), dtype=float)
@@ -82,3 +90,39 @@ def test_clicks_give_the_options_to_paste(photos, tmp_path):
         browser.value("document.getElementById('undo').click()")
         assert option()[0] == "--distance" and len(option()) == 4
         assert not browser.errors
+
+
+def test_a_recording_is_watched_in_the_browser(tmp_path):
+    """The page that `view --web` serves shows the ball: rerun draws it on the processor here, which takes a while."""
+    scene = Scene(duration=0.2)
+    scene.add("floor", plane={})
+    scene.add("ball", sphere={"radius": 0.5}, position=(0, 0, 0.5))
+    loaded = scene.load()
+    rollout = Simulator(loaded).run()
+    save_rollout(loaded, rollout, tmp_path / "rollout.rrd")
+    command = [sys.executable, "-m", "cli", "view", str(tmp_path / "rollout.rrd"), "--web"]
+    shown = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        assert shown.stderr
+        page = shown.stderr.readline().removeprefix("watch it at ").strip()
+        assert page.startswith("http://localhost:")
+        hue = np.array(body_colors(loaded)[1], dtype=float)
+        with Browser(tmp_path / "profile") as browser:
+            browser.open(page)
+            end = time.monotonic() + 400
+            while True:
+                pixels = np.asarray(Image.open(browser.picture(tmp_path / "page.png")).convert("RGB"), dtype=float)
+                # Light and shade change how bright the ball is, not its hue.
+                along = pixels @ hue / np.linalg.norm(hue)
+                aside = np.linalg.norm(pixels - along[..., None] * hue / np.linalg.norm(hue), axis=-1)
+                ball = (along > 60) & (aside < 0.15 * along)
+                if ball[:, :900].sum() > 2000:
+                    break
+                assert time.monotonic() < end, "no ball on the page"
+                time.sleep(2.0)
+            rows, columns = np.nonzero(ball[:, :900])
+            assert 0.7 < np.ptp(columns) / np.ptp(rows) < 1.4  # round
+    finally:
+        shown.send_signal(signal.SIGINT)
+        shown.wait()
+    assert shown.returncode in (0, 130)

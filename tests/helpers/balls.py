@@ -57,10 +57,18 @@ def true_depth(view: View, distance: Distance, far: float = 8.0) -> np.ndarray:
     return np.where(missed, np.nan, along).reshape(view.height, view.width)
 
 
-def shoot(views: list[View], distance: Distance, folder: Path, seed: int = 0) -> PosedPhotos:
+def grey_of(points: np.ndarray) -> np.ndarray:
+    """The texture [P] in 0..1 at points [P, 3]: values between random ones on two lattices, plain far away."""
+    rng = np.random.default_rng(0)
+    grids = [rng.random((n, n, n)) for n in (64, 127)]
+    parts = [share * map_coordinates(grid, ((points + 1.5) / 3 * (len(grid) - 1)).T, order=1, mode="nearest")
+             for share, grid in zip((0.6, 0.4), grids, strict=True)]  # fmt: skip
+    return parts[0] + parts[1]
+
+
+def shoot(views: list[View], distance: Distance, folder: Path) -> PosedPhotos:
     """Writes the photos of views to `folder`/images; returns them with sparse points of the surface."""
-    noise = np.random.default_rng(seed)
-    grids = [noise.random((n, n, n)) for n in (64, 127)]
+    noise = np.random.default_rng(0)
     (folder / "images").mkdir(parents=True)
     points, point_of, view_of = [], [], []
     for view in views:
@@ -68,11 +76,7 @@ def shoot(views: list[View], distance: Distance, folder: Path, seed: int = 0) ->
         rays = view.rays(column.ravel(), row.ravel())
         along = true_depth(view, distance).ravel()
         at = view.center + np.nan_to_num(along, nan=8.0)[:, None] * rays
-        # Values between random ones on two lattices; far away everything is plain.
-        grey = sum(
-            share * map_coordinates(grid, ((at + 1.5) / 3 * (len(grid) - 1)).T, order=1, mode="nearest")
-            for share, grid in zip((0.6, 0.4), grids, strict=True)
-        )
+        grey = grey_of(at)
         shade = np.where(np.isnan(along), 0.5, grey).reshape(view.height, view.width)
         picture = (255 * np.clip(shade, 0, 1)).astype(np.uint8)
         Image.fromarray(picture).convert("RGB").save(folder / "images" / view.name, quality=97)

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from sdfsim.learned import inference
-from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.model import Model, new_network
 from sdfsim.learned.near import Contacts, find_contacts
 from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
-from sdfsim.physics.motion import MOTION
 from sdfsim.physics.solver.prepare import Compiled
-from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, Edges
-from sdfsim.physics.solver.world import World
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 
-kernel = inference.compiled
 CPU = torch.device("cpu")
 
 
@@ -52,6 +44,8 @@ def random_model(kind: str, seed: int = 0, push: float = 0.5, **config: int) -> 
         for layer in network.rounds:  # type: ignore[union-attr]
             torch.nn.init.normal_(layer.normal_impulse.weight, std=push)
             torch.nn.init.normal_(layer.tangent_impulse.weight, std=push)
+            if layer.moment is not None:
+                torch.nn.init.normal_(layer.moment.weight, std=push)
     network.eval().requires_grad_(False)
     return Model("random", kind, network, dt=0.02, gravity=10.0, length=1.0, reach=0.1)
 
@@ -90,34 +84,6 @@ def dropped(box_shape) -> Scene:
     return Scene((box_shape, analytic_shape("plane")), bodies, gravity=np.array([0.0, 0.0, -9.81]), duration=1.0)
 
 
-def contact_graph(
-    world: World, before: State, solved: State, edges: Edges, terms: kernel.Terms
-) -> tuple[torch.Tensor, ContactGraph]:
-    """The bodies [A] of a step's graph, and the graph, as the compiled network has it but in torch."""
-    start, end = (kernel.Poses(*(getattr(state, name) for name in MOTION)) for state in (before, solved))
-    given = kernel._graph(world, start, end, edges.pair, edges.value, terms)
-    columns = {"normal": AXIS, "arm_first": ARM, "arm_second": OTHER, "impulse": GIVEN}
-    twists = {"": kernel.START, "free_": kernel.FREE, "solved_": kernel.END, "mean_": kernel.MEAN}
-    value, twist, pair = (torch.from_numpy(array) for array in (given.value, given.twist, given.pair))
-    pairs = len(given.first) - 1
-    return torch.from_numpy(given.body), ContactGraph(
-        inverse_mass=torch.from_numpy(given.inverse_mass),
-        inverse_inertia=torch.from_numpy(given.inverse_inertia),
-        **{f"{name}velocity": twist[:, k : k + 3] for name, k in twists.items()},
-        **{f"{name}angular": twist[:, k + 3 : k + 6] for name, k in twists.items()},
-        **{name: value[:, k : k + 3] for name, k in columns.items()},
-        first=pair[:, 0],
-        second=pair[:, 1],
-        pair=torch.repeat_interleave(torch.arange(pairs), torch.from_numpy(np.diff(given.first))),
-        pairs=pairs,
-        gap=value[:, APART],
-        when=value[:, WHEN],
-        friction=torch.from_numpy(given.product[:, 0]),
-        restitution=torch.from_numpy(given.product[:, 1]),
-        dt=terms.known,
-    )
-
-
 def in_torch(bodies: Bodies, state: State) -> tuple[BodyTensors, StateTensors]:
     """Bodies and state as a network on surface nodes has them."""
     return body_tensors(bodies, CPU), state_tensors(state, CPU)
@@ -129,12 +95,6 @@ def contact_edges(
     """Bodies, state and contact edges as a network on surface nodes is given them."""
     tensors = in_torch(bodies, state)
     return *tensors, find_contacts(*tensors, gravity, reach, dt, Compiled(bodies, state))
-
-
-def in_single(graph: ContactGraph) -> ContactGraph:
-    """The graph in single precision, as a network has it."""
-    values = {name: value for name, value in vars(graph).items() if isinstance(value, torch.Tensor)}
-    return replace(graph, **{name: v.float() for name, v in values.items() if v.is_floating_point()})
 
 
 def surface_model(kind: str = "sdf-sim", push: float = 1e-3):

@@ -7,23 +7,30 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sdfsim.learned.contact_graph import ContactGraph, EdgeFrames, edge_frames
-from sdfsim.learned.impulse import bounded, pushed
-from sdfsim.learned.inference import terms_of
+from sdfsim.learned.contact_graph import ContactGraph, EdgeFrames, edge_frames, in_single
+from sdfsim.learned.impulse import LEVER, bounded, pushed, struck, with_moments
+from sdfsim.learned.inference import step_graph
+from sdfsim.learned.model import Model
 from sdfsim.physics.solver.record import GIVEN
 from sdfsim.physics.validity import NO_LIMITS
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
-from tests.helpers.scenes import angle_between, contact_graph, in_single, make_body, random_model
+from tests.helpers.scenes import angle_between, make_body, random_model
+
+
+@pytest.fixture(params=["everywhere", "impacts"])
+def model(request) -> Model:
+    """Untrained networks on the solve: one that acts wherever something moves, one that acts in impacts."""
+    return random_model("impulse", width=16, rounds=2, impacts=int(request.param == "impacts"))
 
 
 def linear_momentum(sim: Simulator) -> np.ndarray:
     return (sim.bodies.mass[:, None] * sim.state.velocity).sum(0)
 
 
-def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair):
-    sim = Simulator(free_pair, random_model("impulse"))
+def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair, model):
+    sim = Simulator(free_pair, model)
     before = linear_momentum(sim)
     touched = 0
     for _ in range(20):
@@ -33,15 +40,17 @@ def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair):
     assert touched > 1
 
 
-def first_graph(scene: Scene, steps: int = 30) -> tuple[Simulator, torch.Tensor, ContactGraph]:
+def first_graph(
+    scene: Scene, steps: int = 30, model: Model | None = None
+) -> tuple[Simulator, np.ndarray, ContactGraph]:
     """The first step in which contacts act: the simulator before it, the bodies in contact, and their graph."""
-    sim = Simulator(scene, random_model("impulse"))
-    world, options, state = sim.carry.scene.world, replace(sim.options, record=True), sim.state
+    sim = Simulator(scene, model or random_model("impulse"))
+    options, state = replace(sim.options, record=True), sim.state
     for _ in range(steps):
         made = sim.carry.scene.advance(state, options, 1, NO_LIMITS)
         solved, edges = made.state, made.edges
         if edges.value[:, GIVEN : GIVEN + 3].any():
-            active, graph = contact_graph(world, state, solved, edges, terms_of(options, sim.model.dt))
+            active, graph = step_graph(sim.bodies, state, solved, edges, options, sim.model.dt)
             sim.restore(state)
             return sim, active, in_single(graph)
         state = solved
@@ -81,6 +90,15 @@ def pushes(graph: ContactGraph, strength: float, seed: int) -> tuple[EdgeFrames,
     return frames, torch.stack([end, mean], -1), torch.randn(len(graph.gap), 3, 2, generator=generator) * scale
 
 
+def energy(graph: ContactGraph, twist: torch.Tensor) -> float:
+    """Of the bodies that move, with twists [N, 6]."""
+    moves = graph.inverse_mass > 0
+    inertia = torch.linalg.inv(graph.inverse_inertia[moves].double())
+    velocity, spin = twist[moves, :3].double(), twist[moves, 3:].double()
+    turning = (spin * (inertia @ spin[..., None])[..., 0]).sum()
+    return float(0.5 * (velocity.square().sum(-1) / graph.inverse_mass[moves]).sum() + 0.5 * turning)
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("strength", [0.1, 3.0])
 @pytest.mark.parametrize("scene", ["dropped", "free_pair"])
@@ -94,23 +112,51 @@ def test_the_trust_region_keeps_what_contact_can_do(scene, strength, seed, reque
     assert (normal >= -1e-6).all()
     assert (drag <= 2.0**0.5 * graph.friction * normal * (1 + 1e-5) + 1e-6).all()
 
-    def energy(twist: torch.Tensor) -> float:
-        moves = graph.inverse_mass > 0
-        inertia = torch.linalg.inv(graph.inverse_inertia[moves].double())
-        velocity, spin = twist[moves, :3].double(), twist[moves, 3:].double()
-        turning = (spin * (inertia @ spin[..., None])[..., 0]).sum()
-        return float(0.5 * (velocity.square().sum(-1) / graph.inverse_mass[moves]).sum() + 0.5 * turning)
-
     free = torch.cat([graph.free_velocity, graph.free_angular], -1)
     after = pushed(graph, frames, kept, start)[..., 0]
-    assert energy(after) <= max(energy(free), energy(start[..., 0])) * (1 + 1e-3)
+    assert energy(graph, after) <= max(energy(graph, free), energy(graph, start[..., 0])) * (1 + 1e-3)
 
 
-def test_surfaces_that_do_not_move_against_each_other_are_left_to_the_solve(box_shape):
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("strength", [0.1, 3.0])
+@pytest.mark.parametrize("scene", ["dropped", "free_pair"])
+def test_in_impacts_the_network_keeps_what_contact_can_do(scene, strength, seed, request):
+    _, _, graph = first_graph(request.getfixturevalue(scene))
+    _, start, wild = pushes(graph, strength, seed)
+    frames = with_moments(graph, edge_frames(graph))
+    kept = struck(graph, frames, torch.cat([wild, 0.3 * wild.flip(0)], 1), start, 1.0)
+    assert kept[:, 3:].abs().max() > 1e-5
+    push, drag = frames.solved[:, 0], (frames.solved[:, 1:3] + kept[:, 1:3, 0]).norm(dim=-1)
+    normal, moment = push + kept[:, 0, 0], kept[:, 3:, 0].norm(dim=-1)
+    grip = torch.where(push > 0, frames.solved[:, 1:3].norm(dim=-1) / push.clamp_min(1e-9), 0.0)
+    assert (normal >= push / (1.0 + graph.restitution) - 1e-6).all()  # a rebound of restitution 0
+    assert (normal <= 2.0 * push / (1.0 + graph.restitution) + 1e-6).all()  # of 1
+    assert (drag <= torch.maximum(graph.friction, grip) * normal * (1 + 1e-5) + 1e-6).all()
+    arm = torch.minimum(*(
+        torch.where(graph.inverse_mass[body] > 0, way.norm(dim=-1), torch.inf)
+        for body, way in ((graph.first, graph.arm_first), (graph.second, graph.arm_second))
+    ))  # fmt: skip
+    assert (moment <= LEVER * arm * normal + 1e-6).all()
+    free, solved = torch.cat([graph.free_velocity, graph.free_angular], -1), start[..., 0]
+    assert energy(graph, pushed(graph, frames, kept, start)[..., 0]) <= max(
+        energy(graph, free), energy(graph, solved)
+    ) * (1 + 1e-3)
+
+
+def test_in_impacts_what_parts_or_slides_is_left_to_the_solve(free_pair):
+    _, _, graph = first_graph(free_pair)
+    parting = replace(graph, velocity=-graph.velocity, angular=-graph.angular)
+    _, start, wild = pushes(graph, 1.0, 0)
+    for one, acts in ((graph, True), (parting, False)):
+        frames = with_moments(one, edge_frames(one))
+        assert struck(one, frames, torch.cat([wild, wild], 1), start, 1.0).any() == acts
+
+
+def test_surfaces_that_do_not_move_against_each_other_are_left_to_the_solve(box_shape, model):
     resting = make_body("box", 0, [0.0, 0.0, 0.3])
     floor = make_body("floor", 1, [0.0, 0.0, 0.0], motion="static", mass=0.0)
     scene = Scene((box_shape, analytic_shape("plane")), (resting, floor), np.array([0.0, 0.0, -9.81]), duration=1.0)
-    alone, other = (Simulator(scene, m).run(steps=40) for m in ("solver", random_model("impulse")))
+    alone, other = (Simulator(scene, m).run(steps=40) for m in ("solver", model))
     np.testing.assert_allclose(other.position, alone.position, atol=1e-4)
     assert np.abs(other.velocity[-1]).max() < 1e-6
 
@@ -135,9 +181,8 @@ def turned(scene, rotation: Rotation):
     return replace(scene, bodies=tuple(body(b) for b in scene.bodies), gravity=rotation.apply(scene.gravity))
 
 
-def test_turning_the_scene_with_its_gravity_turns_the_rollout(dropped):
+def test_turning_the_scene_with_its_gravity_turns_the_rollout(dropped, model):
     rotation = Rotation.from_rotvec([0.4, -1.1, 0.7])
-    model = random_model("impulse")
     plain = Simulator(dropped, model).run(steps=10)
     other = Simulator(turned(dropped, rotation), model).run(steps=10)
     assert plain.contact_count.sum() > 0
@@ -148,16 +193,15 @@ def test_turning_the_scene_with_its_gravity_turns_the_rollout(dropped):
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e4, 1e6])
-def test_far_from_the_origin_nothing_changes(dropped, distance):
+def test_far_from_the_origin_nothing_changes(dropped, distance, model):
     shift = np.array([distance, -distance, 0.0])
     far = replace(dropped, bodies=tuple(replace(b, position=b.position + shift) for b in dropped.bodies))
-    model = random_model("impulse")
     near_run, far_run = (Simulator(s, model).run(steps=8) for s in (dropped, far))
     np.testing.assert_allclose(far_run.position[:, 1:] - shift, near_run.position[:, 1:], atol=1e-4)
 
 
 @pytest.mark.parametrize(("size", "strength"), [(0.01, 9.81), (100.0, 9.81), (1.0, 1.62)])
-def test_froude_scaled_scenes_move_alike(dropped, size, strength):
+def test_froude_scaled_scenes_move_alike(dropped, size, strength, model):
     time = np.sqrt(size * 9.81 / strength)
     scaled = replace(
         dropped,
@@ -174,14 +218,12 @@ def test_froude_scaled_scenes_move_alike(dropped, size, strength):
             for b in dropped.bodies
         ),
     )
-    model = random_model("impulse")
     one, other = Simulator(dropped, model).run(steps=8), Simulator(scaled, model).run(steps=8)
     np.testing.assert_allclose(other.time, one.time * time, rtol=1e-9)
     np.testing.assert_allclose(other.position / size, one.position, atol=1e-4)
 
 
-def test_same_scene_same_bits(dropped):
-    model = random_model("impulse")
+def test_same_scene_same_bits(dropped, model):
     one, other = Simulator(dropped, model).run(steps=8), Simulator(dropped, model).run(steps=8)
     assert (one.position == other.position).all() and (one.orientation == other.orientation).all()
 
@@ -200,9 +242,9 @@ def test_without_friction_nothing_tangential_is_computed(dropped):
     np.testing.assert_allclose(rollout.velocity[:, 1, :2], np.tile([[1.0, 0.5]], (9, 1)), atol=1e-5)
 
 
-def test_mirrored_frames_mirror_the_network_output(dropped):
+def test_mirrored_frames_mirror_the_network_output(dropped, model):
     """A left-handed frame is what the mirror image shows: twice mirrored is the same, and it is a different input."""
-    sim, _, graph = first_graph(dropped)
+    sim, _, graph = first_graph(dropped, model=model)
 
     def mirror(v):
         return v * v.new_tensor([1.0, -1.0, 1.0])

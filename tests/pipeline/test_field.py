@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn import functional
 
 from pipeline.cameras import View
 from pipeline.field.grid_field import (
+    Bricks,
     FieldSize,
     GridField,
     contract,
@@ -21,10 +23,18 @@ from pipeline.field.grid_field import (
     render_weights,
     stencil,
 )
-from pipeline.field.interpolation import by_rows, interpolate
+from pipeline.field.interpolation import (
+    bricks_by_rows,
+    by_rows,
+    interpolate,
+    interpolate_bricks,
+    near_bricks,
+    places_of,
+)
 from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, Trained, Trainer, camera_rays, load_rays, save_field, train
+from pipeline.stereo.fusion import Fused
 from sdfsim.base.errors import SdfsimError
 from tests.helpers.fields import SMALL, UNIT, posed_noise, toy_rays
 from tests.helpers.sparse import NOTHING
@@ -257,6 +267,100 @@ def test_values_and_gradient_are_those_of_the_general_sampler(side, channels, wa
     (one,) = torch.autograd.grad((found * weights).sum(), grid)
     (two,) = torch.autograd.grad((wanted * weights).sum(), grid)
     torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("side", "channels"), [(5, 1), (13, 3), (32, 2)])
+@pytest.mark.parametrize("way", [interpolate_bricks, bricks_by_rows])
+def test_a_grid_in_bricks_is_one_that_is_0_where_there_are_none(side, channels, way):
+    rng = torch.Generator().manual_seed(side)
+    count = -(-side // 4)
+    there = torch.rand(count, count, count, generator=rng) < 0.5
+    there[0, 0, 0] = True
+    numbers = torch.full((count,) * 3, -1, dtype=torch.int32)
+    numbers[there] = torch.arange(int(there.sum()), dtype=torch.int32)
+    table = torch.randn(64 * int(there.sum()), channels, generator=rng, dtype=torch.float64, requires_grad=True)
+    place = torch.from_numpy(places_of(torch.nonzero(there).numpy()))
+    inside = (place < side).all(1)
+    grid = torch.zeros(side, side, side, channels, dtype=torch.float64)
+    grid = grid.index_put(tuple(place[inside].t()), table[inside])
+    points = torch.rand(800, 3, generator=rng, dtype=torch.float64) * 2.2 - 1.1
+    found, wanted = way(table, numbers, side, points), twin(grid, points)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+    weights = torch.randn(found.shape, generator=rng, dtype=torch.float64)
+    (one,) = torch.autograd.grad((found * weights).sum(), table)
+    (two,) = torch.autograd.grad((wanted * weights).sum(), table)
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
+
+
+def ball_fused(side: int = 24) -> Fused:
+    """A ball of radius 0.5, coarsely, and what it has more in bricks near its surface."""
+    line = np.linspace(-1, 1, side)
+    coarse = (np.linalg.norm(np.stack(np.meshgrid(line, line, line, indexing="ij"), -1), axis=-1) - 0.5) * 1.0
+    bricks = near_bricks(coarse, 2 * side - 1)
+    place = places_of(bricks)
+    true = np.linalg.norm(place * 2 / (2 * side - 2) - 1, axis=1) - 0.5
+    rest = true - map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
+    color = np.broadcast_to(np.float32([0.8, 0.5, 0.2]), (len(place), 3))
+    return Fused(coarse.astype(np.float32), 2 * side - 1, bricks, rest.astype(np.float32), color)
+
+
+def test_training_starts_from_fused_depth_and_half_a_cell_finer_than_without_bricks():
+    size = FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,))
+    fused = ball_fused()
+    field = GridField(size, 0, fused=fused)
+    rng = torch.Generator().manual_seed(0)
+    points = torch.randn(4000, 3, generator=rng)
+    points = points / points.norm(dim=1, keepdim=True) * (0.5 + 0.02 * torch.randn(4000, 1, generator=rng))
+    with torch.no_grad():
+        off = (field.start_of(points)[0] - (points.norm(dim=1) - 0.5)).abs().mean()
+        rough = (interpolate(field.start, points)[:, 0] - (points.norm(dim=1) - 0.5)).abs().mean()
+        assert (field.sdf(points) - field.start_of(points)[0]).abs().mean() < 0.005
+        _, geometry, features = field.geometry_at(points)
+        color = field.color_of(geometry, features, points)
+    np.testing.assert_allclose(color.mean(0), [0.8, 0.5, 0.2], atol=0.1)
+    assert off < 0.35 * rough  # the error of linear interpolation goes with the square of the cell
+
+
+def test_bricks_are_added_once_and_features_stay_what_they_were():
+    fused = ball_fused()
+    field = GridField(FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,)), 0, fused=fused)
+    level, count = field.bricks[0], len(fused.bricks)
+    assert isinstance(level, Bricks)
+    level.values.data += torch.arange(len(level.values))[:, None]
+    before = level.values.detach().clone()
+    line = torch.linspace(-1, 1, 24)
+    cache = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1)
+    shifted = (cache - torch.tensor([0.0, 0.0, 0.1])).norm(dim=-1, keepdim=True) - 0.5
+    field.refine(shifted)
+    assert len(level.places) > count and len({tuple(place) for place in level.places.tolist()}) == len(level.places)
+    assert torch.equal(level.values[: len(before)], before) and not level.values[len(before) :].any()
+    field.refine(shifted)
+    assert len(level.values) == 64 * len(level.places) == len(level.start)
+
+
+@pytest.mark.parametrize("killed", [10, 18])
+def test_a_run_that_goes_on_has_the_bricks_of_an_undisturbed_one(tmp_path, one_thread, killed):
+    """They are added at two fifths of training, which the cache of step 16 of 20 finds passed."""
+
+    def started() -> Trainer:
+        settings = replace(PRESETS["quick"], size=FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,)), rays=64,
+                           iterations=20, surface_points=32)  # fmt: skip
+        return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), 0, fused=ball_fused())
+
+    whole, first, second = started(), started(), started()
+    for _ in range(20):
+        whole.step()
+    for _ in range(killed):
+        first.step()
+    first.save(tmp_path / "c.safetensors")
+    assert second.load(tmp_path / "c.safetensors") and second.refined == (killed > 16)
+    for _ in range(20 - killed):
+        second.step()
+    assert whole.refined and isinstance(whole.field, GridField)
+    level = whole.field.bricks[0]
+    assert isinstance(level, Bricks) and len(level.places) >= len(ball_fused().bricks)
+    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_threads_change_nothing():

@@ -13,13 +13,14 @@ from pipeline.cameras import Similarity
 from pipeline.materials import ASSUMED, MATERIALS, materials_of
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
-from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, floor_height, scene_text, write_scene
+from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, floor_height, samples_of, scene_text, write_scene
 from sdfsim.base.files import write_json
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.load import load_scene
+from sdfsim.sdf.grid import GridSdf
 from sdfsim.shape.make import analytic_shape
-from sdfsim.shape.shape import Shape
+from sdfsim.shape.shape import Shape, load_shape
 from tests.helpers.surfaces import cube, scenery
 
 PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m", size_assumed=True)
@@ -94,7 +95,7 @@ def test_bodies_found_can_move():
 @pytest.fixture
 def meshes(tmp_path):
     """A mesh folder: a floor with a block of 0.6 m, and a cube that was found on the floor."""
-    parts = {"scenery": True, "objects": [{"name": "object1"}]}
+    parts = {"scenery": True, "cell": 0.02, "objects": [{"name": "object1"}]}
     (tmp_path / "objects").mkdir()
     for name in ("solid.ply", "shown.ply"):
         (tmp_path / name).write_bytes(write_ply(scenery()))
@@ -201,6 +202,28 @@ def test_the_scene_file_names_the_source_of_every_number_and_what_is_assumed(fit
     assert above["- {name: object1"].startswith("# ceramic, a wall of 4 mm. From: density: CRC Handbook")
     assert above["- {name: floor"].startswith("# wood. From: density: CRC Handbook")
     assert all(above[f"- {{name: {name}"].startswith("# assumed") for name in ("scenery", "box"))
+
+
+def test_shapes_without_a_fit_are_samples_of_their_meshes(meshes, tmp_path):
+    """A cube of 0.2 m about the middle of its base: two samples for each of the field's cells of 2 cm, at least 65."""
+    report = fit_parts(meshes, tmp_path / "assets", budget=None, sdf="grid")
+    assert report["passed"] and set(report["shapes"]) == {"scenery", "object1"}
+    shape = load_shape(tmp_path / "assets" / "object1")
+    assert isinstance(shape.sdf, GridSdf) and shape.sdf.resolution == 65
+    cell = 1.4 * 0.2 / 64
+    points = np.random.default_rng(0).uniform([-0.13, -0.13, -0.03], [0.13, 0.13, 0.23], (4000, 3))
+    off = np.abs(points - np.array([0, 0, 0.1])) - 0.1
+    true = np.linalg.norm(np.maximum(off, 0), axis=1) + np.minimum(off.max(1), 0)
+    away = np.abs(np.asarray(shape.sdf(points)[0]) - true)
+    assert away[np.abs(true) < 2 * cell].max() < 0.5 * cell and away.max() < 2 * cell
+    assert shape.volume == pytest.approx(0.2**3, rel=1e-6) and len(shape.nodes)
+    block = load_shape(tmp_path / "assets" / "scene")
+    assert isinstance(block.sdf, GridSdf) and block.sdf.resolution == samples_of(scenery(), 0.02)
+
+
+@pytest.mark.parametrize(("side", "cell", "samples"), [(1.0, 0.01, 193), (1.0, 0.025, 113), (0.1, 0.02, 65)])
+def test_a_grid_has_two_samples_a_cell_within_limits(side, cell, samples):
+    assert samples_of(cube(side, (0, 0, 0)), cell) == samples
 
 
 def sheet(height: float, side: float = 1.0) -> Mesh:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +13,17 @@ from scipy.ndimage import map_coordinates
 from pipeline.cameras import PosedPhotos
 from pipeline.field.interpolation import places_of
 from pipeline.stereo.depth import BEYOND, DepthMap, neighbours, only, outside_mask, stereo, stereo_summary
-from pipeline.stereo.fusion import fuse
-from tests.helpers.balls import ball_on_plane, camera, ring, shoot, true_depth
+from pipeline.stereo.fusion import behind, fuse
+from tests.helpers.balls import BALL, GROUND, ball_on_plane, camera, grey_of, ring, shoot, true_depth
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> tuple[PosedPhotos, list[DepthMap]]:
-    folder = tmp_path_factory.mktemp("stereo")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("stereo")
+
+
+@pytest.fixture(scope="module")
+def scene(folder) -> tuple[PosedPhotos, list[DepthMap]]:
     views = [*ring(10, 2.4, 15, 200, 150, 210.0), *ring(10, 2.4, 40, 200, 150, 210.0, start=10)]
     poses = shoot(views, ball_on_plane, folder)
     return poses, stereo(poses, folder, 200)
@@ -55,10 +60,11 @@ def test_the_report_says_how_much_was_seen_and_how_exactly(scene):
     assert 0 < found["spread"] < 0.006
 
 
-def test_fused_depth_is_the_signed_distance(scene):
-    """To a third of a cell where photos see the surface; solid within the ball and below the plane, empty above."""
+def test_fused_depth_is_the_signed_distance(scene, folder):
+    """To a third of a cell where photos see the surface; solid within the ball and below the plane, empty above. Its
+    colours are those of the texture there."""
     _, maps = scene
-    fused = fuse(maps, 48)
+    fused = fuse(maps, 48, folder)
     assert fused is not None and fused.side == 95
     cell = 2 / 94
     place = places_of(fused.bricks)
@@ -67,6 +73,12 @@ def test_fused_depth_is_the_signed_distance(scene):
     true = ball_on_plane(points)
     seen = (np.abs(true) < cell) & (np.linalg.norm(points, axis=1) < 0.8) & (points[:, 2] > -0.34)
     assert np.median(np.abs(value - true)[seen]) < cell / 3
+    known = seen & (np.abs(fused.color - 0.5) > 1e-6).any(1)
+    at = points[known] / np.maximum(np.linalg.norm(points[known], axis=1, keepdims=True), 1e-9) * BALL
+    on = np.abs(np.linalg.norm(points[known], axis=1) - BALL) < cell
+    wanted = grey_of(at[on])
+    assert known.sum() > 0.6 * seen.sum() and np.corrcoef(wanted, fused.color[known][on][:, 0])[0, 1] > 0.8
+    np.testing.assert_allclose(fused.color[known][:, 0], fused.color[known][:, 2], atol=0.02)
     line = np.linspace(-1, 1, 48)
     grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., ::-1]
     inside = np.linalg.norm(grid, axis=-1) < 0.95
@@ -74,9 +86,24 @@ def test_fused_depth_is_the_signed_distance(scene):
     assert ((fused.coarse < 0) == (ball_on_plane(grid) < 0))[inside & away].mean() > 0.97
 
 
-def test_what_no_photo_shows_makes_no_surface(scene):
+def test_what_lies_behind_the_sphere_is_there_in_its_colours(scene, folder):
+    """The plane goes on below: dense where it is in contracted space, and not above; colours are those of photos."""
     _, maps = scene
-    assert fuse([replace(one, inverse=np.zeros_like(one.inverse)) for one in maps], 24) is None
+    found = behind(maps, 48, folder)
+    line = np.linspace(-1, 1, 48)
+    at = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., ::-1]
+    size = np.linalg.norm(at, axis=-1)
+    dense = (found[..., 0] > 0) & (size > 0.5) & (size < 0.75)
+    points = at[dense] / size[dense][:, None] / (2 - 2 * size[dense])[:, None]
+    assert dense.sum() > 300 and np.median(np.abs(points[:, 2] - GROUND)) < 0.15  # one to two cells there
+    assert (points[:, 2] < 0.3).mean() > 0.95
+    grey = 1 / (1 + np.exp(-10 * found[dense][:, 1:]))
+    assert 0.3 < grey.mean() < 0.7 and np.abs(grey[:, 0] - grey[:, 2]).max() < 0.05
+
+
+def test_what_no_photo_shows_makes_no_surface(scene, tmp_path):
+    _, maps = scene
+    assert fuse([replace(one, inverse=np.zeros_like(one.inverse)) for one in maps], 24, tmp_path) is None
 
 
 def test_what_masks_leave_out_is_empty(scene, tmp_path):

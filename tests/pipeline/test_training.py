@@ -131,7 +131,7 @@ def trainer(iteration: int, iterations: int) -> SimpleNamespace:
         (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
         (500, 1000, 30.0, 1100),  # faster
         (500, 1000, 101.0, 500),  # over: ends at once
-        (2700, 2790, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
+        (850, 890, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
     ],
 )
 def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
@@ -193,8 +193,9 @@ def test_what_a_killed_run_had_trained_is_not_lost_in_silence(tmp_path, clock):
     report = train(poses, tmp_path, tmp_path, settings=replace(SETTINGS, iterations=20),
                    on_progress=lambda fraction, message: told.append(message)).report  # fmt: skip
     assert not report["resumed"] and report["iterations"] == 20
-    assert "what a killed run had trained is lost: checkpoint.safetensors cannot be read" in told[0]
-    assert notes({"distill": report}) == report["notes"] == told[:1]
+    lost = [message for message in told if "a killed run" in message]
+    assert "what a killed run had trained is lost: checkpoint.safetensors cannot be read" in lost[0]
+    assert notes({"distill": report}) == report["notes"] == lost[:1]
 
 
 def painted_ball(view: View, gain: np.ndarray) -> np.ndarray:

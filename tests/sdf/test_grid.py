@@ -180,3 +180,27 @@ def test_cuda_gives_what_the_cpu_gives() -> None:
     # this has run a few of 5,000 points were off, by 0.003 at most.
     apart = (here[1] - there[1].cpu()).abs().amax(1)
     assert int((apart > 1e-3).sum()) <= 5 and float(apart.max()) < 0.02
+
+
+@pytest.mark.parametrize("coarse", [2, 4, 8])
+def test_a_grid_sampled_near_the_surface_only_is_the_same_there(coarse):
+    """A ball of 0.5 m: equal wherever a block reaches the surface, and near enough to the distance elsewhere."""
+    ball, asked = SphereSdf(0.5), []
+
+    def counted(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        asked.append(len(points))
+        return ball(points)
+
+    whole = sample_grid(ball, ball.bounds, 129).values.numpy()
+    near = sample_grid(counted, ball.bounds, 129, coarse=coarse).values.numpy()
+    block = 1.4 * coarse / 128
+    close = np.abs(whole) < 0.8 * block
+    np.testing.assert_array_equal(near[close], whole[close])
+    assert np.abs(near - whole).max() < 0.3 * block
+    assert sum(asked) < 0.85 * 129**3
+
+
+def test_blocks_have_to_fill_a_grid():
+    ball = SphereSdf(0.5)
+    with pytest.raises(ValueError, match="multiple of coarse"):
+        sample_grid(ball, ball.bounds, 64, coarse=4)

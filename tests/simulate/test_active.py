@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from sdfsim.learned import inference, near
+from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.sdf_sim import sdf_sim_graph
 from sdfsim.learned.surfaces import compact, node_owner, predict
 from sdfsim.learned.tensors import state_arrays
 from sdfsim.physics import free_flight
-from sdfsim.physics.solver import impulse
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
@@ -108,15 +108,16 @@ def seen_by(model) -> list:
 
 
 @pytest.fixture
-def graphs(monkeypatch) -> list[impulse.Graph]:
-    """The graphs that the compiled network is given."""
-    found, compiled = [], impulse.correct
+def graphs(monkeypatch) -> list[ContactGraph]:
+    """The graphs that the network on the solve is given."""
+    found, make = [], inference.step_graph
 
-    def correct(weights, *rest):
-        found.append(impulse._graph(*rest))
-        compiled(weights, *rest)
+    def made(*given):
+        rows, graph = make(*given)
+        found.append(graph)
+        return rows, graph
 
-    monkeypatch.setattr(impulse, "correct", correct)
+    monkeypatch.setattr(inference, "step_graph", made)
     return found
 
 
@@ -131,8 +132,8 @@ def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped, graphs)
         if len(graphs) > before:
             graph = graphs[-1]
             assert counts["nodes"] == len(graph.inverse_mass) < len(dropped.bodies)
-            assert counts["edges"] == len(graph.pair)
-            assert set(graph.pair.ravel().tolist()) == set(range(len(graph.inverse_mass)))
+            assert counts["edges"] == len(graph.gap)
+            assert {*graph.first.tolist(), *graph.second.tolist()} == set(range(len(graph.inverse_mass)))
             met += 1
     assert met > 0
 
@@ -221,8 +222,8 @@ def test_a_body_on_a_path_meets_others_with_the_velocity_of_its_path(dropped, gr
     speed = 15.0 / sim.units.velocity
     np.testing.assert_allclose(state.velocity[4], (speed, 0, 0), atol=1e-6)
     np.testing.assert_allclose(state.angular_velocity[4, 2] / sim.units.time, 8.0, atol=1e-6)
-    fixed = graphs[-1].twist[graphs[-1].inverse_mass == 0]
-    velocity, mean = (fixed[:, column : column + 3] for column in (impulse.START, impulse.MEAN))
+    fixed = graphs[-1].inverse_mass == 0
+    velocity, mean = graphs[-1].velocity[fixed].numpy(), graphs[-1].mean_velocity[fixed].numpy()
     assert (np.linalg.norm(velocity, axis=-1) > 1).any()
     np.testing.assert_allclose(velocity, mean, atol=1e-9)
 

@@ -74,6 +74,7 @@ def test_a_worker_that_was_killed_is_told_in_one_line():
         next(batches(Draws(Fatal(), 1, 0, ALONE), 0, 1))
 
 
+@pytest.mark.slow
 def test_a_training_with_workers_gives_the_same_weights(ball_data, presets, tmp_path):
     """Also one that was stopped and goes on without them."""
     train(ball_data, tmp_path / "none", preset="tiny-sdf-sim", steps=6)

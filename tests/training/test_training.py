@@ -11,9 +11,9 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.data.batching import merged
 from sdfsim.data.pybullet_sim import MARGIN, engine_settings
 from sdfsim.evaluation.evaluate import evaluate
-from sdfsim.learned.contact_graph import REST_SPEED
+from sdfsim.learned.contact_graph import REST_SPEED, in_single
 from sdfsim.learned.impulse import Velocities
-from sdfsim.learned.inference import terms_of
+from sdfsim.learned.inference import step_graph
 from sdfsim.learned.model import SURFACE, load_model
 from sdfsim.physics.bodies import Units
 from sdfsim.physics.options import Options
@@ -27,7 +27,7 @@ from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
-from tests.helpers.scenes import contact_graph, in_single, in_torch
+from tests.helpers.scenes import in_torch
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]
@@ -58,8 +58,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
         made = scene.advance(state, options, 1, NO_LIMITS)
         solved, edges, touch = made.state, made.edges, made.state.touch
         if len(edges.pair):
-            terms = terms_of(options, first.dt)
-            found.append(in_single(contact_graph(scene.world, state, solved, edges, terms)[1]))
+            found.append(in_single(step_graph(bodies, state, solved, edges, options, first.dt)[1]))
     assert len(found) == len(task.frames) > 5
     for k, graph in enumerate(found):
         batch = task.batch(np.array([k])).graph

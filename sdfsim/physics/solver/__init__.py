@@ -18,7 +18,8 @@ from numba.core import config
 
 def _cache() -> Path:
     told = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.glob("*.py")):
+    here = Path(__file__).parent
+    for file in [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]:
         if file.name != "prepare.py":
             told.update(file.read_bytes())
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.solver.flight import pull_of, torque_free
 from sdfsim.physics.solver.impulses import solve_contacts
 from sdfsim.physics.solver.internal_edges import heed_supports
+from sdfsim.physics.solver.joints import (
+    assemble,
+    begin_step,
+    end_step,
+    kept_together,
+    roused,
+    solve_with_joints,
+)
 from sdfsim.physics.solver.manifold import scratch_room
 from sdfsim.physics.solver.narrow_phase import broad_phase, narrow_phase
 from sdfsim.physics.solver.record import gathered, no_edges, noted
@@ -28,15 +35,13 @@ from sdfsim.physics.solver.vectors import (
     turn,
     turn_back,
     turned_by,
-    vector,
 )
 
-MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 
-
-@njit(**FAST)
-def advance(shapes, world, work, motion, rules, manifolds):
-    """Advance `motion` by one step, in place; time is that of the bodies that go, however many others there are.
+@njit(**FAST, inline="always")  # where it is called, and not once more by itself
+def advance(shapes, world, work, motion, rules, manifolds, held):
+    """Advance `motion` by one step, in place, and what is known of the joints that hold bodies; time is that of
+    the bodies that go, however many others there are.
 
     Returns:
         The manifolds at its end; what contacts did, where it is to be noted; and counts: pairs looked at, contacts of
@@ -48,12 +53,15 @@ def advance(shapes, world, work, motion, rules, manifolds):
         to_matrix(motion.orientation, b, matrix)
         work.met[b] = False
     manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds)
-    while rules.sleep and woken(world, motion, manifolds, near):
+    jointed = len(held.each.body) > 0
+    while rules.sleep and (woken(world, motion, manifolds, near) or (jointed and roused(world, motion, held))):
         manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
     scratch = scratch_room()
     contacts, edges = 0, no_edges()
     _shifted(world, work, motion, rules, -0.5)
+    if jointed:
+        begin_step(world, work, motion, rules, held)
     for k in range(rules.substeps):
         for b in world.going:
             if work.gone[b] > work.ways[b] and world.moves[b]:
@@ -66,27 +74,38 @@ def advance(shapes, world, work, motion, rules, manifolds):
             for x in range(9):
                 free[b, x] = 0.0
             motion.touching[b] = False
-            if world.moves[b] and motion.island[b] < 0 and work.beside[b]:
+            if world.moves[b] and motion.island[b] < 0 and (work.beside[b] or (jointed and held.graph.of_body[b] >= 0)):
                 _prepare(world, motion, matrix, inverse, work.wrench, rules, free, b)
+        if jointed:
+            assemble(world, work, motion, rules, held, True)
         narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, work.gone, scratch)
         heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch)
-        system = solve_contacts(world, work, motion, rules, manifolds)
+        if jointed:
+            system = solve_with_joints(world, work, motion, rules, manifolds, held)
+        else:
+            system = solve_contacts(world, work, motion, rules, manifolds)
         contacts = len(system.where)
         if rules.note:
             edges = noted(motion, matrix, manifolds, system, k / rules.substeps, edges)
         time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch)
+        if jointed:
+            kept_together(held, work.part)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
                 moved = _move(world, motion, matrix, rules, work.wrench, change, shift, work.part[b], trial, frame, b)
                 work.gone[b] += moved
+                if jointed and held.calm[b]:  # of what only joints hold
+                    motion.touching[b] = False
                 work.met[b] = work.met[b] or motion.touching[b]
     if rules.note:
         edges = gathered(
             world, motion, matrix, manifolds, len(near.start), (rules.substeps - 1) / rules.substeps, edges
         )
     _shifted(world, work, motion, rules, 0.5)
+    if jointed:
+        end_step(world, work, motion, rules, held)
     if rules.sleep:
-        put_to_sleep(world, motion, rules, manifolds)
+        put_to_sleep(world, motion, rules, manifolds, held.graph.of_body, held.each.body)
     met = 0  # of those that are awake still
     for b in world.going:
         met += work.met[b] and motion.island[b] < 0
@@ -99,28 +118,16 @@ def _shifted(world, work, motion, rules, part):
     and back: bodies that nothing held in the last inner step then move exactly as in free flight."""
     for b in world.going:
         if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
-            v, w = _pulled(world, work.matrix, work.wrench, rules, part, b)
+            v, w = pull_of(world, work.matrix, work.wrench, rules, part, b)
             put(motion.velocity, b, add(get(motion.velocity, b), v))
             if rules.rotation:
                 put(motion.angular, b, add(get(motion.angular, b), w))
 
 
 @njit(**BARE)
-def _pulled(world, matrix, wrench, rules, part, b):
-    """What gravity and what pulls at a body add to its velocities in a part of an inner step."""
-    span = rules.substep_dt * part
-    weight = scale(vector(rules.gravity), span)
-    if not wrench[b].any():
-        return weight, (0.0, 0.0, 0.0)
-    force, torque = (wrench[b, 0], wrench[b, 1], wrench[b, 2]), (wrench[b, 3], wrench[b, 4], wrench[b, 5])
-    turned = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, torque)))
-    return along(weight, force, world.inverse_mass[b] * span), scale(turned, span)
-
-
-@njit(**BARE)
 def _prepare(world, motion, matrix, inverse, wrench, rules, free, b):
     """Inverse inertia in world axes, and what gravity, pulls and the gyroscopic torque make of the velocities."""
-    v, w = _pulled(world, matrix, wrench, rules, 1.0, b)
+    v, w = pull_of(world, matrix, wrench, rules, 1.0, b)
     for x in range(3):
         free[b, x], free[b, 3 + x] = v[x], w[x]
     for x in range(3):
@@ -152,7 +159,7 @@ def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, fram
         for x in range(6):
             if change[b, x] != 0.0 or shift[b, x] != 0.0:
                 motion.touching[b] = True
-        pulled, spun = _pulled(world, matrix, wrench, rules, 1.0, b)
+        pulled, spun = pull_of(world, matrix, wrench, rules, 1.0, b)
         v = add(add(v, pulled), (change[b, 0], change[b, 1], change[b, 2]))
         put(motion.velocity, b, v)
         v = add(v, (shift[b, 0], shift[b, 1], shift[b, 2]))
@@ -165,7 +172,7 @@ def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, fram
         put(motion.angular, b, w)
     put(motion.position, b, along(get(motion.position, b), v, span))
     if world.moves[b] and rules.rotation and not world.isotropic[b]:
-        _torque_free(world, motion, matrix, span, trial, frame, b)
+        torque_free(world, motion, matrix, span, trial, frame, b)
         way = norm(w) + norm(turned)
     else:
         turned = add(w, turned)
@@ -184,39 +191,3 @@ def _turn_on(motion, matrix, r, b):
         for x in range(4):
             motion.orientation[b, x] = q[x]
         to_matrix(motion.orientation, b, matrix)
-
-
-@njit(**BARE)
-def _torque_free(world, motion, matrix, span, trial, frame, b):
-    """Rotation without torque: angular momentum is kept exactly, the pose to fourth order (Runge-Kutta-Munthe-Kaas)."""
-    w = get(motion.angular, b)
-    speed = norm(w)
-    if speed == 0.0:
-        return
-    momentum = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, w)))
-    stages = max(1, math.ceil(min(speed * span, 100.0) / MOST_TURN))
-    h = span / stages
-    for _ in range(stages):
-        k1 = scale(w, h)
-        k2 = _slope(world, motion.orientation, momentum, scale(k1, 0.5), h, b, trial, frame)
-        k3 = _slope(world, motion.orientation, momentum, scale(k2, 0.5), h, b, trial, frame)
-        k4 = _slope(world, motion.orientation, momentum, k3, h, b, trial, frame)
-        total = scale(add(add(k1, k4), scale(add(k2, k3), 2.0)), 1.0 / 6.0)
-        q = turned_by(total, motion.orientation, b)
-        for x in range(4):
-            motion.orientation[b, x] = q[x]
-        to_matrix(motion.orientation, b, matrix)
-        w = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, momentum)))
-    put(motion.angular, b, w)
-
-
-@njit(**BARE)
-def _slope(world, orientation, momentum, u, h, b, trial, frame):
-    q = turned_by(u, orientation, b)
-    for x in range(4):
-        trial[0, x] = q[x]
-    to_matrix(trial, 0, frame)
-    w = turn(frame, 0, turn(world.inverse_inertia, b, turn_back(frame, 0, momentum)))
-    one = cross(u, w)
-    two = cross(u, one)
-    return scale(add(along(w, one, -0.5), scale(two, 1.0 / 12.0)), h)

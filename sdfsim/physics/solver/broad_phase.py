@@ -44,6 +44,10 @@ def _stirs(world, motion, b):
 
 @njit(**BARE)
 def _may_meet(world, a, b):
+    if len(world.apart):
+        for k in range(world.apart[a], world.apart[a + 1]):
+            if world.apart[k] == b:
+                return False
     one, other = world.world[a], world.world[b]
     return (one == other or one < 0 or other < 0) and world.allowed[world.group[a], world.group[b]]
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.physics.solver.advance import _torque_free
+from sdfsim.physics.solver.flight import torque_free
 from sdfsim.physics.solver.islands import join, root
 from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
 from sdfsim.physics.solver.vectors import (
@@ -180,7 +180,7 @@ def _graph(world, before, after, pair, value, terms):
             if not world.isotropic[b]:
                 put(flight.angular, b, spin)
                 flight.orientation[b] = before.orientation[b]
-                _torque_free(world, flight, matrix, terms.dt, trial, frame, b)
+                torque_free(world, flight, matrix, terms.dt, trial, frame, b)
                 spin = get(flight.angular, b)
                 to_matrix(before.orientation, b, matrix)
             taken[a] += _turning(world, matrix, b, spin)

@@ -75,13 +75,19 @@ def solve_contacts(world, work, motion, rules, manifolds):
     change, shift = work.change, work.shift
     system = _equations(world, work, motion, rules, manifolds)
     _solve_all(world.inverse_mass, rules, system, change, shift, world.threads)
+    remembered(manifolds, system)
+    return system
+
+
+@njit(**BARE)
+def remembered(manifolds, system):
+    """Impulses go to the manifolds."""
     for c in range(len(system.where)):
         point = manifolds.point[system.where[c, 0], system.where[c, 1]]
         point[NORMAL_IMPULSE] = system.row[c, 0, IMPULSE]
         for x in range(3):
             one, other = system.row[c, 1], system.row[c, 2]
             point[TANGENTIAL + x] = one[IMPULSE] * one[AXIS + x] + other[IMPULSE] * other[AXIS + x]
-    return system
 
 
 @njit(**FAST)

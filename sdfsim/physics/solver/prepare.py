@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from sdfsim.base.compiling import warn_compiling
-from sdfsim.physics import pose
+from sdfsim.physics import joint_columns, pose
+from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
 from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import Options
@@ -18,6 +19,7 @@ from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.physics.solver.edges import nodes_within
+from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows, Trial
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
@@ -34,6 +36,7 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 # Penetration that is left as it is, so that what rests has contacts that do not come and go: model lengths, and less in
 # inner steps below the usual 4 ms, which scenes of slender bodies have.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
+ROUNDS, TEACHERS = 100, 50  # of sequential impulses in an inner step at most, and of the teacher
 CROWD = 64  # bodies that move, from which on pairs may be looked at in threads
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
@@ -62,6 +65,7 @@ class Compiled:
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
         )  # fmt: skip
+        self.held = held_by(self.bodies)
         self._load: np.ndarray | None = None
         self._latest: State | None = None  # what `_motion` and `_manifolds` are the arrays of
 
@@ -70,14 +74,14 @@ class Compiled:
         script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, keep: bool = False,
     ) -> tuple[Any, ...]:  # fmt: skip
         """So many steps: `motion` is written to. Returns what `run_steps` does, and last what is kept of each."""
-        n, bodies = steps if keep else 0, len(self.bodies)
+        n, count = steps if keep else 0, len(self.bodies)
         kept = Kept(
-            np.empty((n, bodies, 3)), np.empty((n, bodies, 4)), np.empty((n, bodies, 3)), np.empty((n, bodies, 3)),
-            np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n),
+            np.empty((n, count, 3)), np.empty((n, count, 4)), np.empty((n, count, 3)), np.empty((n, count, 3)),
+            np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, len(self.held.each.body), 7)),
         )  # fmt: skip
         # An integer of another kind would be compiled for anew.
-        known = (self.shapes, self.world, self.work, motion, rules, manifolds, script, most, kept, TOUCHING, int(steps))
-        return *run_steps(*known), kept
+        bodies = (self.shapes, self.world, self.work, motion, rules, manifolds, self.held)
+        return *run_steps(*bodies, script, most, kept, TOUCHING, int(steps)), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make so many steps of the contact solve from `state`, fewer where one leads to a state that is more than
@@ -85,6 +89,7 @@ class Compiled:
         if state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
+            self.held.each.state[:] = 0.0 if state.joints is None else state.joints
         if state.load is not self._load:
             self.work.wrench[:] = 0.0 if state.load is None else state.load
             self._load = state.load
@@ -115,7 +120,8 @@ class Compiled:
         )  # fmt: skip
         arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
         moved = {name: array[rows] for name, array in zip(MOTION, arrays, strict=True)}
-        self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load)
+        known = None if state.joints is None else self.held.each.state.copy()
+        self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         asleep = int((motion.island[rows] >= 0).sum())
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
 
@@ -167,10 +173,18 @@ def _touch(motion: compiled.Motion, manifolds: compiled.Manifolds) -> Touch:
     )  # fmt: skip
 
 
-def disturbed(state: State, changed: np.ndarray, *, gravity: bool = False) -> State:
+def disturbed(bodies: Bodies, state: State, changed: np.ndarray, *, gravity: bool = False) -> State:
     """The state after somebody has changed the bodies `changed` [N] bool, or the `gravity` of all: they are awake, and
     so are those that slept with them or on them."""
     touch = state.touch
+    if bodies.joints is not None and state.joints is not None and changed.any():
+        # Nothing is known of the impulses of joints at what was changed, nor of what they connect.
+        place = jointed.coordinates(
+            bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
+        )
+        known = state.joints.copy()
+        known[:, joint_columns.COORD], known[:, joint_columns.FRESH] = place, 1.0
+        state = replace(state, joints=known)
     if touch is None:
         return state
     island, quiet, touching = (array.copy() for array in (touch.island, touch.quiet, touch.touching))
@@ -201,10 +215,13 @@ def nodes_near(
 def compiled_rules(options: Options) -> compiled.Rules:
     """The options of a run as the compiled step wants them."""
     gravity, inner = options.gravity, options.dt / options.substeps
+    # What is met in the course of an inner step is found before it is. The teacher looks at poses alone.
+    ahead = 0.0 if options.adds and not (options.record and inner > COARSE) else inner
+    rounds = TEACHERS if options.adds else ROUNDS
     return compiled.Rules(
         gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,
         options.restitution, options.rotation, options.sleep, options.margin, options.adds, options.cone,
-        options.record, ahead=inner if options.record and inner > COARSE else 0.0, slop=min(SLOP, SLOP_A_TIME * inner),
+        options.record, ahead=ahead, slop=min(SLOP, SLOP_A_TIME * inner), rounds=rounds,
     )  # fmt: skip
 
 
@@ -334,5 +351,34 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         group=array["group"], allowed=array["allowed"], world=array["world"],
         going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
+        apart=np.zeros(0, np.int64) if bodies.joints is None else jointed.apart(bodies.joints, len(bodies)),
         threads=np.zeros((0, 0) if np.count_nonzero(moves) >= CROWD else 0),
+    )  # fmt: skip
+
+
+def held_by(bodies: Bodies) -> Held:
+    """The joints of a scene, with room for what an inner step makes of them."""
+    empty = np.zeros((0, 3))
+    joints = bodies.joints or jointed.joints_of((), empty, length=1.0, time=1.0, mass=1.0)
+    order = jointed.ordered(joints, bodies.moves)
+    j, k, f = len(joints), len(order.node), len(order.row)
+    n = len(bodies) if j else 0
+
+    def room(*shape: int) -> np.ndarray:
+        return np.zeros(shape)
+
+    return Held(
+        graph=Graph(**vars(order)),
+        factors=Factors(room(k, 6, 6), room(k, 6, 6), room(f, 6, 6), room(f, 6, 6), room(k, 6)),
+        each=Each(
+            joints.body, joints.kind, joints.anchor, joints.axes, joints.number, room(j, joint_columns.STATE),
+            room(j, 1, 12),
+        ),
+        rows=Rows(
+            room(j, ROWS, 12), np.zeros((j, ROWS), np.int64), room(j, ROWS), room(j, ROWS), room(j, ROWS),
+            room(j, ROWS), room(j, ROWS), room(1, 24),
+        ),
+        trial=Trial(room(n, 3), room(n, 4), room(n, 3), room(n, 3), room(n, 3, 3), room(1, 4), room(1, 3, 3)),
+        reply=room(n, 6),
+        calm=np.zeros(n, np.bool_),
     )  # fmt: skip

@@ -7,7 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
+from sdfsim.physics.solver.joints import given, stored
 from sdfsim.physics.solver.record import no_edges
 from sdfsim.physics.solver.survey import broken, energy, touching
 from sdfsim.physics.solver.vectors import BARE, ENTRY, add, dot, get, put, sub
@@ -33,11 +35,13 @@ class Kept(NamedTuple):
     energy: np.ndarray  # [n, 3] kinetic and potential; what pulls have given in the step
     count: np.ndarray  # [n, 5] int64: pairs looked at, contacts, active bodies, sleeping ones, points where they touch
     depth: np.ndarray  # [n] the deepest penetration
+    joint: np.ndarray  # [n, J, 7] of each joint where it is; force and torque on its first body, at its anchor
 
 
 @njit(**ENTRY, nogil=True)
-def run_steps(shapes, world, work, motion, rules, manifolds, script, most, kept, within, steps):
-    """Advance `motion` by so many steps, in place; the first state that cannot be ends it early.
+def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most, kept, within, steps):
+    """Advance `motion`, and what `held` knows of joints, by so many steps, in place; the first state that cannot be
+    ends it early.
 
     Args:
         most: [5] what a state may be, see `survey.broken`.
@@ -52,7 +56,7 @@ def run_steps(shapes, world, work, motion, rules, manifolds, script, most, kept,
     going, dt = world.going, rules.substep_dt * rules.substeps
     place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
     pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
-    edges, counts, given = no_edges(), (0, 0, 0), 0.0
+    edges, counts, total = no_edges(), (0, 0, 0), 0.0
     for k in range(steps):
         for s in range(len(script.body)):
             b = script.body[s]
@@ -61,7 +65,7 @@ def run_steps(shapes, world, work, motion, rules, manifolds, script, most, kept,
         for i in range(len(going)):
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
-        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds)
+        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds, held)
         for s in range(len(script.body)):
             b = script.body[s]
             for x in range(3):
@@ -75,13 +79,18 @@ def run_steps(shapes, world, work, motion, rules, manifolds, script, most, kept,
                     motion.position, motion.orientation, motion.velocity, motion.angular, place, i, b, dt, most
                 )
                 if wrong >= 0:
-                    return manifolds, edges, counts, k, b, wrong, get(place, i), given, pair[:found], point[:found]
-        pulled = _pulled(going, work.wrench, motion, place, spin, dt)
-        given += pulled
+                    return manifolds, edges, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
+        pulled = _pulled(going, work.wrench, motion, place, spin, dt) + given(held.each)
+        total += pulled
         if len(kept.depth):
             kept.position[k], kept.orientation[k] = motion.position, motion.orientation
             kept.velocity[k], kept.angular_velocity[k] = motion.velocity, motion.angular
             kept.energy[k, 0], kept.energy[k, 1] = _energies(world, motion, rules)
+            kept.energy[k, 1] += stored(held.each)
+            for j in range(len(held.each.body)):
+                kept.joint[k, j, 0] = held.each.state[j, COORD]
+                for x in range(6):
+                    kept.joint[k, j, 1 + x] = held.each.state[j, PULL + x]
             kept.energy[k, 2] = pulled
             here = touching(manifolds, motion.position, motion.orientation, within)
             while found + len(here.pair) > len(pair):
@@ -97,7 +106,7 @@ def run_steps(shapes, world, work, motion, rules, manifolds, script, most, kept,
             kept.depth[k] = 0.0
             for gap in here.gap:
                 kept.depth[k] = max(kept.depth[k], -gap)
-    return manifolds, edges, counts, steps, -1, 0, (0.0, 0.0, 0.0), given, pair[:found], point[:found]
+    return manifolds, edges, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
 
 
 @njit(**BARE)

@@ -36,13 +36,18 @@ def woken(world, motion, manifolds, near):
 
 
 @njit(**FAST)
-def put_to_sleep(world, motion, rules, manifolds):
-    """Freeze the islands all of which have stayed where they were for long enough."""
+def put_to_sleep(world, motion, rules, manifolds, of_node, joint):
+    """Freeze the islands all of which have stayed where they were for long enough; joints join as contacts do.
+
+    Args:
+        of_node: [N] int64, below 0 for bodies that no joint holds.
+        joint: [J, 2] int64, the bodies of joints, -1 for the world.
+    """
     n = len(world.shape)
     for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
             continue
-        if motion.touching[b] and _strayed(world, motion, b, 0) < rules.stray:
+        if (motion.touching[b] or of_node[b] >= 0) and _strayed(world, motion, b, 0) < rules.stray:
             motion.quiet[b] += 1
         else:
             motion.quiet[b] = 0
@@ -58,7 +63,17 @@ def put_to_sleep(world, motion, rules, manifolds):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         if manifolds.count[m] and world.moves[a] and world.moves[b]:
             join(parent, a, b)
+    for j in range(len(joint)):
+        a, b = joint[j, 0], joint[j, 1]
+        if a >= 0 and b >= 0 and world.moves[a] and world.moves[b]:
+            join(parent, a, b)
     restless = np.zeros(n, np.bool_)
+    for j in range(len(joint)):
+        for s in range(2):
+            a, b = joint[j, s], joint[j, 1 - s]
+            if a >= 0 and b >= 0 and world.scripted[b] and world.moves[a]:
+                if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
+                    restless[root(parent, a)] = True
     for b in range(n):
         if world.moves[b] and motion.island[b] < 0 and motion.quiet[b] < rules.rest:
             restless[root(parent, b)] = True

@@ -57,6 +57,7 @@ class World(NamedTuple):
     high: np.ndarray
     reach: np.ndarray  # [M] the highest end so far along `axis`
     axis: int  # 0, 1 or 2
+    apart: np.ndarray  # [E] int64, which bodies joints keep from touching, see `physics.joints.apart`
     # [0, 0] where there may be so many pairs that threads are worth their while, else [0]: loops on all cores take a
     # quarter of the time in which all is compiled, and are compiled for worlds of another type only.
     threads: np.ndarray = np.zeros(0)
@@ -139,7 +140,7 @@ class Rules(NamedTuple):
     erp: float = 0.08  # the share of a penetration that an inner step resolves, through velocity
     slop: float = 5e-4  # penetration that is left as it is
     split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
-    rounds: int = 50  # of sequential impulses at most
+    rounds: int = 100  # of sequential impulses at most
     exact: float = 2e-5  # they end when no impulse changes a velocity by more
     apart: float = 0.03  # points of a manifold are at least so far from each other
     # stray, rest: who stays within `stray` for `rest` steps falls asleep, if its forces are so nearly in balance that

@@ -1,0 +1,359 @@
+"""How far engines are from real tosses of an elbow, two links on a hinge, each with its own best parameters: joints.md.
+
+    python benchmarks/elbow.py TOSSES -o DIR [--rounds N]
+
+TOSSES holds `elbow.npz`: tosses of two printed links onto a table, tracked at 148 Hz (dair_pll). Ours are the numbers
+that `sdfsim identify` finds on 60 tosses; other engines' are found on the same ones by a search over as many, as
+`benchmarks/reality.py` does for the cube. All are judged on 100 others, over the first 75 frames, from the same starts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import differential_evolution
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.reality import CLEAR, FAR, FIT, FLIGHT, FRAMES, GRAVITY, IMPRATIO, INNER, SEED, SOFT, SOLID, TEST
+from benchmarks.results import progress
+from sdfsim.apps.identify import identify, repeated, write_scene
+from sdfsim.apps.observed import Recording, cleaned, with_velocities
+from sdfsim.apps.observed_joints import held_together
+from sdfsim.base.errors import SdfsimError, run_main
+from sdfsim.base.files import read_arrays, write_json, write_text
+from sdfsim.data.pybullet_sim import import_pybullet
+from sdfsim.evaluation.engines import engine_module
+from sdfsim.evaluation.harness import one_thread
+from sdfsim.evaluation.metrics import interval
+from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import Scene
+
+SIZE, MASS = np.array([0.1, 0.05, 0.05]), 0.37  # m and kg of a link
+PIVOT, ARM = np.array([-0.035, 0.06, 0.0]), np.array([0.035, 0.0, 0.0])  # m: link 1 to the hinge, that to link 2
+EVEN = MASS / 12.0 * np.array([SIZE[b] ** 2 + SIZE[c] ** 2 for b, c in ((1, 2), (2, 0), (0, 1))])  # kg m^2, solid
+LONGEST = 12  # frames of flight that a start is fitted to
+HELD, PULLED = 0.002, 2.0  # m and m/s^2: a flight that is farther off a parabola, or falls so differently, is none
+ROUNDS, CROWD = 15, 25
+SCENE = """version: 1
+model: solver
+effects: {{sleep: off}}
+gravity: {gravity}
+shapes: {{link: {{box: {{size: [0.1, 0.05, 0.05]}}}}}}
+bodies:
+  - {{name: table, plane: {{}}, friction: 1, restitution: 1}}
+  - {{name: one, shape: link, position: [0, 0, 0.2], mass: 0.37}}
+  - {{name: two, shape: link, position: [0, 0.06, 0.2], mass: 0.37}}
+joints:
+  - {{name: elbow, type: hinge, bodies: [two, one], anchor: [-0.035, 0.06, 0.2], axis: [0, 1, 0]}}
+"""
+
+
+class Motion(NamedTuple):
+    """Poses of the two links of B tosses in T frames."""
+
+    position: np.ndarray  # [B, T, 2, 3] m
+    quat_xyzw: np.ndarray  # [B, T, 2, 4]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Poses and velocities of both links at a first frame."""
+
+    position: np.ndarray  # [2, 3] m
+    quat_xyzw: np.ndarray  # [2, 4]
+    velocity: np.ndarray  # [2, 3] m/s
+    angular_velocity: np.ndarray  # [2, 3] rad/s, world
+
+
+def load_tosses(folder: Path) -> tuple[float, list[Motion]]:
+    """Frame spacing s, and both links' poses [1, T, 2, *] of every toss."""
+    found = read_arrays(folder / "elbow.npz", "recorded tosses", "give the folder that holds elbow.npz")
+    tosses = []
+    for a, b in zip(found["start"][:-1], found["start"][1:], strict=True):
+        place, angle = found["position"][a:b].astype(np.float64), found["hinge"][a:b].astype(np.float64)
+        one = Rotation.from_quat(found["quat_xyzw"][a:b].astype(np.float64))
+        two = one * Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0])
+        other = place + one.apply(PIVOT) + two.apply(ARM)
+        turns = np.stack([one.as_quat(), two.as_quat()], 1)
+        tosses.append(Motion(np.stack([place, other], 1)[None], turns[None]))
+    return float(found["dt"]), tosses
+
+
+def flight(toss: Motion) -> int:
+    """How many frames pass before the lowest corner is as near to the table as `CLEAR`."""
+    turn = Rotation.from_quat(toss.quat_xyzw[0].reshape(-1, 4)).as_matrix()[:, 2]
+    low = toss.position[0, :, :, 2] - 0.5 * (np.abs(turn) @ SIZE).reshape(-1, 2)
+    near = (low < CLEAR).any(1)
+    return int(near.argmax()) if near.any() else len(near)
+
+
+def fall(toss: Motion, dt: float) -> tuple[np.ndarray, float]:
+    """[3] m/s^2, the acceleration of the mass centre of both links until the first impact, and how far it is off a
+    parabola at most, m."""
+    count = flight(toss)
+    time = dt * np.arange(count)
+    powers = np.stack([np.ones_like(time), time, 0.5 * time**2], 1)
+    middle = toss.position[0, :count].mean(1)
+    fit = np.linalg.lstsq(powers, middle, rcond=None)[0]
+    return fit[2], float(np.linalg.norm(middle - powers @ fit, axis=1).max())
+
+
+def free(toss: Motion, dt: float) -> bool:
+    """Whether it falls freely until the first impact."""
+    pull, off = fall(toss, dt)
+    return bool(off < HELD and np.linalg.norm(pull + np.array([0.0, 0.0, GRAVITY])) < PULLED)
+
+
+def gravity_of(tosses: Sequence[Motion], dt: float) -> np.ndarray:
+    """[3] m/s^2, with which recorded elbows fall, medians over tosses: the recordings' axes are not upright."""
+    return np.median([fall(toss, dt)[0] for toss in tosses], axis=0)
+
+
+def fitted_start(toss: Motion, dt: float, scene: Scene) -> Start:
+    """The mass centre of both on its parabola; the turn of the one link and the angle of the hinge as cubics in time;
+    all through the flight before the first impact."""
+    count = min(flight(toss), LONGEST)
+    time = dt * np.arange(count)[:, None]
+    place, turn = toss.position[0, :count], toss.quat_xyzw[0, :count]
+    fallen = place.mean(1) - 0.5 * time**2 * scene.gravity
+    middle = np.linalg.lstsq(np.concatenate([np.ones_like(time), time], 1), fallen, rcond=None)[0]
+    powers = time ** np.arange(4 if count >= 10 else 3)
+    one, two = (Rotation.from_quat(turn[:, k]) for k in (0, 1))
+    turned = np.linalg.lstsq(powers, (one * one[0].inv()).as_rotvec(), rcond=None)[0]
+    angle = np.unwrap((one.inv() * two).as_rotvec()[:, 1])
+    bent = np.linalg.lstsq(powers, angle, rcond=None)[0]
+    first = Rotation.from_rotvec(turned[0]) * one[0]
+    second = first * Rotation.from_rotvec([0.0, bent[0], 0.0])
+    spins = np.stack([turned[1], turned[1] + bent[1] * first.apply([0.0, 1.0, 0.0])])
+    arms = first.apply(PIVOT), second.apply(ARM)
+    apart = arms[0] + arms[1]
+    fast = np.cross(spins[0], arms[0]) + np.cross(spins[1], arms[1])
+    places = np.stack([middle[0] - 0.5 * apart, middle[0] + 0.5 * apart])
+    speeds = np.stack([middle[1] - 0.5 * fast, middle[1] + 0.5 * fast])
+    arrays = places[None], np.stack([first.as_quat(), second.as_quat()])[None], speeds[None], spins[None]
+    # The bodies of the scene are in the order of the links; the joint has the second first.
+    return Start(*(array[0] for array in held_together(arrays, scene)))
+
+
+def split(tosses: Sequence[Motion], dt: float) -> tuple[list[Motion], list[Motion]]:
+    """Tosses to find parameters on, and others to judge by; such as are long enough, and fly freely from their first
+    frame on: some begin in the hand."""
+    usable = [toss for toss in tosses if toss.position.shape[1] > FRAMES and flight(toss) >= FLIGHT and free(toss, dt)]
+    if len(usable) < FIT + TEST:
+        raise SdfsimError(f"{len(usable)} tosses are long enough (at least {FIT + TEST})")
+    order = np.random.default_rng(SEED).permutation(len(usable))
+    return [usable[k] for k in order[:FIT]], [usable[k] for k in order[FIT : FIT + TEST]]
+
+
+def recorded(tosses: Sequence[Motion]) -> Motion:
+    return Motion(*(np.concatenate([getattr(t, n)[:, 1 : FRAMES + 1] for t in tosses]) for n in Motion._fields))
+
+
+def errors(found: Motion, truth: Motion) -> np.ndarray:
+    """[3, B] of each toss: root mean square distance of the links in % of a link's length, mean turn of the links in
+    degrees, and mean error of the hinge's angle in degrees."""
+    way = np.square(found.position - truth.position).sum(-1).mean((1, 2))
+    one, other = (Rotation.from_quat(m.quat_xyzw.reshape(-1, 4)) for m in (found, truth))
+    angle = (one * other.inv()).magnitude().reshape(found.position.shape[:3])
+    bent = [
+        Rotation.from_quat(m.quat_xyzw[:, :, 0].reshape(-1, 4)).inv()
+        * Rotation.from_quat(m.quat_xyzw[:, :, 1].reshape(-1, 4))
+        for m in (found, truth)
+    ]
+    hinge = (bent[0] * bent[1].inv()).magnitude().reshape(angle.shape[:2])
+    return np.stack([100.0 / SIZE[0] * np.sqrt(way), np.degrees(angle.mean((1, 2))), np.degrees(hinge.mean(1))])
+
+
+def cost(found: Motion, truth: Motion) -> float:
+    return float(np.minimum(errors(found, truth)[:2], FAR).mean(1).sum())
+
+
+# --- engines ---
+
+
+def ours(starts: Sequence[Start], dt: float, scene: Scene) -> Motion:
+    shape = (FRAMES + 1, 2)
+    yes = np.ones(shape, bool)
+    begun = []
+    for start in starts:
+        place, turn, speed, spin = (np.broadcast_to(v, (*shape, v.shape[-1])) for v in vars(start).values())
+        begun.append(Recording("", dt, place, turn, speed, spin, yes[:, 0], ~yes, yes, (place, turn)))
+    return Motion(*repeated(begun, scene, FRAMES))
+
+
+def _falling(start: Start, step: float, gravity: np.ndarray) -> np.ndarray:
+    """[2, 3] velocities with which engines that add gravity first fly along the exact parabola."""
+    return start.velocity - 0.5 * step * gravity
+
+
+def mujoco(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[str, float]) -> Motion:
+    engine, rollout = (engine_module(name, "MuJoCo", "bench") for name in ("mujoco", "mujoco.rollout"))
+    spec, step = engine.MjSpec(), dt / INNER
+    spec.option.timestep, spec.option.gravity = step, gravity
+    spec.option.cone, spec.option.impratio = engine.mjtCone.mjCONE_ELLIPTIC, IMPRATIO
+    spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0], pos=[0, 0, values["height"]])
+    inertia = (values["inertia"] * EVEN).tolist()
+    one = spec.worldbody.add_body(mass=MASS, inertia=inertia, explicitinertial=True)
+    one.add_freejoint()
+    two = one.add_body(pos=PIVOT, mass=MASS, inertia=inertia, ipos=ARM, explicitinertial=True)
+    hinge = two.add_joint(type=engine.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0], frictionloss=values["drag"])
+    hinge.damping = np.array([values["damping_of_hinge"], 0.0, 0.0])
+    for body, place in ((one, np.zeros(3)), (two, ARM)):
+        geom = body.add_geom(type=engine.mjtGeom.mjGEOM_BOX, size=0.5 * values["side"] * SIZE, pos=place)
+        geom.priority, geom.condim, geom.friction[0] = 1, 3, values["friction"]
+        geom.solref = [max(values["softness"], 2.0 * step), values["damping"]]
+        geom.contype, geom.conaffinity = 2, 1
+    spec.worldbody.geoms[0].contype, spec.worldbody.geoms[0].conaffinity = 1, 2
+    model = spec.compile()
+    state = []
+    for start in starts:
+        turns = Rotation.from_quat(start.quat_xyzw)
+        angle = (turns[0].inv() * turns[1]).as_rotvec()[1]
+        rate = (start.angular_velocity[1] - start.angular_velocity[0]) @ turns[0].apply([0.0, 1.0, 0.0])
+        spin = turns[0].inv().apply(start.angular_velocity[0])
+        quat = np.roll(start.quat_xyzw[0], 1)
+        state.append([0.0, *start.position[0], *quat, angle, *_falling(start, step, gravity)[0], *spin, rate])
+    data = engine.MjData(model)
+    states = rollout.rollout(model, data, np.array(state), nstep=FRAMES * INNER)[0][:, INNER - 1 :: INNER]
+    place, turn = states[..., 1:4], Rotation.from_quat(np.roll(states[..., 4:8], -1, axis=-1).reshape(-1, 4))
+    return _links(place, turn, states[..., 8])
+
+
+def _links(place: np.ndarray, one: Rotation, angle: np.ndarray) -> Motion:
+    """Both links, by the pose of the first [B, T] and the angle of the hinge."""
+    two = one * Rotation.from_rotvec(angle.reshape(-1, 1) * [0.0, 1.0, 0.0])
+    other = place + (one.apply(PIVOT) + two.apply(ARM)).reshape(place.shape)
+    turns = [turn.as_quat().reshape(*place.shape[:2], 4) for turn in (one, two)]
+    return Motion(np.stack([place, other], 2), np.stack(turns, 2))
+
+
+def bullet(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[str, float]) -> Motion:
+    engine = import_pybullet()
+    client, step = engine.connect(engine.DIRECT), dt / INNER
+    here: dict[str, Any] = {"physicsClientId": client}
+    try:
+        engine.setGravity(*gravity, **here)
+        engine.setTimeStep(step, **here)
+        plane = engine.createCollisionShape(engine.GEOM_PLANE, **here)
+        table = engine.createMultiBody(0.0, plane, basePosition=[0.0, 0.0, values["height"]], **here)
+        engine.changeDynamics(table, -1, lateralFriction=1.0, restitution=1.0, **here)
+        engine.setCollisionFilterGroupMask(table, -1, 1, 2, **here)
+        half = (0.5 * values["side"] * SIZE).tolist()
+        box = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half, **here)
+        other = engine.createCollisionShape(
+            engine.GEOM_BOX, halfExtents=half, collisionFramePosition=ARM.tolist(), **here
+        )
+        elbows = []
+        for start in starts:
+            turns = Rotation.from_quat(start.quat_xyzw)
+            elbow = engine.createMultiBody(
+                MASS, box, -1, start.position[0], start.quat_xyzw[0], linkMasses=[MASS],
+                linkCollisionShapeIndices=[other], linkVisualShapeIndices=[-1], linkPositions=[PIVOT.tolist()],
+                linkOrientations=[[0, 0, 0, 1]], linkInertialFramePositions=[ARM.tolist()],
+                linkInertialFrameOrientations=[[0, 0, 0, 1]], linkParentIndices=[0],
+                linkJointTypes=[engine.JOINT_REVOLUTE], linkJointAxis=[[0, 1, 0]], **here,
+            )  # fmt: skip
+            for link in (-1, 0):
+                engine.changeDynamics(
+                    elbow, link, localInertiaDiagonal=(values["inertia"] * EVEN).tolist(),
+                    lateralFriction=values["friction"], restitution=values["restitution"], linearDamping=0.0,
+                    angularDamping=0.0, jointDamping=values["damping_of_hinge"], **here,
+                )  # fmt: skip
+                engine.setCollisionFilterGroupMask(elbow, link, 2, 1, **here)
+            angle = (turns[0].inv() * turns[1]).as_rotvec()[1]
+            rate = (start.angular_velocity[1] - start.angular_velocity[0]) @ turns[0].apply([0.0, 1.0, 0.0])
+            engine.resetJointState(elbow, 0, angle, rate, **here)
+            engine.setJointMotorControl2(
+                elbow, 0, engine.VELOCITY_CONTROL, targetVelocity=0.0, force=values["drag"], **here
+            )
+            engine.resetBaseVelocity(elbow, _falling(start, step, gravity)[0], start.angular_velocity[0], **here)
+            elbows.append(elbow)
+        frames = []
+        for _ in range(FRAMES):
+            for _ in range(INNER):
+                engine.stepSimulation(**here)
+            frames.append(
+                [
+                    (*engine.getBasePositionAndOrientation(e, **here), engine.getJointState(e, 0, **here)[0])
+                    for e in elbows
+                ]
+            )
+    finally:
+        engine.disconnect(client)
+    place, turn, angle = (np.swapaxes(np.array([[o[k] for o in f] for f in frames]), 0, 1) for k in range(3))
+    return _links(place, Rotation.from_quat(turn.reshape(-1, 4)), angle)
+
+
+HINGE = {"drag": (0.0, 0.05), "damping_of_hinge": (0.0, 0.005), "inertia": (0.7, 2.0), "friction": (0.05, 0.6)}
+Engine = Callable[[Sequence[Start], float, np.ndarray, dict[str, float]], Motion]
+ENGINES: dict[str, tuple[Engine, dict[str, tuple[float, float]]]] = {
+    "MuJoCo": (mujoco, SOFT | HINGE),
+    "PyBullet": (bullet, SOLID | HINGE),
+}
+
+
+@one_thread()
+def main(tosses: Path, out: Path, rounds: int, only: Sequence[str]) -> None:
+    dt, known = load_tosses(tosses)
+    groups = split(known, dt)
+    out.mkdir(parents=True, exist_ok=True)
+    gravity = gravity_of([*groups[0], *groups[1]], dt)
+    write_text(out / "scene.yaml", SCENE.format(gravity=np.round(gravity, 4).tolist()))
+    scene = load_scene(out / "scene.yaml")
+    (fit, fit_truth), (test, test_truth) = (
+        ([fitted_start(toss, dt, scene) for toss in group], recorded(group)) for group in groups
+    )
+    result: dict[str, Any] = {}
+    if "sdfsim" in only:
+        progress(0.0, "sdfsim: identify")
+        poses = [np.concatenate([toss.position[0], toss.quat_xyzw[0]], -1) for toss in groups[0]]
+        recordings = with_velocities([cleaned(str(k), dt, one, scene) for k, one in enumerate(poses)], scene)
+        own = identify(recordings, scene, on_progress=progress)
+        write_scene(own, out / "scene.yaml", out / "identified.yaml")
+        found = load_scene(out / "identified.yaml")
+        values = {"bodies": own.scene_values, "joints": own.joint_values}
+        result["sdfsim"] = values, *(errors(ours(s, dt, found), t) for s, t in ((fit, fit_truth), (test, test_truth)))
+        write_json(out / "identified.json", own.report())
+    for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
+        if name not in only:
+            continue
+        progress(k / 3, f"{name}: {rounds} rounds of a search over {len(bounds)} parameters")
+        best = differential_evolution(
+            lambda point, e=engine, b=bounds: cost(e(fit, dt, gravity, dict(zip(b, point, strict=True))), fit_truth),
+            list(bounds.values()), maxiter=rounds - 1, popsize=CROWD // len(bounds), init="sobol", tol=0.0,
+            polish=False, rng=SEED,
+        )  # fmt: skip
+        values = dict(zip(bounds, best.x.tolist(), strict=True))
+        result[name] = (
+            values,
+            errors(engine(fit, dt, gravity, values), fit_truth),
+            errors(engine(test, dt, gravity, values), test_truth),
+        )
+    rows = ["| | links apart, % of a link | turned, degrees | hinge, degrees | the same on the 60 |"]
+    rows.append("| --- | ---: | ---: | ---: | ---: |")
+    for name, (_, fitted, judged) in result.items():
+        cells = [f"{np.mean(e):.1f} +- {interval(e)[1] - np.mean(e):.1f}" for e in judged]
+        rows.append(f"| {name} | {' | '.join(cells)} | {fitted[0].mean():.1f} %, {fitted[1].mean():.1f} |")
+    kept = {n: {"values": v, "fit": f.tolist(), "test": j.tolist()} for n, (v, f, j) in result.items()}
+    write_json(out / f"elbow-{'-'.join(result)}.json", kept)
+    for name, (values, *_) in result.items():
+        print(name, values)
+    print("\n".join(rows))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("tosses", type=Path)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--only", nargs="+", default=["sdfsim", *ENGINES])
+    args = parser.parse_args()
+    run_main(lambda: main(args.tosses, args.out, args.rounds, args.only))

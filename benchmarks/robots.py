@@ -1,0 +1,207 @@
+"""How many robots of PyBullet's data import, and whether MuJoCo puts their links where the scenes do.
+
+    python benchmarks/robots.py            # all of pybullet_data but its random solids
+
+Of each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
+scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim import load_scene
+from sdfsim.apps.import_robot import import_robot
+from sdfsim.base.errors import SdfsimError, run_main
+from sdfsim.scene.scene import Joint, Scene
+
+TRIES = 20
+FREE = 1.0  # rad or m to each side, of joints without limits
+
+
+def poses(scene: Scene, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies of a scene of trees, in the world: roots as they are
+    at the start, joints at `q` (rad, m; of a ball a rotation vector), by name."""
+    held: dict[int, Joint] = {joint.bodies[0]: joint for joint in scene.joints if not joint.collides}
+    found: dict[int, tuple[np.ndarray, Rotation]] = {-1: (np.zeros(3), Rotation.identity())}
+
+    def pose(k: int) -> tuple[np.ndarray, Rotation]:
+        if k not in found:
+            body = scene.bodies[k]
+            found[k] = body.position, Rotation.from_quat(body.quat_xyzw)
+            if k in held:
+                joint, value = held[k], q.get(held[k].name, 0.0)
+                place, turn = pose(joint.bodies[1])
+                theirs, own = (Rotation.from_quat(frame) for frame in joint.quat_xyzw[::-1])
+                frame, origin = turn * theirs, place + turn.apply(joint.anchor[1])
+                if joint.kind == "hinge":
+                    frame = frame * Rotation.from_rotvec([value, 0.0, 0.0])
+                elif joint.kind == "slider":
+                    origin = origin + frame.apply([value, 0.0, 0.0])
+                elif joint.kind == "ball":
+                    frame = frame * Rotation.from_rotvec(np.zeros(3) + value)
+                axes = frame * own.inv()
+                found[k] = origin - axes.apply(joint.anchor[0]), axes
+        return found[k]
+
+    places, axes = zip(*(pose(k) for k in range(len(scene.bodies))), strict=True)
+    turns = np.stack([turn.as_matrix() for turn in axes])
+    com = np.stack([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
+    return np.stack(places) + np.einsum("nij,nj->ni", turns, com), turns
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How far a scene is from what MuJoCo makes of the same file."""
+
+    links: int  # that both have
+    apart: float  # m, the largest
+    turned: float  # rad, the largest
+    mass: float  # relative, the largest
+
+
+def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> Judged:
+    """Compare a scene with MuJoCo's model of the file that it was made from, at the start and at random positions."""
+    import mujoco
+
+    spec = (
+        mujoco.MjSpec.from_string(_bare(source)) if source.suffix == ".urdf" else mujoco.MjSpec.from_file(str(source))
+    )
+    if source.suffix == ".urdf":
+        spec.compiler.fusestatic = False
+        spec.compiler.balanceinertia = True
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    number = {body.name: k for k, body in enumerate(scene.bodies)}
+    ids = {k: model.body(k).name or f"body_{k}" for k in range(1, model.nbody)}
+    # Statics of MJCF are bodies a geom each; links of no mass are parts of others.
+    both = [(k, number[name]) for k, name in ids.items() if name in number and model.body_mass[k] > 0]
+    both = [(k, i) for k, i in both if scene.bodies[i].motion == "dynamic"]
+    by_name = {joint.name: joint for joint in scene.joints}
+    joints = {j: model.joint(j).name or _named(model, j) for j in range(model.njnt)}
+    rng = np.random.default_rng(seed)
+    start = _set(mujoco, model, data, joints, by_name, None)
+    places, turns = poses(scene, start)
+    first = [(data.xmat[k].reshape(3, 3).copy(), turns[i]) for k, i in both]
+    axes = {k: ours.T @ theirs for (k, _), (theirs, ours) in zip(both, first, strict=True)}
+    apart = turned = 0.0
+    # MuJoCo holds the roots of a URDF in the origin, and a scene has free roots where they are.
+    for trial in range(tries + 1):
+        values = start if trial == 0 else _set(mujoco, model, data, joints, by_name, rng, axes)
+        places, turns = poses(scene, values)
+        for (k, i), (theirs, ours) in zip(both, first, strict=True):
+            apart = max(apart, float(np.linalg.norm(data.xipos[k] - places[i])))
+            change = data.xmat[k].reshape(3, 3) @ theirs.T @ (turns[i] @ ours.T).T
+            turned = max(turned, float(np.linalg.norm(Rotation.from_matrix(change).as_rotvec())))
+    mass = max((abs(_mass(scene, i) / model.body_mass[k] - 1.0) for k, i in both), default=0.0)
+    return Judged(len(both), apart, turned, mass)
+
+
+def _mass(scene: Scene, k: int) -> float:
+    """kg, of a body with the small balls that hold a part of its mass."""
+    name = scene.bodies[k].name
+    balls = [b for b in scene.bodies if b.collides_with == () and b.name.startswith(f"{name}_")]
+    chain = [b for b in balls if b.name.removeprefix(f"{name}_") in {joint.name for joint in scene.joints}]
+    return scene.bodies[k].mass + sum(b.mass for b in chain)
+
+
+def _named(model, j: int) -> str:
+    body = int(model.jnt_bodyid[j])
+    count = j - int(model.body_jntadr[body])
+    return f"{model.body(body).name or f'body_{body}'}_joint" + (f"_{count}" if count else "")
+
+
+def _set(
+    mujoco, model, data, joints, known: dict[str, Joint], rng: np.random.Generator | None,
+    shape_axes: dict[int, np.ndarray] | None = None,
+) -> dict:  # fmt: skip
+    """Set joints to where the scene starts, or at random within limits, and return their positions; `shape_axes` by
+    body carry from the axes of its link to those of its shape."""
+    mujoco.mj_resetData(model, data)
+    if "start" in (keys := [model.key(k).name for k in range(model.nkey)]):
+        mujoco.mj_resetDataKeyframe(model, data, keys.index("start"))
+    values: dict[str, float | np.ndarray] = {}
+    for j, name in joints.items():
+        at, kind = int(model.jnt_qposadr[j]), mujoco.mjtJoint(int(model.jnt_type[j]))
+        if kind == mujoco.mjtJoint.mjJNT_FREE or name not in known:
+            continue
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            turn = np.zeros(3) if rng is None else rng.normal(size=3)
+            data.qpos[at : at + 4] = np.roll(Rotation.from_rotvec(turn).as_quat(), 1)
+            # MuJoCo turns about the link's axes, which need not be those of the shape that stands for it.
+            own = Rotation.from_quat(known[name].quat_xyzw[0]).inv()
+            values[name] = own.apply(shape_axes[int(model.jnt_bodyid[j])] @ turn) if shape_axes else turn
+            continue
+        low, high = model.jnt_range[j] if model.jnt_limited[j] else (-FREE, FREE)
+        value = float(data.qpos[at]) if rng is None else float(rng.uniform(low, high))
+        if rng is None and model.jnt_limited[j]:
+            value = min(max(value, low), high)
+        data.qpos[at] = values[name] = value
+    mujoco.mj_forward(model, data)
+    return values
+
+
+def _bare(source: Path) -> str:
+    """A URDF without geometry: MuJoCo finds no meshes by ROS paths, and masses and joints do not need them. Without
+    what no XML has around it, and with ROS' defaults in place of variables of the environment."""
+    text = source.read_bytes().decode(errors="replace").strip(" \t\r\n\0")
+    root = ElementTree.fromstring(re.sub(r"\$\(optenv +\w+([^()]*)\)", r"\1", text).encode())
+    for link in root.findall("link"):
+        for tag in ("visual", "collision"):
+            for child in link.findall(tag):
+                link.remove(child)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("files", nargs="*", type=Path, help="URDF and MJCF files (default: those of pybullet_data)")
+    args = parser.parse_args()
+    files = args.files or _all()
+    counts = {"imported": 0, "judged": 0, "refused": 0}
+    print("| file | bodies | joints | links judged | apart, mm | turned, degrees | mass | |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
+    for file in files:
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                import_robot(file, Path(folder) / "scene.yaml")
+                scene = load_scene(Path(folder) / "scene.yaml")
+            except SdfsimError as error:
+                counts["refused"] += 1
+                print(
+                    f"| {file.name} | | | | | | | {error.message.replace(str(file.parent) + '/', '')[:150]} |",
+                    flush=True,
+                )
+                continue
+        counts["imported"] += 1
+        row = f"| {file.name} | {len(scene.bodies)} | {len(scene.joints)} |"
+        try:
+            found = judge(file, scene)
+        except ValueError as error:
+            print(f"{row} | | | | MuJoCo: {str(error).splitlines()[0][:100]} |", flush=True)
+            continue
+        counts["judged"] += 1
+        numbers = f"{1e3 * found.apart:.2g} | {math.degrees(found.turned):.2g} | {found.mass:.1g}"
+        print(f"{row} {found.links} | {numbers} | |", flush=True)
+    print(f"\n{len(files)} files: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
+
+
+def _all() -> list[Path]:
+    import pybullet_data
+
+    data = Path(pybullet_data.getDataPath())
+    found = [*data.rglob("*.urdf"), *(data / "mjcf").glob("*.xml")]
+    return sorted(file for file in found if "random_urdfs" not in file.parts)
+
+
+if __name__ == "__main__":
+    run_main(main)

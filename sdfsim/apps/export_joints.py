@@ -1,0 +1,383 @@
+"""Joints of a scene in the formats of `export`: nested bodies of MJCF, links of URDF, joints of UsdPhysics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.scene.scene import Body, Joint, Scene
+
+NESTING = ("hinge", "slider", "ball", "fixed")  # kinds that can hold a body below another
+KEEN = 20.0  # s/rad or s/m: a motor's largest force over how much too slow it then is
+EFFORT = 1e6  # N m or N, and rad/s or m/s: of URDF's limits, which must be given
+
+
+@dataclass(frozen=True)
+class Held:
+    """A joint as that of a child below its parent; turned round where the scene has the child second."""
+
+    joint: Joint
+    parent: int  # -1: the world
+    anchor: np.ndarray  # [3] m, in the child
+    frame: Rotation  # of the joint's axes, in the child
+    parent_anchor: np.ndarray  # [3] m, in the parent
+    parent_frame: Rotation
+    sense: float  # -1 where it is turned round: its axis then is the other way
+
+    def axis(self) -> np.ndarray:
+        """[3] in the child."""
+        return self.frame.apply([self.sense, 0.0, 0.0])
+
+
+def held(joint: Joint, child: int) -> Held:
+    """A joint as that of one of its bodies."""
+    own = 0 if joint.bodies[0] == child else 1
+    frames = [Rotation.from_quat(quat) for quat in joint.quat_xyzw]
+    return Held(
+        joint, joint.bodies[1 - own], joint.anchor[own], frames[own], joint.anchor[1 - own], frames[1 - own],
+        1.0 if own == 0 else -1.0,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Trees:
+    """The bodies of a scene as trees: who holds whom, and the joints that are left, which close loops."""
+
+    order: tuple[int, ...]  # all bodies, each right after its parent and all that its elder siblings hold
+    above: dict[int, Held]  # of bodies that are held
+    loops: tuple[Joint, ...]  # the others, distances among them
+
+    def root(self, k: int) -> int:
+        """The body that holds a body in the end, -1 for the world."""
+        while k in self.above:
+            k = self.above[k].parent
+        return k
+
+
+def trees(scene: Scene) -> Trees:
+    """Trees whose roots are the world and what it does not move, then bodies that fly."""
+    at: dict[int, list[int]] = {}
+    for number, joint in enumerate(scene.joints):
+        if joint.kind in NESTING:
+            for k in joint.bodies:
+                at.setdefault(k, []).append(number)
+    still = [k for k, body in enumerate(scene.bodies) if body.motion != "dynamic"]
+    above: dict[int, Held] = {}
+    reached, used = {-1, *still}, set()
+    # Bodies that no joint has first are the natural roots of what flies.
+    free = [k for k in range(len(scene.bodies)) if k not in reached]
+    firsts = {joint.bodies[0] for joint in scene.joints if joint.kind in NESTING}
+    for seeds in ([-1, *still], *([k] for k in sorted(free, key=lambda k: k in firsts))):
+        if seeds[0] != -1 and seeds[0] in reached:
+            continue
+        queue = list(seeds)
+        reached |= set(seeds)
+        for k in queue:  # grows
+            for number in at.get(k, ()):
+                joint = scene.joints[number]
+                other = joint.bodies[1] if joint.bodies[0] == k else joint.bodies[0]
+                if other not in reached:
+                    above[other] = held(joint, other)
+                    used.add(number)
+                    reached.add(other)
+                    queue.append(other)
+    below: dict[int, list[int]] = {}
+    for k in sorted(above):
+        below.setdefault(above[k].parent, []).append(k)
+    order: list[int] = []
+    stack = sorted((k for k in range(len(scene.bodies)) if k not in above or above[k].parent < 0), reverse=True)
+    while stack:
+        k = stack.pop()
+        order.append(k)
+        stack += reversed(below.get(k, ()))
+    return Trees(tuple(order), above, tuple(j for n, j in enumerate(scene.joints) if n not in used))
+
+
+def place(body: Body | None) -> tuple[np.ndarray, Rotation]:
+    """Of a body at the start, or of the world."""
+    return (np.zeros(3), Rotation.identity()) if body is None else (body.position, Rotation.from_quat(body.quat_xyzw))
+
+
+def start_of(scene: Scene, one: Held, child: int) -> float:
+    """rad or m: the position of a hinge or a slider at the start; 0 of others."""
+    (here, turn), (there, other) = place(scene.bodies[child]), place(_body(scene, one.parent))
+    own, theirs = turn * one.frame, other * one.parent_frame
+    if one.joint.kind == "hinge":
+        vector = (theirs.inv() * own).as_rotvec()
+        angle = one.sense * vector[0]
+        # Turns add up, and a pose does not tell them: the one that is within the limits.
+        low, high = one.joint.limits or (-math.pi, math.pi)
+        whole = 2.0 * math.pi
+        return float(angle + whole * max(0, math.ceil((low - 1e-9 - angle) / whole)) - whole * max(
+            0, math.ceil((angle - high - 1e-9) / whole)
+        ))  # fmt: skip
+    if one.joint.kind == "slider":
+        apart = here + turn.apply(one.anchor) - there - other.apply(one.parent_anchor)
+        return float(one.sense * theirs.apply([1.0, 0.0, 0.0]) @ apart)
+    return 0.0
+
+
+def _body(scene: Scene, k: int) -> Body | None:
+    return scene.bodies[k] if k >= 0 else None
+
+
+def _speed(scene: Scene, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity [3] m/s of a body at a point of the world, and its angular velocity [3] rad/s."""
+    body = _body(scene, k)
+    if body is None or body.motion != "dynamic":
+        return np.zeros(3), np.zeros(3)
+    centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(body.scale * scene.shapes[body.shape].com)
+    return body.velocity + np.cross(body.angular_velocity, point - centre), body.angular_velocity
+
+
+def speed_of(scene: Scene, one: Held, child: int) -> np.ndarray:
+    """[0, 1 or 3] rad/s or m/s: how a joint moves at the start; of a ball in the axes of the child."""
+    here, turn = place(scene.bodies[child])
+    point = here + turn.apply(one.anchor)
+    (fast, spin), (carried, turned) = _speed(scene, child, point), _speed(scene, one.parent, point)
+    axis = turn.apply(one.axis())
+    kinds = {"hinge": [axis @ (spin - turned)], "slider": [axis @ (fast - carried)]}
+    if one.joint.kind == "slider":  # the point moves along with the frame that holds it
+        kinds["slider"] = [axis @ (fast - carried)]
+    return turn.inv().apply(spin - turned) if one.joint.kind == "ball" else np.array(kinds.get(one.joint.kind, []))
+
+
+def left_out(joints: Sequence[Joint], *, breaks: bool = True, spring_of: Sequence[str] = ()) -> list[str]:
+    """What no format but ours has of joints, one line each."""
+    lines = {
+        "what joints break at": breaks and any(np.isfinite([j.breaks_force, j.breaks_torque]).any() for j in joints),
+        "how limits of joints rebound": any(j.restitution for j in joints),
+    }
+    lines |= {f"springs of {kind}s": any(j.kind == kind and j.spring for j in joints) for kind in spring_of}
+    return [line for line, there in lines.items() if there]
+
+
+# --- MJCF ---
+
+
+def _text(*values: Any) -> str:
+    return " ".join(f"{value + 0.0:.12g}" for value in np.concatenate([np.ravel(value) for value in values]))
+
+
+def _add(parent: Element, tag: str, **attributes: str) -> Element:
+    return SubElement(parent, tag, {key.rstrip("_"): value for key, value in attributes.items()})
+
+
+def mjcf_pose(scene: Scene, tree: Trees, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Position [3] m and quaternion [4] xyzw of a body in that which holds it, at the start."""
+    here, turn = place(scene.bodies[k])
+    there, other = place(_body(scene, tree.above[k].parent) if k in tree.above else None)
+    return other.inv().apply(here - there), (other.inv() * turn).as_quat()
+
+
+def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Write what holds a body, and return its part of qpos and of qvel."""
+    joint, start = one.joint, start_of(scene, one, child)
+    speed = speed_of(scene, one, child)
+    if joint.kind == "fixed":
+        return np.zeros(0), speed
+    keys = {"type": {"hinge": "hinge", "slider": "slide", "ball": "ball"}[joint.kind], "pos": _text(one.anchor)}
+    if joint.kind != "ball":
+        keys |= {"axis": _text(one.axis()), "ref": _text(start)}
+    keys |= {"damping": _text(joint.damping)} if joint.damping else {}
+    keys |= {"frictionloss": _text(joint.friction)} if joint.friction else {}
+    if joint.limits is not None:
+        keys |= {"limited": "true", "range": _text(joint.limits)}
+    if joint.spring is not None:
+        keys |= {"stiffness": _text(joint.spring.stiffness), "springref": _text(joint.spring.rest)}
+    _add(node, "joint", name=name, **keys)
+    return (np.array([1.0, 0.0, 0.0, 0.0]) if joint.kind == "ball" else np.array([start])), speed
+
+
+def mjcf_rest(
+    root: Element, sites: Sequence[Element], scene: Scene, tree: Trees, bodies: Sequence[str], names: dict[str, str]
+) -> tuple[list[float], list[str]]:
+    """Write loops, distances, motors and who does not touch whom: the controls [U] of the start, and what is left out.
+    `sites` are the elements of the bodies, the world's last; `bodies` and `names` what bodies and joints are called."""
+    told, controls = left_out(scene.joints), []
+    tags = ("equality", "tendon", "actuator", "contact")
+    into = {tag: Element(tag) for tag in tags}
+
+    def end(joint: Joint, side: int) -> str:
+        name = f"{names[joint.name]}_end{side}"
+        _add(sites[joint.bodies[side]], "site", name=name, pos=_text(joint.anchor[side]), size="0.002")
+        return name
+
+    for joint in tree.loops:
+        name = names[joint.name]
+        if joint.kind == "distance":
+            keys: dict[str, str] = {}
+            if joint.limits is not None:
+                keys |= {"limited": "true", "range": _text(joint.limits)}
+            if joint.spring is not None:
+                keys |= {"stiffness": _text(joint.spring.stiffness), "springlength": _text(joint.spring.rest)}
+            keys |= {"damping": _text(joint.damping)} if joint.damping else {}
+            rope = _add(into["tendon"], "spatial", name=name, width="0.003", **keys)
+            for side in (0, 1):
+                _add(rope, "site", site=end(joint, side))
+            if joint.length is not None:
+                _add(into["equality"], "tendon", name=f"{name}_rod", tendon1=name)
+            continue
+        one = held(joint, joint.bodies[0])
+        ends = {"body1": bodies[joint.bodies[0]]} | ({"body2": bodies[one.parent]} if one.parent >= 0 else {})
+        if joint.kind == "fixed":
+            _add(into["equality"], "weld", name=name, **ends, anchor=_text(np.zeros(3)))
+        elif joint.kind == "slider":
+            told.append(f"slider {joint.name}, which closes a loop")
+        else:  # a hinge is held in two points of its axis
+            points = [one.anchor] if joint.kind == "ball" else [one.anchor + s * 0.1 * one.axis() for s in (-1.0, 1.0)]
+            for number, point in enumerate(points):
+                _add(
+                    into["equality"], "connect", name=name + (f"_{number}" if number else ""), **ends,
+                    anchor=_text(point),
+                )  # fmt: skip
+            if joint.limits or joint.damping or joint.friction or joint.spring or joint.motor:
+                told.append(f"limits, damping, friction, spring and motor of {joint.name}, which closes a loop")
+    for joint in scene.joints:
+        first, second = joint.bodies
+        if joint.collides and any(one.joint is joint for one in tree.above.values()):
+            told.append(f"that bodies of {joint.name} touch each other")
+        elif not joint.collides and second >= 0 and "dynamic" == scene.bodies[first].motion:
+            _add(into["contact"], "exclude", body1=bodies[first], body2=bodies[second])
+        if joint.motor is None or joint in tree.loops:
+            continue
+        speed = KEEN * joint.motor.most
+        keys = {"name": f"{names[joint.name]}_motor", "joint": names[joint.name]}
+        keys |= {"forcerange": _text((-joint.motor.most, joint.motor.most))}
+        if joint.motor.speed is not None:
+            _add(into["actuator"], "velocity", kv=_text(speed), **keys)
+            controls.append(joint.motor.speed)
+        else:
+            _add(into["actuator"], "position", kp=_text(speed / joint.motor.time), kv=_text(speed), **keys)
+            controls.append(float(joint.motor.position or 0.0))
+    if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
+        told.append("that a cone bounds the lean of a ball only: MuJoCo bounds its whole turn")
+    for tag in tags:
+        before = root.find(tag)
+        if len(into[tag]) and before is not None:
+            before.extend(into[tag])
+        elif len(into[tag]):
+            root.append(into[tag])
+    return controls, told
+
+
+# --- URDF ---
+
+
+def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], links: dict[int, str],
+               origin: np.ndarray) -> None:  # fmt: skip
+    """Write what holds a link; `origin` [3] m is that of the parent's link in the parent's body."""
+    joint = one.joint
+    bounded = joint.limits is not None and joint.kind != "ball"
+    kinds = {"hinge": "revolute" if bounded else "continuous", "slider": "prismatic", "ball": "spherical"}
+    made = _add(root, "joint", name=names[joint.name], type=kinds.get(joint.kind, "fixed"))
+    _add(made, "parent", link=links[one.parent])
+    _add(made, "child", link=links[child])
+    turn = one.parent_frame * one.frame.inv()
+    _add(made, "origin", xyz=_text(one.parent_anchor - origin), rpy=_text(turn.as_euler("xyz")))
+    if joint.kind in ("hinge", "slider"):
+        _add(made, "axis", xyz=_text(one.axis()))
+        low, high = joint.limits or (-EFFORT, EFFORT)
+        effort = EFFORT if joint.motor is None else joint.motor.most
+        ends = {} if joint.kind == "hinge" and not bounded else {"lower": _text(low), "upper": _text(high)}
+        _add(made, "limit", **ends, effort=_text(effort), velocity=_text(EFFORT))
+    if joint.damping or joint.friction:
+        _add(made, "dynamics", damping=_text(joint.damping), friction=_text(joint.friction))
+
+
+def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
+    """What a URDF does not hold of joints."""
+    told = left_out(scene.joints, spring_of=("hinge", "slider"))
+    told += [f"joint {joint.name}: URDF knows trees only" for joint in tree.loops if joint.kind in NESTING]
+    told += [f"joint {joint.name}: URDF knows no {joint.kind}" for joint in tree.loops if joint.kind not in NESTING]
+    if any(joint.motor for joint in scene.joints):
+        told.append("motors of joints: their largest force is the effort")
+    if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
+        told.append("cones of balls")
+    for k, one in tree.above.items():
+        if abs(start := start_of(scene, one, k)) > 1e-9:
+            unit = "m" if one.joint.kind == "slider" else "rad"
+            told.append(f"that joint {one.joint.name} starts at {start:.6g} {unit}: in a URDF all begin at zero")
+    return told
+
+
+# --- USD ---
+
+
+def usd_joints(
+    stage: Any, physics: Any, gf: Any, scene: Scene, bodies: Sequence[str], names: dict[str, str]
+) -> list[str]:
+    """Write joints of UsdPhysics; their x axes are the joints' axes. Returns what is left out."""
+    made_of = {
+        "hinge": physics.RevoluteJoint, "slider": physics.PrismaticJoint, "ball": physics.SphericalJoint,
+        "fixed": physics.FixedJoint, "distance": physics.DistanceJoint,
+    }  # fmt: skip
+    told = left_out(scene.joints, breaks=False)
+    stage.DefinePrim("/World/joints", "Scope")
+    for joint in scene.joints:
+        made = made_of[joint.kind].Define(stage, f"/World/joints/{names[joint.name]}")
+        sides = ((0, 1), (1, 0))  # of USD, and of ours: USD's second body moves against its first
+        for theirs, ours in sides:
+            if joint.bodies[ours] >= 0:
+                relation = made.CreateBody0Rel() if theirs == 0 else made.CreateBody1Rel()
+                relation.SetTargets([f"/World/{bodies[joint.bodies[ours]]}"])
+            x, y, z, w = joint.quat_xyzw[ours].tolist()
+            (made.CreateLocalPos0Attr if theirs == 0 else made.CreateLocalPos1Attr)(
+                gf.Vec3f(*joint.anchor[ours].tolist())
+            )
+            (made.CreateLocalRot0Attr if theirs == 0 else made.CreateLocalRot1Attr)(gf.Quatf(w, x, y, z))
+        made.CreateCollisionEnabledAttr(joint.collides)
+        if math.isfinite(joint.breaks_force):
+            made.CreateBreakForceAttr(joint.breaks_force)
+        if math.isfinite(joint.breaks_torque):
+            made.CreateBreakTorqueAttr(joint.breaks_torque)
+        degrees = 180.0 / math.pi if joint.kind == "hinge" else 1.0
+        if joint.kind in ("hinge", "slider", "ball"):
+            made.CreateAxisAttr("X")
+        if joint.kind in ("hinge", "slider") and joint.limits is not None:
+            made.CreateLowerLimitAttr(joint.limits[0] * degrees)
+            made.CreateUpperLimitAttr(joint.limits[1] * degrees)
+        if joint.kind == "ball" and joint.limits is not None:
+            made.CreateConeAngle0LimitAttr(math.degrees(joint.limits[1]))
+            made.CreateConeAngle1LimitAttr(math.degrees(joint.limits[1]))
+        if joint.kind == "distance":
+            low, high = (joint.length, joint.length) if joint.length is not None else joint.limits or (-1.0, -1.0)
+            made.CreateMinDistanceAttr(low if low > 0 else -1.0)
+            made.CreateMaxDistanceAttr(high)
+        told += _usd_drive(made, physics, joint, degrees)
+    return told
+
+
+def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[str]:
+    """Motor, spring and damping of a hinge or slider; a drive's numbers are for degrees."""
+    told = [f"friction of joint {joint.name}"] if joint.friction else []
+    if joint.kind not in ("hinge", "slider"):
+        return [*told, *([f"spring and damping of joint {joint.name}"] if joint.spring or joint.damping else [])]
+    if not (joint.motor or joint.spring or joint.damping):
+        return told
+    drive = physics.DriveAPI.Apply(made.GetPrim(), "angular" if joint.kind == "hinge" else "linear")
+    drive.CreateTypeAttr("force")
+    if joint.motor is not None:
+        keen = KEEN * joint.motor.most
+        drive.CreateMaxForceAttr(joint.motor.most)
+        drive.CreateDampingAttr(keen / degrees)
+        drive.CreateStiffnessAttr(0.0 if joint.motor.position is None else keen / joint.motor.time / degrees)
+        if joint.motor.speed is not None:
+            drive.CreateTargetVelocityAttr(joint.motor.speed * degrees)
+        else:
+            drive.CreateTargetPositionAttr(float(joint.motor.position or 0.0) * degrees)
+        return [
+            *told,
+            *([f"spring and damping beside the motor of joint {joint.name}"] * bool(joint.spring or joint.damping)),
+        ]
+    drive.CreateDampingAttr(joint.damping / degrees)
+    if joint.spring is not None:
+        drive.CreateStiffnessAttr(joint.spring.stiffness / degrees)
+        drive.CreateTargetPositionAttr(joint.spring.rest * degrees)
+    return told

@@ -1,0 +1,387 @@
+"""MJCF -> links and joints, as `robot` turns them into a scene. MuJoCo itself reads the file: its compiler knows all
+defaults, frames, inertias and includes, and what it refuses is no MJCF."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.apps.robot import Held, Link, Part, Robot, moved, named, pose_of
+from sdfsim.base.errors import SdfsimError, nearest
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.primitives import sphere
+
+START = "start"  # the keyframe that our own exports have
+SOFTEST = 1.99  # damping ratio from which on contacts count as not rebounding
+USUAL = (0.02, 1.0)  # MuJoCo's own time and damping ratio of contacts
+NEAR = 1e-4  # m, or part of a length, by which ends of a loop may be apart
+# What a model may have that no scene holds: the field that counts it, and what to call it.
+COUNTED = {
+    "nsensor": "sensors",
+    "ncam": "cameras",
+    "nlight": "lights",
+    "nsite": "sites",
+    "nflex": "deformable bodies (flex)",
+    "nskin": "skins",
+    "nplugin": "plugins",
+    "npair": "contact pairs with coefficients of their own: those of the two bodies count",
+    "ntex": "textures: colours stand for them",
+}
+
+
+def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
+    """The bodies and joints of an MJCF file, as they are in the keyframe `key`, or else in one called start, or as the
+    file draws them. Raises SdfsimError where MuJoCo is not installed or refuses the file, for no such keyframe, or for
+    geometry that no body can have."""
+    try:
+        mujoco: Any = importlib.import_module("mujoco")
+    except ImportError as error:
+        raise SdfsimError("mujoco is not installed: it reads MJCF", "pip install 'sdfsim[mjcf]'") from error
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, RuntimeError) as error:
+        told = "; ".join(part.strip() for part in str(error).splitlines() if part.strip())
+        line = re.search(r"\bline (\d+)", told)
+        where = f"{path}:{line[1]}" if line else str(path)
+        raise SdfsimError(f"{where}: MuJoCo refuses it ({told})", "a URDF needs the ending .urdf") from error
+    return _Reader(path, mujoco, model, key).robot()
+
+
+class _Reader:
+    def __init__(self, path: Path, mujoco: Any, model: Any, key: str | None) -> None:
+        self.mj, self.path, self.model, self.data = mujoco, path, model, mujoco.MjData(model)
+        self.left: list[str] = []
+        self.notes: list[str] = []
+        keys = [model.key(k).name or f"key {k}" for k in range(model.nkey)]
+        if key is not None and key not in keys:
+            there = ", ".join(keys) or "none"
+            raise SdfsimError(f"{path}: no keyframe is called {key!r}{nearest(key, keys)}", f"there are {there}")
+        mujoco.mj_resetData(model, self.data)
+        chosen = key if key is not None else START if START in keys else None
+        if chosen is not None:
+            mujoco.mj_resetDataKeyframe(model, self.data, keys.index(chosen))
+        if others := [name for name in keys if name != chosen]:
+            self.left.append(named("keyframes: give one with --key", others))
+        self._within_limits()
+        mujoco.mj_forward(model, self.data)
+
+    def _within_limits(self) -> None:
+        model, types = self.model, self.mj.mjtJoint
+        for j in range(model.njnt):
+            if model.jnt_limited[j] and types(int(model.jnt_type[j])) in (types.mjJNT_HINGE, types.mjJNT_SLIDE):
+                at = model.jnt_qposadr[j]
+                within = float(np.clip(self.data.qpos[at], *model.jnt_range[j]))
+                if within != self.data.qpos[at]:
+                    self.notes.append(f"joint {self._joint_name(j)} starts at {within:.6g}, the nearest of its limits")
+                    self.data.qpos[at] = within
+
+    def robot(self) -> Robot:
+        model = self.model
+        for counter, what in COUNTED.items():
+            if count := int(getattr(model, counter, 0)):
+                self.left.append(f"{what} ({count})")
+        if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):
+            self.left.append("the air: density, viscosity and wind")
+        if np.any(model.body_gravcomp):
+            self.left.append(named("gravcomp of bodies", self._names(model.body, np.flatnonzero(model.body_gravcomp))))
+        links: list[Link] = []
+        geoms: list[list[int]] = []  # that each link touches others with
+        self.link: list[int] = []  # of every body, its first; -1 for the world, and where there is nothing
+        for b in range(model.nbody):
+            made = self._links(b)
+            self.link.append(len(links) if b and made else -1)
+            links += [link for link, _ in made]
+            geoms += [own for _, own in made]
+        joints = [joint for b in range(1, model.nbody) for joint in self._joints(b)]
+        motors = self._motors()
+        joints = [replace(joint, motor=motors.get(joint.name)) for joint in joints]
+        if rotors := [self._joint_name(j) for j in self._rotors()]:
+            self.left.append(named("armature of joints", rotors))
+        joints += [*self._loops(), *self._ropes()]
+        return Robot(
+            self.path.stem, tuple(links), tuple(joints), np.array(model.opt.gravity), self._apart(geoms),
+            tuple(self.left), tuple(self.notes),
+        )  # fmt: skip
+
+    def _names(self, of: Any, which: Any) -> list[str]:
+        return [of(int(k)).name or f"number {k}" for k in which]
+
+    def _body_name(self, b: int) -> str:
+        return self.model.body(b).name or f"body_{b}"
+
+    def _joint_name(self, j: int) -> str:
+        joint = self.model.joint(j)
+        if joint.name:
+            return joint.name
+        first = self.model.body_jntadr[self.model.jnt_bodyid[j]]
+        return f"{self._body_name(int(self.model.jnt_bodyid[j]))}_joint" + (f"_{j - first}" if j > first else "")
+
+    # --- bodies ---
+
+    def _links(self, b: int) -> list[tuple[Link, list[int]]]:
+        """A body that moves; or a link for each geometry of one that does not."""
+        model, data = self.model, self.data
+        pose = pose_of(data.xpos[b], Rotation.from_matrix(data.xmat[b].reshape(3, 3)))
+        first = model.body_geomadr[b]
+        geoms = [g for g in range(first, first + model.body_geomnum[b]) if first >= 0]
+        solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        if model.body_weldid[b] == 0:
+            if b and model.body_mocapid[b] >= 0:
+                self.left.append(f"body {self._body_name(b)} is a mocap body: it stands still")
+            return self._still(b, pose, geoms, solid)
+        parts = {g: part for g in geoms if (part := self._part(g)) is not None}
+        turn = Rotation.from_quat(np.roll(model.body_iquat[b], -1)).as_matrix()
+        speed = np.zeros(6)
+        self.mj.mj_objectVelocity(model, data, self.mj.mjtObj.mjOBJ_BODY, b, speed, 0)
+        link = Link(
+            self._body_name(b), pose, tuple(parts[g] for g in solid if g in parts),
+            tuple(parts[g] for g in geoms if g in parts and g not in solid), float(model.body_mass[b]),
+            np.array(model.body_ipos[b]), turn @ np.diag(model.body_inertia[b]) @ turn.T, velocity=speed[3:],
+            spin=speed[:3], where=f"{self.path}: body {self._body_name(b)}", **self._surface(solid, self._body_name(b)),
+        )  # fmt: skip
+        if link.solid and any(part.kind == "plane" for part in link.shown):
+            link = replace(link, shown=tuple(part for part in link.shown if part.kind != "plane"))
+        return [(link, solid)]
+
+    def _still(self, b: int, pose: np.ndarray, geoms: list[int], solid: list[int]) -> list[tuple[Link, list[int]]]:
+        names, found, name = [], [], self._body_name(b)
+        for g in geoms:
+            part = self._part(g)
+            if part is None:
+                continue
+            called = name if b and len(geoms) == 1 else self.model.geom(g).name or f"{name}_{g}"
+            while called in names or (called != name and called in self._all_bodies()):
+                called += "_"
+            names.append(called)
+            kind: Any = {"solid" if g in solid else "shown": (part,)}
+            where = f"{self.path}: geom {called}"
+            link = Link(called, pose, still=True, where=where, **kind, **self._surface([g], called))
+            found.append((link, [g] if g in solid else []))
+        return found
+
+    def _all_bodies(self) -> set[str]:
+        return {self._body_name(b) for b in range(self.model.nbody)}
+
+    def _surface(self, geoms: list[int], name: str) -> dict[str, Any]:
+        """Coefficients of which two alike give MuJoCo's as their product."""
+        if not geoms:
+            return {}
+        frictions = {float(self.model.geom_friction[g, 0]) for g in geoms}
+        if len(frictions) > 1:
+            told = ", ".join(f"{value:g}" for value in sorted(frictions))
+            self.notes.append(f"body {name}: its geoms have unlike friction ({told}): the largest counts")
+        friction = float(np.sqrt(max(frictions)))
+        return {"friction": friction, "restitution": max(_restitution(self.model.geom_solref[g]) for g in geoms)}
+
+    def _part(self, g: int) -> Part | None:
+        model, types = self.model, self.mj.mjtGeom
+        size, kind, mesh = model.geom_size[g], types(int(model.geom_type[g])), None
+        where = f"{self.path}: geom {model.geom(g).name or g}"
+        pose = pose_of(model.geom_pos[g], Rotation.from_quat(np.roll(model.geom_quat[g], -1)))
+        material = model.geom_matid[g]
+        rgba = model.geom_rgba[g] if material < 0 else model.mat_rgba[material]
+        color: Any = tuple(round(255 * float(c)) for c in np.clip(rgba[:3], 0.0, 1.0))
+        sizes: dict[str, Any] = {}
+        if kind == types.mjGEOM_PLANE:
+            return Part("plane", pose, where=where, color=color)
+        if kind == types.mjGEOM_BOX:
+            sizes = {"size": 2.0 * size}
+        elif kind == types.mjGEOM_SPHERE:
+            sizes = {"radius": float(size[0])}
+        elif kind in (types.mjGEOM_CAPSULE, types.mjGEOM_CYLINDER):
+            caps = 2.0 * size[0] if kind == types.mjGEOM_CAPSULE else 0.0
+            sizes = {"radius": float(size[0]), "height": float(2.0 * size[1] + caps)}
+        elif kind == types.mjGEOM_ELLIPSOID:
+            mesh = moved(sphere(1.0), np.diag([*size, 1.0]))
+        elif kind == types.mjGEOM_MESH:
+            k = model.geom_dataid[g]
+            corners = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
+            faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
+            mesh = Mesh(model.mesh_vert[corners].astype(np.float64), model.mesh_face[faces].astype(np.int64))
+        else:
+            self.left.append(f"{where}: a {kind.name.removeprefix('mjGEOM_').lower()} is no shape here")
+            return None
+        name: Any = "mesh" if mesh is not None else kind.name.removeprefix("mjGEOM_").lower()
+        return Part(name, pose, sizes, mesh, where, color)
+
+    def _apart(self, geoms: list[list[int]]) -> frozenset[tuple[int, int]]:
+        """Links that masks of bits or <exclude> keep apart; what is jointed is not asked for."""
+        model = self.model
+        has, takes = (
+            [[int(bits[g]) for g in own] for own in geoms] for bits in (model.geom_contype, model.geom_conaffinity)
+        )
+        barred = {tuple(sorted(divmod(int(pair), 1 << 16))) for pair in model.exclude_signature}
+        body = [int(model.geom_bodyid[own[0]]) if own else -1 for own in geoms]
+        found = set()
+        for a in range(len(geoms)):
+            for b in range(a + 1, len(geoms)):
+                meet = any(
+                    (c1 & a2) or (c2 & a1)
+                    for c1, a1 in zip(has[a], takes[a], strict=True)
+                    for c2, a2 in zip(has[b], takes[b], strict=True)
+                )
+                if not meet or tuple(sorted((body[a], body[b]))) in barred:
+                    found.add((a, b))
+        return frozenset(found)
+
+    # --- joints ---
+
+    def _joints(self, b: int) -> list[Held]:
+        model, data, types = self.model, self.data, self.mj.mjtJoint
+        child, parent = self.link[b], self.link[model.body_parentid[b]]
+        if model.body_weldid[b] == 0:
+            return []
+        first, count = model.body_jntadr[b], model.body_jntnum[b]
+        if not count:
+            return [Held(f"{self._body_name(b)}_weld", "fixed", child, parent, data.xpos[b].copy())]
+        found = []
+        for j in range(first, first + count):
+            kind, dof, at = types(int(model.jnt_type[j])), model.jnt_dofadr[j], model.jnt_qposadr[j]
+            if kind == types.mjJNT_FREE:
+                return []
+            name, limited = self._joint_name(j), bool(model.jnt_limited[j])
+            others = {"damping": float(model.dof_damping[dof]), "friction": float(model.dof_frictionloss[dof])}
+            others = {key: value for key, value in others.items() if value}
+            held = {"name": name, "child": child, "parent": parent, "anchor": data.xanchor[j].copy(), "others": others}
+            if any(np.any(getattr(model, poly)[k]) for poly, k in (("dof_dampingpoly", dof), ("jnt_stiffnesspoly", j))):
+                self.left.append(f"joint {name}: stiffness or damping that is not linear")
+            stiff = float(model.jnt_stiffness[j])
+            if kind == types.mjJNT_BALL:
+                cone = (0.0, min(float(model.jnt_range[j, 1]), np.pi)) if limited else None
+                if limited:
+                    self.notes.append(f"joint {name}: MuJoCo bounds its turn, here the lean of the x axis of its body")
+                    held["axis"] = data.xmat[b].reshape(3, 3)[:, 0].copy()
+                if stiff:
+                    self.left.append(f"joint {name}: the stiffness of a ball")
+                found.append(Held(kind="ball", **held, limits=cone))
+                continue
+            limits = tuple(float(end) for end in model.jnt_range[j]) if limited else None
+            spring = (stiff, float(model.qpos_spring[at])) if stiff else None
+            held |= {"axis": data.xaxis[j].copy(), "start": float(data.qpos[at]), "limits": limits, "spring": spring}
+            found.append(Held(kind="hinge" if kind == types.mjJNT_HINGE else "slider", **held))
+        return found
+
+    def _rotors(self) -> list[int]:
+        dofs = np.flatnonzero(self.model.dof_armature)
+        return sorted({int(self.model.dof_jntid[dof]) for dof in dofs})
+
+    def _motors(self) -> dict[str, dict[str, float]]:
+        """Actuators that keep a speed or a place with a largest force, by their joints."""
+        model, mj = self.model, self.mj
+        found: dict[str, dict[str, float]] = {}
+        others = []
+        for k in range(model.nactuator if hasattr(model, "nactuator") else model.nu):
+            one = model.actuator(k)
+            joint = int(model.actuator_trnid[k, 0])
+            of_joint = int(model.actuator_trntype[k]) == int(mj.mjtTrn.mjTRN_JOINT)
+            kind = mj.mjtJoint(int(model.jnt_type[joint])) if of_joint else None
+            gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
+            linear = int(model.actuator_gaintype[k]) == int(mj.mjtGain.mjGAIN_FIXED)
+            linear &= int(model.actuator_biastype[k]) == int(mj.mjtBias.mjBIAS_AFFINE)
+            most = float(model.actuator_forcerange[k, 1]) if model.actuator_forcelimited[k] else 0.0
+            straight = model.actuator_gear[k, 0] == 1.0 and bias[0] == 0.0 and most > 0.0
+            turns = kind in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE)
+            name = self._joint_name(joint) if of_joint else ""
+            if not (turns and linear and straight) or name in found or bias[2] > 0 or bias[1] > 0:
+                others.append(one.name or f"number {k}")
+                continue
+            wanted = gain[0] * float(self.data.ctrl[k])
+            if bias[1] < 0:
+                found[name] = {"position": wanted / -bias[1], "most": most}
+                found[name] |= {"time": float(bias[2] / bias[1])} if bias[2] < 0 else {}
+            elif bias[2] < 0:
+                found[name] = {"speed": wanted / -bias[2], "most": most}
+            else:
+                others.append(one.name or f"number {k}")
+        if others:
+            told = "actuators that are not a position or velocity one of a joint with a forcerange"
+            self.left.append(named(told, others))
+        return found
+
+    def _loops(self) -> list[Held]:
+        """Connect and weld of two bodies, which close loops."""
+        model, mj = self.model, self.mj
+        found, others = [], []
+        for k in range(model.neq):
+            kind, name = mj.mjtEq(int(model.eq_type[k])), model.eq(k).name or f"equality_{k}"
+            if kind == mj.mjtEq.mjEQ_TENDON:
+                continue
+            ends = [int(model.eq_obj1id[k]), max(int(model.eq_obj2id[k]), 0)]
+            of_bodies = int(model.eq_objtype[k]) == int(mj.mjtObj.mjOBJ_BODY)
+            both = [self.link[b] for b in ends] if of_bodies else [-1, -1]
+            moves = of_bodies and any(model.body_weldid[b] != 0 for b in ends)
+            known = kind in (mj.mjtEq.mjEQ_CONNECT, mj.mjtEq.mjEQ_WELD) and moves and self.data.eq_active[k]
+            if not known:
+                others.append(name)
+                continue
+            ball = kind == mj.mjtEq.mjEQ_CONNECT
+            # Of a weld the anchor is that of the second body, and comes first; of a connect that of the first does.
+            first, second = (ends[0], ends[1]) if ball else (ends[1], ends[0])
+            places = [
+                self.data.xpos[b] + self.data.xmat[b].reshape(3, 3) @ model.eq_data[k, 3 * i : 3 * i + 3]
+                for i, b in enumerate((first, second))
+            ]
+            if np.linalg.norm(places[0] - places[1]) > NEAR:
+                self.notes.append(f"equality {name}: its ends are apart at the start; it holds them as they are")
+            child, parent = both if both[0] >= 0 else both[::-1]
+            found.append(Held(name, "ball" if ball else "fixed", child, parent, places[0], loop=True))
+        if others:
+            self.left.append(named("equalities that are not a connect or weld of two bodies", others))
+        return found
+
+    def _ropes(self) -> list[Held]:
+        """Tendons between two sites."""
+        model, mj = self.model, self.mj
+        rods = {
+            int(model.eq_obj1id[k])
+            for k in range(model.neq)
+            if int(model.eq_type[k]) == int(mj.mjtEq.mjEQ_TENDON) and model.eq_obj2id[k] < 0 and model.eq_active0[k]
+        }
+        found, others = [], []
+        for k in range(model.ntendon):
+            name, first = model.tendon(k).name or f"tendon_{k}", model.tendon_adr[k]
+            wraps = range(first, first + model.tendon_num[k])
+            sites = [int(model.wrap_objid[w]) for w in wraps if int(model.wrap_type[w]) == int(mj.mjtWrap.mjWRAP_SITE)]
+            ends_of = [int(model.site_bodyid[s]) for s in sites]
+            both, moves = [self.link[b] for b in ends_of], any(model.body_weldid[b] != 0 for b in ends_of)
+            stiff, low = float(model.tendon_stiffness[k]), float(model.tendon_range[k, 0])
+            rope = bool(model.tendon_limited[k])
+            known = len(sites) == len(wraps) == 2 and moves and both[0] != both[1]
+            if not known or not (rope or stiff or k in rods) or (rope and low > NEAR):
+                others.append(name)
+                continue
+            order = (0, 1) if both[0] >= 0 else (1, 0)
+            ends = [self.data.site_xpos[sites[i]].copy() for i in order]
+            made: dict[str, Any] = {"to": ends[1]}
+            if k in rods:
+                made["rod"] = float(np.linalg.norm(ends[0] - ends[1]))
+            if model.tendon_damping[k] and k not in rods:
+                made["damping"] = float(model.tendon_damping[k])
+            found.append(
+                Held(
+                    name, "distance", both[order[0]], both[order[1]], ends[0], loop=True, others=made,
+                    limits=(0.0, float(model.tendon_range[k, 1])) if rope and k not in rods else None,
+                    spring=(stiff, float(model.tendon_lengthspring[k, 1])) if stiff and k not in rods else None,
+                )
+            )  # fmt: skip
+        if others:
+            self.left.append(named("tendons that are not a rope, rod or spring between two sites", others))
+        return found
+
+
+def _restitution(solref: np.ndarray) -> float:
+    """Of a body beside one like itself, from the damping of its contacts: a spring that only pushes gives back
+    exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed, z relative to the critical damping. MuJoCo's own default
+    counts as no rebound."""
+    time, damping = float(solref[0]), float(solref[1])
+    if time <= 0.0 or damping <= 0.0 or damping >= SOFTEST or (time, damping) == USUAL:
+        return 0.0
+    damping = damping if abs(damping - 1.0) > 1e-6 else 1.0 - 1e-6
+    turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
+    return float(np.sqrt(np.exp(-damping * np.abs(turned))))

@@ -1,0 +1,579 @@
+"""Links and joints, as files of robots have them -> a scene: its scene.yaml, and a Shape folder for each link that is
+more than one primitive. `urdf` and `mjcf` read the files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.apps.export import plain_names
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.geometry.mesh import Mesh, convex_hull, is_closed, joined, signed_volume
+from sdfsim.scene.builder import SceneBuilder
+from sdfsim.scene.scene import WORLD
+from sdfsim.shape.make import analytic_shape, fit_pieces, mesh_shape
+from sdfsim.shape.shape import Shape
+
+FLOOR = "floor"
+SMALL_PART = 0.02  # of a link's mass, that a ball between two of its joints has
+EVEN = 1e-5  # relative, by which mass may be off from what is spread evenly, to be written as such
+CONVEX = 1e-3  # relative, by which a convex mesh may have less volume than its hull
+OVERLAP = 2e-3  # of the smaller size: links that are deeper in each other at the start do not touch
+SWATCH = 16  # pixels of a colour in the texture of what is shown
+MOST_NAMED = 6  # in a line of the report
+GREY = (180, 180, 185)
+
+PartKind = Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A geometry of a link."""
+
+    kind: PartKind
+    pose: np.ndarray  # [4, 4] in the link
+    sizes: dict[str, Any] = field(default_factory=dict)  # m, as scene.yaml has them: size, radius, height
+    mesh: Mesh | None = None  # m, of the kind "mesh"
+    where: str = ""  # file, line and element, for messages
+    color: tuple[int, int, int] | None = None  # sRGB
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid part of a robot, as it is at the start."""
+
+    name: str
+    pose: np.ndarray  # [4, 4] in the world
+    solid: tuple[Part, ...] = ()  # what touches others
+    shown: tuple[Part, ...] = ()  # what is seen; without any, the solid
+    mass: float = 0.0  # kg
+    com: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] m, in the link
+    # [3, 3] kg m^2 about the centre of mass, axes of the link; None: the mass is spread evenly in its parts
+    inertia: np.ndarray | None = None
+    still: bool = False  # whether it never moves
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] m/s, of the centre of mass
+    spin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] rad/s, world
+    friction: float = 0.5
+    restitution: float = 0.0
+    where: str = ""
+
+    @property
+    def whole(self) -> bool:
+        """Whether it has all that a body needs."""
+        return bool(self.solid or self.shown) and (self.still or self.mass > 0)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A joint: how the link `child` is held by the link `parent` (-1: by the world), in the world as all is at the
+    start."""
+
+    name: str
+    kind: Literal["hinge", "slider", "ball", "fixed", "distance"]
+    child: int
+    parent: int
+    anchor: np.ndarray | None = None  # [3] m
+    axis: np.ndarray | None = None  # [3]
+    start: float = 0.0  # rad or m
+    limits: tuple[float, float] | None = None  # rad or m; of a ball the cone, of a distance a rope
+    spring: tuple[float, float] | None = None  # stiffness, and where it is at rest
+    motor: dict[str, float] | None = None  # speed or position (rad or m), most, time
+    others: dict[str, Any] = field(default_factory=dict)  # further keys of scene.yaml
+    loop: bool = False  # closes a loop: its links may touch
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What a file describes."""
+
+    name: str
+    links: tuple[Link, ...]
+    joints: tuple[Held, ...]
+    gravity: np.ndarray | None = None  # [3] m/s^2
+    # pairs of links, the lower number first, that never touch; None: those that overlap at the start
+    apart: frozenset[tuple[int, int]] | None = None
+    left_out: tuple[str, ...] = ()  # what is not carried over, one line each
+    notes: tuple[str, ...] = ()  # what was made otherwise, one line each
+
+
+def named(what: str, names: Sequence[str]) -> str:
+    """`what (3: a, b, c)`, for a line of the report."""
+    more = ", ..." if len(names) > MOST_NAMED else ""
+    return f"{what} ({len(names)}: {', '.join(names[:MOST_NAMED])}{more})"
+
+
+def pose_of(place: Any = (0.0, 0.0, 0.0), turn: Rotation | None = None) -> np.ndarray:
+    """[4, 4] of a place [3] and a rotation."""
+    made = np.eye(4)
+    made[:3, 3] = place
+    if turn is not None:
+        made[:3, :3] = turn.as_matrix()
+    return made
+
+
+def moved(mesh: Mesh, pose: np.ndarray) -> Mesh:
+    """A mesh in the frame in which its own has the `pose`."""
+    return replace(mesh, vertices=mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
+
+
+# --- to a scene ---
+
+
+def write_scene(
+    robot: Robot, out: Path, *, floor: bool = False, on_progress: Progress = silent
+) -> tuple[list[Path], list[str]]:
+    """Write a scene.yaml, and Shape folders in `NAME_shapes/` beside it: the files and folders, and notes on what was
+    made otherwise, one line each. With a `floor`, a plane at z = 0, all is raised or lowered to stand on it.
+
+    Raises SdfsimError for a link that cannot be a body, or where files cannot be written.
+    """
+    whole, notes = _apart(_merged(robot, {WORLD, FLOOR} if floor else {WORLD}))
+    folder = out.with_name(f"{out.stem}_shapes")
+    scene = SceneBuilder(**({} if whole.gravity is None else {"gravity": _round(whole.gravity)}))
+    made: list[tuple[Shape | None, dict[str, Any], np.ndarray, dict[str, Any]]] = []
+    for k, link in enumerate(whole.links):
+        on_progress(k / len(whole.links), link.name)
+        made.append(_body(link, notes))
+    poses = [link.pose @ frame for link, (_, _, frame, _) in zip(whole.links, made, strict=True)]
+    lift = np.zeros(3)
+    if floor:
+        corners = [
+            moved(shape.mesh, pose).vertices[:, 2].min()
+            for (shape, *_), pose in zip(made, poses, strict=True)
+            if shape is not None and np.isfinite(shape.sdf.bounds).all()
+        ]
+        lift[2] = -min(corners, default=0.0)
+        scene.add(FLOOR, plane={}, friction=1.0, restitution=0.0)
+    partners = _partners(whole, [shape for shape, *_ in made], poses, floor, notes)
+    folders: list[Path] = []
+    names = [link.name for link in whole.links]
+    files = dict(zip(names, plain_names(names), strict=True))
+    for link, (shape, keys, _, mass), pose, touches in zip(whole.links, made, poses, partners, strict=True):
+        if "asset" in keys and shape is not None:
+            folders.append(shape.save(folder / files[link.name]))
+            keys = keys | {"asset": folders[-1]}
+        surface = {"friction": _round(link.friction), "restitution": _round(link.restitution)}
+        if "plane" in keys:
+            normal = pose[:3, 2]
+            flat = {"normal": _round(normal), "offset": _round(normal @ (pose[:3, 3] + lift))}
+            scene.add(link.name, plane=flat, **surface)
+            continue
+        motion = {"motion": "static"} if link.still else mass
+        speeds = {"velocity": link.velocity, "angular_velocity": link.spin}
+        motion |= {key: _round(value) for key, value in speeds.items() if np.any(value) and not link.still}
+        quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        turned = {} if abs(quat[3]) > 1 - 1e-15 else {"quat_xyzw": _round(quat)}
+        scene.add(
+            link.name, **keys, position=_round(pose[:3, 3] + lift), **turned, **motion, **surface,
+            **({} if touches is None else {"collides_with": touches}),
+        )  # fmt: skip
+    for joint in whole.joints:
+        _join(scene, joint, names, lift)
+    return [scene.save(out), *folders], notes
+
+
+def _round(values: Any) -> Any:
+    """Numbers of twelve digits."""
+    found = np.vectorize(lambda value: float(f"{value:.12g}") + 0.0)(np.asarray(values, np.float64))
+    return found.tolist()
+
+
+def _merged(robot: Robot, taken: set[str]) -> Robot:
+    """Links that can be no bodies of their own go into those that they are fixed to, and what is fixed to what never
+    moves is still itself, without a joint."""
+    links, joints, notes = list(robot.links), list(robot.joints), list(robot.notes)
+    into = list(range(len(links)))
+    frames: list[str] = []
+
+    def home(k: int) -> int:
+        while k >= 0 and into[k] != k:
+            k = into[k]
+        return k
+
+    for joint in [joint for joint in joints if joint.kind == "fixed" and joint.parent >= 0 and not joint.loop]:
+        one, other = home(joint.child), home(joint.parent)
+        if links[other].still or (links[one].whole and links[other].whole):
+            continue
+        # The one that is a body stays. Where neither is one, that nearer to the root does.
+        keep, gone = (one, other) if links[one].whole else (other, one)
+        if links[gone].solid or links[gone].shown or links[gone].mass:
+            notes.append(f"link {links[gone].name} is part of {links[keep].name}, to which it is fixed")
+        else:
+            frames.append(links[gone].name)
+        links[keep] = _with(links[keep], links[gone])
+        into[gone] = keep
+        joints.remove(joint)
+    joints = [replace(joint, child=home(joint.child), parent=home(joint.parent)) for joint in joints]
+    held = {joint.child for joint in joints}
+    for k, link in enumerate(links):
+        if into[k] == k and not link.still and not link.mass and k not in held:
+            links[k] = replace(link, still=True)
+            if link.solid or link.shown:
+                notes.append(f"link {link.name} has no mass and is held by none: it stands still")
+    while bound := [j for j in joints if j.kind == "fixed" and not j.loop and (j.parent < 0 or links[j.parent].still)]:
+        for joint in bound:
+            links[joint.child] = replace(links[joint.child], still=True)
+        joints = [joint for joint in joints if joint not in bound]
+    # What never moves and is not seen is the world.
+    gone = {k for k, link in enumerate(links) if into[k] != k or (link.still and not (link.solid or link.shown))}
+    frames += [links[k].name for k in sorted(gone) if into[k] == k and links[k].name != WORLD]
+    kept = [k for k in range(len(links)) if k not in gone]
+    number = {k: i for i, k in enumerate(kept)}
+    joints = [
+        replace(joint, child=number[joint.child], parent=number.get(joint.parent, -1))
+        for joint in joints
+        if not links[joint.child].still
+    ]
+    if frames:
+        notes.append(named("links without mass and shape are no bodies", frames))
+    apart = robot.apart
+    if apart is not None:
+        pairs = {tuple(sorted((number.get(home(a), -1), number.get(home(b), -1)))) for a, b in apart}
+        apart = frozenset((a, b) for a, b in pairs if 0 <= a < b)
+    return replace(
+        robot,
+        links=tuple(_renamed([links[k] for k in kept], taken)),
+        joints=tuple(joints),
+        apart=apart,
+        notes=tuple(notes),
+    )
+
+
+def _renamed(links: list[Link], taken: set[str]) -> Iterator[Link]:
+    """Links with names that are not taken, nor those of others."""
+    names = {link.name for link in links} | taken
+    for link in links:
+        name = link.name
+        while name in taken or (name != link.name and name in names):
+            name += "_"
+        names.add(name)
+        yield replace(link, name=name)
+
+
+def _with(keep: Link, gone: Link) -> Link:
+    """A link with all of another that is fixed to it."""
+    into = np.linalg.inv(keep.pose) @ gone.pose
+
+    def carried(parts: tuple[Part, ...]) -> tuple[Part, ...]:
+        return tuple(replace(part, pose=into @ part.pose) for part in parts)
+
+    mass, com, inertia = keep.mass, keep.com, keep.inertia
+    if gone.mass > 0:
+        turn, other = into[:3, :3], into[:3, :3] @ gone.com + into[:3, 3]
+        theirs = None if gone.inertia is None else turn @ gone.inertia @ turn.T
+        if keep.mass > 0:
+            mass = keep.mass + gone.mass
+            com = (keep.mass * keep.com + gone.mass * other) / mass
+            if inertia is not None and theirs is not None:
+                inertia = _shifted(inertia, keep.mass, keep.com - com) + _shifted(theirs, gone.mass, other - com)
+            else:
+                inertia = None
+        else:
+            mass, com, inertia = gone.mass, other, theirs
+    return replace(
+        keep, mass=mass, com=com, inertia=inertia, solid=keep.solid + carried(gone.solid),
+        shown=(keep.shown or keep.solid * bool(gone.shown)) + carried(gone.shown),
+    )  # fmt: skip
+
+
+def _shifted(inertia: np.ndarray, mass: float, away: np.ndarray) -> np.ndarray:
+    """An inertia about a point that is `away` [3] m from the centre of mass."""
+    return inertia + mass * (away @ away * np.eye(3) - np.outer(away, away))
+
+
+def _apart(robot: Robot) -> tuple[Robot, list[str]]:
+    """Links that are held by several joints get small balls between these, which hold a little of their mass."""
+    links, joints, notes = list(robot.links), [], list(robot.notes)
+    chains: dict[tuple[int, int], list[Held]] = {}
+    for joint in robot.joints:
+        if joint.loop or joint.kind == "distance":
+            joints.append(joint)
+        else:
+            chains.setdefault((joint.child, joint.parent), []).append(joint)
+    split = []
+    for (child, parent), chain in chains.items():
+        link, before = links[child], parent
+        if len(chain) > 1:
+            split.append(link.name)
+            part = SMALL_PART * link.mass
+            mean = float(np.trace(_spread(link))) / 3.0
+            radius = 0.5 * np.sqrt(1.5 * mean / link.mass) if link.mass > 0 else 0.01
+            left = 1.0 - SMALL_PART * (len(chain) - 1)
+            tensor = None if link.inertia is None else left * link.inertia
+            links[child] = replace(link, mass=left * link.mass, inertia=tensor)
+            for joint in chain[:-1]:
+                assert joint.anchor is not None
+                ball = Part("sphere", np.eye(4), {"radius": radius})
+                name = f"{link.name}_{joint.name}"
+                links.append(
+                    Link(name, pose_of(joint.anchor), shown=(ball,), mass=part, inertia=SMALL_PART * mean * np.eye(3))
+                )
+                joints.append(replace(joint, child=len(links) - 1, parent=before))
+                before = len(links) - 1
+        joints.append(replace(chain[-1], child=child, parent=before))
+    if split:
+        part = f"{100 * SMALL_PART:g} % of their mass"
+        notes.append(named(f"links with several joints: a small ball between two of these has {part}", split))
+    return replace(robot, links=tuple(links), joints=tuple(joints)), notes
+
+
+def _spread(link: Link) -> np.ndarray:
+    """[3, 3] kg m^2, an inertia that a link has about; of no known one, that of a ball of its size."""
+    if link.inertia is not None:
+        return link.inertia
+    parts = [_mesh(part).vertices for part in (link.solid or link.shown) if part.kind != "plane"]
+    size = max((float(np.ptp(points, axis=0).max()) for points in parts), default=0.1)
+    return 0.1 * link.mass * size**2 * np.eye(3)
+
+
+def _mesh(part: Part) -> Mesh:
+    """The surface of a part, in its link."""
+    return moved(_primitive(part, "").mesh if part.mesh is None else part.mesh, part.pose)
+
+
+def _primitive(part: Part, name: str) -> Shape:
+    kind: Any = part.kind
+    return analytic_shape(kind, name=name, **part.sizes)
+
+
+def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], np.ndarray, dict[str, Any]]:
+    """The shape of a link, its keys in scene.yaml, its frame [4, 4] in the link, and the keys of its mass."""
+    parts = list(link.solid or link.shown)
+    flat = [part for part in parts if part.kind == "plane"]
+    if flat and (not link.still or len(parts) > 1):
+        what = "moves" if not link.still else "has other parts"
+        raise SdfsimError(f"{flat[0].where}: a plane goes with links of its own that never move ({link.name} {what})")
+    if flat:
+        return None, {"plane": {}}, flat[0].pose, {}
+    if not parts:
+        if not link.mass > 0:
+            told = "has neither a mass nor a shape, and a joint that moves"
+            raise SdfsimError(f"{link.where}: link {link.name} {told}", "give it an inertial with a mass, or fix it")
+        radius = np.sqrt(2.5 * np.trace(_spread(link)) / 3.0 / link.mass)
+        notes.append(f"link {link.name} has no shape: a ball of {radius:.3g} m that touches nothing stands for it")
+        parts = [Part("sphere", pose_of(link.com), {"radius": radius})]
+    density = 1000.0
+    if len(parts) == 1 and parts[0].mesh is None:
+        frame, shape = parts[0].pose, _primitive(parts[0], link.name)
+        keys: dict[str, Any] = {parts[0].kind: {key: _round(value) for key, value in parts[0].sizes.items()}}
+    else:
+        frame, keys, shape = np.eye(4), {"asset": link.name}, _solid(link, parts, notes)
+    shape = _dressed(link, shape, frame)
+    mass: dict[str, Any] = {}
+    if not link.still:
+        held = link.mass
+        if not held > 0:
+            held = density * shape.volume
+            notes.append(f"link {link.name} has no mass: it gets that of water, {held:.3g} kg")
+        mass = {"mass": _round(held)}
+        turn = frame[:3, :3]
+        com = turn.T @ (link.com - frame[:3, 3]) if link.mass > 0 else shape.com
+        even = held / shape.volume * shape.inertia
+        tensor = even if link.inertia is None or not link.mass > 0 else turn.T @ link.inertia @ turn
+        tensor = _possible(link, tensor, even, notes)
+        factor = float(np.trace(tensor) / np.trace(even))
+        size = float(np.ptp(shape.mesh.vertices, axis=0).max())
+        near = np.abs(com - shape.com).max() <= EVEN * size and np.abs(tensor - factor * even).max() <= (
+            EVEN * factor * np.abs(even).max()
+        )
+        if near and factor <= 100.0:
+            mass |= {} if abs(factor - 1.0) <= EVEN else {"inertia_factor": _round(factor)}
+        else:  # a folder holds any
+            keys = {"asset": link.name}
+            shape = replace(shape, com=com, inertia=tensor * shape.volume / held)
+    if shape.skin is not None:
+        keys = {"asset": link.name}
+    return shape, keys, frame, mass
+
+
+def _possible(link: Link, tensor: np.ndarray, even: np.ndarray, notes: list[str]) -> np.ndarray:
+    """An inertia that a body can have, or else that of its mass spread evenly."""
+    principal = np.linalg.eigvalsh(tensor)
+    if principal[0] <= 1e-9 * principal[2]:
+        told = f"moments of {', '.join(f'{value:.3g}' for value in principal)} kg m^2 are not all above zero"
+        notes.append(f"link {link.name}: its inertia is not possible ({told}): its mass is spread evenly instead")
+        return even
+    if principal[2] > (1.0 + 1e-6) * (principal[0] + principal[1]):
+        told = f"{principal[2]:.3g} kg m^2 is above the sum of {principal[0]:.3g} and {principal[1]:.3g}"
+        notes.append(f"link {link.name}: no solid has its inertia ({told}); it is kept")
+    return tensor
+
+
+def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
+    """The shape of several parts, or of a mesh, in the link's frame. Where all are convex, bodies meet these."""
+    meshes, convex = [], []
+    for part in parts:
+        mesh = _mesh(part)
+        if part.mesh is None:
+            meshes.append(mesh)
+            convex.append(mesh)
+            continue
+        try:
+            hull = convex_hull(mesh.vertices)
+        except SdfsimError as error:
+            raise SdfsimError(f"{part.where}: the mesh is flat, so it is no body", "give it a thickness") from error
+        closed = is_closed(mesh)
+        if closed and abs(signed_volume(mesh)) >= (1.0 - CONVEX) * signed_volume(hull):
+            convex.append(hull)
+        meshes.append(mesh)
+    if len(convex) == len(parts) > 1:
+        return fit_pieces(convex, name=link.name, kind="grid")
+    try:
+        shape = mesh_shape(joined(meshes), name=link.name, kind="mesh")
+    except SdfsimError as error:
+        notes.append(f"link {link.name}: its convex hull stands for it ({error.message})")
+        hulls = [convex_hull(mesh.vertices) for mesh in meshes]
+        shape = fit_pieces(hulls, name=link.name, kind="grid")
+    source = {key: value for key, value in shape.source.items() if key != "notes"}
+    return replace(shape, source=source)
+
+
+def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> Shape:
+    """A shape with what is seen of its link, where that is not the solid itself: a mesh whose texture has a patch for
+    each colour."""
+    parts = [part for part in (link.shown if link.solid else ()) if part.kind != "plane"]
+    if not parts or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
+        return shape
+    back = np.linalg.inv(frame)
+    meshes = [moved(_mesh(part), back) for part in parts]
+    colors = [
+        part.color
+        or (tuple(int(c) for c in part.mesh.colors.mean(0)) if part.mesh and part.mesh.colors is not None else GREY)
+        for part in parts
+    ]
+    texture = np.repeat(np.repeat(np.array([colors], np.uint8), SWATCH, 0), SWATCH, 1)
+    places = [np.tile([(k + 0.5) / len(parts), 0.5], (len(mesh.vertices), 1)) for k, mesh in enumerate(meshes)]
+    return replace(shape, skin=replace(joined(meshes), uv=np.concatenate(places), texture=texture))
+
+
+def _same(part: Part) -> tuple:
+    mesh = None if part.mesh is None else part.mesh.digest()
+    return part.kind, tuple(np.round(part.pose, 9).ravel() + 0.0), str(_sizes(part)), mesh
+
+
+def _sizes(part: Part) -> list:
+    return [(key, np.round(value, 9).tolist()) for key, value in sorted(part.sizes.items())]
+
+
+# --- who touches whom ---
+
+
+def _partners(
+    robot: Robot, shapes: list[Shape | None], poses: list[np.ndarray], floor: bool, notes: list[str]
+) -> list[list[str] | None]:
+    """What `collides_with` lists of each link; None: all. Jointed bodies do not touch anyway."""
+    links, count = robot.links, len(robot.links)
+    rigid = list(range(count))  # what moves as one, and all that is still
+    still = [k for k, link in enumerate(links) if link.still]
+    for k in still:
+        rigid[k] = still[0]
+
+    def root(k: int) -> int:
+        while rigid[k] != k:
+            k = rigid[k]
+        return k
+
+    tree = [joint for joint in robot.joints if not joint.loop and joint.kind != "distance"]
+    for joint in tree:
+        if joint.kind == "fixed" and joint.parent >= 0:
+            rigid[root(joint.child)] = root(joint.parent)
+    bare = [not link.solid for link in links]
+    denied: set[tuple[int, int]] = set()
+    above = {joint.child: joint.parent for joint in tree}
+    own, near = set(), set()
+    for joint in tree:
+        own |= {(joint.child, joint.parent), (joint.parent, joint.child)}
+        parent = joint.parent
+        while parent >= 0 and bare[parent] and parent in above:  # what holds a chain of small balls
+            parent = above[parent]
+        if parent >= 0 and links[parent].still:
+            denied |= {(joint.child, parent), (parent, joint.child)}
+        elif parent >= 0:
+            near |= {(root(joint.child), root(parent)), (root(parent), root(joint.child))}
+    overlapping: list[str] = []
+    for a in range(count):
+        for b in range(a + 1, count):
+            if (links[a].still and links[b].still) or (a, b) in own:
+                continue
+            if bare[a] or bare[b] or root(a) == root(b) or (root(a), root(b)) in near:
+                denied.add((a, b))
+            elif robot.apart is not None:
+                denied |= {(a, b)} & robot.apart
+            elif _overlap(shapes[a], poses[a], shapes[b], poses[b]):
+                denied.add((a, b))
+                overlapping.append(f"{links[a].name} and {links[b].name}")
+    if overlapping:
+        notes.append(named("links that overlap at the start do not touch each other", overlapping))
+    found: list[list[str] | None] = [None] * count
+    names = [link.name for link in links]
+    listed = []
+    for k in range(count):
+        others = {b if a == k else a for a, b in denied if k in (a, b)}
+        if not others or "plane" in {part.kind for part in links[k].solid or links[k].shown}:
+            continue
+        found[k] = []
+        if not bare[k]:
+            found[k] = [FLOOR] * floor + [names[j] for j in range(count) if j != k and j not in others]
+            listed.append(names[k])
+    if listed:
+        notes.append(named("links with lists in collides_with: what you add to the scene goes into these", listed))
+    return found
+
+
+def _overlap(one: Shape | None, pose: np.ndarray, other: Shape | None, place: np.ndarray) -> bool:
+    """Whether two shapes are in each other."""
+    if one is None or other is None:
+        return False
+    for a, b, into in ((one, other, np.linalg.inv(place) @ pose), (other, one, np.linalg.inv(pose) @ place)):
+        points = a.nodes @ into[:3, :3].T + into[:3, 3]
+        low, high = b.sdf.bounds
+        near = points[((points > low) & (points < high)).all(1)]
+        depth = OVERLAP * min(float(np.ptp(shape.mesh.vertices, axis=0).max()) for shape in (a, b))
+        if len(near) and float(np.min(b.sdf(near)[0])) < -depth:
+            return True
+    return False
+
+
+# --- joints ---
+
+
+def _join(scene: SceneBuilder, joint: Held, names: list[str], lift: np.ndarray) -> None:
+    """Write a joint; angles are in degrees there."""
+    turns = joint.kind in ("hinge", "ball")
+
+    def told(name: str, value: Any) -> dict[str, Any]:
+        return {f"{name}_deg" if turns else name: _round(np.rad2deg(value) if turns else value)}
+
+    keys: dict[str, Any] = {}
+    if joint.anchor is not None:
+        keys["anchor"] = _round(joint.anchor + lift)
+    if joint.axis is not None:
+        keys["axis"] = _round(joint.axis)
+    if joint.start and joint.kind in ("hinge", "slider"):
+        keys |= told("start", joint.start)
+    if joint.limits is not None:
+        if joint.kind == "ball":
+            keys |= told("cone", joint.limits[1])
+        elif joint.kind == "distance":
+            keys["rope"] = _round(joint.limits[1])
+        else:
+            keys |= told("limits", joint.limits)
+    if joint.spring is not None:
+        keys["spring"] = {"stiffness": _round(joint.spring[0]), **told("rest", joint.spring[1])}
+    if joint.motor is not None:
+        place = {key: value for key, value in joint.motor.items() if key != "position"}
+        keys["motor"] = {key: _round(value) for key, value in place.items()}
+        keys["motor"] |= told("position", joint.motor["position"]) if "position" in joint.motor else {}
+    keys |= {
+        key: _round(value) if isinstance(value, float | np.ndarray) else value for key, value in joint.others.items()
+    }
+    keys |= {"to": _round(joint.others["to"] + lift)} if "to" in joint.others else {}
+    keys |= {"collide": "on"} if joint.loop else {}
+    held = names[joint.parent] if joint.parent >= 0 else WORLD
+    scene.join(joint.name, joint.kind, names[joint.child], held, **keys)

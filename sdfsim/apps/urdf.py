@@ -1,0 +1,396 @@
+"""URDF -> links and joints, as `robot` turns them into a scene."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.apps.robot import Held, Link, Part, Robot, moved, pose_of
+from sdfsim.base.errors import SdfsimError, nearest
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
+from sdfsim.scene.scene import WORLD
+
+MOST_BYTES = 64 * 2**20  # of a file
+OPTIONAL = re.compile(rb"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: a variable of the environment, or else the rest
+KINDS = {
+    "revolute": "hinge",
+    "continuous": "hinge",
+    "prismatic": "slider",
+    "spherical": "ball",
+    "fixed": "fixed",
+    "floating": "",
+    "planar": "",
+}
+GEOMETRIES = ("box", "sphere", "cylinder", "capsule", "mesh", "plane")
+_ORIGIN = (0.0, 0.0, 0.0)
+_ROOT = ("link", "joint", "material")
+_OF_LINK = ("inertial", "visual", "collision", "contact")
+_OF_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics")
+_OF_CONTACT = ("lateral_friction", "restitution")
+
+
+def read_urdf(path: Path, *, packages: Sequence[Path] = (), fixed: bool = False) -> Robot:
+    """The robot of a URDF file at its zero pose, or, where limits do not allow that, as near to it as they do. With
+    `fixed`, its root never moves; a root that is called world never does. `packages` are folders in which package://
+    paths are looked for, beside those around the file and of ROS_PACKAGE_PATH.
+
+    Raises SdfsimError with file, line and element for what is not URDF, is missing, or is no tree.
+    """
+    return _Reader(path, packages).robot(fixed)
+
+
+def _environment(found: re.Match[bytes]) -> bytes:
+    value = os.environ.get(found[1].decode(), found[2].decode(errors="replace").strip())
+    return value.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;").encode()
+
+
+class _Reader:
+    def __init__(self, path: Path, packages: Sequence[Path]) -> None:
+        self.path = path
+        around = [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+        self.packages = [*packages, *path.resolve().parents, *around]
+        self.line: dict[int, int] = {}
+        self.left: Counter[str] = Counter()
+        self.missed: list[str] = []
+        self.notes: list[str] = []
+        self.meshes: dict[Path, Mesh] = {}
+        self.root = self._parse()
+
+    def _parse(self) -> Element:
+        try:
+            if self.path.is_file() and self.path.stat().st_size > MOST_BYTES:
+                raise SdfsimError(f"{self.path}: too large for a URDF (at most {MOST_BYTES // 2**20} MiB)")
+            content = self.path.read_bytes()
+        except OSError as error:
+            raise SdfsimError(f"{self.path}: cannot be read ({error.strerror or error})") from error
+        builder, parser = TreeBuilder(), expat.ParserCreate()
+
+        def start(tag: str, attributes: dict[str, str]) -> None:
+            self.line[id(builder.start(tag, attributes))] = parser.CurrentLineNumber
+
+        parser.StartElementHandler, parser.CharacterDataHandler = start, builder.data
+        parser.EndElementHandler = lambda tag: builder.end(tag)
+        try:
+            # Blanks before the first element and zero bytes after the last are no XML, but common.
+            text = content.lstrip().rstrip(b"\0 \t\r\n")
+            self.skipped = content[: len(content) - len(text)].count(b"\n")
+            parser.Parse(OPTIONAL.sub(_environment, text), True)
+        except expat.ExpatError as error:
+            line = error.lineno + self.skipped
+            raise SdfsimError(f"{self.path}:{line}: not valid XML ({expat.ErrorString(error.code)})") from error
+        root = builder.close()
+        if root.tag != "robot":
+            raise self.wrong(root, "must be <robot>", "a URDF file has one <robot>; give MJCF the ending .xml")
+        if any(element.tag.startswith("xacro:") for element in root.iter()):
+            raise self.wrong(root, "holds xacro macros", "expand them first: xacro robot.urdf.xacro > robot.urdf")
+        return root
+
+    def where(self, element: Element) -> str:
+        return f"{self.path}:{self.line[id(element)] + self.skipped}: <{element.tag}>"
+
+    def wrong(self, element: Element, told: str, hint: str = "") -> SdfsimError:
+        return SdfsimError(f"{self.where(element)} {told}", hint)
+
+    # --- values ---
+
+    def text(self, element: Element, name: str) -> str:
+        value = element.get(name, "").strip()
+        if not value:
+            raise self.wrong(element, f"needs {name}=")
+        return value
+
+    def numbers(self, element: Element, name: str, count: int, default: Sequence[float] | None = None) -> np.ndarray:
+        value = element.get(name)
+        if value is None or (not value.strip() and default is not None):
+            if default is None:
+                raise self.wrong(element, f"needs {name}=, {count} numbers")
+            return np.array(default, np.float64)
+        try:
+            found = np.array([float(part) for part in value.split()])
+        except ValueError:
+            found = np.zeros(0)
+        if len(found) != count or not np.isfinite(found).all() or np.abs(found).max(initial=0.0) > 1e12:
+            what = "a number" if count == 1 else f"{count} numbers"
+            raise self.wrong(element, f"{name} must be {what} (got {value[:40]!r})")
+        return found
+
+    def number(self, element: Element, name: str, default: float | None = None, *, least: float = -np.inf) -> float:
+        value = float(self.numbers(element, name, 1, None if default is None else [default])[0])
+        if value < least:
+            raise self.wrong(element, f"{name} must be at least {least:g} (got {value:g})")
+        return value
+
+    def child(self, element: Element, tag: str) -> Element | None:
+        """The only child of a kind."""
+        found = element.findall(tag)
+        if len(found) > 1:
+            raise self.wrong(found[1], f"a second one in <{element.tag}>: one is allowed")
+        return found[0] if found else None
+
+    def origin(self, element: Element) -> np.ndarray:
+        """[4, 4] of its <origin>."""
+        found = self.child(element, "origin")
+        if found is None:
+            return np.eye(4)
+        turn = Rotation.from_euler("xyz", self.numbers(found, "rpy", 3, _ORIGIN))
+        return pose_of(self.numbers(found, "xyz", 3, _ORIGIN), turn)
+
+    # --- the robot ---
+
+    def robot(self, fixed: bool) -> Robot:
+        for element in self.root:
+            if element.tag not in _ROOT:
+                self.left[f"<{element.tag}>"] += 1
+        colors = {e.get("name", ""): self._rgb(e) for e in self.root.findall("material")}
+        elements: dict[str, Element] = {}
+        for element in self.root.findall("link"):
+            name = self.text(element, "name")
+            if name in elements:
+                first = self.line[id(elements[name])] + self.skipped
+                raise self.wrong(element, f"two links are called {name!r} (the first in line {first})")
+            elements[name] = element
+        if not elements:
+            raise self.wrong(self.root, "has no <link>")
+        links = [self._link(name, element, colors) for name, element in elements.items()]
+        number = {name: k for k, name in enumerate(elements)}
+        by_child: dict[int, tuple[Element, int]] = {}
+        seen: dict[str, Element] = {}
+        for element in self.root.findall("joint"):
+            if element.find("parent") is None and element.find("child") is None and element.get("type") is None:
+                continue  # of a transmission that is not in one
+            name = self.text(element, "name")
+            if name in seen:
+                first = self.line[id(seen[name])] + self.skipped
+                raise self.wrong(element, f"two joints are called {name!r} (the first in line {first})")
+            seen[name] = element
+            ends = []
+            for tag in ("parent", "child"):
+                end = self.child(element, tag)
+                if end is None:
+                    raise self.wrong(element, f"{name} needs <{tag} link=>")
+                link = self.text(end, "link")
+                if link not in number:
+                    raise self.wrong(end, f"no link is called {link!r}{nearest(link, number)}")
+                ends.append(number[link])
+            parent, child = ends
+            if child in by_child:
+                told = f"link {links[child].name!r} is held by two joints: URDF knows trees only"
+                raise self.wrong(element, told, "close loops in MJCF (equality connect), or in scene.yaml")
+            by_child[child] = element, parent
+        joints: list[Held] = []
+        roots = [k for k in range(len(links)) if k not in by_child]
+        order, children = list(roots), {k: [c for c, (_, p) in by_child.items() if p == k] for k in range(len(links))}
+        for k in order:  # grows
+            order += children[k]
+        if len(order) < len(links):
+            k = next(k for k in range(len(links)) if k not in order)
+            raise self.wrong(by_child[k][0], f"link {links[k].name!r} holds itself: URDF knows trees only")
+        for k in order[len(roots) :]:
+            element, parent = by_child[k]
+            links[k], made = self._joint(element, links, k, parent)
+            joints += made
+        for k in roots:
+            if fixed or links[k].name == WORLD:
+                links[k] = replace(links[k], still=True)
+        left = [f"{what} ({count})" for what, count in self.left.items()]
+        return Robot(
+            self.root.get("name", self.path.stem), tuple(links), tuple(joints),
+            left_out=(*left, *self.missed), notes=tuple(self.notes),
+        )  # fmt: skip
+
+    def _rgb(self, element: Element | None) -> tuple[int, int, int] | None:
+        color = None if element is None else element.find("color")
+        if color is None:
+            return None
+        red, green, blue = (round(255 * c) for c in np.clip(self.numbers(color, "rgba", 4)[:3], 0.0, 1.0))
+        return red, green, blue
+
+    def _link(self, name: str, element: Element, colors: dict[str, Any]) -> Link:
+        for child in element:
+            if child.tag not in _OF_LINK:
+                self.left[f"<{child.tag}> of links"] += 1
+        parts: dict[str, list[Part]] = {"visual": [], "collision": []}
+        for tag, found in parts.items():
+            for child in element.findall(tag):
+                material = child.find("material")
+                color = self._rgb(material)
+                if color is None and material is not None:
+                    color = colors.get(material.get("name", ""))
+                for other in child:
+                    if other.tag not in ("geometry", "origin", "material"):
+                        self.left[f"<{other.tag}> of {tag}s"] += 1
+                part = self._part(child, color, needed=tag == "collision")
+                found += [part] if part else []
+        mass, com, inertia = 0.0, np.zeros(3), None
+        inertial = self.child(element, "inertial")
+        if inertial is not None:
+            pose, weight = self.origin(inertial), self.child(inertial, "mass")
+            if weight is None:
+                raise self.wrong(inertial, "needs <mass value=>")
+            mass, com = self.number(weight, "value", least=0.0), pose[:3, 3]
+            tensor = self.child(inertial, "inertia")
+            if tensor is not None:
+                xx, xy, xz, yy, yz, zz = (
+                    self.number(tensor, key, 0.0 if len(set(key)) == 3 else None)
+                    for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+                )
+                about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+                inertia = pose[:3, :3] @ about @ pose[:3, :3].T
+        surface: dict[str, Any] = {"friction": 0.5, "restitution": 0.0}
+        contact = self.child(element, "contact")
+        for child in contact if contact is not None else ():
+            if child.tag in _OF_CONTACT:
+                key = child.tag.removeprefix("lateral_")
+                surface[key] = self.number(child, "value", least=0.0)
+                if key == "restitution" and surface[key] > 1.0:
+                    raise self.wrong(child, f"value must be at most 1 (got {surface[key]:g})")
+            else:
+                self.left[f"<{child.tag}> of <contact>"] += 1
+        return Link(
+            name, np.eye(4), tuple(parts["collision"]), tuple(parts["visual"]), mass, com, inertia,
+            where=self.where(element), **surface,
+        )  # fmt: skip
+
+    def _part(self, element: Element, color: Any, *, needed: bool) -> Part | None:
+        geometry = self.child(element, "geometry")
+        if geometry is None:
+            raise self.wrong(element, "needs <geometry>")
+        forms = [child for child in geometry if child.tag in GEOMETRIES]
+        if len(forms) != 1:
+            got = ", ".join(child.tag for child in geometry) or "nothing"
+            raise self.wrong(geometry, f"must hold one of {', '.join(GEOMETRIES)} (got {got})")
+        form, pose, mesh, sizes = forms[0], self.origin(element), None, {}
+        if form.tag == "mesh":
+            if (mesh := self._mesh(form, needed=needed)) is None:
+                return None
+        elif form.tag == "plane":
+            normal = self.numbers(form, "normal", 3, (0.0, 0.0, 1.0))
+            if not np.any(normal):
+                raise self.wrong(form, "normal must not be zero")
+            pose = pose @ pose_of(turn=Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])[0])
+        elif form.tag == "box":
+            sizes = {"size": self.numbers(form, "size", 3)}
+        else:
+            sizes = {"radius": self.number(form, "radius")}
+            if form.tag != "sphere":
+                caps = 2.0 * sizes["radius"] if form.tag == "capsule" else 0.0
+                sizes["height"] = self.number(form, "length") + caps
+        if any(np.min(value) == 0.0 for value in sizes.values()):
+            self.notes.append(f"{self.where(form)} has no size: it is left out")
+            return None
+        for key, value in sizes.items():
+            if np.min(value) < 0.0:
+                raise self.wrong(form, f"{key} must be above zero (got {form.get(key) or value})")
+        return Part(form.tag, pose, sizes, mesh, self.where(form), color)  # type: ignore[arg-type]
+
+    def _mesh(self, element: Element, *, needed: bool) -> Mesh | None:
+        """None where it is only shown and cannot be."""
+        name, scale = self.text(element, "filename"), self.numbers(element, "scale", 3, (1.0, 1.0, 1.0))
+        place = self._find(name)
+        try:
+            if place is None:
+                tried = "beside the file and above it, in --packages and ROS_PACKAGE_PATH"
+                raise self.wrong(element, f"no such file: {name} (looked for {tried})", "give its folder: --packages")
+            if place not in self.meshes:
+                try:
+                    self.meshes[place] = load_mesh(place)
+                except SdfsimError as error:
+                    hint = error.hint or "use " + " ".join(MESH_SUFFIXES)
+                    raise self.wrong(element, error.message, hint) from error
+        except SdfsimError as error:
+            if needed:
+                raise
+            self.missed.append(f"what is shown at line {self.line[id(element)] + self.skipped}: {error.message}")
+            return None
+        if not np.all(scale):
+            raise self.wrong(element, f"scale must not be zero (got {element.get('scale')!r})")
+        mesh = moved(self.meshes[place], np.diag([*scale, 1.0]))
+        return mesh if np.prod(scale) > 0 else replace(mesh, faces=mesh.faces[:, ::-1])
+
+    def _find(self, name: str) -> Path | None:
+        scheme, _, rest = name.partition("://")
+        if not rest:
+            scheme, rest = "", name
+        if scheme == "file":
+            tried = [Path(rest)]
+        elif not scheme:
+            tried = [self.path.parent / rest, *(folder / rest for folder in self.packages)]
+        else:
+            package, _, inner = rest.partition("/")
+            tried = [folder / rest for folder in self.packages]
+            tried += [folder / inner for folder in self.packages if folder.name == package]
+        try:
+            return next((place for place in tried if place.is_file()), None)
+        except (OSError, ValueError):
+            return None
+
+    def _joint(self, element: Element, links: list[Link], child: int, parent: int) -> tuple[Link, list[Held]]:
+        """The child where it is at the start, and what holds it."""
+        name, kind = self.text(element, "name"), self.text(element, "type")
+        if kind not in KINDS:
+            raise self.wrong(element, f"type must be one of {', '.join(KINDS)} (got {kind!r}{nearest(kind, KINDS)})")
+        for other in element:
+            if other.tag not in _OF_JOINT:
+                self.left[f"<{other.tag}> of joints"] += 1
+        pose = links[parent].pose @ self.origin(element)
+        anchor, turn = pose[:3, 3], pose[:3, :3]
+        axis = self.child(element, "axis")
+        along = np.array([1.0, 0.0, 0.0]) if axis is None else self.numbers(axis, "xyz", 3, (1.0, 0.0, 0.0))
+        if not np.any(along) and KINDS[kind] in ("hinge", "slider"):
+            raise self.wrong(element if axis is None else axis, "xyz must not be zero")
+        along = turn @ along / (np.linalg.norm(along) or 1.0)
+        dynamics = self.child(element, "dynamics")
+        others = {}
+        for key in ("damping", "friction"):
+            value = 0.0 if dynamics is None else self.number(dynamics, key, 0.0, least=0.0)
+            others |= {key: value} if value else {}
+        held = {"name": name, "child": child, "parent": parent, "anchor": anchor}
+        if kind == "floating":
+            return replace(links[child], pose=pose), []
+        if kind == "planar":
+            sides = Rotation.align_vectors([along], [[0.0, 0.0, 1.0]])[0].as_matrix()
+            made = [Held(f"{name}_{k}", "slider", child, parent, anchor, sides[:, k]) for k in (0, 1)]
+            return replace(links[child], pose=pose), [*made, Held(name, "hinge", child, parent, anchor, along)]
+        if KINDS[kind] in ("fixed", "ball"):
+            if KINDS[kind] == "ball" and self.child(element, "limit") is not None:
+                self.left["limits of spherical joints"] += 1
+            return replace(links[child], pose=pose), [Held(kind=KINDS[kind], **held, others=others)]  # type: ignore[arg-type]
+        limits, start = self._limits(element, name, kind), 0.0
+        if limits is not None and not limits[0] <= 0.0 <= limits[1]:
+            start = min(max(0.0, limits[0]), limits[1])
+            unit = "m" if kind == "prismatic" else "rad"
+            self.notes.append(f"joint {name} starts at {start:.6g} {unit}: its limits leave zero out")
+        if kind == "prismatic":
+            pose = pose_of(start * along) @ pose
+        else:
+            pose = pose @ np.eye(4)
+            pose[:3, :3] = Rotation.from_rotvec(start * along).as_matrix() @ turn
+        held |= {"anchor": pose[:3, 3], "axis": along, "start": start, "limits": limits, "others": others}
+        return replace(links[child], pose=pose), [Held(kind=KINDS[kind], **held)]  # type: ignore[arg-type]
+
+    def _limits(self, element: Element, name: str, kind: str) -> tuple[float, float] | None:
+        limit = self.child(element, "limit")
+        if limit is not None:
+            for key in ("effort", "velocity"):
+                self.left[f"{key} of <limit>"] += key in limit.attrib
+        if kind == "continuous":
+            return None
+        if limit is None:
+            self.notes.append(f"joint {name} has no <limit>: nothing bounds it")
+            return None
+        low, high = self.number(limit, "lower", 0.0), self.number(limit, "upper", 0.0)
+        if low > high:  # PyBullet's way to say so
+            self.notes.append(f"joint {name} has its lower limit above its upper one: nothing bounds it")
+            return None
+        return low, high

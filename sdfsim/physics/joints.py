@@ -1,0 +1,273 @@
+"""Joints of a scene as arrays in model units: what they are, what is known of them, and where they stand."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdfsim.physics import pose
+from sdfsim.physics.joint_columns import (
+    BOUNCE,
+    BROKEN,
+    COORD,
+    DAMPING,
+    DRAG,
+    FORCE,
+    FRESH,
+    HIGH,
+    KINDS,
+    LENGTH,
+    LOW,
+    MOST,
+    MOTOR,
+    NUMBERS,
+    REST,
+    STATE,
+    STIFFNESS,
+    TARGET,
+    TIME,
+    TO_PLACE,
+    TO_SPEED,
+    TORQUE,
+)
+from sdfsim.scene.scene import Joint
+
+
+@dataclass(frozen=True)
+class Joints:
+    """J joints of N bodies; lengths, times and masses in model units."""
+
+    body: np.ndarray  # [J, 2] int64, the second -1 for the world
+    kind: np.ndarray  # [J] int64, of `KINDS`
+    anchor: np.ndarray  # [J, 2, 3] from the centres of mass, in the bodies' axes
+    axes: np.ndarray  # [J, 2, 3, 3] the axes of the joint's frames in those of the bodies, a row each
+    number: np.ndarray  # [J, NUMBERS], see the columns
+    target: np.ndarray  # [J] what motors aim at
+    collides: np.ndarray  # [J] bool, whether the two bodies may touch
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+
+def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: float, mass: float) -> Joints:
+    """Those of a scene; `com` [N, 3] are the centres of mass from the shapes' origins in model units, of which one is
+    `length` m, `time` s and `mass` kg."""
+    count = len(joints)
+    number, target = np.zeros((count, NUMBERS)), np.zeros(count)
+    number[:, LOW], number[:, HIGH], number[:, LENGTH] = -np.inf, np.inf, -1.0
+    force = mass * length / time**2
+    torque = force * length
+    for row, joint, k in zip(number, joints, range(count), strict=True):
+        turns = joint.kind in ("hinge", "ball")
+        unit, effort = (1.0, torque) if turns else (length, force)
+        if joint.limits is not None:
+            one_sided = joint.kind in ("ball", "distance")
+            row[LOW] = -np.inf if one_sided else joint.limits[0] / unit
+            row[HIGH] = joint.limits[1] / unit
+        row[BOUNCE] = joint.restitution
+        row[DAMPING] = joint.damping / (effort / unit * time)
+        row[DRAG] = joint.friction / effort
+        if joint.spring is not None:
+            row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
+        if (motor := joint.motor) is not None:
+            row[MOST], row[TIME] = motor.most / effort, motor.time / time
+            row[MOTOR] = TO_PLACE if motor.speed is None else TO_SPEED
+            aim = motor.position if motor.speed is None else motor.speed * time
+            target[k] = (aim or 0.0) / unit
+        if joint.length is not None:
+            row[LENGTH] = joint.length / length
+        row[FORCE], row[TORQUE] = joint.breaks_force / force, joint.breaks_torque / torque
+    body = np.array([joint.bodies for joint in joints], np.int64).reshape(count, 2)
+    anchor = np.array([joint.anchor for joint in joints], np.float64).reshape(count, 2, 3) / length
+    anchor -= np.where(body[:, :, None] >= 0, com[body], 0.0)
+    turned = pose.to_matrix(np.array([joint.quat_xyzw for joint in joints], np.float64).reshape(-1, 4))
+    axes = np.ascontiguousarray(turned.reshape(count, 2, 3, 3).swapaxes(2, 3))
+    kind = np.array([KINDS.index(joint.kind) for joint in joints], np.int64)
+    collides = np.array([joint.collides for joint in joints], bool)
+    return Joints(body, kind, anchor, axes, number, target, collides)
+
+
+def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """[J, STATE] of joints of which nothing is known yet but where they stand."""
+    state = np.zeros((len(joints), STATE))
+    state[:, TARGET], state[:, FRESH] = joints.target, 1.0
+    # A hinge may be more than half a turn away from its zero: where it is within its limits.
+    ends = joints.number[:, LOW : HIGH + 1]
+    state[:, COORD] = np.where(np.isfinite(ends), ends, 0.0).mean(1)
+    state[:, COORD] = coordinates(joints, state[:, COORD], position, orientation)
+    return state
+
+
+def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """[J] the angle of hinges (the one nearest to `near` [J]), the position of sliders, the angle between the axes of
+    balls, the length of distances, and 0 of what is fixed, of bodies at `position` [N, 3] and `orientation` [N, 4]."""
+    if not len(joints):
+        return np.zeros(0)
+    known = joints.body >= 0
+    matrix = np.where(known[:, :, None, None], pose.to_matrix(orientation)[joints.body], np.eye(3))
+    place = np.where(known[:, :, None], position[joints.body], 0.0)
+    point = place + np.einsum("jsxy,jsy->jsx", matrix, joints.anchor)
+    axes = np.einsum("jsxy,jsky->jskx", matrix, joints.axes)
+    way = point[:, 0] - point[:, 1]
+
+    def times(k: int, m: int) -> np.ndarray:
+        return (axes[:, 0, k] * axes[:, 1, m]).sum(-1)
+
+    angle = np.arctan2(times(1, 2), times(1, 1))
+    angle += 2.0 * np.pi * np.floor((near - angle) / (2.0 * np.pi) + 0.5)
+    leaning = np.arctan2(np.linalg.norm(np.cross(axes[:, 0, 0], axes[:, 1, 0]), axis=-1), times(0, 0))
+    along, length = (axes[:, 1, 0] * way).sum(-1), np.linalg.norm(way, axis=-1)
+    return np.choose(joints.kind, [angle, along, leaning, np.zeros(len(joints)), length])
+
+
+def stored(joints: Joints, state: np.ndarray) -> float:
+    """The energy of springs."""
+    stiffness, away = joints.number[:, STIFFNESS], state[:, COORD] - joints.number[:, REST]
+    return float((0.5 * stiffness * away**2 * (state[:, BROKEN] == 0.0)).sum())
+
+
+@dataclass(frozen=True)
+class Order:
+    """In which bodies and joints are eliminated, and what that fills in; see `solver.joints.Held`."""
+
+    comp: np.ndarray
+    node: np.ndarray
+    of_body: np.ndarray
+    of_comp: np.ndarray
+    entry: np.ndarray
+    below: np.ndarray
+    row: np.ndarray
+    start: np.ndarray
+    target: np.ndarray
+
+
+def ordered(joints: Joints, moves: np.ndarray) -> Order:
+    """Eliminate what has the fewest neighbours first: bodies that move, and joints once one of their bodies is gone,
+    or both where what is gone already is held by the world or in a loop, and so cannot give way in all directions.
+    Trees are solved in a time that grows with their size, whatever their form."""
+    ends: list[list[int]] = [[int(b) for b in row if b >= 0 and moves[b]] for row in joints.body]
+    near: dict[int, set[int]] = {}
+    for j, bodies in enumerate(ends):
+        near[-1 - j] = set(bodies)
+        for b in bodies:
+            near.setdefault(b, set()).add(-1 - j)
+    comps: list[list[int]] = []
+    seen: set[int] = set()
+    for first in sorted(n for n in near if n >= 0):
+        if first in seen:
+            continue
+        seen.add(first)
+        todo, found = [first], []
+        while todo:
+            n = todo.pop()
+            found.append(n)
+            new = near[n] - seen
+            seen |= new
+            todo += sorted(new)
+        comps.append(found)
+    node: list[int] = []
+    fill: dict[int, list[int]] = {}
+    comp = [0]
+    own: dict[int, int] = {}  # of every body that is gone one that stands for all it is connected to among these
+    firm: set[int] = set()  # those of them that the world or a loop holds
+    waiting: dict[int, list[int]] = {}  # bodies that are not gone, and what joints that are hold to them
+    pinned: set[int] = set()  # what is held so: as long as that lasts
+
+    def whose(n: int) -> int:
+        while own[n] != n:
+            n = own[n]
+        return n
+
+    def ready(n: int) -> bool:
+        if n >= 0:
+            return True
+        gone = {whose(b) for b in ends[-1 - n] if b in own}
+        whole = all(b in own for b in ends[-1 - n])
+        return bool(gone) and not gone & pinned and (whole or not gone & firm)
+
+    for found in comps:
+        queue = [(len(near[n]), n) for n in found if n >= 0]
+        heapq.heapify(queue)
+        taken: set[int] = set()
+        while queue:
+            degree, n = heapq.heappop(queue)
+            if n in taken or degree != len(near[n]) or not ready(n):
+                continue
+            taken.add(n)
+            node.append(n)
+            around = near[n]
+            fill[n] = list(around)
+            for m in around:
+                near[m] |= around
+                near[m] -= {n, m}
+            if n >= 0:
+                own[n] = n
+                for one in waiting.pop(n, []):
+                    pinned.discard(one)
+                    if one in firm or whose(one) == n:
+                        firm.add(n)
+                    own[one] = n
+            else:
+                gone = [whose(b) for b in ends[-1 - n] if b in own]
+                if len(gone) < len(ends[-1 - n]):
+                    (left,) = [b for b in ends[-1 - n] if b not in own]
+                    waiting.setdefault(left, []).append(gone[0])
+                    pinned.add(gone[0])
+                elif len(gone) == 1 or gone[0] == gone[1]:
+                    firm.add(gone[0])
+                else:
+                    own[gone[0]] = gone[1]
+                    if gone[0] in firm:
+                        firm.add(gone[1])
+            for m in around:
+                heapq.heappush(queue, (len(near[m]), m))
+            if not queue:
+                queue = [(len(near[m]), m) for m in found if m not in taken]
+        comp.append(len(node))
+    place = {n: k for k, n in enumerate(node)}
+    below, row, start, target = [0], [], [0], []
+    block: dict[tuple[int, int], int] = {}
+    for k, n in enumerate(node):
+        for r in sorted(place[m] for m in fill[n]):
+            block[r, k] = len(row)
+            row.append(r)
+        below.append(len(row))
+    for k in range(len(node)):
+        rows = row[below[k] : below[k + 1]]
+        for p, r in enumerate(rows):
+            target += [block[r, q] for q in rows[:p]] + [-1 - r]
+        start.append(len(target))
+    of_body, of_comp = np.full(len(moves), -1, np.int64), np.full(len(moves), -1, np.int64)
+    for n, k in place.items():
+        if n >= 0:
+            of_body[n], of_comp[n] = k, np.searchsorted(comp, k, side="right") - 1
+    entry = np.full((len(joints), 2), -1, np.int64)
+    for j, bodies in enumerate(joints.body):
+        for s, b in enumerate(bodies):
+            if b >= 0 and moves[b]:
+                pair = place[-1 - j], place[int(b)]
+                entry[j, s] = block[max(pair), min(pair)]
+
+    def whole(values: list[int]) -> np.ndarray:
+        return np.array(values, np.int64)
+
+    return Order(
+        whole(comp), whole(node), of_body, of_comp, entry, whole(below), whole(row), whole(start), whole(target)
+    )
+
+
+def apart(joints: Joints, count: int) -> np.ndarray:
+    """[N + 1 + E] int64: which bodies a body may not touch, as joints hold them: from place `apart[b]` to
+    `apart[b + 1]`; empty where there are none."""
+    pairs = [(int(a), int(b)) for a, b in joints.body[~joints.collides] if a >= 0 and b >= 0]
+    if not pairs:
+        return np.zeros(0, np.int64)
+    partners: list[list[int]] = [[] for _ in range(count)]
+    for a, b in pairs:
+        partners[a].append(b)
+        partners[b].append(a)
+    first = count + 1 + np.cumsum([0, *map(len, partners)])
+    return np.concatenate([first, [b for some in partners for b in some]]).astype(np.int64)

@@ -1,0 +1,73 @@
+"""Free flight, compiled: what pulls at bodies, and rotation without torque."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from sdfsim.physics.solver.vectors import (
+    BARE,
+    add,
+    along,
+    cross,
+    get,
+    norm,
+    put,
+    scale,
+    to_matrix,
+    turn,
+    turn_back,
+    turned_by,
+    vector,
+)
+
+MOST_TURN = 0.1  # rad in one stage of torque-free rotation
+
+
+@njit(**BARE)
+def pull_of(world, matrix, wrench, rules, part, b):
+    """What gravity and what pulls at a body add to its velocities in a part of an inner step."""
+    span = rules.substep_dt * part
+    weight = scale(vector(rules.gravity), span)
+    if not wrench[b].any():
+        return weight, (0.0, 0.0, 0.0)
+    force, torque = (wrench[b, 0], wrench[b, 1], wrench[b, 2]), (wrench[b, 3], wrench[b, 4], wrench[b, 5])
+    turned = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, torque)))
+    return along(weight, force, world.inverse_mass[b] * span), scale(turned, span)
+
+
+@njit(**BARE)
+def torque_free(world, motion, matrix, span, trial, frame, b):
+    """Rotation without torque: angular momentum is kept exactly, the pose to fourth order (Runge-Kutta-Munthe-Kaas)."""
+    w = get(motion.angular, b)
+    speed = norm(w)
+    if speed == 0.0:
+        return
+    momentum = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, w)))
+    stages = max(1, math.ceil(min(speed * span, 100.0) / MOST_TURN))
+    h = span / stages
+    for _ in range(stages):
+        k1 = scale(w, h)
+        k2 = _slope(world, motion.orientation, momentum, scale(k1, 0.5), h, b, trial, frame)
+        k3 = _slope(world, motion.orientation, momentum, scale(k2, 0.5), h, b, trial, frame)
+        k4 = _slope(world, motion.orientation, momentum, k3, h, b, trial, frame)
+        total = scale(add(add(k1, k4), scale(add(k2, k3), 2.0)), 1.0 / 6.0)
+        q = turned_by(total, motion.orientation, b)
+        for x in range(4):
+            motion.orientation[b, x] = q[x]
+        to_matrix(motion.orientation, b, matrix)
+        w = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, momentum)))
+    put(motion.angular, b, w)
+
+
+@njit(**BARE)
+def _slope(world, orientation, momentum, u, h, b, trial, frame):
+    q = turned_by(u, orientation, b)
+    for x in range(4):
+        trial[0, x] = q[x]
+    to_matrix(trial, 0, frame)
+    w = turn(frame, 0, turn(world.inverse_inertia, b, turn_back(frame, 0, momentum)))
+    one = cross(u, w)
+    two = cross(u, one)
+    return scale(add(along(w, one, -0.5), scale(two, 1.0 / 12.0)), h)

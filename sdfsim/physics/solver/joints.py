@@ -1,0 +1,1558 @@
+"""Joints, compiled: the rows that hold bodies together are solved exactly, beside contacts and what else is bounded.
+
+In an inner step, impulses act along the rows where bodies are at its start, and are such that the rows hold where
+bodies are at its end (SHAKE, with the exact free rotation in between): this keeps energy as the step without joints
+does, and nothing drifts. What bounds them (limits, motors, friction, contacts) is solved in turn, each seeing through
+the joints.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sdfsim.physics.joint_columns import (
+    BALL,
+    BEND,
+    BOUNCE,
+    BROKEN,
+    COORD,
+    DAMPING,
+    DISTANCE,
+    DRAG,
+    DRIVE,
+    FORCE,
+    FRESH,
+    GIVEN,
+    HIGH,
+    HINGE,
+    LENGTH,
+    LOW,
+    MOST,
+    MOTOR,
+    PULL,
+    REST,
+    SLIDER,
+    SOFT,
+    SPEED,
+    STIFFNESS,
+    STOP,
+    TARGET,
+    TIME,
+    TORQUE,
+    TWIST,
+)
+from sdfsim.physics.solver.flight import pull_of, torque_free
+from sdfsim.physics.solver.impulses import (
+    ARM,
+    AXIS,
+    COUNTER,
+    IMPULSE,
+    OTHER,
+    SPIN,
+    WANTED,
+    WIDTH,
+    System,
+    _equations,
+    _gains,
+    _resolve_penetration,
+    _solve,
+    _within,
+    remembered,
+)
+from sdfsim.physics.solver.islands import join, root
+from sdfsim.physics.solver.vectors import (
+    BARE,
+    FAST,
+    add,
+    along,
+    cross,
+    dot,
+    get,
+    norm,
+    put,
+    scale,
+    sub,
+    to_matrix,
+    turn,
+    turned_by,
+)
+
+ROWS = 6
+STRETCH = 1e-7  # model lengths (and rad): rows that hold worse are mended by moving bodies
+REACH = 0.05  # by at most so much in an inner step
+HOLDS = 1e-11  # model lengths (and rad): better need no row hold
+ROUNDS = 6  # of the search for impulses after which rows hold
+BREAKS = 4  # times that joints may break in one inner step
+SOFTEN = 1e-10  # of what a unit of impulse does along a row: where rows say the same twice, both are satisfied
+GIVES = 0.2  # the share of what is beyond a limit that an inner step resolves
+AHEAD = 0.05  # model lengths (and rad): limits that are nearer are looked at
+EXACT = 0.01  # of the precision that impulses of contacts alone are solved to
+DENSE = 240  # bounded rows of an island up to which each sees what it does through all joints
+
+
+class Graph(NamedTuple):
+    """The bodies that move and the joints are K nodes of a graph, in the order in which they are eliminated; the nodes
+    from comp[c] to comp[c + 1] are connected."""
+
+    comp: np.ndarray  # [C + 1] int64
+    node: np.ndarray  # [K] int64: a body, or -1 - j for joint j
+    of_body: np.ndarray  # [N] int64, the node of a body, -1 for those that no joint holds or that do not move
+    of_comp: np.ndarray  # [N] int64, likewise what it is connected to, a number
+    entry: np.ndarray  # [J, 2] int64, the block where a joint meets its body, -1 where that does not move
+    below: np.ndarray  # [K + 1] int64, the blocks below the diagonal of a column
+    row: np.ndarray  # [F] int64, the node whose row a block is in
+    start: np.ndarray  # [K + 1] int64, the targets of a column
+    target: np.ndarray  # [U] int64, block that a pair of blocks of a column adds to; -1 - k for the diagonal of node k
+
+
+class Factors(NamedTuple):
+    """The matrix of masses and rows: diagonal, inverse [K, 6, 6]; block, low [F, 6, 6]; and a right side x [K, 6]."""
+
+    diagonal: np.ndarray
+    inverse: np.ndarray
+    block: np.ndarray
+    low: np.ndarray
+    x: np.ndarray
+
+
+class Each(NamedTuple):
+    """What each of J joints is and does."""
+
+    body: np.ndarray  # [J, 2] int64, -1 for the world
+    kind: np.ndarray  # [J] int64
+    anchor: np.ndarray  # [J, 2, 3] from the centres of mass, in the bodies' axes
+    axes: np.ndarray  # [J, 2, 3, 3] the joint's three axes in those of the bodies
+    number: np.ndarray  # [J, NUMBERS]
+    state: np.ndarray  # [J, STATE]
+    axis: np.ndarray  # [J, 1, 12] the row along which it moves
+
+
+class Rows(NamedTuple):
+    """The rows of joints that hold, as they are in an inner step."""
+
+    line: np.ndarray  # [J, ROWS, 12] how a row reads the velocities of both bodies
+    active: np.ndarray  # [J, ROWS] int64: 0 for none, 1 for one that holds, 2 for a spring
+    # [J, ROWS]: by how much a unit of impulse gives way; what a row is to read; its impulse; by how much it does not
+    # hold before and after the inner step
+    soft: np.ndarray
+    wanted: np.ndarray
+    impulse: np.ndarray
+    error: np.ndarray
+    later: np.ndarray
+    eased: np.ndarray  # [1, 24], its latter half: what a unit of impulse makes of velocities, for a moment
+
+
+class Trial(NamedTuple):
+    """Where bodies would be: position [N, 3], orientation [N, 4], velocity and angular [N, 3], frame [N, 3, 3]; and
+    amid it turned [1, 4] and tried [1, 3, 3] of one."""
+
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    angular: np.ndarray
+    frame: np.ndarray
+    turned: np.ndarray
+    tried: np.ndarray
+
+
+class Held(NamedTuple):
+    """All joints of a scene, with room for what an inner step makes of them."""
+
+    graph: Graph
+    factors: Factors
+    each: Each
+    rows: Rows
+    trial: Trial
+    reply: np.ndarray  # [N, 6] what an impulse makes of velocities through the joints
+    calm: np.ndarray  # [N] bool, whether joints hold a body that nothing else touches
+
+
+class Moving(NamedTuple):
+    """What joints ask of bodies: of `World`, `Motion` and `Work`. All arrays that a function is given are copied, one
+    number after the other, which takes longer to compile than most of what is done to them."""
+
+    moves: np.ndarray
+    isotropic: np.ndarray
+    inverse_mass: np.ndarray
+    inertia: np.ndarray
+    inverse_inertia: np.ndarray
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    angular: np.ndarray
+    matrix: np.ndarray
+    inverse: np.ndarray
+    free: np.ndarray
+    change: np.ndarray
+    touching: np.ndarray
+    island: np.ndarray
+
+
+# Kinds of bounded rows: of contacts, normal and tangential (two rows); of joints, limits, motors with friction, and the
+# friction of a ball (three rows).
+NORMAL_ROW, TANGENT_ROW, STOP_ROW, DRIVE_ROW, GRIP_ROW = range(5)
+
+
+class Bounded(NamedTuple):
+    """R bounded rows of an island."""
+
+    kind: np.ndarray  # [R] int64
+    of: np.ndarray  # [R] int64, the contact or the joint
+    body: np.ndarray  # [R, 2] int64
+    # [R, 24] how a row reads velocities of both bodies, and what a unit of impulse makes of these without the joints
+    row: np.ndarray
+    want: np.ndarray  # [R] the wanted change of what it reads
+    impulse: np.ndarray  # [R]
+    # [R] what it reads without any impulse; the impulses of a motor and of friction at most. Of a tangent grip is the
+    # coefficient of friction; of a limit strong is what is to be left of the way to it after the inner step (infinite
+    # where it rebounds), and grip 1 for the lower one and -1 for the higher.
+    base: np.ndarray
+    strong: np.ndarray
+    grip: np.ndarray
+    give: np.ndarray  # [R] what a unit of impulse does along its row, through the joints where that is known
+    now: np.ndarray  # [R] the change so far
+    known: np.ndarray  # [R] the impulses before
+    see: np.ndarray  # [R, R] or [0, 0]: what a unit of impulse does along all rows, through the joints
+
+
+@njit(**FAST)
+def _moving(world, work, motion):
+    """Not one of `BARE`: these do not count the references to arrays that they return."""
+    return Moving(
+        world.moves, world.isotropic, world.inverse_mass, world.inertia, world.inverse_inertia, motion.position,
+        motion.orientation, motion.velocity, motion.angular, work.matrix, work.inverse, work.free, work.change,
+        motion.touching, motion.island,
+    )  # fmt: skip
+
+
+@njit(**BARE)
+def asleep(island, graph, c):
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        if graph.node[k] >= 0:
+            return island[graph.node[k]] >= 0
+    return True
+
+
+@njit(**BARE)
+def _arm(matrix, body, anchor, j, s):
+    b = body[j, s]
+    a = (anchor[j, s, 0], anchor[j, s, 1], anchor[j, s, 2])
+    return a if b < 0 else turn(matrix, b, a)
+
+
+@njit(**BARE)
+def _axis(matrix, body, axes, j, s, k):
+    b = body[j, s]
+    a = (axes[j, s, k, 0], axes[j, s, k, 1], axes[j, s, k, 2])
+    return a if b < 0 else turn(matrix, b, a)
+
+
+@njit(**BARE)
+def _between(position, body, j, arm, other):
+    """From the second body's anchor to the first's."""
+    a, b = body[j, 0], body[j, 1]
+    way = sub(arm, other)
+    if a >= 0:
+        way = add(way, get(position, a))
+    if b >= 0:
+        way = sub(way, get(position, b))
+    return way
+
+
+@njit(**BARE)
+def _unit(k):
+    """An axis of the world."""
+    return 1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0
+
+
+@njit(**BARE)
+def _errors(each, position, matrix, j, out):
+    """By how much the rows of a joint do not hold."""
+    kind = each.kind[j]
+    way = _between(
+        position, each.body, j, _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
+    )
+    for e in range(ROWS):
+        out[j, e] = 0.0
+    if kind == DISTANCE:
+        if each.number[j, LENGTH] >= 0.0:
+            out[j, 0] = norm(way) - each.number[j, LENGTH]
+        return
+    first = 3
+    if kind == SLIDER:
+        out[j, 0] = dot(_axis(matrix, each.body, each.axes, j, 1, 1), way)
+        out[j, 1] = dot(_axis(matrix, each.body, each.axes, j, 1, 2), way)
+        first = 2
+    else:
+        out[j, 0], out[j, 1], out[j, 2] = way[0], way[1], way[2]
+    if kind == HINGE:
+        a = _axis(matrix, each.body, each.axes, j, 0, 0)
+        out[j, 3] = dot(a, _axis(matrix, each.body, each.axes, j, 1, 1))
+        out[j, 4] = dot(a, _axis(matrix, each.body, each.axes, j, 1, 2))
+    elif kind != BALL:
+        for k in range(3):
+            out[j, first + k] = dot(
+                _axis(matrix, each.body, each.axes, j, 0, (k + 1) % 3),
+                _axis(matrix, each.body, each.axes, j, 1, (k + 2) % 3),
+            )
+
+
+@njit(**BARE)
+def _write(line, j, e, pull, arm, other):
+    """A row along a direction at two places."""
+    one, two = cross(arm, pull), cross(other, pull)
+    for x in range(3):
+        line[j, e, x], line[j, e, 3 + x], line[j, e, 6 + x], line[j, e, 9 + x] = pull[x], one[x], -pull[x], -two[x]
+
+
+@njit(**BARE)
+def _write_turn(line, j, e, axis):
+    """A row about an axis."""
+    for x in range(3):
+        line[j, e, x] = line[j, e, 6 + x] = 0.0
+        line[j, e, 3 + x], line[j, e, 9 + x] = axis[x], -axis[x]
+
+
+@njit(**BARE)
+def _coordinate(each, position, matrix, j):
+    """The angle, position or length of a joint, and the row along which it changes."""
+    kind, state = each.kind[j], each.state
+    arm, other = _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
+    way = _between(position, each.body, j, arm, other)
+    one = each.axis
+    if kind == HINGE:
+        a, b, c = (
+            _axis(matrix, each.body, each.axes, j, 0, 1),
+            _axis(matrix, each.body, each.axes, j, 1, 1),
+            _axis(matrix, each.body, each.axes, j, 1, 2),
+        )
+        angle = math.atan2(dot(a, c), dot(a, b))
+        turns = math.floor((state[j, COORD] - angle) / (2.0 * math.pi) + 0.5)
+        state[j, COORD] = angle + 2.0 * math.pi * turns
+        _write_turn(one, j, 0, _axis(matrix, each.body, each.axes, j, 0, 0))
+    elif kind == SLIDER:
+        a = _axis(matrix, each.body, each.axes, j, 1, 0)
+        state[j, COORD] = dot(a, way)
+        _write(one, j, 0, a, arm, add(other, way))
+    elif kind == BALL:
+        a, b = _axis(matrix, each.body, each.axes, j, 0, 0), _axis(matrix, each.body, each.axes, j, 1, 0)
+        n = cross(a, b)
+        s = norm(n)
+        state[j, COORD] = math.atan2(s, dot(a, b))
+        _write_turn(one, j, 0, scale(n, -1.0 / s) if s > 1e-9 else (0.0, 0.0, 0.0))
+    elif kind == DISTANCE:
+        length = norm(way)
+        state[j, COORD] = length
+        _write(one, j, 0, scale(way, 1.0 / length) if length > 1e-12 else (0.0, 0.0, 1.0), arm, other)
+
+
+@njit(**BARE)
+def _rows(each, lines, position, matrix, j):
+    """The rows that hold, as bodies are now."""
+    kind, line, active = each.kind[j], lines.line, lines.active
+    arm, other = _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
+    for e in range(ROWS):
+        active[j, e] = 0
+        lines.soft[j, e] = 0.0
+    if kind == DISTANCE:
+        if each.number[j, LENGTH] >= 0.0:
+            for x in range(12):
+                line[j, 0, x] = each.axis[j, 0, x]
+            active[j, 0] = 1
+        return
+    first = 3
+    if kind == SLIDER:
+        far = add(other, _between(position, each.body, j, arm, other))
+        _write(line, j, 0, _axis(matrix, each.body, each.axes, j, 1, 1), arm, far)
+        _write(line, j, 1, _axis(matrix, each.body, each.axes, j, 1, 2), arm, far)
+        first = 2
+    else:
+        for k in range(3):
+            _write(line, j, k, _unit(k), arm, other)
+    for e in range(first):
+        active[j, e] = 1
+    if kind == HINGE:
+        a = _axis(matrix, each.body, each.axes, j, 0, 0)
+        for k in range(2):
+            _write_turn(line, j, 3 + k, cross(a, _axis(matrix, each.body, each.axes, j, 1, 1 + k)))
+            active[j, 3 + k] = 1
+    elif kind != BALL:
+        for k in range(3):
+            one, two = (
+                _axis(matrix, each.body, each.axes, j, 0, (k + 1) % 3),
+                _axis(matrix, each.body, each.axes, j, 1, (k + 2) % 3),
+            )
+            _write_turn(line, j, first + k, cross(one, two))
+            active[j, first + k] = 1
+
+
+@njit(**BARE)
+def _reads(line, j, e, velocity, angular, a, b):
+    """What a row says of velocities [N, 3] of both bodies."""
+    total = 0.0
+    for x in range(3):
+        if a >= 0:
+            total += line[j, e, x] * velocity[a, x] + line[j, e, 3 + x] * angular[a, x]
+        if b >= 0:
+            total += line[j, e, 6 + x] * velocity[b, x] + line[j, e, 9 + x] * angular[b, x]
+    return total
+
+
+@njit(**BARE)
+def _reads_six(line, j, e, change, a, b):
+    """Likewise of [N, 6]."""
+    total = 0.0
+    for x in range(6):
+        if a >= 0:
+            total += line[j, e, x] * change[a, x]
+        if b >= 0:
+            total += line[j, e, 6 + x] * change[b, x]
+    return total
+
+
+@njit(**BARE)
+def _eased(moves, inverse_mass, inverse, rotation, line, j, e, a, b, out):
+    """Write what a unit of impulse along a row makes of both bodies' velocities by themselves; returns what that does
+    along the row."""
+    total = 0.0
+    for s in range(2):
+        body = a if s == 0 else b
+        for x in range(6):
+            out[0, 12 + 6 * s + x] = 0.0
+        if body >= 0 and moves[body]:
+            first = 6 * s
+            spin = turn(inverse, body, (line[j, e, first + 3], line[j, e, first + 4], line[j, e, first + 5]))
+            for x in range(3):
+                out[0, 12 + first + x] = inverse_mass[body] * line[j, e, first + x]
+                out[0, 15 + first + x] = spin[x] if rotation else 0.0
+            for x in range(6):
+                total += line[j, e, first + x] * out[0, 12 + first + x]
+    return total
+
+
+@njit(**BARE)
+def _springs(bodies, rules, each, lines, j):
+    """Springs and damping as soft rows: a force in the middle of what it is before and after the inner step."""
+    number, state, kind, h = each.number, each.state, each.kind[j], rules.substep_dt
+    stiff, damping = number[j, STIFFNESS], number[j, DAMPING]
+    if stiff <= 0.0 and damping <= 0.0:
+        return
+    a, b = each.body[j, 0], each.body[j, 1]
+    for k in range(3 if kind == BALL else 1):
+        e = 3 + k if kind == BALL else (5 if kind != DISTANCE else 1)
+        if kind == BALL:
+            _write_turn(lines.line, j, e, _unit(k))
+        else:
+            for x in range(12):
+                lines.line[j, e, x] = each.axis[j, 0, x]
+        z = (
+            damping
+            * h
+            * _eased(
+                bodies.moves, bodies.inverse_mass, bodies.inverse, rules.rotation, lines.line, j, e, a, b, lines.eased
+            )
+        )
+        late = 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
+        give = h * (0.25 * stiff * h + damping * late)
+        before = _reads(lines.line, j, e, bodies.velocity, bodies.angular, a, b)
+        lines.active[j, e] = 2
+        lines.soft[j, e] = 1.0 / give
+        away = state[j, COORD] - number[j, REST] if stiff > 0.0 else 0.0
+        lines.wanted[j, e] = before - h * (stiff * away + damping * before) / give
+
+
+@njit(**FAST)
+def assemble(world, work, motion, rules, held, springs):
+    """Write the rows of all joints that are awake, and factor what they make of velocities. Where rows do not hold,
+    bodies are moved. `springs`: whether these are among them."""
+    bodies = _moving(world, work, motion)
+    graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
+    for c in range(len(graph.comp) - 1):
+        if asleep(bodies.island, graph, c):
+            continue
+        for attempt in range(3):
+            worst = 0.0
+            for k in range(graph.comp[c], graph.comp[c + 1]):
+                if graph.node[k] < 0:
+                    j = -1 - graph.node[k]
+                    _coordinate(each, bodies.position, bodies.matrix, j)
+                    if each.state[j, BROKEN] > 0.0:
+                        for e in range(ROWS):
+                            lines.active[j, e] = 0
+                            lines.error[j, e] = lines.soft[j, e] = 0.0
+                        continue
+                    _rows(each, lines, bodies.position, bodies.matrix, j)
+                    _errors(each, bodies.position, bodies.matrix, j, lines.error)
+                    for e in range(ROWS):
+                        lines.wanted[j, e] = each.state[j, BEND + e] if springs else 0.0
+                        worst = max(worst, abs(lines.error[j, e]))
+                    if springs:
+                        _springs(bodies, rules, each, lines, j)
+            _factor(bodies, rules, graph, factors, each, lines, c)
+            if worst <= STRETCH or attempt == 2:
+                break
+            _mend(bodies, work.gone, world.radius, rules, graph, factors, lines, c)
+
+
+@njit(**BARE)
+def _mend(bodies, gone, radius, rules, graph, factors, lines, c):
+    """Move bodies so that rows hold: as little as their masses ask for."""
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        for e in range(6):
+            factors.x[k, e] = 0.0
+        if graph.node[k] < 0:
+            j = -1 - graph.node[k]
+            for e in range(ROWS):
+                if lines.active[j, e] == 1:
+                    factors.x[k, e] = lines.error[j, e]
+    _substitute(graph, factors, c, graph.comp[c])
+    most = 0.0
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        b = graph.node[k]
+        if b >= 0:
+            moved, turned = get(factors.x, k), (factors.x[k, 3], factors.x[k, 4], factors.x[k, 5])
+            most = max(most, norm(moved), norm(turned))
+    share = 1.0 if most <= REACH else REACH / most
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        b = graph.node[k]
+        if b >= 0:
+            moved, turned = get(factors.x, k), (factors.x[k, 3], factors.x[k, 4], factors.x[k, 5])
+            put(bodies.position, b, along(get(bodies.position, b), moved, share))
+            if rules.rotation:
+                q = turned_by(scale(turned, share), bodies.orientation, b)
+                for x in range(4):
+                    bodies.orientation[b, x] = q[x]
+                to_matrix(bodies.orientation, b, bodies.matrix)
+            if radius[b] < math.inf:
+                gone[b] += share * (norm(moved) + norm(turned) * radius[b])
+
+
+@njit(**BARE)
+def _factor(bodies, rules, graph, factors, each, lines, c):
+    """The matrix of masses and rows, factored block by block."""
+    first, last = graph.comp[c], graph.comp[c + 1]
+    for k in range(first, last):
+        for p in range(graph.below[k], graph.below[k + 1]):
+            for x in range(6):
+                for y in range(6):
+                    factors.block[p, x, y] = 0.0
+        for x in range(6):
+            for y in range(6):
+                factors.diagonal[k, x, y] = 0.0
+        b = graph.node[k]
+        if b >= 0:
+            for x in range(3):
+                factors.diagonal[k, x, x] = 1.0 / bodies.inverse_mass[b]
+                for y in range(3):
+                    total = 0.0
+                    for u in range(3):
+                        for w in range(3):
+                            total += bodies.matrix[b, x, u] * bodies.inertia[b, u, w] * bodies.matrix[b, y, w]
+                    factors.diagonal[k, 3 + x, 3 + y] = total
+    for k in range(first, last):
+        if graph.node[k] >= 0:
+            continue
+        j = -1 - graph.node[k]
+        for e in range(ROWS):
+            factors.diagonal[k, e, e] = -1.0
+            if lines.active[j, e] > 0:
+                eased = _eased(
+                    bodies.moves,
+                    bodies.inverse_mass,
+                    bodies.inverse,
+                    rules.rotation,
+                    lines.line,
+                    j,
+                    e,
+                    each.body[j, 0],
+                    each.body[j, 1],
+                    lines.eased,
+                )
+                factors.diagonal[k, e, e] = -lines.soft[j, e] - SOFTEN * eased
+                if eased == 0.0:
+                    factors.diagonal[k, e, e] = -1.0
+        for s in range(2):
+            p = graph.entry[j, s]
+            if p < 0:
+                continue
+            lower = graph.row[p] == k
+            for e in range(ROWS):
+                if lines.active[j, e] == 0:
+                    continue
+                for x in range(6):
+                    value = -lines.line[j, e, 6 * s + x] if x < 3 or rules.rotation else 0.0
+                    if lower:
+                        factors.block[p, e, x] = value
+                    else:
+                        factors.block[p, x, e] = value
+    for k in range(first, last):
+        _invert(factors.diagonal, factors.inverse, k)
+        t = graph.start[k]
+        for p in range(graph.below[k], graph.below[k + 1]):
+            _multiply(factors.low, factors.block, factors.inverse, p, k)
+            for q in range(graph.below[k], p + 1):
+                target = graph.target[t]
+                t += 1
+                if target < 0:
+                    _subtract(factors.diagonal, -1 - target, factors.low, p, factors.block, q)
+                else:
+                    _subtract(factors.block, target, factors.low, p, factors.block, q)
+
+
+@njit(**BARE)
+def _invert(diagonal, inverse, k):
+    """Gauss and Jordan without pivots: the blocks are definite."""
+    a = inverse[k]
+    for x in range(6):
+        for y in range(6):
+            a[x, y] = diagonal[k, x, y]
+    for i in range(6):
+        pivot = 1.0 / a[i, i]
+        a[i, i] = 1.0
+        for y in range(6):
+            a[i, y] *= pivot
+        for x in range(6):
+            if x != i:
+                factor = a[x, i]
+                a[x, i] = 0.0
+                for y in range(6):
+                    a[x, y] -= factor * a[i, y]
+
+
+@njit(**BARE)
+def _multiply(out, block, inverse, p, k):
+    for x in range(6):
+        for y in range(6):
+            total = 0.0
+            for u in range(6):
+                total += block[p, x, u] * inverse[k, u, y]
+            out[p, x, y] = total
+
+
+@njit(**BARE)
+def _subtract(out, t, low, p, block, q):
+    for x in range(6):
+        for y in range(6):
+            total = 0.0
+            for u in range(6):
+                total += low[p, x, u] * block[q, y, u]
+            out[t, x, y] -= total
+
+
+@njit(**BARE)
+def _substitute(graph, factors, c, first):
+    """Solve for the right side `x`, which is 0 before node `first`."""
+    x, last = factors.x, graph.comp[c + 1]
+    for k in range(first, last):
+        for p in range(graph.below[k], graph.below[k + 1]):
+            r = graph.row[p]
+            for i in range(6):
+                total = 0.0
+                for u in range(6):
+                    total += factors.low[p, i, u] * x[k, u]
+                x[r, i] -= total
+    for k in range(last - 1, graph.comp[c] - 1, -1):
+        a, b, d, e, f, g = x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5]
+        for i in range(6):
+            m = factors.inverse[k, i]
+            x[k, i] = m[0] * a + m[1] * b + m[2] * d + m[3] * e + m[4] * f + m[5] * g
+        for p in range(graph.below[k], graph.below[k + 1]):
+            r = graph.row[p]
+            for i in range(6):
+                total = 0.0
+                for u in range(6):
+                    total += factors.low[p, u, i] * x[r, u]
+                x[k, i] -= total
+
+
+@njit(**BARE)
+def _project(bodies, graph, factors, each, lines, c, change, whole):
+    """Let the rows hold: what `change` lacks is added. `whole`: of all velocities, as the rows want them; else of the
+    change alone, which is to be none along them."""
+    free = bodies.free
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        n = graph.node[k]
+        for e in range(6):
+            factors.x[k, e] = 0.0
+        if n < 0:
+            j = -1 - n
+            a, b = each.body[j, 0], each.body[j, 1]
+            for e in range(ROWS):
+                if lines.active[j, e] == 0:
+                    continue
+                now = _reads_six(lines.line, j, e, change, a, b)
+                if whole:
+                    now += _reads(lines.line, j, e, bodies.velocity, bodies.angular, a, b)
+                    now += _reads_six(lines.line, j, e, free, a, b)
+                    now += lines.soft[j, e] * lines.impulse[j, e] - lines.wanted[j, e]
+                factors.x[k, e] = now
+    _substitute(graph, factors, c, graph.comp[c])
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        n = graph.node[k]
+        if n >= 0:
+            for x in range(6):
+                change[n, x] += factors.x[k, x]
+        elif whole:
+            for e in range(ROWS):
+                lines.impulse[-1 - n, e] += factors.x[k, e]
+
+
+@njit(**BARE)
+def _bend(bodies, rules, graph, each, lines, trial, c):
+    """Move the bodies as far as the inner step would, and let rows turn by as much as they do not hold there; returns
+    the largest error."""
+    h = rules.substep_dt
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        n = graph.node[k]
+        if n >= 0:
+            _tried(bodies, rules, trial, n)
+            continue
+        for s in range(2):
+            b = each.body[-1 - n, s]
+            if b >= 0 and graph.of_body[b] < 0:
+                _tried(bodies, rules, trial, b)
+    worst = 0.0
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        if graph.node[k] < 0:
+            j = -1 - graph.node[k]
+            if each.state[j, BROKEN] > 0.0:
+                continue
+            _errors(each, trial.position, trial.frame, j, lines.later)
+            for e in range(ROWS):
+                if lines.active[j, e] == 1:
+                    error = lines.later[j, e] - lines.error[j, e]
+                    lines.wanted[j, e] -= error / h
+                    worst = max(worst, abs(error))
+    return worst
+
+
+@njit(**BARE)
+def _tried(bodies, rules, trial, b):
+    """Where a body would be after the inner step."""
+    h, change, free = rules.substep_dt, bodies.change, bodies.free
+    v, w = get(bodies.velocity, b), get(bodies.angular, b)
+    for x in range(4):
+        trial.orientation[b, x] = bodies.orientation[b, x]
+    for x in range(3):
+        for y in range(3):
+            trial.frame[b, x, y] = bodies.matrix[b, x, y]
+    if bodies.moves[b]:
+        v = add(v, add((free[b, 0], free[b, 1], free[b, 2]), (change[b, 0], change[b, 1], change[b, 2])))
+        w = add(w, add((free[b, 3], free[b, 4], free[b, 5]), (change[b, 3], change[b, 4], change[b, 5])))
+    put(trial.position, b, along(get(bodies.position, b), v, h))
+    if not rules.rotation and bodies.moves[b]:
+        return
+    put(trial.angular, b, w)
+    if bodies.moves[b] and not bodies.isotropic[b]:
+        torque_free(bodies, trial, trial.frame, h, trial.turned, trial.tried, b)
+    elif w[0] != 0.0 or w[1] != 0.0 or w[2] != 0.0:
+        q = turned_by(scale(w, h), trial.orientation, b)
+        for x in range(4):
+            trial.orientation[b, x] = q[x]
+        to_matrix(trial.orientation, b, trial.frame)
+
+
+@njit(**BARE)
+def _limited(bodies, rules, graph, each, c, rows, count, steady):
+    """Write the bounded rows of joints behind `count` others; returns how many there are then. `steady`: only limits
+    that hold, as they are after an inner step."""
+    h, number, state = rules.substep_dt, each.number, each.state
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        if graph.node[k] >= 0:
+            continue
+        j = -1 - graph.node[k]
+        if state[j, BROKEN] > 0.0:
+            continue
+        a, b, coord = each.body[j, 0], each.body[j, 1], state[j, COORD]
+        before = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
+        free = before + _reads_six(each.axis, j, 0, bodies.free, a, b)
+        for side in range(2):
+            end = number[j, LOW + side]
+            sign = 1.0 - 2.0 * side
+            gap = sign * (coord - end)
+            if not gap < math.inf or (steady and state[j, STOP] * sign <= 0.0):
+                continue
+            then = sign * free
+            if gap + h * then > AHEAD and gap > AHEAD:
+                continue
+            approach = -sign * before
+            left = 0.0 if gap >= 0.0 else (1.0 - GIVES) * gap
+            aim = (left - gap) / h
+            if steady:
+                aim, then = 0.0, sign * before
+            elif number[j, BOUNCE] > 0.0 and approach > rules.slow and gap <= h * approach:
+                aim, left = number[j, BOUNCE] * approach, math.inf
+            for x in range(12):
+                rows.row[count, x] = sign * each.axis[j, 0, x]
+            _begin(bodies, rules, each, rows, count, STOP_ROW, j, aim, then)
+            rows.impulse[count] = 0.0 if steady else max(0.0, sign * state[j, STOP])
+            rows.strong[count], rows.grip[count] = left, sign
+            count += 1
+        if steady or each.kind[j] > BALL:
+            continue
+        grip, most, motor = h * number[j, DRAG], h * number[j, MOST], number[j, MOTOR]
+        if motor == 0.0:
+            most = 0.0
+        if each.kind[j] == BALL:
+            for e in range(3 if grip > 0.0 else 0):
+                for x in range(12):
+                    rows.row[count, x] = 0.0
+                rows.row[count, 3 + e], rows.row[count, 9 + e] = 1.0, -1.0
+                now = 0.0
+                if a >= 0:
+                    now += bodies.angular[a, e] + bodies.free[a, 3 + e]
+                if b >= 0:
+                    now -= bodies.angular[b, e] + bodies.free[b, 3 + e]
+                _begin(bodies, rules, each, rows, count, GRIP_ROW, j, 0.0, now)
+                rows.impulse[count], rows.grip[count] = state[j, DRIVE + e], grip
+                count += 1
+        elif grip > 0.0 or most > 0.0:
+            aim = 0.0
+            if motor == 1.0:
+                aim = state[j, TARGET]
+            elif motor == 2.0:
+                aim = (state[j, TARGET] - coord) / max(number[j, TIME], h)
+            for x in range(12):
+                rows.row[count, x] = each.axis[j, 0, x]
+            _begin(bodies, rules, each, rows, count, DRIVE_ROW, j, aim, free)
+            rows.impulse[count], rows.grip[count], rows.strong[count] = state[j, DRIVE], grip, most
+            count += 1
+    return count
+
+
+@njit(**BARE)
+def _begin(bodies, rules, each, rows, r, kind, j, aim, base):
+    rows.kind[r], rows.of[r] = kind, j
+    rows.body[r, 0], rows.body[r, 1] = each.body[j, 0], each.body[j, 1]
+    rows.base[r], rows.want[r] = base, aim - base
+    rows.strong[r] = rows.grip[r] = 0.0
+    rows.give[r] = 0.0
+    for s in range(2):
+        b = each.body[j, s]
+        for x in range(6):
+            rows.row[r, 12 + 6 * s + x] = 0.0
+        if b >= 0 and bodies.moves[b]:
+            first = 6 * s
+            spin = turn(bodies.inverse, b, (rows.row[r, first + 3], rows.row[r, first + 4], rows.row[r, first + 5]))
+            for x in range(3):
+                rows.row[r, 12 + first + x] = bodies.inverse_mass[b] * rows.row[r, first + x]
+                rows.row[r, 15 + first + x] = spin[x] if rules.rotation else 0.0
+            for x in range(6):
+                rows.give[r] += rows.row[r, first + x] * rows.row[r, 12 + first + x]
+
+
+@njit(**BARE)
+def _touched(inverse_mass, system, island, rows):
+    """Write the rows of an island's contacts; returns how many."""
+    count = 0
+    for o in range(system.start[island], system.start[island + 1]):
+        c = system.order[o]
+        a, b = system.where[c, 2], system.where[c, 3]
+        for e in range(3 if system.friction[c] > 0.0 else 1):
+            own = system.row[c, e]
+            rows.kind[count], rows.of[count] = NORMAL_ROW if e == 0 else TANGENT_ROW, c
+            rows.body[count, 0], rows.body[count, 1] = a, b
+            rows.give[count] = 0.0
+            for x in range(3):
+                rows.row[count, x], rows.row[count, 6 + x] = own[AXIS + x], -own[AXIS + x]
+                rows.row[count, 3 + x], rows.row[count, 9 + x] = own[ARM + x], own[OTHER + x]
+                rows.row[count, 12 + x] = own[AXIS + x] * inverse_mass[a]
+                rows.row[count, 18 + x] = -own[AXIS + x] * inverse_mass[b]
+                rows.row[count, 15 + x], rows.row[count, 21 + x] = own[SPIN + x], own[COUNTER + x]
+            for x in range(12):
+                rows.give[count] += rows.row[count, x] * rows.row[count, 12 + x]
+            rows.want[count], rows.impulse[count] = own[WANTED], own[IMPULSE]
+            rows.base[count] = rows.strong[count] = 0.0
+            rows.grip[count] = system.friction[c]
+            count += 1
+    return count
+
+
+@njit(**BARE)
+def _read(rows, r, change):
+    total = 0.0
+    for s in range(2):
+        b = rows.body[r, s]
+        if b >= 0:
+            for x in range(6):
+                total += rows.row[r, 6 * s + x] * change[b, x]
+    return total
+
+
+@njit(**BARE)
+def _give(moves, rows, r, impulse, change):
+    for s in range(2):
+        b = rows.body[r, s]
+        if b >= 0 and moves[b]:
+            for x in range(6):
+                change[b, x] += impulse * rows.row[r, 12 + 6 * s + x]
+
+
+@njit(**BARE)
+def _see(bodies, graph, factors, reply, rows, count):
+    """What a unit of impulse along each row does along all, through the joints."""
+    for r in range(count):
+        for s in range(2):
+            b = rows.body[r, s]
+            if b >= 0:
+                for x in range(6):
+                    reply[b, x] = 0.0
+    for r in range(count):
+        one = other = -1
+        for s in range(2):
+            b = rows.body[r, s]
+            if b < 0 or not bodies.moves[b]:
+                continue
+            k = graph.of_body[b]
+            if k < 0 or bodies.island[b] >= 0:
+                for x in range(6):
+                    reply[b, x] += rows.row[r, 12 + 6 * s + x]
+                continue
+            c = graph.of_comp[b]
+            if c != one and c != other:
+                for i in range(graph.comp[c], graph.comp[c + 1]):
+                    for x in range(6):
+                        factors.x[i, x] = 0.0
+                if one < 0:
+                    one = c
+                else:
+                    other = c
+            for x in range(6):
+                factors.x[k, x] += rows.row[r, 6 * s + x]
+        for c in (one, other):
+            if c >= 0:
+                _substitute(graph, factors, c, graph.comp[c])
+                for i in range(graph.comp[c], graph.comp[c + 1]):
+                    if graph.node[i] >= 0:
+                        for x in range(6):
+                            reply[graph.node[i], x] = factors.x[i, x]
+        for q in range(count):
+            rows.see[r, q] = _read(rows, q, reply)
+        rows.give[r] = rows.see[r, r]
+        for s in range(2):
+            b = rows.body[r, s]
+            if b >= 0:
+                for x in range(6):
+                    reply[b, x] = 0.0
+        for c in (one, other):
+            if c >= 0:
+                for i in range(graph.comp[c], graph.comp[c + 1]):
+                    if graph.node[i] >= 0:
+                        for x in range(6):
+                            reply[graph.node[i], x] = 0.0
+
+
+@njit(**BARE)
+def _step(moves, rows, count, r, total, change):
+    """Give a row its impulse; returns by how much that changes what it reads."""
+    step = total - rows.impulse[r]
+    if step == 0.0:
+        return 0.0
+    rows.impulse[r] = total
+    if len(rows.see):
+        for q in range(count):
+            rows.now[q] += step * rows.see[r, q]
+    else:
+        _give(moves, rows, r, step, change)
+    return abs(step) * rows.give[r]
+
+
+@njit(**BARE)
+def _short(rows, r, change):
+    """What a row lacks of the change that it wants."""
+    return rows.want[r] - (rows.now[r] if len(rows.see) else _read(rows, r, change))
+
+
+@njit(**BARE)
+def _driven(now, aim, give, most, grip):
+    """The impulse of a motor with friction: `now` is the speed without it."""
+    sign = 1.0 if aim >= 0.0 else -1.0
+    now, aim = sign * now, sign * aim
+    reach = (aim - now) / give
+    if reach <= most - grip or aim == 0.0:
+        if aim == 0.0:
+            return sign * min(max(reach, -most - grip), most + grip)
+        return sign * max(reach, -most - grip)
+    stay = -now / give
+    return sign * min(max(stay, most - grip), most + grip)
+
+
+@njit(**BARE)
+def _sweep(moves, cone, rows, count, change):
+    """All bounded rows in turn, friction of contacts last; returns the largest change."""
+    worst = 0.0
+    for r in range(count):
+        kind = rows.kind[r]
+        if kind == TANGENT_ROW or rows.give[r] <= 0.0:
+            continue
+        total = rows.impulse[r] + _short(rows, r, change) / rows.give[r]
+        if kind == NORMAL_ROW or kind == STOP_ROW:
+            total = max(total, 0.0)
+        elif kind == DRIVE_ROW:
+            aim = rows.base[r] + rows.want[r]
+            now = aim - _short(rows, r, change) - rows.impulse[r] * rows.give[r]
+            total = _driven(now, aim, rows.give[r], rows.strong[r], rows.grip[r])
+        worst = max(worst, _step(moves, rows, count, r, total, change))
+        if kind == GRIP_ROW and (r + 1 == count or rows.of[r + 1] != rows.of[r] or rows.kind[r + 1] != GRIP_ROW):
+            length = math.sqrt(rows.impulse[r] ** 2 + rows.impulse[r - 1] ** 2 + rows.impulse[r - 2] ** 2)
+            if length > rows.grip[r]:
+                for q in range(r - 2, r + 1):
+                    _step(moves, rows, count, q, rows.impulse[q] * rows.grip[r] / length, change)
+    r = 0
+    while r < count:
+        if rows.kind[r] != TANGENT_ROW:
+            r += 1
+            continue
+        most = rows.grip[r] * rows.impulse[r - 1]
+        if cone:
+            give = max(rows.give[r], rows.give[r + 1])
+            one = rows.impulse[r] + _short(rows, r, change) / give
+            other = rows.impulse[r + 1] + _short(rows, r + 1, change) / give
+            share = _within(one, other, most)
+            worst = max(worst, _step(moves, rows, count, r, share * one, change))
+            worst = max(worst, _step(moves, rows, count, r + 1, share * other, change))
+        else:
+            for q in range(r, r + 2):
+                total = rows.impulse[q] + _short(rows, q, change) / rows.give[q]
+                worst = max(worst, _step(moves, rows, count, q, min(max(total, -most), most), change))
+        r += 2
+    return worst
+
+
+@njit(**BARE)
+def _all_rows(bodies, rules, system, graph, each, comps, lo, hi, island, rows):
+    """The bounded rows of an island, and what was known of their impulses, given to the bodies."""
+    count = _touched(bodies.inverse_mass, system, island, rows)
+    for i in range(lo, hi):
+        count = _limited(bodies, rules, graph, each, comps[i], rows, count, False)
+    for r in range(count):
+        if rows.impulse[r] != 0.0:
+            _give(bodies.moves, rows, r, rows.impulse[r], bodies.change)
+    return count
+
+
+@njit(**BARE)
+def _hold(bodies, rules, held, comps, lo, hi, rows, count, steady):
+    """Solve for all impulses of an island so that its rows hold after the inner step."""
+    graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
+    change, h = bodies.change, rules.substep_dt
+    for i in range(lo, hi):
+        for k in range(graph.comp[comps[i]], graph.comp[comps[i] + 1]):
+            if graph.node[k] < 0:
+                for e in range(ROWS):
+                    lines.impulse[-1 - graph.node[k], e] = 0.0
+        _project(bodies, graph, factors, each, lines, comps[i], change, True)
+    for _ in range(ROUNDS):
+        if count:
+            for r in range(count):
+                rows.known[r] = rows.impulse[r]
+                rows.now[r] = _read(rows, r, change)
+            for _ in range(rules.rounds):
+                worst = _sweep(bodies.moves, rules.cone, rows, count, change)
+                if len(rows.see) == 0:
+                    for i in range(lo, hi):
+                        _project(bodies, graph, factors, each, lines, comps[i], change, True)
+                if worst <= EXACT * rules.exact:
+                    break
+            if len(rows.see):
+                for r in range(count):
+                    if rows.impulse[r] != rows.known[r]:
+                        _give(bodies.moves, rows, r, rows.impulse[r] - rows.known[r], change)
+                for i in range(lo, hi):
+                    _project(bodies, graph, factors, each, lines, comps[i], change, True)
+        if steady:
+            return
+        worst = 0.0
+        for i in range(lo, hi):
+            worst = max(worst, _bend(bodies, rules, graph, each, lines, held.trial, comps[i]))
+        for r in range(count):
+            if rows.kind[r] == STOP_ROW and rows.impulse[r] > 0.0 and rows.strong[r] < math.inf:
+                j = rows.of[r]
+                coord = each.state[j, COORD]
+                _coordinate(each, held.trial.position, held.trial.frame, j)
+                sign = rows.grip[r]
+                gap = sign * (each.state[j, COORD] - each.number[j, LOW if sign > 0.0 else HIGH])
+                each.state[j, COORD] = coord
+                for x in range(12):
+                    each.axis[j, 0, x] = sign * rows.row[r, x]
+                rows.want[r] -= (gap - rows.strong[r]) / h
+                worst = max(worst, abs(gap - rows.strong[r]))
+        if worst <= HOLDS:
+            return
+        for i in range(lo, hi):
+            _project(bodies, graph, factors, each, lines, comps[i], change, True)
+
+
+@njit(**BARE)
+def _clear(graph, system, island, comps, lo, hi, change):
+    for o in range(system.start[island], system.start[island + 1]):
+        c = system.order[o]
+        for x in range(6):
+            change[system.where[c, 2], x] = change[system.where[c, 3], x] = 0.0
+    for i in range(lo, hi):
+        for k in range(graph.comp[comps[i]], graph.comp[comps[i] + 1]):
+            if graph.node[k] >= 0:
+                for x in range(6):
+                    change[graph.node[k], x] = 0.0
+
+
+@njit(**FAST)
+def _room(count):
+    return Bounded(
+        np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64), np.empty((count, 24)),
+        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
+        np.empty(count), np.empty(count), np.empty((0, 0)),
+    )  # fmt: skip
+
+
+@njit(**FAST)
+def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
+    """An island that joints hold together: as `impulses._solve`, through the joints."""
+    graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
+    contacts = system.start[island + 1] - system.start[island]
+    most = 3 * contacts
+    for i in range(lo, hi):
+        most += 4 * (graph.comp[comps[i] + 1] - graph.comp[comps[i]])
+    lively = deep = False
+    for o in range(system.start[island], system.start[island + 1]):
+        c = system.order[o]
+        deep = deep or system.wanted[c] > 0.0
+        lively = lively or system.row[c, 0, WANTED] > system.calm[c, 0]
+    if deep:
+        _resolve_penetration(bodies.inverse_mass, rules, system, shift, island)
+        for i in range(lo, hi):
+            _project(bodies, graph, factors, each, lines, comps[i], shift, False)
+    room = _room(most)
+    count = _all_rows(bodies, rules, system, graph, each, comps, lo, hi, island, room)
+    rows = _seen(room, count if count <= DENSE else 0)
+    if len(rows.see):
+        _see(bodies, graph, factors, held.reply, rows, count)
+    for _ in range(BREAKS):
+        share = 0.5
+        while True:
+            _hold(bodies, rules, held, comps, lo, hi, rows, count, False)
+            for r in range(count):
+                c = rows.of[r]
+                if rows.kind[r] == NORMAL_ROW:
+                    system.row[c, 0, IMPULSE] = rows.impulse[r]
+                    if rows.grip[r] > 0.0:
+                        system.row[c, 1, IMPULSE] = rows.impulse[r + 1]
+                        system.row[c, 2, IMPULSE] = rows.impulse[r + 2]
+            if not lively or share < 0.0 or not _gains(rules, system, bodies.change, island):
+                break
+            _clear(graph, system, island, comps, lo, hi, bodies.change)
+            for r in range(count):
+                rows.impulse[r] = 0.0
+                c = rows.of[r]
+                if rows.kind[r] == NORMAL_ROW:
+                    calm = system.calm[c, 0]
+                    system.row[c, 0, WANTED] = calm + share * (system.row[c, 0, WANTED] - calm)
+                    rows.want[r] = system.row[c, 0, WANTED]
+            share = 0.0 if share > 0.0 else -1.0
+        touched = False
+        for r in range(count):
+            struck = rows.kind[r] == STOP_ROW and rows.strong[r] == math.inf
+            touched = touched or ((rows.kind[r] == NORMAL_ROW or struck) and rows.impulse[r] > 0.0)
+        for i in range(lo, hi):
+            _told(bodies, rules, graph, each, lines, held.calm, comps[i], touched or deep)
+        for r in range(count):
+            if rows.kind[r] >= STOP_ROW:
+                _tell(bodies, rules, each, rows, r)
+        broke = False
+        for i in range(lo, hi):
+            if _broken(graph, each, lines, comps[i]):
+                broke = True
+                _factor(bodies, rules, graph, factors, each, lines, comps[i])
+        if not broke:
+            break
+        # What broke has not held: all impulses are found once more.
+        _clear(graph, system, island, comps, lo, hi, bodies.change)
+        if len(rows.see):
+            _see(bodies, graph, factors, held.reply, rows, count)
+        for r in range(count):
+            rows.impulse[r] = 0.0
+            if rows.kind[r] >= STOP_ROW and each.state[rows.of[r], BROKEN] > 0.0:
+                rows.give[r] = 0.0
+
+
+@njit(**FAST)
+def _seen(rows, count):
+    return Bounded(
+        rows.kind, rows.of, rows.body, rows.row, rows.want, rows.impulse, rows.base, rows.strong, rows.grip, rows.give,
+        rows.now, rows.known, np.empty((count, count)),
+    )  # fmt: skip
+
+
+@njit(**BARE)
+def _told(bodies, rules, graph, each, lines, calm, c, touched):
+    """Write down what the rows that hold have done."""
+    h, state = rules.substep_dt, each.state
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        n = graph.node[k]
+        if n >= 0:
+            calm[n] = not touched
+            if touched:
+                bodies.touching[n] = True
+            continue
+        j = -1 - n
+        a, b = each.body[j, 0], each.body[j, 1]
+        speed = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
+        state[j, SPEED] = speed + _reads_six(each.axis, j, 0, bodies.free, a, b)
+        state[j, SPEED] += _reads_six(each.axis, j, 0, bodies.change, a, b)
+        for x in range(3):
+            state[j, PULL + x] = state[j, TWIST + x] = state[j, DRIVE + x] = state[j, SOFT + x] = 0.0
+        state[j, STOP] = state[j, FRESH] = 0.0
+        for e in range(ROWS):
+            state[j, BEND + e] = lines.wanted[j, e] if lines.active[j, e] == 1 else 0.0
+            if lines.active[j, e] == 0:
+                continue
+            if lines.active[j, e] == 2:
+                state[j, SOFT + (e - 3 if each.kind[j] == BALL else 0)] = lines.impulse[j, e]
+            _add_pull(bodies.matrix, each, j, lines.line, j, e, lines.impulse[j, e] / h)
+
+
+@njit(**BARE)
+def _add_pull(matrix, each, j, line, i, e, force):
+    """Add what a row does to the force and the torque on the first body, about its anchor."""
+    pull = (line[i, e, 0], line[i, e, 1], line[i, e, 2])
+    twist = sub((line[i, e, 3], line[i, e, 4], line[i, e, 5]), cross(_arm(matrix, each.body, each.anchor, j, 0), pull))
+    for x in range(3):
+        each.state[j, PULL + x] += force * pull[x]
+        each.state[j, TWIST + x] += force * twist[x]
+
+
+@njit(**BARE)
+def _tell(bodies, rules, each, rows, r):
+    """Write down what a bounded row of a joint has done."""
+    j, kind, impulse, h, state = rows.of[r], rows.kind[r], rows.impulse[r], rules.substep_dt, each.state
+    pull = (rows.row[r, 0], rows.row[r, 1], rows.row[r, 2])
+    twist = sub(
+        (rows.row[r, 3], rows.row[r, 4], rows.row[r, 5]), cross(_arm(bodies.matrix, each.body, each.anchor, j, 0), pull)
+    )
+    for x in range(3):
+        state[j, PULL + x] += impulse / h * pull[x]
+        state[j, TWIST + x] += impulse / h * twist[x]
+    if kind == STOP_ROW:
+        state[j, STOP] += rows.grip[r] * impulse
+    elif kind == DRIVE_ROW:
+        state[j, DRIVE] = impulse
+        if rows.strong[r] > 0.0:
+            before = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, each.body[j, 0], each.body[j, 1])
+            mean = 0.5 * (before + state[j, SPEED])
+            own = impulse + (rows.grip[r] if mean > 0.0 else -rows.grip[r])
+            state[j, DRIVE + 1] = min(max(own, -rows.strong[r]), rows.strong[r])
+            state[j, GIVEN] += state[j, DRIVE + 1] * mean
+    else:
+        for e in range(3):
+            if rows.row[r, 3 + e] != 0.0:
+                state[j, DRIVE + e] = impulse
+
+
+@njit(**BARE)
+def _broken(graph, each, lines, c):
+    """Joints that bear more than they can are none any more; whether there are new ones."""
+    found = False
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        if graph.node[k] < 0:
+            j = -1 - graph.node[k]
+            own, number = each.state[j], each.number[j]
+            pull = norm((own[PULL], own[PULL + 1], own[PULL + 2]))
+            twist = norm((own[TWIST], own[TWIST + 1], own[TWIST + 2]))
+            if own[BROKEN] == 0.0 and (pull > number[FORCE] or twist > number[TORQUE]):
+                own[BROKEN] = 1.0
+                found = True
+                for e in range(ROWS):
+                    lines.active[j, e] = 0
+                    lines.soft[j, e] = 0.0
+    return found
+
+
+@njit(**FAST)
+def _islands(bodies, parent, number, graph, where):
+    """Contacts and connected joints ordered by island: bodies that move, joined by both.
+
+    Returns:
+        start [I + 1] and order [C] of contacts, and the same of what joints connect, of which those that sleep are left
+        out.
+    """
+    connected = len(graph.comp) - 1
+    for k in range(len(graph.node)):
+        if graph.node[k] >= 0:
+            parent[graph.node[k]], number[graph.node[k]] = graph.node[k], -1
+    for c in range(len(where)):
+        for e in range(2, 4):
+            parent[where[c, e]], number[where[c, e]] = where[c, e], -1
+    own = np.empty(connected, np.int64)
+    for c in range(connected):
+        own[c] = -1
+        for k in range(graph.comp[c], graph.comp[c + 1]):
+            if graph.node[k] >= 0:
+                if own[c] >= 0:
+                    join(parent, own[c], graph.node[k])
+                own[c] = graph.node[k]
+        if asleep(bodies.island, graph, c):
+            own[c] = -1
+    for c in range(len(where)):
+        a, b = where[c, 2], where[c, 3]
+        if bodies.moves[a] and bodies.moves[b]:
+            join(parent, a, b)
+    islands = 0
+    label, group = np.empty(len(where), np.int64), np.empty(connected, np.int64)
+    for c in range(len(where) + connected):
+        b = where[c, 2] if c < len(where) else own[c - len(where)]
+        if b < 0:
+            group[c - len(where)] = -1
+            continue
+        a = root(parent, b)
+        if number[a] < 0:
+            number[a] = islands
+            islands += 1
+        if c < len(where):
+            label[c] = number[a]
+        else:
+            group[c - len(where)] = number[a]
+    start, order = _sorted(label, islands)
+    begin, comps = _sorted(group, islands)
+    return start, order, begin, comps
+
+
+@njit(**FAST)
+def _sorted(label, count):
+    """Where each label begins, and the numbers of those that have it; -1 is none."""
+    start = np.zeros(count + 1, np.int64)
+    for c in range(len(label)):
+        if label[c] >= 0:
+            start[label[c] + 1] += 1
+    for i in range(count):
+        start[i + 1] += start[i]
+    fill, order = start[:-1].copy(), np.empty(len(label), np.int64)
+    for c in range(len(label)):
+        if label[c] >= 0:
+            order[fill[label[c]]] = c
+            fill[label[c]] += 1
+    return start, order
+
+
+@njit(**FAST)
+def solve_with_joints(world, work, motion, rules, manifolds, held):
+    """Solve for the impulses of all contacts and joints, as `impulses.solve_contacts`, which it returns what of."""
+    bodies = _moving(world, work, motion)
+    graph = held.graph
+    found = _equations(world, work, motion, rules, manifolds)
+    start, order, begin, comps = _islands(bodies, work.parent, work.number, graph, found.where)
+    system = System(found.where, found.row, found.friction, found.wanted, found.pushed, found.calm, start, order)
+    for i in range(len(start) - 1):
+        if begin[i + 1] > begin[i]:
+            _solve_island(bodies, work.shift, rules, system, held, comps, begin[i], begin[i + 1], np.int64(i))
+        else:
+            _solve(bodies.inverse_mass, rules, system, bodies.change, work.shift, np.int64(i))
+    remembered(manifolds, system)
+    return system
+
+
+@njit(**BARE)
+def _ready(world, work, rules, graph, c, share):
+    """Inverse inertias of bodies in world axes as they lie, and what pulls at them in a share of an inner step."""
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        b = graph.node[k]
+        if b < 0:
+            continue
+        for x in range(3):
+            for y in range(3):
+                total = 0.0
+                for i in range(3):
+                    for j in range(3):
+                        total += work.matrix[b, x, i] * world.inverse_inertia[b, i, j] * work.matrix[b, y, j]
+                work.inverse[b, x, y] = total
+        v, w = pull_of(world, work.matrix, work.wrench, rules, share, b)
+        for x in range(3):
+            work.free[b, x], work.free[b, 3 + x] = v[x], w[x]
+            work.change[b, x] = work.change[b, 3 + x] = work.shift[b, x] = work.shift[b, 3 + x] = 0.0
+
+
+@njit(**BARE)
+def _resting(touching, graph, c):
+    """Whether contacts have a say in what joints connect: its velocities are then those of a whole inner step."""
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        if graph.node[k] >= 0 and touching[graph.node[k]]:
+            return True
+    return False
+
+
+@njit(**BARE)
+def _kick(bodies, rules, graph, each, lines, c, share):
+    """A share of what springs, damping, motors and friction have given in the last inner step, to velocities."""
+    state = each.state
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        if graph.node[k] >= 0:
+            continue
+        j = -1 - graph.node[k]
+        if state[j, BROKEN] > 0.0:
+            continue
+        a, b = each.body[j, 0], each.body[j, 1]
+        for e in range(3 if each.kind[j] == BALL else 1):
+            impulse = share * (state[j, SOFT + e] + state[j, DRIVE + e])
+            if impulse == 0.0:
+                continue
+            line, i, row = each.axis, j, 0
+            if each.kind[j] == BALL:
+                row = 3 + e
+                line = lines.line
+                _write_turn(line, j, row, _unit(e))
+            eased = _eased(
+                bodies.moves, bodies.inverse_mass, bodies.inverse, rules.rotation, line, i, row, a, b, lines.eased
+            )
+            if each.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # of which the motor's work is told
+                before = _reads(line, i, row, bodies.velocity, bodies.angular, a, b)
+                state[j, GIVEN] += share * state[j, DRIVE + 1] * (before + 0.5 * impulse * eased)
+            for s in range(2):
+                body = each.body[j, s]
+                if body >= 0 and bodies.moves[body]:
+                    for x in range(3):
+                        bodies.velocity[body, x] += impulse * lines.eased[0, 12 + 6 * s + x]
+                        bodies.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
+
+
+@njit(**FAST)
+def begin_step(world, work, motion, rules, held):
+    """Velocities at an instant become those of the inner step before it, see `advance._shifted`. Where nothing is known
+    of impulses they are found first."""
+    bodies = _moving(world, work, motion)
+    graph, each, lines = held.graph, held.each, held.rows
+    fresh = False
+    for j in range(len(each.body)):
+        each.state[j, GIVEN] = 0.0
+        fresh = fresh or each.state[j, FRESH] > 0.0
+    for c in range(len(graph.comp) - 1):
+        if not asleep(bodies.island, graph, c):
+            _ready(world, work, rules, graph, c, 1.0)
+    if fresh:
+        _find_first(world, work, motion, rules, held)
+    for c in range(len(graph.comp) - 1):
+        if not asleep(bodies.island, graph, c) and not _resting(bodies.touching, graph, c):
+            for k in range(graph.comp[c], graph.comp[c + 1]):
+                if graph.node[k] < 0:
+                    _coordinate(each, bodies.position, bodies.matrix, -1 - graph.node[k])
+            _kick(bodies, rules, graph, each, lines, c, -0.5)
+
+
+@njit(**FAST)
+def _find_first(world, work, motion, rules, held):
+    """The impulses of joints that nothing is known of, as if there were no contact."""
+    bodies = _moving(world, work, motion)
+    graph, each = held.graph, held.each
+    from_contacts = System(
+        np.empty((0, 4), np.int64), np.empty((0, 3, WIDTH)), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)),
+        np.zeros(2, np.int64), np.empty(0, np.int64),
+    )  # fmt: skip
+    assemble(world, work, motion, rules, held, True)
+    one = np.empty(1, np.int64)
+    for c in range(len(graph.comp) - 1):
+        fresh = False
+        for k in range(graph.comp[c], graph.comp[c + 1]):
+            fresh = fresh or (graph.node[k] < 0 and each.state[-1 - graph.node[k], FRESH] > 0.0)
+        if not fresh or asleep(bodies.island, graph, c):
+            continue
+        one[0] = c
+        _solve_island(bodies, work.shift, rules, from_contacts, held, one, np.int64(0), np.int64(1), np.int64(0))
+        for k in range(graph.comp[c], graph.comp[c + 1]):
+            if graph.node[k] >= 0:
+                bodies.touching[graph.node[k]] = False
+            else:
+                each.state[-1 - graph.node[k], GIVEN] = 0.0
+
+
+@njit(**FAST)
+def end_step(world, work, motion, rules, held):
+    """Velocities of the last inner step become those at its end, which joints let be."""
+    bodies = _moving(world, work, motion)
+    graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
+    one = np.empty(1, np.int64)
+    for c in range(len(graph.comp) - 1):
+        if not asleep(bodies.island, graph, c):
+            _ready(world, work, rules, graph, c, 0.0)
+    assemble(world, work, motion, rules, held, False)
+    for c in range(len(graph.comp) - 1):
+        if asleep(bodies.island, graph, c) or _resting(bodies.touching, graph, c):
+            continue
+        _kick(bodies, rules, graph, each, lines, c, 0.5)
+        one[0] = c
+        rows = _room(np.int64(2 * (graph.comp[c + 1] - graph.comp[c])))
+        count = _limited(bodies, rules, graph, each, c, rows, np.int64(0), True)
+        rows = _seen(rows, count if count <= DENSE else 0)
+        if len(rows.see):
+            _see(bodies, graph, factors, held.reply, rows, count)
+        _hold(bodies, rules, held, one, np.int64(0), np.int64(1), rows, count, True)
+        for k in range(graph.comp[c], graph.comp[c + 1]):
+            n = graph.node[k]
+            if n >= 0:
+                for x in range(3):
+                    bodies.velocity[n, x] += bodies.change[n, x]
+                    if rules.rotation:
+                        bodies.angular[n, x] += bodies.change[n, 3 + x]
+            else:
+                j = -1 - n
+                a, b = each.body[j, 0], each.body[j, 1]
+                speed = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
+                each.state[j, SPEED] = speed + _reads_six(each.axis, j, 0, bodies.change, a, b)
+    for j in range(len(each.body)):
+        a, b = each.body[j, 0], each.body[j, 1]
+        each.state[j, SPEED] = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
+
+
+@njit(**BARE)
+def kept_together(held, part):
+    """What joints connect goes the same part of an inner step."""
+    graph = held.graph
+    for c in range(len(graph.comp) - 1):
+        least = 1.0
+        for k in range(graph.comp[c], graph.comp[c + 1]):
+            if graph.node[k] >= 0:
+                least = min(least, part[graph.node[k]])
+        for k in range(graph.comp[c], graph.comp[c + 1]):
+            if graph.node[k] >= 0:
+                part[graph.node[k]] = least
+
+
+@njit(**BARE)
+def roused(world, motion, held):
+    """Wake what sleeps on a joint to a body that is led along; whether there was any."""
+    each = held.each
+    found = False
+    for j in range(len(each.body)):
+        for s in range(2):
+            a, b = each.body[j, s], each.body[j, 1 - s]
+            if a < 0 or b < 0 or motion.island[a] < 0 or not world.scripted[b]:
+                continue
+            if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
+                found = True
+                island = motion.island[a]
+                for c in range(len(motion.island)):
+                    if motion.island[c] == island:
+                        motion.island[c] = -1
+                        motion.quiet[c] = 0
+                        motion.touching[c] = True
+    return found
+
+
+@njit(**BARE)
+def given(each):
+    """What motors have given in a step."""
+    total = 0.0
+    for j in range(len(each.body)):
+        total += each.state[j, GIVEN]
+    return total
+
+
+@njit(**BARE)
+def stored(each):
+    """The energy of springs."""
+    total = 0.0
+    for j in range(len(each.body)):
+        if each.number[j, STIFFNESS] > 0.0 and not each.state[j, BROKEN] > 0.0:
+            total += 0.5 * each.number[j, STIFFNESS] * (each.state[j, COORD] - each.number[j, REST]) ** 2
+    return total

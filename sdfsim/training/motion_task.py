@@ -1,0 +1,286 @@
+"""What training the *impulse* network on recorded motions means, over several steps in a row.
+
+Windows of recordings run side by side, each from where the recording has the bodies: the contact solve steps them, the
+network changes what it makes of contacts, and the next step starts from there. Gradients flow through the network and
+through what its changes lead to, free motion and contacts that hold. What the solve makes of a step is a constant.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.data.dataset import ranges_of
+from sdfsim.learned.contact_graph import ContactGraph, edge_frames, in_single
+from sdfsim.learned.impulse import ImpulseNetwork
+from sdfsim.learned.inference import changed, step_graph
+from sdfsim.learned.model import load_model
+from sdfsim.physics import pose
+from sdfsim.physics.options import GRAVITY, LENGTH, STEP, SUBSTEPS, Options
+from sdfsim.physics.solver.record import Edges
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.scene import Scene
+from sdfsim.simulate.batch import placed, side_by_side
+from sdfsim.simulate.steppers import stepper_of
+from sdfsim.training.distributed import ALONE, Team
+
+if TYPE_CHECKING:
+    from sdfsim.apps.observed import Recording
+
+SOFT = 0.02  # of a body's size: errors below count squared, above by their size
+LOST = 0.3  # of a body's size: errors count as less than this, since who is as far off has met with chance
+SLOW = 0.03  # model units of speed: what moves slower has come to rest
+IMPACT = 3.0  # times what gravity makes in a frame: larger changes of a velocity are of contacts
+HORIZONS = 0.25, 0.5, 1.0  # model units of time: lengths of windows, each batch has one of them
+NOISE = 2.0  # deviations of the tracker's noise, by which starts are disturbed
+KNOWN = 0.1  # of its noise in a pose over the spacing of frames: how uncertain a fitted velocity is
+HELD = 6  # every so many-th recording is held out
+LEAST = 4  # recordings
+
+
+@dataclass(frozen=True)
+class Starts:
+    """W windows of D bodies: poses and velocities at their first frames, and the poses that follow; SI units."""
+
+    position: np.ndarray  # [W * D, 3]
+    orientation: np.ndarray  # [W * D, 4]
+    velocity: np.ndarray  # [W * D, 3]
+    angular_velocity: np.ndarray  # [W * D, 3]
+    goal: np.ndarray  # [K, W * D, 7], NaN where there is none
+
+
+class Stepped(NamedTuple):
+    """One step: where the bodies are after it, and their contact graph; None where nothing touched."""
+
+    position: np.ndarray  # [W * D, 3] model lengths
+    orientation: np.ndarray  # [W * D, 4]
+    rows: np.ndarray  # [A] int64, the bodies of the graph
+    graph: ContactGraph | None
+
+
+class Worlds:
+    """W copies of the bodies of a scene, each in a world of its own, in the solver's units."""
+
+    def __init__(self, scene: Scene, count: int, dt: float) -> None:
+        """`dt` is the frames' spacing, s."""
+        self.units = scene_units(scene)
+        moving = [b for b in scene.bodies if b.motion == "dynamic"]
+        fixed = [b for b in scene.bodies if b.motion == "static"]
+        whole = replace(scene, bodies=tuple([*moving] * count + fixed))
+        world = [*np.repeat(np.arange(count), len(moving)), *[-1] * len(fixed)]
+        self.bodies, self.start = side_by_side(whole, world, self.units)
+        self.dt = dt / self.units.time
+        self.options = Options(
+            np.asarray(scene.gravity) / self.units.acceleration, self.dt, inner_steps(self.dt), record=True
+        )
+        self.solver = stepper_of(load_model())
+        self.carry = self.solver.init(self.bodies, self.start, self.options)
+        self.total = count * len(moving)
+
+    def roll(
+        self, network: ImpulseNetwork | None, starts: Starts, steps: int, *, mirrored: bool = False
+    ) -> list[Stepped]:
+        """What comes of these starts with a network on the solve, or with the solve alone."""
+        u, found = self.units, []
+        state = placed(
+            self.start, starts.position / u.length, starts.orientation, starts.velocity / u.velocity,
+            starts.angular_velocity * u.time,
+        )  # fmt: skip
+        for _ in range(steps):
+            solved, _ = self.solver.advance(state, self.carry)
+            edges, rows, graph = cast("Edges", self.carry.edges), np.zeros(0, np.int64), None
+            if len(edges.pair):
+                rows, graph = step_graph(self.bodies, state, solved, edges, self.options, self.dt)
+                graph = in_single(graph)
+                if network is not None:
+                    with torch.no_grad():
+                        made = network(graph, mirrored=mirrored)
+                    solved = changed(self.bodies, solved, rows, graph, made, self.options)
+            state = solved
+            found.append(Stepped(state.position[: self.total], state.orientation[: self.total], rows, graph))
+        return found
+
+
+def inner_steps(dt: float) -> int:
+    """Inner steps of the solve in a recorded one of `dt` model units."""
+    return max(1, math.ceil(dt / (STEP / SUBSTEPS) - 0.01))
+
+
+def joined(graphs: Sequence[ContactGraph]) -> ContactGraph:
+    """Graphs side by side as one."""
+    whole: dict[str, Any] = {"dt": graphs[0].dt, "pairs": sum(g.pairs for g in graphs)}
+    bodies = np.cumsum([0, *(len(g.inverse_mass) for g in graphs)]).tolist()
+    pairs = np.cumsum([0, *(g.pairs for g in graphs)]).tolist()
+    shifts = {"first": bodies, "second": bodies, "pair": pairs}
+    for field in fields(ContactGraph):
+        if field.name not in whole:
+            shift = shifts.get(field.name, [0] * len(graphs))
+            whole[field.name] = torch.cat([getattr(g, field.name) + k for g, k in zip(graphs, shift, strict=False)])
+    return ContactGraph(**whole)
+
+
+class MotionTask:
+    """Draws windows of recordings and tells how far a network on the solve leads from them; on the CPU."""
+
+    def __init__(self, recordings: Sequence[Recording], scene: Scene, *, noisy: bool = False) -> None:
+        self.recordings, self.scene, self.noisy = list(recordings), scene, noisy
+        spacing = self.recordings[0].dt
+        if any(abs(r.dt - spacing) > 1e-3 * spacing for r in self.recordings):
+            raise SdfsimError("recordings to train on must have the same spacing of frames")
+        self.worlds = cache(lambda count: Worlds(scene, count, spacing))
+        self.units = scene_units(scene)
+        self.dt, self.gravity, self.length = spacing / self.units.time, GRAVITY, LENGTH
+        self.inner, self.counts = inner_steps(self.dt), [len(self.recordings)]
+        self.begin = {horizon: self._begin(max(2, round(horizon / self.dt))) for horizon in HORIZONS}
+
+    def _begin(self, steps: int) -> tuple[list[tuple[int, int]], np.ndarray]:
+        """Where windows of so many steps may begin, and how often they do: something touches in their first half, and
+        half of them begin before the first impact, where velocities are known best and most is to come."""
+        begin, early = [], []
+        for k, r in enumerate(self.recordings):
+            speed = np.linalg.norm(r.velocity, axis=-1).max(1) / self.units.velocity
+            touched = np.asarray(~r.flying.all(1))
+            fall = np.asarray(self.scene.gravity) * r.dt
+            sudden = np.linalg.norm(np.diff(r.velocity, axis=0) - fall, axis=-1).max(1) > IMPACT * np.linalg.norm(fall)
+            touched[1:] |= sudden  # an impact between two frames of flight
+            flown = int(touched.argmax())
+            for t in np.flatnonzero(r.known[:-LEAST]):
+                if speed[t] > SLOW and touched[t + 1 : t + 1 + max(2, steps // 2)].any():
+                    begin.append((k, int(t)))
+                    early.append(t < flown)
+        if not begin:
+            raise SdfsimError("nothing touches in the recordings, where they are smooth before it")
+        first = np.array(early)
+        weight = first / max(1, first.sum()) + ~first / max(1, (~first).sum())
+        return begin, weight / weight.sum()
+
+    def digest(self) -> str:
+        """Changes with the data."""
+        told = hashlib.sha256()
+        for r in self.recordings:
+            for array in (*r.goal, r.position, r.velocity, r.angular_velocity):
+                told.update(np.ascontiguousarray(array).tobytes())
+        for b in self.scene.bodies:
+            told.update(repr((b.name, b.scale, b.mass, b.friction, b.restitution, *b.position, *b.quat_xyzw)).encode())
+        return told.hexdigest()[:16]
+
+    def ranges(self) -> dict[str, list[float]]:
+        """What the recordings hold, in the solver's units; see `ranges_of`."""
+        bodies = self.worlds(1).bodies
+        moves = bodies.moves
+        speed = np.concatenate([np.linalg.norm(r.velocity[r.known], axis=-1).ravel() for r in self.recordings])
+        ratio = float(bodies.mass[moves].max() / bodies.mass[moves].min())
+        fixed = np.stack([bodies.friction[~moves], bodies.restitution[~moves]], 1)
+        return ranges_of(
+            bodies.size[moves], speed / self.units.velocity, np.array([ratio]), bodies.friction[moves],
+            bodies.restitution[moves], fixed,
+        )  # fmt: skip
+
+    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Starts:
+        """Starts of `count` windows of one length."""
+        horizon = float(rng.choice(HORIZONS))
+        begin, weight = self.begin[horizon]
+        picked = [begin[i] for i in rng.choice(len(begin), count, p=weight)]
+        return self.starts(picked[team.share(count)], max(2, round(horizon / self.dt)), rng if self.noisy else None)
+
+    def starts(self, picked: Sequence[tuple[int, int]], steps: int, rng: np.random.Generator | None = None) -> Starts:
+        """Windows that begin in these recordings at these frames, disturbed as a tracker does where `rng` is given."""
+        some = [(self.recordings[k], t) for k, t in picked]
+        position, turn, speed, spin = (
+            np.concatenate([getattr(r, name)[t] for r, t in some])
+            for name in ("position", "orientation", "velocity", "angular_velocity")
+        )
+        many = some[0][0].seen.shape[1]
+        goal = np.full((steps, len(some), many, 7), np.nan)
+        for w, (r, t) in enumerate(some):
+            rows = slice(t + 1, min(t + 1 + steps, len(r.known)))
+            both = np.concatenate([r.goal[0][rows], r.goal[1][rows]], -1)
+            goal[: len(both), w] = np.where(r.seen[rows][..., None], both, np.nan)
+        if rng is not None:
+            place, angle = NOISE * np.repeat([r.noise for r, _ in some], many, axis=0).T[..., None]
+            shake = rng.standard_normal((4, *position.shape))
+            position = position + place * shake[0]
+            turn = pose.normalise(pose.multiply(pose.from_rotvec(angle * shake[1]), turn))
+            speed = speed + KNOWN * place / some[0][0].dt * shake[2]
+            spin = spin + KNOWN * angle / some[0][0].dt * shake[3]
+        return Starts(position, turn, speed, spin, goal.reshape(steps, -1, 7))
+
+    def loss(self, network: ImpulseNetwork, batch: Starts, *, mirrored: bool = False) -> Tensor:
+        """Mean soft error of poses in body sizes, turns at half a size."""
+        many = self.recordings[0].seen.shape[1]
+        worlds = self.worlds(len(batch.position) // many)
+        rolled = worlds.roll(network, batch, len(batch.goal), mirrored=mirrored)
+        return loss_of(network, worlds, rolled, batch.goal, mirrored=mirrored)
+
+    def weight_of(self, batch: Starts) -> int:
+        """Over how many windows of a body a batch's loss is the mean."""
+        return len(batch.position)
+
+
+def loss_of(
+    network: ImpulseNetwork, worlds: Worlds, rolled: Sequence[Stepped], goal: np.ndarray, *, mirrored: bool = False
+) -> Tensor:
+    """Mean soft error of steps that a network has made against `goal` [K, W * D, 7] in metres."""
+    total, dt = worlds.total, worlds.dt
+    size = worlds.bodies.size[:total, None]
+    place, turn = (np.stack([getattr(step, name) for step in rolled]) for name in ("position", "orientation"))
+    away = pose.to_rotvec(pose.multiply(turn, pose.conjugate(goal[..., 3:])))
+    off = np.concatenate([(place - goal[..., :3] / worlds.units.length) / size, 0.5 * away], -1)
+    seen = torch.from_numpy(np.isfinite(off).all(-1))
+    off = torch.from_numpy(np.nan_to_num(off).astype(np.float32))
+    lengths = torch.from_numpy(np.concatenate([np.repeat(1.0 / size, 3, 1), np.full((total, 3), 0.5)], 1)).float()
+    made = iter(_pushes(network, [step.graph for step in rolled if step.graph is not None], mirrored))
+    # What all that the network has added does to twists and poses: its value is 0, its gradient is not.
+    twist, shift = torch.zeros(len(worlds.bodies), 6), torch.zeros(len(worlds.bodies), 6)
+    errors = []
+    for t, step in enumerate(rolled):
+        shift = shift + dt * twist
+        if step.graph is not None:
+            rows, (end, mean) = torch.from_numpy(step.rows), next(made)
+            after = twist[rows] if network.config.alone else _held(step.graph, twist[rows])
+            twist = twist.index_copy(0, rows, after + end)
+            shift = shift.index_add(0, rows, dt * mean)
+        error = off[t] + shift[:total] * lengths
+        errors.append(_soft(error[:, :3]) + _soft(error[:, 3:]))
+    return (torch.stack(errors) * seen).sum() / seen.sum().clamp_min(1)
+
+
+def _pushes(network: ImpulseNetwork, graphs: list[ContactGraph], mirrored: bool) -> list[tuple[Tensor, Tensor]]:
+    """Of each graph the changes of twists [A, 6] at the end of the step and on its mean, less their values."""
+    if not graphs:
+        return []
+    made = network(joined(graphs), mirrored=mirrored)
+    counts = [len(g.inverse_mass) for g in graphs]
+    parts = [
+        (both - both.detach()).split(counts)
+        for both in (
+            torch.cat([made.velocity, made.angular], -1), torch.cat([made.mean_velocity, made.mean_angular], -1)
+        )
+    ]  # fmt: skip
+    return list(zip(*parts, strict=True))
+
+
+def _held(graph: ContactGraph, twist: Tensor) -> Tensor:
+    """Changes of twists [A, 6] after contacts that push: what goes along their normals is lost."""
+    with torch.no_grad():
+        frames = edge_frames(graph)
+        hold = (frames.solved[:, 0] > 0).to(twist.dtype) * frames.mass[:, 0]
+    seen = (frames.jacobian_first[:, 0] * twist[graph.first]).sum(-1)
+    push = -(hold * (seen - (frames.jacobian_second[:, 0] * twist[graph.second]).sum(-1)))[:, None]
+    twist = twist.index_add(0, graph.first, frames.response_first[..., 0] * push)
+    return twist.index_add(0, graph.second, frames.response_second[..., 0] * push)
+
+
+def _soft(error: Tensor) -> Tensor:
+    """[N] sizes of errors [N, 3], squared below `SOFT` and less than `LOST`."""
+    size = (error.square().sum(-1) + SOFT**2).sqrt() - SOFT
+    return size / (1.0 + size / LOST)

@@ -1,0 +1,553 @@
+"""Joints in files of other programs: imports and exports, judged by MuJoCo, PyBullet, OpenUSD and by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco  # noqa: TID253
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+import cli
+from sdfsim import load_scene
+from sdfsim.apps.export import export
+from sdfsim.apps.import_robot import import_robot
+from sdfsim.apps.recording import save_rollout
+from sdfsim.apps.recording_joints import ends, marks
+from sdfsim.base.errors import SdfsimError
+from sdfsim.physics.rollout import Rollout
+from sdfsim.scene.builder import SceneBuilder
+from sdfsim.scene.scene import Joint, Scene
+from tests.helpers.runs import read
+
+LINK = """
+  <link name="{name}">
+    <inertial><origin xyz="{com}" rpy="{rpy}"/><mass value="{mass}"/>
+      <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial>
+    <collision><origin xyz="{at}" rpy="{turn}"/><geometry>{form}</geometry></collision>
+  </link>"""
+ARM = (
+    '<robot name="arm">'
+    + LINK.format(
+        name="base",
+        com="0 0 0.1",
+        rpy="0 0 0",
+        mass=4,
+        ixx=0.04,
+        iyy=0.05,
+        izz=0.03,
+        at="0 0 0.1",
+        turn="0 0 0",
+        form='<box size="0.2 0.2 0.2"/>',
+    )
+    + LINK.format(
+        name="upper",
+        com="0.02 0 0.2",
+        rpy="0.3 0.2 -0.4",
+        mass=1.5,
+        ixx=0.02,
+        iyy=0.021,
+        izz=0.004,
+        at="0 0 0.2",
+        turn="0 0 0",
+        form='<cylinder radius="0.04" length="0.36"/>',
+    )
+    + LINK.format(
+        name="slide",
+        com="0 0.1 0",
+        rpy="0 0 0",
+        mass=0.7,
+        ixx=0.002,
+        iyy=0.001,
+        izz=0.002,
+        at="0 0.1 0",
+        turn="1.5707963 0 0",
+        form='<capsule radius="0.03" length="0.1"/>',
+    )
+    + LINK.format(
+        name="tip",
+        com="0 0 0.05",
+        rpy="0 0 0",
+        mass=0.2,
+        ixx=0.0002,
+        iyy=0.0002,
+        izz=0.0001,
+        at="0 0 0.05",
+        turn="0 0 0",
+        form='<sphere radius="0.04"/>',
+    )
+    + """
+  <link name="tool0"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <origin xyz="0.01 0.02 0.25" rpy="0.1 -0.2 0.3"/><axis xyz="0 0.6 0.8"/>
+    <limit lower="0.2" upper="1.4" effort="20" velocity="3"/><dynamics damping="0.3" friction="0.05"/></joint>
+  <joint name="rail" type="prismatic"><parent link="upper"/><child link="slide"/>
+    <origin xyz="0 0 0.4" rpy="0 0.5 0"/><axis xyz="0 1 0"/><limit lower="-0.1" upper="0.2" effort="5" velocity="1"/>
+  </joint>
+  <joint name="spin" type="continuous"><parent link="slide"/><child link="tip"/>
+    <origin xyz="0 0.2 0" rpy="0 0 0.7"/><axis xyz="0 0 -2"/></joint>
+  <joint name="end" type="fixed"><parent link="tip"/><child link="tool0"/><origin xyz="0 0 0.1"/></joint>
+  <transmission name="t"><type>simple</type></transmission>
+</robot>"""
+)
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def imported(file: Path, **options) -> tuple[Scene, dict]:
+    out = file.with_name("scene.yaml")
+    report = import_robot(file, out, **options)
+    return load_scene(out), report
+
+
+def centres(scene: Scene, q: dict[str, float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By body: its centre of mass [3] and its axes [3, 3] with joints at `q`, roots as they are at the start."""
+    held: dict[int, Joint] = {joint.bodies[0]: joint for joint in scene.joints if not joint.collides}
+    found: dict[int, tuple[np.ndarray, Rotation]] = {-1: (np.zeros(3), Rotation.identity())}
+
+    def pose(k: int) -> tuple[np.ndarray, Rotation]:
+        if k not in found and k in held:
+            joint, value = held[k], q.get(held[k].name, 0.0)
+            place, turn = pose(joint.bodies[1])
+            own, theirs = (Rotation.from_quat(frame) for frame in joint.quat_xyzw)
+            frame, origin = turn * theirs, place + turn.apply(joint.anchor[1])
+            if joint.kind == "hinge":
+                frame = frame * Rotation.from_rotvec([value, 0.0, 0.0])
+            elif joint.kind == "slider":
+                origin = origin + frame.apply([value, 0.0, 0.0])
+            axes = frame * own.inv()
+            found[k] = origin - axes.apply(joint.anchor[0]), axes
+        elif k not in found:
+            found[k] = scene.bodies[k].position, Rotation.from_quat(scene.bodies[k].quat_xyzw)
+        return found[k]
+
+    made = {}
+    for k, body in enumerate(scene.bodies):
+        place, turn = pose(k)
+        made[body.name] = place + turn.apply(body.scale * scene.shapes[body.shape].com), turn.as_matrix()
+    return made
+
+
+def inertia(scene: Scene, name: str) -> np.ndarray:
+    """[3, 3] kg m^2 about the centre of mass, in the world as all is at the start."""
+    body = next(body for body in scene.bodies if body.name == name)
+    shape, turn = scene.shapes[body.shape], Rotation.from_quat(body.quat_xyzw).as_matrix()
+    own = body.mass / shape.volume * body.scale**2 * shape.inertia if body.inertia is None else body.inertia
+    return turn @ own @ turn.T
+
+
+def mujoco_of(text: str) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(text)
+    spec.compiler.fusestatic = False
+    return spec.compile()
+
+
+def test_urdf_has_the_poses_masses_and_inertias_that_mujoco_has(tmp_path: Path) -> None:
+    scene, _ = imported(write(tmp_path, "arm.urdf", ARM), fixed=True)
+    model = mujoco_of(ARM)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    lows, highs = [0.2, -0.1, -3.0], [1.4, 0.2, 3.0]
+    for trial in range(10):
+        q = dict(zip(("shoulder", "rail", "spin"), rng.uniform(lows, highs), strict=True))
+        q = {"shoulder": 0.2, "rail": 0.0, "spin": 0.0} if trial == 0 else q
+        for name, value in q.items():
+            data.joint(name).qpos[0] = value
+        mujoco.mj_forward(model, data)
+        for name, (place, axes) in centres(scene, q).items():
+            assert place == pytest.approx(data.body(name).xipos, abs=1e-9), name
+            if trial == 0:  # the start of the scene, to which inertias belong
+                principal = data.body(name).ximat.reshape(3, 3)
+                theirs = principal @ np.diag(model.body(name).inertia) @ principal.T
+                body = next(b for b in scene.bodies if b.name == name)
+                if body.motion == "dynamic":
+                    assert inertia(scene, name) == pytest.approx(theirs, rel=1e-6, abs=1e-9)
+                    assert body.mass == pytest.approx(float(model.body(name).mass[0]), rel=1e-9)
+            del axes
+    joints = {joint.name: joint for joint in scene.joints}
+    assert joints["shoulder"].limits == pytest.approx((0.2, 1.4))
+    assert (joints["shoulder"].damping, joints["shoulder"].friction) == pytest.approx((0.3, 0.05))
+    assert joints["rail"].kind == "slider" and joints["rail"].limits == pytest.approx((-0.1, 0.2))
+    assert joints["spin"].kind == "hinge" and joints["spin"].limits is None
+
+
+def test_urdf_tells_what_it_leaves_out_and_what_it_made_otherwise(tmp_path: Path) -> None:
+    scene, report = imported(write(tmp_path, "arm.urdf", ARM), fixed=True)
+    assert [body.name for body in scene.bodies] == ["base", "upper", "slide", "tip"]
+    assert scene.bodies[0].motion == "static"
+    assert "<transmission> (1)" in report["left_out"]
+    assert any("effort" in line for line in report["left_out"])
+    assert any("tool0" in line for line in report["notes"])
+    assert any("shoulder starts at 0.2 rad" in line for line in report["notes"])
+
+
+def test_what_other_readers_pass_over_is_passed_over(tmp_path: Path) -> None:
+    text = "\n \n" + ARM.replace('xyz="0.01 0.02 0.25"', 'xyz="$(optenv NO_SUCH_VARIABLE 0.01 0.02 0.25)"')
+    (tmp_path / "arm.urdf").write_bytes(text.encode() + b"\n\0")
+    scene, _ = imported(tmp_path / "arm.urdf", fixed=True)
+    plain, _ = imported(write(tmp_path / "plain", "arm.urdf", ARM), fixed=True)
+    for one, other in zip(scene.bodies, plain.bodies, strict=True):
+        assert one.position == pytest.approx(other.position, abs=1e-12)
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", "</robt>"))
+    with pytest.raises(SdfsimError, match=rf"arm\.urdf:{text.count(chr(10)) + 1}: not valid XML"):
+        import_robot(tmp_path / "arm.urdf", tmp_path / "scene.yaml")
+
+
+def test_a_floor_is_under_the_lowest_link(tmp_path: Path) -> None:
+    scene, _ = imported(write(tmp_path, "arm.urdf", ARM), floor=True)
+    base = next(body for body in scene.bodies if body.name == "base")
+    assert base.position[2] == pytest.approx(0.1)  # half its height, of a frame in its middle
+    assert scene.bodies[0].name == "floor" and base.motion == "dynamic"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('<mass value="4"/>', '<mass value="four"/>', ":3: <mass> value must be a number (got 'four')"),
+        ('type="revolute"', 'type="revolut"', "type must be one of revolute, continuous"),
+        ('child link="upper"', 'child link="uper"', "no link is called 'uper' (did you mean 'upper'?)"),
+        ('xyz="0 0.6 0.8"', 'xyz="0 0.6"', "<axis> xyz must be 3 numbers (got '0 0.6')"),
+        ('child link="tool0"', 'child link="upper"', "held by two joints"),
+        ("</robot>", "</robt>", "not valid XML (mismatched tag)"),
+        ('<box size="0.2 0.2 0.2"/>', '<mesh filename="package://a/b.obj"/>', "no such file: package://a/b.obj"),
+        ('<box size="0.2 0.2 0.2"/>', '<box size="0.2 -1 0.2"/>', "size must be above zero"),
+        ('<box size="0.2 0.2 0.2"/>', "<cone/>", "must hold one of box, sphere"),
+    ],
+)
+def test_faults_name_file_line_and_element(tmp_path: Path, old: str, new: str, told: str) -> None:
+    file = write(tmp_path, "arm.urdf", ARM.replace(old, new))
+    assert file.read_text() != ARM
+    with pytest.raises(SdfsimError) as error:
+        import_robot(file, tmp_path / "scene.yaml")
+    assert told in error.value.message and error.value.message.startswith(f"{file}:") and "\n" not in str(error.value)
+    assert not (tmp_path / "scene.yaml").exists()
+
+
+MJCF = """<mujoco model="crane">
+  <compiler angle="degree" eulerseq="xyz" autolimits="true"/>
+  <option gravity="0 0 -3.7"/>
+  <default>
+    <joint damping="0.2"/>
+    <default class="arm"><geom type="capsule" size="0.03" density="700" friction="0.81"/>
+      <joint damping="0.5"/></default>
+  </default>
+  <worldbody>
+    <geom name="ground" type="plane" size="5 5 0.1"/>
+    <body name="mast" pos="0 0 1" euler="10 20 30">
+      <joint name="yaw" axis="0 0 1" range="-90 90" armature="0.1"/>
+      <geom class="arm" fromto="0 0 0 0 0 0.5"/>
+      <geom class="arm" fromto="0 0 0.5 0.3 0 0.5"/>
+      <body name="boom" pos="0.3 0 0.5" axisangle="0 1 0 40" childclass="arm">
+        <joint name="pitch" axis="0 1 0" range="-30 60" ref="10" stiffness="4" springref="20"/>
+        <joint name="roll" axis="1 0 0" range="-45 45"/>
+        <geom fromto="0 0 0 0.6 0 0"/>
+        <body name="hook" pos="0.6 0 0" quat="0.8 0 0.6 0">
+          <joint name="reel" type="slide" axis="0 0 1" range="-0.2 0.4" frictionloss="0.3"/>
+          <geom type="box" size="0.05 0.04 0.03" pos="0 0 -0.1" euler="0 0 15" mass="0.4"/>
+          <body name="load" pos="0 0 -0.2"><joint name="swing" type="ball"/><geom type="sphere" size="0.06"/></body>
+        </body>
+      </body>
+    </body>
+    <body name="crate" pos="1 1 0.2"><freejoint/><geom type="box" size="0.2 0.2 0.2" density="200"/></body>
+  </worldbody>
+  <contact><exclude body1="crate" body2="load"/></contact>
+  <sensor><jointpos joint="yaw"/></sensor>
+</mujoco>"""
+
+
+def test_mjcf_has_the_poses_and_masses_that_mujoco_has(tmp_path: Path) -> None:
+    scene, report = imported(write(tmp_path, "crane.xml", MJCF))
+    model = mujoco.MjModel.from_xml_string(MJCF)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
+    for trial in range(10):
+        q = {"yaw": rng.uniform(-1, 1), "pitch": rng.uniform(-0.5, 1), "roll": rng.uniform(-0.7, 0.7)}
+        q |= {"reel": rng.uniform(-0.2, 0.4)}
+        q = {"yaw": 0.0, "pitch": math.radians(10), "roll": 0.0, "reel": 0.0} if trial == 0 else q
+        for name, value in q.items():
+            data.joint(name).qpos[0] = value
+        mujoco.mj_forward(model, data)
+        found = centres(scene, q)
+        for name in ("mast", "boom", "hook", "load", "crate"):
+            assert found[name][0] == pytest.approx(data.body(name).xipos, abs=1e-8), name
+    bodies = {body.name: body for body in scene.bodies}
+    small = [body for name, body in bodies.items() if name.startswith("boom_")]
+    assert len(small) == 1 and small[0].mass == pytest.approx(0.02 * float(model.body("boom").mass[0]))
+    for name in ("mast", "hook", "load", "crate"):
+        assert bodies[name].mass == pytest.approx(float(model.body(name).mass[0]), rel=1e-9)
+    assert small[0].mass + bodies["boom"].mass == pytest.approx(float(model.body("boom").mass[0]))
+    joints = {joint.name: joint for joint in scene.joints}
+    assert joints["yaw"].limits == pytest.approx((-math.pi / 2, math.pi / 2))
+    assert joints["pitch"].spring is not None
+    assert (joints["pitch"].spring.stiffness, joints["pitch"].spring.rest) == pytest.approx((4.0, math.radians(20)))
+    assert (joints["yaw"].damping, joints["roll"].damping, joints["reel"].friction) == pytest.approx((0.2, 0.5, 0.3))
+    assert joints["swing"].kind == "ball"
+    assert scene.gravity == pytest.approx([0, 0, -3.7])
+    assert bodies["mast"].friction == pytest.approx(0.9)  # two of them: 0.81
+    assert bodies["ground"].motion == "static"
+    assert "sensors (1)" in report["left_out"] and any("armature" in line for line in report["left_out"])
+    # Inertias are those of the whole links.
+    data = mujoco.MjData(model)
+    data.joint("pitch").qpos[0] = math.radians(10)
+    mujoco.mj_forward(model, data)
+    for name in ("mast", "hook"):
+        principal = data.body(name).ximat.reshape(3, 3)
+        theirs = principal @ np.diag(model.body(name).inertia) @ principal.T
+        assert inertia(scene, name) == pytest.approx(theirs, rel=1e-6, abs=1e-9)
+
+
+def test_mjcf_that_mujoco_refuses_is_one_line(tmp_path: Path) -> None:
+    file = write(tmp_path, "bad.xml", MJCF.replace('type="ball"', 'type="bal"'))
+    with pytest.raises(SdfsimError, match=r"bad\.xml:\d+: MuJoCo refuses it \(.*") as error:
+        import_robot(file, tmp_path / "scene.yaml")
+    assert "\n" not in error.value.message
+
+
+def jointed() -> SceneBuilder:
+    """A tree of every kind of joint with a start that is not zero, and a rope and a rod beside it."""
+    scene = SceneBuilder().add("floor", plane={}, friction=0.7)
+    scene.add("post", box={"size": [0.2, 0.2, 1.0]}, position=(0, 0, 0.5), motion="static", restitution=0.0)
+    arm = {"box": {"size": [0.6, 0.06, 0.04]}, "restitution": 0.0}
+    scene.add("arm", **arm, position=(0.45, 0, 0.8), euler_xyz_deg=(0, 15, 0), mass=2, angular_velocity=(0, 0.4, 0))
+    scene.add("fore", **arm, position=(1.0, 0.1, 0.6), euler_xyz_deg=(10, 15, 30), mass=1)
+    scene.add("bob", sphere={"radius": 0.08}, position=(1.4, 0.3, 0.4), mass=0.5, restitution=0.0)
+    scene.add("kite", sphere={"radius": 0.05}, position=(1.4, 0.3, 1.4), mass=0.1, restitution=0.0)
+    scene.add("cart", box={"size": [0.3, 0.2, 0.1]}, position=(0, 2, 0.3), mass=3, restitution=0.0)
+    scene.add(
+        "lid", box={"size": [0.3, 0.2, 0.02]}, position=(0, 2, 0.4), mass=0.3, inertia_factor=1.5, restitution=0.0
+    )
+    scene.join("shoulder", "hinge", "arm", "post", anchor=(0.15, 0, 0.85), axis=(0, 1, 0.1), start_deg=20,
+               limits_deg=(-30, 70), damping=0.2, friction=0.1, spring={"stiffness": 3, "rest_deg": 10})  # fmt: skip
+    scene.join("elbow", "hinge", "arm", "fore", anchor=(0.75, 0.0, 0.7), axis=(0, 0.2, 1), start_deg=-15)
+    scene.join("wrist", "ball", "bob", "fore", anchor=(1.3, 0.25, 0.5), damping=0.01)
+    scene.join("track", "slider", "cart", anchor=(0, 2, 0.3), axis=(1, 0, 0), start=0.1, limits=(-0.5, 1),
+               motor={"position": 0.4, "most": 20, "time": 0.2})  # fmt: skip
+    scene.join("weld", "fixed", "lid", "cart", anchor=(0, 2, 0.35))
+    scene.join("string", "distance", "kite", "bob", anchor=(1.4, 0.3, 1.4), to=(1.4, 0.3, 0.4), rope=1.2)
+    return scene
+
+
+def start_positions(scene: Scene) -> dict[str, float]:
+    return {"shoulder": math.radians(20), "elbow": math.radians(-15), "track": 0.1}
+
+
+def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
+    scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
+    report = export(tmp_path / "scene.yaml", tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    for name, value in start_positions(scene).items():
+        # The elbow has the arm first, so MuJoCo's goes from the arm to the forearm about the other way of its axis.
+        assert data.joint(name).qpos[0] == pytest.approx(value, abs=1e-9), name
+    for body in scene.bodies:
+        shape = scene.shapes[body.shape]
+        assert data.body(body.name).xpos == pytest.approx(body.position, abs=1e-9)
+        if body.motion == "dynamic":
+            centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(body.scale * shape.com)
+            speed = np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(body.name).id, speed, 0)
+            assert data.body(body.name).xipos == pytest.approx(centre, abs=1e-9)
+    assert float(model.joint("shoulder").damping[0]) == pytest.approx(0.2)
+    assert model.joint("shoulder").range == pytest.approx(np.radians([-30, 70]))
+    assert data.ctrl[0] == pytest.approx(0.4) and model.actuator_forcerange[0] == pytest.approx([-20, 20])
+    assert data.ten_length[0] == pytest.approx(1.0) and model.tendon_range[0] == pytest.approx([0, 1.2])
+    # At other positions the arm is where the scene's joint puts it.
+    data.joint("shoulder").qpos[0] = 0.9
+    data.joint("elbow").qpos[0] = 0.3
+    mujoco.mj_forward(model, data)
+    post = next(body for body in scene.bodies if body.name == "post")
+    joint = next(joint for joint in scene.joints if joint.name == "shoulder")
+    own, theirs = (Rotation.from_quat(quat) for quat in joint.quat_xyzw)
+    axes = theirs * Rotation.from_rotvec([0.9, 0, 0]) * own.inv()
+    place = post.position + joint.anchor[1] - axes.apply(joint.anchor[0])
+    assert data.body("arm").xpos == pytest.approx(place, abs=1e-9)
+    assert data.body("arm").xmat.reshape(3, 3) == pytest.approx(axes.as_matrix(), abs=1e-9)
+    elbow = next(joint for joint in scene.joints if joint.name == "elbow")
+    arm, fore = (Rotation.from_matrix(data.body(name).xmat.reshape(3, 3)) for name in ("arm", "fore"))
+    frames = [turn * Rotation.from_quat(q) for turn, q in zip((arm, fore), elbow.quat_xyzw, strict=True)]
+    assert (frames[1].inv() * frames[0]).as_rotvec() == pytest.approx([0.3, 0, 0], abs=1e-9)
+    assert not any("elbow" in line for line in report["left_out"])
+
+
+def same_joint(scene: Scene, other: Scene, name: str) -> None:
+    """Both have a joint in the same place of the world, of the same kind, with the same numbers."""
+
+    def told(scene: Scene) -> list:
+        joint = next(joint for joint in scene.joints if joint.name == name)
+        first = scene.bodies[joint.bodies[0]]
+        turn = Rotation.from_quat(first.quat_xyzw)
+        anchor = first.position + turn.apply(joint.anchor[0])
+        axis = (turn * Rotation.from_quat(joint.quat_xyzw[0])).apply([1, 0, 0])
+        held = {scene.bodies[k].name if k >= 0 else "world" for k in joint.bodies}
+        numbers = [joint.damping, joint.friction, *(joint.limits or (0, 0)), joint.length or 0.0]
+        numbers += [joint.spring.stiffness, joint.spring.rest] if joint.spring else [0, 0]
+        motor = joint.motor
+        numbers += [motor.most, motor.position or 0, motor.speed or 0, motor.time] if motor else [0, 0, 0, 0]
+        return [joint.kind, held, anchor, axis if joint.kind in ("hinge", "slider") else np.zeros(3), np.array(numbers)]
+
+    for one, two in zip(told(scene), told(other), strict=True):
+        if isinstance(one, np.ndarray):
+            sign = -1.0 if name == "elbow" and one is not two and np.allclose(one, -two, atol=1e-8) else 1.0
+            assert one == pytest.approx(sign * two, abs=1e-8), name
+        else:
+            assert one == two, name
+
+
+def same_bodies(scene: Scene, other: Scene, names: list[str], *, moved: np.ndarray | None = None) -> None:
+    for name in names:
+        one, two = (next(b for b in s.bodies if b.name == name) for s in (scene, other))
+        places = [
+            b.position + Rotation.from_quat(b.quat_xyzw).apply(b.scale * s.shapes[b.shape].com)
+            for b, s in ((one, scene), (two, other))
+        ]
+        assert places[0] == pytest.approx(places[1] if moved is None else places[1] + moved, abs=1e-8), name
+        assert (one.motion, one.mass) == (two.motion, pytest.approx(two.mass, rel=1e-8)), name
+        assert one.friction == pytest.approx(two.friction, rel=1e-6)
+        if one.motion == "dynamic":
+            assert inertia(scene, name) == pytest.approx(inertia(other, name), rel=1e-6, abs=1e-9), name
+
+
+def test_mjcf_comes_back_as_it_was(tmp_path: Path) -> None:
+    scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
+    export(tmp_path / "scene.yaml", tmp_path / "out.xml")
+    back, _ = imported(write(tmp_path / "back", "out.xml", (tmp_path / "out.xml").read_text()))
+    for joint in scene.joints:
+        if joint.name != "weld":
+            same_joint(scene, back, joint.name)
+    assert sum(joint.kind == "fixed" for joint in back.joints) == 1
+    same_bodies(scene, back, [body.name for body in scene.bodies if body.name != "floor"])
+    fast = next(body for body in back.bodies if body.name == "arm")
+    assert np.linalg.norm(fast.angular_velocity) > 0.3
+
+
+def test_urdf_comes_back_as_it_was(tmp_path: Path) -> None:
+    scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
+    report = export(tmp_path / "scene.yaml", tmp_path / "out.urdf")
+    assert any("string" in line and "distance" in line for line in report["left_out"])
+    assert any("shoulder starts at" in line for line in report["left_out"])
+    back, _ = imported(tmp_path / "out.cart.urdf")
+    # The cart begins at zero, a tenth to the side.
+    joints = {joint.name: joint for joint in back.joints}
+    assert set(joints) == {"track", "weld"} and joints["track"].limits == pytest.approx((-0.5, 1.0))
+    same_bodies(scene, back, ["cart", "lid"], moved=np.array([0.1, 0, 0]))
+    post = tmp_path / "out.post.urdf"
+    model = mujoco_of(post.read_text())
+    assert {model.joint(j).name for j in range(model.njnt)} >= {"shoulder", "elbow"}
+    arm, _ = imported(post)
+    kinds = {joint.name: joint.kind for joint in arm.joints}
+    assert kinds == {"shoulder": "hinge", "elbow": "hinge", "wrist": "ball"}
+
+
+def test_usd_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
+    export(tmp_path / "scene.yaml", tmp_path / "out.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
+    for joint in scene.joints:
+        prim = stage.GetPrimAtPath(f"/World/joints/{joint.name}")
+        made = UsdPhysics.Joint(prim)
+        frames = []
+        for relation, place, turn in (
+            (made.GetBody0Rel(), made.GetLocalPos0Attr(), made.GetLocalRot0Attr()),
+            (made.GetBody1Rel(), made.GetLocalPos1Attr(), made.GetLocalRot1Attr()),
+        ):
+            targets, world = relation.GetTargets(), np.eye(4)
+            if targets:
+                xform = UsdGeom.Xformable(stage.GetPrimAtPath(targets[0]))
+                world = np.array(xform.ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
+            q = turn.Get()
+            axes = Rotation.from_quat([*q.GetImaginary(), q.GetReal()]).as_matrix()
+            frames.append((world[:3, :3] @ np.array(place.Get()) + world[:3, 3], world[:3, :3] @ axes))
+        (here, one), (there, two) = frames
+        change = Rotation.from_matrix(one.T @ two).as_rotvec()
+        if joint.kind == "hinge":
+            assert here == pytest.approx(there, abs=1e-6)
+            assert change == pytest.approx([start_positions(scene)[joint.name], 0, 0], abs=1e-6)
+        elif joint.kind == "slider":
+            assert one.T @ (there - here) == pytest.approx([0.1, 0, 0], abs=1e-6)
+        elif joint.kind == "distance":
+            assert np.linalg.norm(here - there) == pytest.approx(1.0, abs=1e-6)
+            assert UsdPhysics.DistanceJoint(prim).GetMaxDistanceAttr().Get() == pytest.approx(1.2)
+        else:
+            assert here == pytest.approx(there, abs=1e-6)
+    hinge = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/World/joints/shoulder"))
+    assert (hinge.GetLowerLimitAttr().Get(), hinge.GetUpperLimitAttr().Get()) == pytest.approx((-30, 70), abs=1e-4)
+    drive = UsdPhysics.DriveAPI(hinge.GetPrim(), "angular")
+    assert drive.GetStiffnessAttr().Get() == pytest.approx(math.radians(3)) and drive.GetTargetPositionAttr().Get() == (
+        pytest.approx(10, abs=1e-4)
+    )
+    slider = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/World/joints/track"), "linear")
+    assert slider.GetMaxForceAttr().Get() == pytest.approx(20) and slider.GetTargetPositionAttr().Get() == (
+        pytest.approx(0.4)
+    )
+
+
+def test_the_command_imports(tmp_path: Path) -> None:
+    file = write(tmp_path, "arm.urdf", ARM)
+    run = CliRunner().invoke(cli.app, ["import", str(file), "-o", str(tmp_path / "scene.yaml"), "--fixed", "--json"])
+    assert run.exit_code == 0, run.output
+    assert load_scene(tmp_path / "scene.yaml").bodies[0].motion == "static"
+
+
+def in_world(scene: Scene, body: int, points: np.ndarray) -> np.ndarray:
+    """Points from a body's centre of mass in its axes, in the world at the start."""
+    if body < 0:
+        return points
+    one = scene.bodies[body]
+    turn = Rotation.from_quat(one.quat_xyzw)
+    return one.position + turn.apply(points + one.scale * scene.shapes[one.shape].com)
+
+
+def test_recordings_show_axes_and_limits_where_they_are(tmp_path: Path) -> None:
+    scene = jointed().load()
+    by_name = {joint.name: joint for joint in scene.joints}
+    hinge = marks(scene, by_name["shoulder"])
+    axis, arc, needle = (in_world(scene, m.body, m.strips[0]) for m in hinge)
+    along = np.array([0, 1, 0.1]) / np.linalg.norm([0, 1, 0.1])
+    anchor = np.array([0.15, 0, 0.85])
+    assert (axis[1] - axis[0]) / np.linalg.norm(axis[1] - axis[0]) == pytest.approx(along)
+    assert axis.mean(0) == pytest.approx(anchor)
+    # The arc goes from the lower limit to the upper one, and the needle is at 20 of -30 to 70 degrees.
+    points = arc[1:-1] - anchor
+    turn = Rotation.from_rotvec(along * math.radians(50)).apply(points[0]) / np.linalg.norm(points[0])
+    assert turn == pytest.approx((needle[1] - needle[0]) / np.linalg.norm(needle[1] - needle[0]))
+    assert Rotation.from_rotvec(along * math.radians(100)).apply(points[0]) == pytest.approx(points[-1])
+    slider = marks(scene, by_name["track"])
+    way = in_world(scene, slider[0].body, slider[0].strips[0])
+    assert way == pytest.approx(np.array([[-0.6, 2, 0.3], [0.9, 2, 0.3]]))  # it starts at 0.1 of -0.5 to 1
+    place = np.array([[body.position for body in scene.bodies]])
+    turns = np.array([[body.quat_xyzw for body in scene.bodies]])
+    assert ends([by_name["string"]], place, turns, scene)[0, 0] == pytest.approx(
+        np.array([[1.4, 0.3, 1.4], [1.4, 0.3, 0.4]])
+    )
+
+
+def test_a_recording_has_a_line_for_each_joint(tmp_path: Path) -> None:
+    scene = jointed().load()
+    shape = (3, len(scene.bodies))
+    still = Rollout(
+        time=np.arange(3) * 0.1,
+        position=np.tile([b.position for b in scene.bodies], (3, 1, 1)),
+        orientation=np.tile([b.quat_xyzw for b in scene.bodies], (3, 1, 1)),
+        velocity=np.zeros((*shape, 3)),
+        angular_velocity=np.zeros((*shape, 3)),
+        contact_count=np.zeros(3, np.int64),
+        contact_point=np.zeros((0, 3)),
+        contact_body=np.zeros((0, 2), np.int64),
+        names=tuple(b.name for b in scene.bodies),
+    )
+    save_rollout(scene, still, tmp_path / "rollout.rrd")
+    entities = set(read(tmp_path / "rollout.rrd"))
+    told = " ".join(sorted(map(str, entities)))
+    for joint in scene.joints:
+        assert f"joint\\ {joint.name}" in told, told
