@@ -71,14 +71,14 @@ def test_a_network_learns_a_rebound_that_the_scene_does_not_have(bounces, tmp_pa
     assert report["steps"] == 150
 
 
-def test_what_the_network_is_told_of_its_effect_is_about_what_it_has(bounces):
-    """The slope of the loss along the weights, beside that of differences. What the solve does is no part of it."""
+def test_what_the_network_is_told_of_its_effect_is_what_it_has(bounces):
+    """The slope of the loss along the weights is that of differences, where free motion is all that follows."""
     recordings, scene = load_recordings([bounces[0]], bounces[1])
     task = MotionTask(recordings, scene)
     network = Run(PRESETS["impacts"], task, 10, 0, torch.device("cpu")).network
     assert isinstance(network, ImpulseNetwork)
     hit = [int((np.diff(r.velocity[:, 0, 2]) > 0).argmax()) for r in recordings]
-    starts = task.starts([(k, max(0, t - 3)) for k, t in enumerate(hit)], 12)
+    starts = task.starts([(k, max(0, t - 3)) for k, t in enumerate(hit)], 8)  # up to the second impact
     loss = task.loss(network, starts)
     loss.backward()
     bias = dict(network.named_parameters())["rounds.1.normal_impulse.bias"]
@@ -92,7 +92,7 @@ def test_what_the_network_is_told_of_its_effect_is_about_what_it_has(bounces):
             bias[0] -= change
         return found
 
-    assert slope == pytest.approx((off(0.01) - off(-0.01)) / 0.02, rel=0.3)
+    assert slope == pytest.approx((off(0.01) - off(-0.01)) / 0.02, rel=1e-3)
     assert slope < -1e-3  # a harder push is nearer to what was recorded
 
 
