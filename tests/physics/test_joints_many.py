@@ -321,7 +321,7 @@ def test_a_state_that_is_set_by_hand_is_taken_up_by_joints():
     built.join("pin", "hinge", "bob", anchor=(0, 0, 0), axis=(0, 0, 1))
     simulator = Simulator(built)
     simulator.step(3)
-    simulator.state = replace(simulator.state, velocity=simulator.state.velocity + [[0.0, 1.0, 0.0]])
+    simulator.state = replace(simulator.state, velocity=simulator.state.velocity + np.array([[0.0, 1.0, 0.0]]))
     simulator.step(1)
     # Turning about the pin takes in the ball's own inertia.
     speed = simulator.joint("pin").speed * simulator.units.time
