@@ -218,8 +218,7 @@ def nodes_near(
 def compiled_rules(options: Options) -> compiled.Rules:
     """The options of a run as the compiled step wants them."""
     gravity, inner = options.gravity, options.dt / options.substeps
-    # What is met in the course of an inner step is found before it is. The teacher looks at poses alone.
-    ahead = 0.0 if options.adds and not (options.record and inner > COARSE) else inner
+    ahead = inner if options.record and inner > COARSE else 0.0
     rounds = TEACHERS if options.adds else ROUNDS
     return compiled.Rules(
         gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,

@@ -28,9 +28,6 @@ NEAR = 2.0  # cells: so near to its surface a grid is fine
 FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
 ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they must lead, in strides
 WAYS = 8  # in which the outermost nodes of a face are looked for
-# A node reads so many cells on its grid at most, which holds for its own surroundings: until the normal has turned by
-# an angle of which the cosine lacks the first of these from 1, and half as much so many cells away.
-OFF, TURNED, FADES = 0.5, 0.15, 4.0
 ONTO_IT = 0.05  # cells: so near a surface is a place on it
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
 SHORTEST, AHEAD = 2.5, 4.0  # the first one again: of the last, and of the way since, at least
@@ -91,14 +88,14 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             break
         if e < 0:
             key, stride, at = 0, STRIDE * size, -1
-            start = p = _foot(shapes, r, mapped(back, middle, (0.0, 0.0, half * (e + 2))))
+            p = _foot(shapes, r, mapped(back, middle, (0.0, 0.0, half * (e + 2))))
             if abs(distance_alone(shapes.table, shapes.brick, shapes.sample, r, p)) > ONTO_IT * shapes.table[r, CELL]:
                 continue  # too far for its way onto the surface
             d, n = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, p))
         else:
             i, stride = scratch.pick[e], STRIDE * size
-            key, at, start = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
-            p, d, n = start, scratch.depth[i] / k, get(scratch.normal, i)
+            key, at, p = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
+            d, n = scratch.depth[i] / k, get(scratch.normal, i)
         if at >= 0 and near.placed[at]:
             # From where the way led the last time, with shorter steps, unless the node is deeper by now.
             q, short = get(near.place, at), min(stride, max(SHORTEST * FINEST * size, AHEAD * way / own))
@@ -109,7 +106,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
                 if there < d:
                     p, d, n, stride = q, there, normal, short
         p, d, n = _refined(
-            shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, start, p, d, n
+            shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
         )
         if at >= 0:
             near.placed[at] = True
@@ -267,13 +264,10 @@ def _along_normal(w, within, n):
 
 
 @njit(**INLINED)
-def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, node, p, d, n):
+def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
     """From a place p on shape s, at the distance d of t with the normal n in t's axes, down the distance along the
-    surface of s, in steps of `stride` at first and `least` at last: place, distance at the scale of t, and normal. The
-    `node` from which the way once began is on the true surface, whatever its grid says there."""
-    ratio, most = k / own, OFF * table[s, CELL]
-    level, facing = distance(table, brick, sample, s, node)
-    level = min(max(level, -most), most)
+    surface of s, in steps of `stride` at first and `least` at last: place, distance at the scale of t, and normal."""
+    ratio = k / own
     _, m = distance(table, brick, sample, s, p)
     way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and how steep the distance was along it
     for _ in range(ROUNDS):
@@ -295,12 +289,12 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, node, p, d
         while stride > least:
             q, share = along(p, way, stride), 0.4
             # Back onto the own surface; beyond an edge one step does not lead there, and a place beside it is none.
-            own_d, across_own = _off_surface(table, brick, sample, s, q, node, level, facing)
+            own_d, across_own = distance(table, brick, sample, s, q)
             for _ in range(ONTO):
                 if abs(own_d) <= BESIDE * stride:
                     break
                 q = along(q, across_own, -own_d)
-                own_d, across_own = _off_surface(table, brick, sample, s, q, node, level, facing)
+                own_d, across_own = distance(table, brick, sample, s, q)
             if abs(own_d) <= BESIDE * stride:
                 q = along(q, across_own, -own_d)
                 there, normal = distance(table, brick, sample, t, mapped(w, c, q))
@@ -315,16 +309,6 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, node, p, d
         if not better:
             break
     return p, k * d, n
-
-
-@njit(**BARE)
-def _off_surface(table, brick, sample, s, q, node, level, facing):
-    """How far q is outside of the true surface of shape s near a node, at which its grid says `level` with the normal
-    `facing`, and the normal at q."""
-    d, n = distance(table, brick, sample, s, q)
-    way, cell = sub(q, node), FADES * table[s, CELL]
-    lift = level * max(0.0, 1.0 - (1.0 - dot(n, facing)) / TURNED)
-    return d - lift / (1.0 + dot(way, way) / (cell * cell)), n
 
 
 @njit(**BARE)
