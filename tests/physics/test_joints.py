@@ -245,5 +245,5 @@ def test_a_four_bar_linkage_moves_as_its_closed_form():
     rollout = Simulator(built).run(2.0)
     for k in range(0, len(rollout.time), 10):
         b = joined(rollout.joint_position[k, 0], b)
-        assert rollout.position[k, 2, :2] == pytest.approx(0.5 * (b + [ground, 0]), abs=1e-4)
+        assert rollout.position[k, 2, :2] == pytest.approx(0.5 * (b + np.array([ground, 0.0])), abs=1e-4)
     assert rollout.joint_position[-1, 0] == pytest.approx(4.0 * rollout.time[-1], rel=5e-3)

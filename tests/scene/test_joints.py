@@ -65,8 +65,14 @@ HINGE = "name: door, type: hinge, anchor: [0.9, 0, 0], axis: [0, 0, 1]"
             "{name: a, type: distance, bodies: [leaf, world], anchor: [1, 0, 0], to: [0, 0, 0], rod: 1.5}",
             "rod: must be the distance of its ends at the start, 1 m (got 1.5 m)",
         ),
-        ("{name: a, type: ball, bodies: [leaf, world], anchor: [1, 0, 0], cone_deg: 20}", "axis: is required: cone_deg is told from it"),
-        ("{name: a, type: weld, bodies: [leaf, world]}", "type: must be one of hinge, slider, ball, fixed, distance (got 'weld')"),
+        (
+            "{name: a, type: ball, bodies: [leaf, world], anchor: [1, 0, 0], cone_deg: 20}",
+            "axis: is required: cone_deg is told from it",
+        ),
+        (
+            "{name: a, type: weld, bodies: [leaf, world]}",
+            "type: must be one of hinge, slider, ball, fixed, distance (got 'weld')",
+        ),
     ],
 )  # fmt: skip
 def test_a_fault_of_a_joint_is_told_with_its_line(load, joint: str, told: str):

@@ -86,6 +86,7 @@ STRETCH = 1e-7  # model lengths (and rad): rows that hold worse are mended by mo
 REACH = 0.05  # by at most so much in an inner step
 HOLDS = 1e-11  # model lengths (and rad): better need no row hold
 ROUNDS = 6  # of the search for impulses after which rows hold
+BREAKS = 4  # times that joints may break in one inner step
 SOFTEN = 1e-10  # of what a unit of impulse does along a row: where rows say the same twice, both are satisfied
 GIVES = 0.2  # the share of what is beyond a limit that an inner step resolves
 AHEAD = 0.05  # model lengths (and rad): limits that are nearer are looked at
@@ -1130,38 +1131,52 @@ def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
     rows = _seen(room, count if count <= DENSE else 0)
     if len(rows.see):
         _see(bodies, graph, factors, held.reply, rows, count)
-    share = 0.5
-    while True:
-        _hold(bodies, rules, held, comps, lo, hi, rows, count, False)
+    for _ in range(BREAKS):
+        share = 0.5
+        while True:
+            _hold(bodies, rules, held, comps, lo, hi, rows, count, False)
+            for r in range(count):
+                c = rows.of[r]
+                if rows.kind[r] == NORMAL_ROW:
+                    system.row[c, 0, IMPULSE] = rows.impulse[r]
+                    if rows.grip[r] > 0.0:
+                        system.row[c, 1, IMPULSE] = rows.impulse[r + 1]
+                        system.row[c, 2, IMPULSE] = rows.impulse[r + 2]
+            if not lively or share < 0.0 or not _gains(rules, system, bodies.change, island):
+                break
+            _clear(graph, system, island, comps, lo, hi, bodies.change)
+            for r in range(count):
+                rows.impulse[r] = 0.0
+                c = rows.of[r]
+                if rows.kind[r] == NORMAL_ROW:
+                    calm = system.calm[c, 0]
+                    system.row[c, 0, WANTED] = calm + share * (system.row[c, 0, WANTED] - calm)
+                    rows.want[r] = system.row[c, 0, WANTED]
+            share = 0.0 if share > 0.0 else -1.0
+        touched = False
         for r in range(count):
-            c = rows.of[r]
-            if rows.kind[r] == NORMAL_ROW:
-                system.row[c, 0, IMPULSE] = rows.impulse[r]
-                if rows.grip[r] > 0.0:
-                    system.row[c, 1, IMPULSE] = rows.impulse[r + 1]
-                    system.row[c, 2, IMPULSE] = rows.impulse[r + 2]
-        if not lively or share < 0.0 or not _gains(rules, system, bodies.change, island):
+            struck = rows.kind[r] == STOP_ROW and rows.strong[r] == math.inf
+            touched = touched or ((rows.kind[r] == NORMAL_ROW or struck) and rows.impulse[r] > 0.0)
+        for i in range(lo, hi):
+            _told(bodies, rules, graph, each, lines, held.calm, comps[i], touched or deep)
+        for r in range(count):
+            if rows.kind[r] >= STOP_ROW:
+                _tell(bodies, rules, each, rows, r)
+        broke = False
+        for i in range(lo, hi):
+            if _broken(graph, each, lines, comps[i]):
+                broke = True
+                _factor(bodies, rules, graph, factors, each, lines, comps[i])
+        if not broke:
             break
+        # What broke has not held: all impulses are found once more.
         _clear(graph, system, island, comps, lo, hi, bodies.change)
+        if len(rows.see):
+            _see(bodies, graph, factors, held.reply, rows, count)
         for r in range(count):
             rows.impulse[r] = 0.0
-            c = rows.of[r]
-            if rows.kind[r] == NORMAL_ROW:
-                calm = system.calm[c, 0]
-                system.row[c, 0, WANTED] = calm + share * (system.row[c, 0, WANTED] - calm)
-                rows.want[r] = system.row[c, 0, WANTED]
-        share = 0.0 if share > 0.0 else -1.0
-    touched = False
-    for r in range(count):
-        struck = rows.kind[r] == STOP_ROW and rows.strong[r] == math.inf
-        touched = touched or ((rows.kind[r] == NORMAL_ROW or struck) and rows.impulse[r] > 0.0)
-    for i in range(lo, hi):
-        _told(bodies, rules, graph, each, lines, held.calm, comps[i], touched or deep)
-    for r in range(count):
-        if rows.kind[r] >= STOP_ROW:
-            _tell(bodies, rules, each, rows, r)
-    for i in range(lo, hi):
-        _broken(graph, each, comps[i])
+            if rows.kind[r] >= STOP_ROW and each.state[rows.of[r], BROKEN] > 0.0:
+                rows.give[r] = 0.0
 
 
 @njit(**FAST)
@@ -1238,16 +1253,22 @@ def _tell(bodies, rules, each, rows, r):
 
 
 @njit(**BARE)
-def _broken(graph, each, c):
-    """Joints that bear more than they can are none any more."""
+def _broken(graph, each, lines, c):
+    """Joints that bear more than they can are none any more; whether there are new ones."""
+    found = False
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] < 0:
             j = -1 - graph.node[k]
             own, number = each.state[j], each.number[j]
             pull = norm((own[PULL], own[PULL + 1], own[PULL + 2]))
             twist = norm((own[TWIST], own[TWIST + 1], own[TWIST + 2]))
-            if pull > number[FORCE] or twist > number[TORQUE]:
+            if own[BROKEN] == 0.0 and (pull > number[FORCE] or twist > number[TORQUE]):
                 own[BROKEN] = 1.0
+                found = True
+                for e in range(ROWS):
+                    lines.active[j, e] = 0
+                    lines.soft[j, e] = 0.0
+    return found
 
 
 @njit(**FAST)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 
 from sdfsim.base.compiling import warn_compiling
@@ -57,6 +58,8 @@ class Compiled:
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
         self.world = compiled_world(self.bodies, state, self.shapes)
+        if self.world.threads.ndim > 1:
+            numba.get_num_threads()  # starts them: code that was kept takes it that they run
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n, 3, 3)),
