@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.commands import distill, fit, measure, mesh, poses, reconstruct
+from pipeline.commands import distill, fit, joint, measure, mesh, poses, reconstruct
 from sdfsim.commands import motion
 
 YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
@@ -41,7 +41,7 @@ def options(
     gc.set_threshold(YOUNG)
 
 
-COMMANDS = [reconstruct, measure, poses, distill, mesh, fit]
+COMMANDS = [reconstruct, measure, poses, distill, mesh, joint, fit]
 COMMANDS += [motion.simulate, motion.samples, motion.plan, motion.view, motion.render, motion.identify, motion.export]
 COMMANDS += [motion.dataset, motion.train, motion.evaluate, motion.tradeoff, motion.stress, motion.info]
 for command in COMMANDS:

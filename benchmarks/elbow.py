@@ -1,4 +1,4 @@
-"""How far engines are from real tosses of an elbow, two links on a hinge, each with its own best parameters: joints.md.
+"""How far engines are from real tosses of an elbow, two links on a hinge, each with its own best parameters.
 
     python benchmarks/elbow.py TOSSES -o DIR [--rounds N]
 

@@ -7,7 +7,7 @@ TOSSES holds `cube.npz`: tosses of an acrylic cube onto a table, tracked at 148 
 tosses; other engines' are found on the same ones by a search over as many parameters, with as many tries. Networks on
 our solve with these numbers are trained on 8 to 256 tosses, three of each, and chosen on others by how far whole
 motions are off. All are judged on 100 others, over the first 75 frames, from the same starts. Drake takes part where it
-is installed. Five minutes, fifteen more for the networks, and ten more with Drake.
+is installed. Five minutes, about fifteen more for the networks, and ten more with Drake.
 """
 
 from __future__ import annotations
@@ -337,8 +337,11 @@ def drake(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, 
 def rolled(network: ImpulseNetwork, task: MotionTask, starts: Sequence[Start]) -> Motion:
     """What a network on the solve makes of these starts."""
     worlds = task.worlds(len(starts))
-    names = ("position", "quat_xyzw", "velocity", "angular_velocity")
-    first = Starts(*(np.array([getattr(start, name) for start in starts]) for name in names), np.zeros((0, 0, 7)))
+    position, turn, speed, spin = (
+        np.array([getattr(start, name) for start in starts])
+        for name in ("position", "quat_xyzw", "velocity", "angular_velocity")
+    )
+    first = Starts(position, turn, speed, spin, np.zeros((0, 0, 7)))
     steps = worlds.roll(network, first, FRAMES)
     place, turn = (np.stack([getattr(step, name) for step in steps], 1) for name in ("position", "orientation"))
     return Motion(place * worlds.units.length, turn)

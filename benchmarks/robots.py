@@ -127,6 +127,8 @@ def _set(
     """Set joints to where the scene starts, or at random within limits, and return their positions; `shape_axes` by
     body carry from the axes of its link to those of its shape."""
     mujoco.mj_resetData(model, data)
+    if "start" in (keys := [model.key(k).name for k in range(model.nkey)]):
+        mujoco.mj_resetDataKeyframe(model, data, keys.index("start"))
     values: dict[str, float | np.ndarray] = {}
     for j, name in joints.items():
         at, kind = int(model.jnt_qposadr[j]), mujoco.mjtJoint(int(model.jnt_type[j]))

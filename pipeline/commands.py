@@ -1,4 +1,4 @@
-"""From photos and meshes to shapes: reconstruct, its stages, measure, and fit."""
+"""From photos and meshes to shapes: reconstruct, its stages, measure, joint, and fit."""
 
 from __future__ import annotations
 
@@ -82,6 +82,24 @@ def measure(
     report = write_page(photos, out, on_progress=session.progress)
     told = f"wrote {out}: {report['photos']} photos, {report['mib']} MiB"
     session.report(report, [told, "open it in a browser: two clicks give --distance, one gives --body"])
+
+
+@command
+def joint(
+    session: Session,
+    one: Annotated[Path, typer.Argument(help="Mesh of the thing in one state.", show_default=False)],
+    other: Annotated[Path, typer.Argument(help="In another, in the same frame and scale.", show_default=False)],
+) -> None:
+    """Two states of one thing, as meshes -> its hinge or slider."""
+    import numpy as np
+
+    from pipeline.mesh.joint import find_joint, scene_keys
+    from sdfsim.geometry.mesh_io import load_mesh
+
+    first = load_mesh(one)
+    found = find_joint(first, load_mesh(other))
+    told = {"type": found.kind, **scene_keys(found), "moving_faces": int(found.moving.sum()), "off_m": found.off}
+    session.report(told, [found.line(float(np.linalg.norm(np.ptp(first.vertices, axis=0))))])
 
 
 @command

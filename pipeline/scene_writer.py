@@ -25,7 +25,7 @@ from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.far_field import BOX
 
-SAMPLES, BLOCK = (65, 193), 4  # fewest and most along a side of a grid; cells a side of what is sampled as a whole
+SAMPLES, BLOCK = (65, 161), 4  # fewest and most along a side of a grid; cells a side of what is sampled as a whole
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily

@@ -210,15 +210,17 @@ class GridField(Field):
         with torch.no_grad():
             self.head.weight[0] *= 0.1
         seen = GEOMETRY + 8 + seen_features
-        self.color = nn.Sequential(layer(seen, width), nn.ReLU(), layer(width, 3, gain=0.3))
+        last = layer(width, 3, gain=0.3)
+        self.color = nn.Sequential(layer(seen, width), nn.ReLU(), last)
         n = size.background
         self.background = uniform(n, n, n, 4, bound=1e-2)
         if fused is not None:
             self.start = torch.from_numpy(fused.coarse)[..., None].contiguous()
             with torch.no_grad():  # A network that knows nothing yet must not bend what is known.
                 self.head.weight[0] *= 0.05
+                last.weight *= 0.1
                 if fused.behind is not None:
-                    self.background += torch.from_numpy(fused.behind)
+                    self.background.add_(torch.from_numpy(fused.behind))
             for level, side in zip(self.bricks, size.sides, strict=True):
                 if side == fused.side:
                     given = torch.from_numpy(np.concatenate([fused.fine[:, None], fused.color - 0.5], 1))

@@ -63,7 +63,8 @@ SMALL_NOISE, BARE = 0.15, 0.05
 # In cells of the field's finest grid, which limits what can be separated:
 LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
 SMALLEST = 4.0  # what rises less stays part of what it stands on
-FINER = 2 / 3  # distance of a body's samples
+FINER = 1 / 3  # distance of a body's samples
+ENOUGH = 96  # samples along a body's longest side, where the field is finer than that
 FILLET = 3.0  # contact layers sideways: what is so near a body's foot is taken away together with it
 FEWEST_SAMPLES = 8  # of a component: less is no body
 NOWHERE = np.zeros((0, 3))  # no points
@@ -390,7 +391,10 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     pieces = [body for body in pieces if not body.name or body.size > SCRAP * largest[body.name]]
     if not pieces:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
-    sampled = {body: body_mesh(body, distance, min(FINER * finest, surface.volume.cell)) for body in pieces}
+    sampled = {
+        body: body_mesh(body, distance, min(max(FINER * finest, body.size / ENOUGH), surface.volume.cell))
+        for body in pieces
+    }
     noise = _noise(sampled, poses.sparse.xyz, finest)
     called = _names([body for body in pieces if body not in noise])
     meshes, unrefined, pictures = {}, {}, load_grey_photos(poses.views, photos_folder)

@@ -206,10 +206,11 @@ class Problem:
             raise SdfsimError("the recordings are too short, or nowhere smooth", told)
         windows = self.windows(WINDOW, begin[:: -(-len(begin) // (2 * MOST))])
         touched = windows.touched()
-        if not touched:
+        if not touched and not self.joints:
             raise SdfsimError("nothing touches in the recordings", "friction and restitution show in contacts only")
         self._choose(touched)
-        rows = sorted({w for w, *_ in touched})
+        # Joints act all the time.
+        rows = range(len(windows.begin)) if self.joints else sorted({w for w, *_ in touched})
         return self.windows(WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
 
     def whole(self, chosen: Sequence[int]) -> Windows:
@@ -603,7 +604,7 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
 
     # First what contacts do, with the bodies and the ground as the scene has them; then all.
     every = np.arange(len(width))
-    usual = np.flatnonzero([p.kind in (*HIGH, "mass") for p in problem.parameters])
+    usual = np.flatnonzero([p.kind in (*HIGH, "mass", *OF_JOINTS) for p in problem.parameters])
     best = settled(short, tried[int(np.argmin(costs))], usual, TRIES[0])
     best = settled(short, best, every, TRIES[1])
     last, longer, scatter = short, problem.whole(fit), np.zeros((len(best), len(best)))

@@ -129,8 +129,8 @@ def _sample_near(
     values = np.asarray(zoom(knots, resolution / len(knots), order=1, grid_mode=False, mode="nearest"), np.float32)
     count = len(knots) - 1
     corners = [knots[i : i + count, j : j + count, k : k + count] for i, j, k in np.ndindex(2, 2, 2)]
-    # Distances change by no more than the way gone.
-    reach = np.sqrt(3.0) * 2 * BOX / count
+    # No place of a block is farther from a corner than half of its diagonal; a quarter of a side more for what is near.
+    reach = (0.5 * np.sqrt(3.0) + 0.25) * 2 * BOX / count
     blocks = np.argwhere(np.abs(corners).min(0) <= reach)
     inner = lattice(*[np.arange(coarse + 1)] * 3).astype(int)
     axis = np.linspace(-BOX, BOX, resolution)

@@ -148,7 +148,7 @@ class MotionTask:
         begin, early = [], []
         for k, r in enumerate(self.recordings):
             speed = np.linalg.norm(r.velocity, axis=-1).max(1) / self.units.velocity
-            touched = ~r.flying.all(1)
+            touched = np.asarray(~r.flying.all(1))
             fall = np.asarray(self.scene.gravity) * r.dt
             sudden = np.linalg.norm(np.diff(r.velocity, axis=0) - fall, axis=-1).max(1) > IMPACT * np.linalg.norm(fall)
             touched[1:] |= sudden  # an impact between two frames of flight

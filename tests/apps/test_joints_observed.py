@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from sdfsim.apps.identify import identify
+from sdfsim.apps.observed import cleaned, with_velocities
 from sdfsim.apps.observed_joints import held_together, jointed
 from sdfsim.scene.builder import SceneBuilder
 
@@ -86,6 +89,36 @@ def test_what_joints_do_not_allow_is_taken_away(kind: str) -> None:
         assert np.cross(spin[:, 0] - spin[:, 1], along) == pytest.approx(0.0, abs=1e-12)
     if kind in ("slider", "fixed"):
         assert (child.inv() * base).magnitude() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_identify_finds_friction_and_damping_of_a_pendulum() -> None:
+    """The motion is that of the equation of a physical pendulum, solved by SciPy."""
+    mass, arm, pull, friction, damping = 1.0, 0.15, 9.81, 0.04, 0.03
+    size = np.array([0.3, 0.04, 0.04])
+    inertia = mass * ((size[0] ** 2 + size[2] ** 2) / 12.0 + arm**2)
+
+    def slope(_: float, state: np.ndarray) -> list[float]:
+        angle, rate = state
+        drag = damping * rate + friction * np.tanh(rate / 1e-3)
+        return [rate, (mass * pull * arm * np.sin(angle + np.pi / 2) - drag) / inertia]  # of a beam that begins level
+
+    dt, count = 0.01, 120
+    found = solve_ivp(slope, (0.0, dt * count), [-0.2, 0.0], t_eval=dt * np.arange(count), rtol=1e-9, atol=1e-10)
+    assert np.abs(found.y[1]).max() > 3.0 and np.sum(np.diff(np.sign(found.y[1])) != 0) >= 1
+    beam = Rotation.from_rotvec(found.y[0][:, None] * [0.0, 1.0, 0.0])
+    rng = np.random.default_rng(0)  # a tracker's noise
+    seen = Rotation.from_rotvec(1e-3 * rng.normal(size=(count, 3))) * beam
+    place = beam.apply([arm, 0.0, 0.0]) + np.array([0, 0, 2.0]) + 1e-4 * rng.normal(size=(count, 3))
+    poses = np.concatenate([place, seen.as_quat()], 1)[:, None]
+    made = SceneBuilder(gravity=[0, 0, -pull], model="solver", effects={"sleep": "off"})
+    made.add("beam", box={"size": size}, position=(arm, 0, 2), mass=mass)
+    made.join("pin", "hinge", "beam", anchor=(0, 0, 2), axis=(0, 1, 0))
+    scene = made.load()
+    recordings = with_velocities([cleaned("swing", dt, poses, scene)], scene)
+    assert recordings[0].known.mean() > 0.5 and not recordings[0].flying.any()
+    answer = identify(recordings, scene).joint_values["pin"]
+    assert answer["friction"] == pytest.approx(friction, abs=0.1 * friction)
+    assert answer["damping"] == pytest.approx(damping, abs=0.1 * damping)
 
 
 def test_jointed_bodies_do_not_fly_freely() -> None:

@@ -16,6 +16,7 @@ from PIL import ExifTags, Image, ImageDraw
 from pipeline.inputs.photos import prepare_photos
 from pipeline.measure import measure
 from pipeline.mesh.placement import check_distance
+from pipeline.options import options_of
 from sdfsim import Scene, Simulator
 from sdfsim.apps.recording import body_colors, save_rollout
 from tests.helpers.browser import Browser
@@ -80,7 +81,7 @@ def test_clicks_give_the_options_to_paste(photos, tmp_path):
         browser.value("document.getElementById('body').click(); document.getElementById('name').value = 'cup'")
         click_dot("<b>it's.png")
         *_, flag, body = option()
-        assert flag == "--body" and body.startswith("cup=")
+        assert flag == "--body" and options_of(body=[body]).body == {"cup": [body[4:]]}
         for text, name in ((first, "wide & big.jpg"), (second, "turned.jpg"), (body[4:], "<b>it's.png")):
             assert text.rpartition(":")[0] == name
             at = np.array(text.rpartition(":")[2].split(","), dtype=float)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh  # noqa: TID253
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+import cli
 from pipeline.mesh.joint import find_joint, scene_keys, split
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 
 
 def box(size, place) -> trimesh.Trimesh:
@@ -61,12 +66,17 @@ def test_a_door_is_a_hinge_to_a_degree_and_a_hundredth_of_its_size(degrees: floa
     assert scene_keys(found)["limits_deg"] == pytest.approx([0.0, abs(degrees)], abs=1.0)
 
 
-def test_a_drawer_is_a_slider_to_a_degree_and_a_hundredth_of_its_size() -> None:
+def test_a_drawer_is_a_slider_to_a_degree_and_a_hundredth_of_its_size(tmp_path: Path) -> None:
     tilt = Rotation.from_rotvec([-0.4, 0.2, 0.3])
     opened = [moved(part, Rotation.identity(), np.zeros(3), (0, -0.22, 0)) for part in DRAWER]
     one, other = (
         Mesh(tilt.apply(mesh.vertices), mesh.faces) for mesh in (whole([*CABINET, *DRAWER]), whole([*CABINET, *opened]))
     )
+    for name, mesh in (("shut", one), ("open", other)):
+        (tmp_path / f"{name}.ply").write_bytes(write_ply(mesh))
+    run = CliRunner().invoke(cli.app, ["joint", str(tmp_path / "shut.ply"), str(tmp_path / "open.ply"), "--json"])
+    told = json.loads(run.stdout)
+    assert told["type"] == "slider" and told["limits"] == pytest.approx([0.0, 0.22], abs=0.01)
     found = find_joint(one, other)
     assert found.kind == "slider"
     assert math.degrees(math.acos(min(1.0, float(found.axis @ tilt.apply([0, -1, 0]))))) < 1.0

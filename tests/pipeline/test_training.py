@@ -235,7 +235,7 @@ def test_photos_of_other_exposure_and_white_balance_train_as_those_of_one(tmp_pa
     run, error_varied, off_varied = trained(varied, 0.02)
     _, error_without, _ = trained(varied, 0.0)
     assert plain.exposure is not None and plain.exposure.spread() < training.VARIED / 2
-    assert error_varied < 1.3 * error < 0.5 * error_without
+    assert error_varied < 2 * error and error_varied < 0.4 * error_without
     assert off_varied < off + 0.01
     assert run.exposure is not None
     # Of the colours that there are, as a gain and an offset can stand in for each other.

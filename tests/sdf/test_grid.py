@@ -194,10 +194,10 @@ def test_a_grid_sampled_near_the_surface_only_is_the_same_there(coarse):
     whole = sample_grid(ball, ball.bounds, 129).values.numpy()
     near = sample_grid(counted, ball.bounds, 129, coarse=coarse).values.numpy()
     block = 1.4 * coarse / 128
-    close = np.abs(whole) < 0.8 * block
+    close = np.abs(whole) < 0.25 * block
     np.testing.assert_array_equal(near[close], whole[close])
     assert np.abs(near - whole).max() < 0.3 * block
-    assert sum(asked) < 0.85 * 129**3
+    assert sum(asked) < 0.6 * 129**3
 
 
 def test_blocks_have_to_fill_a_grid():

@@ -1,6 +1,7 @@
 """Training on recorded motions, judged by motions that are known in closed form."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,8 +62,9 @@ def test_a_network_learns_a_rebound_that_the_scene_does_not_have(bounces, tmp_pa
     for name, of in (("solver", "solver"), ("network", model)):
         sim = Simulator(scene, of)
         assert not sim.outside_training
-        height = sim.run(1.0).position[:, 1, 2]
-        highest[name] = height[np.argmin(height) :].max() - 0.5
+        rollout = sim.run(1.0)
+        rises = rollout.velocity[:, 1, 2] > 0.0
+        highest[name] = rollout.position[rises, 1, 2].max() - 0.5
     # A ball that falls by 0.5 m comes back to e^2 of it.
     assert highest["solver"] == pytest.approx(0.5 * 0.3**2, abs=0.02)
     assert highest["network"] == pytest.approx(0.5 * REBOUND**2, abs=0.06)
@@ -76,10 +78,11 @@ def test_what_the_network_is_told_of_its_effect_is_what_it_has(bounces):
     network = Run(PRESETS["impacts"], task, 10, 0, torch.device("cpu")).network
     assert isinstance(network, ImpulseNetwork)
     hit = [int((np.diff(r.velocity[:, 0, 2]) > 0).argmax()) for r in recordings]
-    starts = task.starts([(k, max(0, t - 3)) for k, t in enumerate(hit)], 12)
+    starts = task.starts([(k, max(0, t - 3)) for k, t in enumerate(hit)], 8)  # up to the second impact
     loss = task.loss(network, starts)
     loss.backward()
-    bias = network.rounds[-1].normal_impulse.bias
+    bias = dict(network.named_parameters())["rounds.1.normal_impulse.bias"]
+    assert bias.grad is not None
     slope = float(bias.grad[0])
 
     def off(change: float) -> float:
@@ -89,12 +92,12 @@ def test_what_the_network_is_told_of_its_effect_is_what_it_has(bounces):
             bias[0] -= change
         return found
 
-    assert slope == pytest.approx((off(0.01) - off(-0.01)) / 0.02, rel=0.1)
+    assert slope == pytest.approx((off(0.01) - off(-0.01)) / 0.02, rel=1e-3)
     assert slope < -1e-3  # a harder push is nearer to what was recorded
 
 
 def test_the_same_seed_trains_the_same_network_and_a_stopped_training_goes_on(bounces, tmp_path):
-    how = {"preset": "impacts", "scene": bounces[1]}
+    how: dict[str, Any] = {"preset": "impacts", "scene": bounces[1]}
     train(bounces[0], tmp_path / "whole", steps=6, **how)
     train(bounces[0], tmp_path / "part", steps=6, budget=1e-9, **how)
     train(bounces[0], tmp_path / "part", steps=6, resume=True, **how)
@@ -105,15 +108,16 @@ def test_the_same_seed_trains_the_same_network_and_a_stopped_training_goes_on(bo
 def test_what_does_not_fit_together_is_told(bounces, tmp_path):
     folder, scene = bounces
     out = tmp_path / "run"
-    for told, given in (
+    cases: list[tuple[str, dict[str, Any]]] = [
         ("impacts trains on recordings", {"preset": "impacts"}),
         ("impacts and alone are trained", {"preset": "small", "scene": scene}),
         ("drawn in one process", {"preset": "impacts", "scene": scene, "workers": 2}),
-    ):
+    ]
+    for told, given in cases:
         with pytest.raises(SdfsimError, match=told):
             train(folder, out, **given)
     with pytest.raises(SdfsimError, match=r"1 recordings \(at least 4"):
         train(folder / "00.npz", out, preset="impacts", scene=scene)
-    given = ["train", "--data", str(folder), "--scene", str(scene), "-o", str(out)]
-    done = CliRunner().invoke(cli.app, given)
+    asked = ["train", "--data", str(folder), "--scene", str(scene), "-o", str(out)]
+    done = CliRunner().invoke(cli.app, asked)
     assert done.exit_code == 1 and "give --preset impacts" in done.output
