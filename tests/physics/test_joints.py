@@ -224,7 +224,7 @@ def test_a_four_bar_linkage_moves_as_its_closed_form():
 
     def joined(angle: float, near: np.ndarray) -> np.ndarray:
         p = crank * np.array([math.cos(angle), math.sin(angle)])
-        return fsolve(lambda q: [np.hypot(*(q - p)) - coupler, np.hypot(*(q - [ground, 0])) - rocker], near)
+        return np.array(fsolve(lambda q: [np.hypot(*(q - p)) - coupler, np.hypot(*(q - [ground, 0])) - rocker], near))
 
     b = joined(0.0, np.array([0.9, 0.6]))
     built = scene(gravity=(0, 0, 0))

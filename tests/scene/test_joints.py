@@ -123,8 +123,8 @@ def test_points_may_be_told_in_a_body(load):
 def test_what_pulls_and_drives_is_kept_in_radians(load):
     given = "spring: {stiffness: 3, rest_deg: 90}, motor: {position_deg: 180, most: 2, time: 0.3}"
     (joint,) = load(f"{TOP}  - {{{HINGE}, bodies: [leaf, world], {given}}}\n").joints
-    assert joint.spring == Spring(3.0, pytest.approx(math.pi / 2))
-    assert joint.motor == Motor(2.0, None, pytest.approx(math.pi), 0.3)
+    assert joint.spring == Spring(3.0, math.radians(90))
+    assert joint.motor == Motor(2.0, None, math.radians(180), 0.3)
 
 
 def test_joints_written_in_python_are_those_of_the_file(load):
