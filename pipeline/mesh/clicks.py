@@ -183,15 +183,15 @@ def borders(shown: list[CutOut], count: int) -> dict[str, np.ndarray]:
     there = [number for number in range(1, count + 1) if (body == number).sum() >= LEAST]
     nothing = (0, 0, 1, 1)
     for number in there if len(there) > 1 else []:
-        models = np.zeros((1, 65)), np.zeros((1, 65))
+        back, front = np.zeros((1, 65)), np.zeros((1, 65))
         known = np.where(body == number, cv2.GC_FGD, cv2.GC_BGD).astype(np.uint8)
         cv2.setRNGSeed(0)
-        cv2.grabCut(color[None], known[None], nothing, *models, 1, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(color[None], known[None], nothing, back, front, 1, cv2.GC_INIT_WITH_MASK)
         for claim, one in zip(claims, shown, strict=True):
             mask = np.where(one.body == number, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
             mask[one.sure] = np.where(one.body == number, cv2.GC_FGD, cv2.GC_BGD)[one.sure]
             mask = np.where(one.body == 0, cv2.GC_BGD, mask).astype(np.uint8)
-            cv2.grabCut(one.picture, mask, nothing, *(model.copy() for model in models), 1, cv2.GC_EVAL_FREEZE_MODEL)
+            cv2.grabCut(one.picture, mask, nothing, back.copy(), front.copy(), 1, cv2.GC_EVAL_FREEZE_MODEL)
             claim[number] = ((mask == cv2.GC_FGD) | (mask == cv2.GC_PR_FGD)) & (one.body > 0)
     return {
         one.view.name: one.labels(np.where(claim.sum(0) == 1, claim.argmax(0), UNKNOWN).astype(np.uint8))
