@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.field.interpolation import BRICK, interpolate, interpolate_bricks, near_bricks
+from pipeline.grids.interpolation import BRICK, interpolate, interpolate_bricks, near_bricks
 
 if TYPE_CHECKING:
     from pipeline.stereo.fusion import Fused

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from pipeline.field.grid_field import BACKGROUND_SAMPLES, Field, laplace_density, render_weights
-from pipeline.field.interpolation import interpolate
+from pipeline.grids.interpolation import interpolate
 
 EPSILON = 0.1  # of opacity
 START = 128  # samples of every ray at first, and added to those that need more

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.cameras import PosedPhotos, Similarity, Sparse, View, nearest_to_axes
-from pipeline.field.interpolation import interpolate
+from pipeline.grids.interpolation import interpolate
 from pipeline.inputs.photos import Photo
 from pipeline.stereo.depth import DepthMap
 from sdfsim.base.errors import SdfsimError

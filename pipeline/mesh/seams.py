@@ -323,25 +323,19 @@ def _laid(solid: ConnectedSolid, seam: Seam) -> Seam:
     cover, which is seen more exactly than the groove around what lies there."""
     if not seam.flat:
         return seam
-    cell, laid = solid.volume.cell, seam
-    for _ in range(2):  # The second time from all that lies in the plane which the first found.
-        near = np.abs(laid.beyond(solid.points)) < COVER * cell
-        near[near] = np.abs(solid.normals[near] @ laid.normal) > PARALLEL
-        outside = laid.outside(solid.points[near]) / cell
-        near[near] = (outside > BESIDE[0]) & (outside < BESIDE[1])
-        side = np.sign(solid.normals[near] @ laid.normal)
-        # Two round bodies face each other from both sides.
-        if near.sum() < AROUND * len(seam.rim) or abs(side.mean()) < ONE_SIDED:
-            return laid
-        middle = np.median(solid.points[near], axis=0)
-        spread, axes = np.linalg.eigh(np.cov((solid.points[near] - middle).T))
-        normal = np.median(solid.normals[near] * side[:, None], axis=0)
-        if spread[1] > (BESIDE[1] * cell) ** 2:  # It goes around the seam, which tells more than normals do.
-            normal = axes[:, 0] * np.sign(axes[:, 0] @ normal)
-        normal = normal / np.linalg.norm(normal)
-        point = seam.point + np.median((solid.points[near] - seam.point) @ normal) * normal
-        laid = replace(seam, point=point, normal=normal, sides=_sides(seam.rim, point, normal))
-    return laid
+    cell = solid.volume.cell
+    near = np.abs(seam.beyond(solid.points)) < COVER * cell
+    near[near] = np.abs(solid.normals[near] @ seam.normal) > PARALLEL
+    outside = seam.outside(solid.points[near]) / cell
+    near[near] = (outside > BESIDE[0]) & (outside < BESIDE[1])
+    side = np.sign(solid.normals[near] @ seam.normal)
+    # Two round bodies face each other from both sides.
+    if near.sum() < AROUND * len(seam.rim) or abs(side.mean()) < ONE_SIDED:
+        return seam
+    normal = np.median(solid.normals[near] * side[:, None], axis=0)
+    normal /= np.linalg.norm(normal)
+    point = seam.point + np.median((solid.points[near] - seam.point) @ normal) * normal
+    return replace(seam, point=point, normal=normal, sides=_sides(seam.rim, point, normal))
 
 
 def _walled(solid: ConnectedSolid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:

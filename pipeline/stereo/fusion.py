@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from pipeline.field.interpolation import near_bricks, places_of
+from pipeline.grids.interpolation import near_bricks, places_of
 from pipeline.progress import Progress, quiet
 from pipeline.stereo.compiled import carve, paint
 from pipeline.stereo.depth import BEYOND, DepthMap, stacked, straightened

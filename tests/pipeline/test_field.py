@@ -23,7 +23,10 @@ from pipeline.field.grid_field import (
     render_weights,
     stencil,
 )
-from pipeline.field.interpolation import (
+from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
+from pipeline.field.supervision import supervision_of
+from pipeline.field.training import PRESETS, Trained, Trainer, camera_rays, load_rays, save_field, train
+from pipeline.grids.interpolation import (
     bricks_by_rows,
     by_rows,
     interpolate,
@@ -31,9 +34,6 @@ from pipeline.field.interpolation import (
     near_bricks,
     places_of,
 )
-from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
-from pipeline.field.supervision import supervision_of
-from pipeline.field.training import PRESETS, Trained, Trainer, camera_rays, load_rays, save_field, train
 from pipeline.stereo.fusion import Fused
 from sdfsim.base.errors import SdfsimError
 from tests.helpers.fields import SMALL, UNIT, posed_noise, toy_rays

@@ -14,8 +14,8 @@ MODULES = {
 }  # fmt: skip
 # From the ground up. What lies in no folder is a room of its own.
 FLOORS = (
-    ("progress", "materials", "naming", "cameras"), ("options",), ("inputs",), ("sfm",), ("stereo",), ("field",),
-    ("mesh",), ("scene_writer", "report", "measure"), ("stages",), ("commands",),
+    ("progress", "materials", "naming", "cameras", "grids"), ("options",), ("inputs",), ("sfm",), ("stereo",),
+    ("field",), ("mesh",), ("scene_writer", "report", "measure"), ("stages",), ("commands",),
 )  # fmt: skip
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 

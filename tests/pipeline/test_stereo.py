@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from pipeline.cameras import PosedPhotos
-from pipeline.field.interpolation import places_of
+from pipeline.grids.interpolation import places_of
 from pipeline.stereo.depth import BEYOND, DepthMap, neighbours, only, outside_mask, stereo, stereo_summary
 from pipeline.stereo.fusion import behind, fuse
 from tests.helpers.balls import BALL, GROUND, ball_on_plane, camera, grey_of, ring, shoot, true_depth

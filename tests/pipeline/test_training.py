@@ -131,11 +131,12 @@ def trainer(iteration: int, iterations: int) -> SimpleNamespace:
         (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
         (500, 1000, 30.0, 1100),  # faster
         (500, 1000, 101.0, 500),  # over: ends at once
-        (850, 890, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
+        (850, 890, 10.0, 950),  # never more than the settings's
     ],
 )
 def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
-    found = paced(trainer(iteration, iterations), PRESETS["quick"], 100.0, elapsed, iteration)  # type: ignore[arg-type]
+    settings = replace(PRESETS["quick"], iterations=950 if iteration == 850 else 2000)
+    found = paced(trainer(iteration, iterations), settings, 100.0, elapsed, iteration)  # type: ignore[arg-type]
     assert found == expected
 
 

@@ -143,7 +143,7 @@ def test_the_surface_of_pieces_has_a_patch_for_each():
 def test_the_balls_of_leaves_hold_the_whole_surface(block):
     """Each place on a fitted surface is in the ball of a leaf, and of a clump: what is far from all balls is far."""
     shape = with_sdf(block, "mesh")
-    surface = ContactGeometry(shape.sdf, shape.nodes[::7], (), NOTHING).surface
+    surface = ContactGeometry(shape.sdf, shape.nodes[::7], (), shape.mesh).surface
     assert surface.leaf_node[-1] == len(surface.node) and surface.clump_leaf[-1] == len(surface.leaf_ball)
     places = project(shape.sdf, np.random.default_rng(0).uniform(*shape.sdf.bounds, (20_000, 3)))
     for balls in (surface.leaf_ball, surface.clump_ball):
@@ -155,9 +155,9 @@ def test_copies_and_processes_share_one_geometry(block, monkeypatch, tmp_path):
     """The surface comes from the disk the second time, as it was."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     shape = with_sdf(block, "mesh")
-    first = ContactGeometry(shape.sdf, shape.nodes, (), NOTHING).surface
+    first = ContactGeometry(shape.sdf, shape.nodes, (), shape.mesh).surface
     monkeypatch.setattr(contact_geometry, "in_leaves", None)
-    again = ContactGeometry(shape.sdf, shape.nodes, (), NOTHING).surface
+    again = ContactGeometry(shape.sdf, shape.nodes, (), shape.mesh).surface
     for name, values in vars(first).items():
         np.testing.assert_array_equal(getattr(again, name), values)
 

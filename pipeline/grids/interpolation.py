@@ -20,7 +20,7 @@ from sdfsim.physics import solver as kernels
 NEAR = 2.0  # cells from a surface within which all bricks are there
 
 with kernels.kept():
-    from pipeline.field.trilinear import (
+    from pipeline.grids.trilinear import (
         BRICK,
         gather,
         gather_bricks,

@@ -1,0 +1,1 @@
+"""Grids of values between which torch and compiled code interpolate."""
