@@ -57,7 +57,8 @@ def test_a_section_is_replaced_and_nothing_else(tmp_path):
 
 
 def test_the_page_has_a_section_for_every_benchmark_that_writes_one():
+    """The roofline stands on the page of scale."""
     sources = "".join(file.read_text() for file in Path(PAGE.parent).glob("*.py"))
-    written = set(re.findall(r'write_section\("([^"]+)"', sources))
+    written = set(re.findall(r'write_section\("([^"]+)"', sources)) - {"roofline"}
     there = re.findall(r"<!-- end of (.+) -->", PAGE.read_text())
     assert set(there) == written and len(there) == len(written) > 5

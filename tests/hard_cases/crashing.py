@@ -265,7 +265,8 @@ def of_fit(folder: Path) -> dict:
     record, tensors = json.loads((folder / "shape.json").read_text()), load_file(folder / "shape.safetensors")
     weights = {name: Close(values) for name, values in tensors.items() if name.startswith("layer")}
     told = {key: record[key] for key in ("name", "volume", "com", "source")}
-    return weights | told | {"mesh": (folder / "mesh.ply").read_bytes(), "steps": record["certificate"]["steps"]}
+    steps = record["certificate"].get("steps")  # a grid is sampled, not fitted
+    return weights | told | {"mesh": (folder / "mesh.ply").read_bytes(), "steps": steps}
 
 
 def of_simulate(folder: Path) -> dict:
