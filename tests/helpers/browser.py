@@ -11,15 +11,18 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 class Browser:
-    """One page of a browser of its own; a context manager. Chromium has to be installed."""
+    """One page of a browser of its own; a context manager. Skips the test where Chromium is not installed."""
 
     def __init__(self, profile: Path, size: tuple[int, int] = (1280, 800)) -> None:
         program = next((found for name in NAMES if (found := shutil.which(name))), None)
-        assert program, "Chromium is needed: apt-get install chromium"
+        if program is None:
+            pytest.skip("Chromium is not installed (apt-get install chromium)")
         to_read, to_write = os.pipe(), os.pipe()  # what the browser reads, and writes
 
         def connected() -> None:
