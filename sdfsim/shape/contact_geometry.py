@@ -24,15 +24,13 @@ from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
 
-VERSION = 5  # of what is kept on disk, beside that of the grid that surfaces are sampled from
+VERSION = 6  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
-# What a grid says on a mesh, in cells, where it rounds off an edge, and the cosine between the faces there at most: the
-# grid of samples of the mesh itself, and that of a fit, which is a little off everywhere.
-SAMPLED, FITTED = (0.05, 1.0), (0.1, SHARP)
+ROUNDED = 0.1  # cells that the grid of a fit is off on an edge of its mesh that it rounds off
 ALONG_EDGE, MOST_ON_EDGES = 2.0, 4000  # cells between nodes of such an edge, and how many of them a shape has at most
 # Of a solid's largest extent, from where its nodes look out, and of its thickness: not out of the other side of a wall.
 INWARD, SHALLOW = 0.004, 0.4
@@ -112,7 +110,7 @@ class ContactGeometry:
         if isinstance(self.sdf, ClosedForm):
             return ContactSurface(**self._surface())
         faces = () if self.pieces else (self.mesh.vertices, self.mesh.faces)
-        known = digest(self.sdf, self.nodes, [*self.pieces], *faces, LEAF, CLUMP, INWARD, SHALLOW, SAMPLED, FITTED)
+        known = digest(self.sdf, self.nodes, [*self.pieces], *faces, LEAF, CLUMP, INWARD, SHALLOW, ROUNDED)
         path = user_cache("contact") / f"{known}-{BAKE_VERSION}-{VERSION}.npz"
         return ContactSurface(**cached_arrays(path, "the contact surface of a shape", self._surface))
 
@@ -123,8 +121,8 @@ class ContactGeometry:
             nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
             patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
         else:
-            kind = FITTED if isinstance(sdf, MlpSdf) else SAMPLED
-            edges = self.nodes[:0] if grid is None or self.pieces else on_edges(self.mesh, grid, *kind)
+            fitted = grid is not None and isinstance(sdf, MlpSdf) and not self.pieces
+            edges = on_edges(self.mesh, grid) if fitted else self.nodes[:0]
             patches = patches_of(sdf, np.concatenate([self.nodes, edges]), self.pieces)
             cover = np.zeros(len(patches["node"]))
             if grid is not None and len(cover):
@@ -140,21 +138,22 @@ class ContactGeometry:
         return {**in_leaves(node, patch, cover, inward), **patches}
 
 
-def on_edges(mesh: Mesh, grid: BakedGrid, rounded: float, sharp: float) -> np.ndarray:
-    """Points [K, 3] m along the edges of a mesh that its grid rounds off by so many cells. Between two nodes that lie
-    far apart such an edge would sink into what it stands on: the way down the distance ends on the rounded surface."""
+def on_edges(mesh: Mesh, grid: BakedGrid) -> np.ndarray:
+    """Points [K, 3] m along the sharp edges of a fit's mesh that its grid rounds off. Between two nodes that lie far
+    apart such an edge would sink into what it stands on: the way down the distance ends on the rounded surface. Where
+    the mesh itself was sampled, such nodes throw a rolling hoop up."""
     spacing, normal = ALONG_EDGE * grid.cell, face_normals(mesh)[0]
     number, _ = directed_edges(mesh.faces)
     order = np.argsort(number, kind="stable")
     one, other = order[:-1], order[1:]
-    bent = (number[one] == number[other]) & ((normal[one % len(normal)] * normal[other % len(normal)]).sum(1) < sharp)
+    bent = (number[one] == number[other]) & ((normal[one % len(normal)] * normal[other % len(normal)]).sum(1) < SHARP)
     edge = np.concatenate([mesh.faces[:, [k, (k + 1) % 3]] for k in range(3)])[one[bent]]
     start, way = mesh.vertices[edge[:, 0]], mesh.vertices[edge[:, 1]] - mesh.vertices[edge[:, 0]]
     parts = np.maximum(1, np.ceil(np.linalg.norm(way, axis=1) / spacing).astype(np.int64))
     row = np.repeat(np.arange(len(edge)), parts)
     part = np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)
     points = np.concatenate([start[row] + (part / parts[row])[:, None] * way[row], start + way])
-    points = points[interpolated(grid, points) > rounded * grid.cell]
+    points = points[interpolated(grid, points) > ROUNDED * grid.cell]
     while len(kept := one_per_voxel(points, spacing)) > MOST_ON_EDGES:
         spacing *= 1.5
     return kept
