@@ -28,19 +28,19 @@ def demo(tmp_path_factory) -> Path:
 def test_the_surface_is_as_near_the_truth_as_it_was(demo):
     """Percent of the table's width, against the mesh that samples/photos/make.py rendered the photos from.
 
-    Seven runs of *quick* (docs/tradeoff.md) had a median of 0.21, with a standard deviation of 0.03, and 90 % within
-    0.79 (0.05). The limits are four and five of these away, so that other seeds and sums in another order pass, and
-    1,575 steps in place of 2,800 do not (90 % within 1.13). What is missing of the true surface is held too: today
-    0.15 in the median, and 97.2 % of it found within 1 %.
+    Two runs had a median of 0.17, 90 % within 0.55 and 0.62, 0.11 missing in the median, 99.6 % found within 1 %, and a
+    vase that is hollow by 19 and 20 cm of 32. Earlier fields, from a ball, scattered by 0.03 and 0.05 from seed to
+    seed; the limits are some four of these away.
     """
     truth, report = evaluate(demo / "scene", PHOTOS), read_json(demo / "scene" / "report.json")
     assert truth["poses"]["center_error_worst_percent"] < 0.5
     assert report["psnr"] > 20
     found = truth["surface_percent_of_table_width"]
-    assert found["surface"]["median"] < 0.33
-    assert found["surface"]["p90"] < 1.05
-    assert found["missing"]["median"] < 0.25
-    assert found["complete_percent"] > 95.5
+    assert found["surface"]["median"] < 0.28
+    assert found["surface"]["p90"] < 0.85
+    assert found["missing"]["median"] < 0.2
+    assert found["complete_percent"] > 98
+    assert found["vase"]["object1"]["hollow_cm"] > 14
 
 
 @pytest.mark.gate
