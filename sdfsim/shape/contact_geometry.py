@@ -121,8 +121,9 @@ class ContactGeometry:
             nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
             patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
         else:
-            fitted = grid is not None and isinstance(sdf, MlpSdf) and not self.pieces
-            edges = on_edges(self.mesh, grid) if fitted else self.nodes[:0]
+            edges = self.nodes[:0]
+            if grid is not None and isinstance(sdf, MlpSdf) and not self.pieces:
+                edges = on_edges(self.mesh, grid)
             patches = patches_of(sdf, np.concatenate([self.nodes, edges]), self.pieces)
             cover = np.zeros(len(patches["node"]))
             if grid is not None and len(cover):
