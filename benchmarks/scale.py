@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numba import njit
-from threadpoolctl import threadpool_limits
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -268,8 +268,8 @@ def best(call: Callable[[], object], rounds: int = 7) -> float:
 def arithmetic() -> float:
     """Operations a second in double precision, of what keeps all units of a core busy."""
     size = 768
-    a, b = np.random.default_rng(0).random((2, size, size))
-    with threadpool_limits(1):
+    a, b = torch.rand((2, size, size), dtype=torch.float64)
+    with one_thread():
         return 2 * size**3 / best(lambda: a @ b)
 
 
