@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sdfsim.apps.render import render
     from sdfsim.apps.run import simulate
     from sdfsim.base.errors import SceneError, SdfsimError
+    from sdfsim.physics.bodies import State
     from sdfsim.physics.rollout import Rollout
     from sdfsim.scene.builder import SceneBuilder as Scene
     from sdfsim.scene.load import load_scene
@@ -42,6 +43,7 @@ __all__ = [
     "SdfsimError",
     "Shape",
     "Simulator",
+    "State",
     "export",
     "fit",
     "load_scene",
@@ -58,6 +60,7 @@ _HOME = {
     "SdfsimError": "sdfsim.base.errors",
     "Shape": "sdfsim.shape.shape",
     "Simulator": "sdfsim.simulate.simulator",
+    "State": "sdfsim.physics.bodies",
     "load_scene": "sdfsim.scene.load",
     "load_shape": "sdfsim.shape.shape",
     "export": "sdfsim.apps.export",

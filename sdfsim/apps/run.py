@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -32,7 +32,7 @@ from sdfsim.base.files import (
 )
 from sdfsim.base.parallel import Progress, StageProgress, silent
 from sdfsim.learned.model import SOLVER, load_model
-from sdfsim.physics.bodies import State, Touch, largest_extent
+from sdfsim.physics.bodies import State, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import EARTH
@@ -304,7 +304,7 @@ class Checkpoint:
             if str(kept["identity"]) != self.identity:
                 raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
             self._parts = int(kept["parts"])
-            self._simulator.restore(_state(kept))
+            self._simulator.restore(State.of_arrays(kept))
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{file}: not a checkpoint of this version ({error})", _ANEW) from error
         return [Rollout.load(self._part(k)) for k in range(self._parts)]
@@ -321,7 +321,7 @@ class Checkpoint:
             self._folder.mkdir(exist_ok=True)
             join([frame for frame, _ in self._fresh]).save(self._part(self._parts))
             done = {"identity": self.identity, "parts": self._parts + 1}
-            write_arrays(self._folder / _STATE, done | _arrays(self._fresh[-1][1]), compressed=False)
+            write_arrays(self._folder / _STATE, done | self._fresh[-1][1].arrays(), compressed=False)
             self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
             self._parts += 1
         self._saved = time.monotonic()
@@ -360,22 +360,3 @@ def identity(simulator: Simulator) -> str:
     model = (s.model.kind, s.model.reach, s.model.network)
     chosen = {name: value for name, value in vars(s.stepper).items() if isinstance(value, bool | float)}
     return digest(s.dt, s.seed, s.options, type(s.stepper).__name__, chosen, s.units, s.bodies, s.state, model)
-
-
-def _arrays(state: State) -> dict[str, np.ndarray]:
-    """Every array of a state and of what touches in it, by name."""
-    found = {"time": np.array(state.time)}
-    for prefix, part in (("", state), ("touch.", state.touch)):
-        for f in fields(part) if part is not None else ():
-            if isinstance(value := getattr(part, f.name), np.ndarray):
-                found[prefix + f.name] = value
-    return found
-
-
-def _state(arrays: dict[str, np.ndarray]) -> State:
-    def known(kind: type, prefix: str) -> dict[str, np.ndarray]:
-        names = {f.name: prefix + f.name for f in fields(kind) if f.name != "time"}
-        return {k: arrays[name] for k, name in names.items() if name in arrays}
-
-    touch = known(Touch, "touch.")
-    return State(**known(State, ""), touch=Touch(**touch) if touch else None, time=float(arrays["time"]))

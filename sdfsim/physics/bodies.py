@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, write_arrays
 from sdfsim.physics import joints as jointed
 from sdfsim.physics import pose
 from sdfsim.physics.joints import Joints
@@ -133,8 +135,16 @@ class Touch(Rows):
 
 
 @dataclass(frozen=True)
+class Moment(Motion):
+    """Where N bodies are and how they move at one instant, in metres and seconds."""
+
+    time: float = 0.0  # s, since the start
+
+
+@dataclass(frozen=True)
 class State(Motion):
-    """Where N bodies are and how they move, at one instant."""
+    """All that a run goes on from, in model units: where N bodies are and how they move at one instant, what touches,
+    sleeps, pulls and drives. A simulator's `options` and what the scene says are not in it."""
 
     # [2, N, 3] and [2, N, 4], the two poses before (oldest first), for networks on surface nodes; None for others
     earlier_position: np.ndarray | None = None
@@ -142,8 +152,46 @@ class State(Motion):
     touch: Touch | None = None  # contacts and sleep of the solve; None before its first step
     # [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does
     load: np.ndarray | None = None
-    joints: np.ndarray | None = None  # [J, STATE] of the joints, see `sdfsim.physics.joints`; None where there are none
+    # [J, STATE] of the joints, see `sdfsim.physics.joint_columns`; None where there are none
+    joints: np.ndarray | None = None
+    # [J, NUMBERS] of the joints, where somebody has told one of them something else than the scene does; else None
+    drive: np.ndarray | None = None
     time: float = 0.0  # since the start
+
+    def save(self, path: Path | str) -> Path:
+        """Write an .npz file from which `read` makes the same state, to the last bit. Raises SdfsimError where it
+        cannot be written."""
+        path = Path(path)
+        write_arrays(path, self.arrays(), compressed=False)
+        return path
+
+    @classmethod
+    def read(cls, path: Path | str) -> State:
+        """What `save` has written. Raises SdfsimError where it is missing or none of ours."""
+        try:
+            return cls.of_arrays(read_arrays(Path(path), "a state"))
+        except (KeyError, TypeError, ValueError) as error:
+            raise SdfsimError(f"{path}: not a state of this version ({error})") from error
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Every array of the state and of what touches in it, by name."""
+        found = {"time": np.array(self.time)}
+        for prefix, part in (("", self), ("touch.", self.touch)):
+            for f in fields(part) if part is not None else ():
+                if isinstance(value := getattr(part, f.name), np.ndarray):
+                    found[prefix + f.name] = value
+        return found
+
+    @classmethod
+    def of_arrays(cls, arrays: dict[str, np.ndarray]) -> State:
+        """The state that has these `arrays`; others are left alone."""
+
+        def known(kind: type, prefix: str) -> dict[str, np.ndarray]:
+            names = {f.name: prefix + f.name for f in fields(kind) if f.name != "time"}
+            return {k: arrays[name] for k, name in names.items() if name in arrays}
+
+        touch = known(Touch, "touch.")
+        return cls(**known(cls, ""), touch=Touch(**touch) if touch else None, time=float(arrays["time"]))
 
 
 def awake(bodies: Bodies, state: State) -> np.ndarray:

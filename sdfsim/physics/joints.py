@@ -35,6 +35,10 @@ from sdfsim.physics.joint_columns import (
 )
 from sdfsim.scene.scene import Joint
 
+# Beside `TO_SPEED` and `TO_PLACE`: a motor gives a torque or force, which the target then is. The compiled step knows
+# no such motor: to it that is the most that one gives for a speed that it never reaches.
+EFFORT = 3
+NEVER = 1e4  # model units of speed
 
 @dataclass(frozen=True)
 class Joints:
@@ -74,9 +78,10 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
             row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
         if (motor := joint.motor) is not None:
             row[MOST], row[TIME] = motor.most / effort, motor.time / time
-            row[MOTOR] = TO_PLACE if motor.speed is None else TO_SPEED
-            aim = motor.position if motor.speed is None else motor.speed * time
-            target[k] = (aim or 0.0) / unit
+            if motor.speed is not None:
+                row[MOTOR], target[k] = TO_SPEED, motor.speed * time / unit
+            elif motor.position is not None:
+                row[MOTOR], target[k] = TO_PLACE, motor.position / unit
         if joint.length is not None:
             row[LENGTH] = joint.length / length
         row[FORCE], row[TORQUE] = joint.breaks_force / force, joint.breaks_torque / torque
@@ -121,6 +126,17 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
     leaning = np.arctan2(np.linalg.norm(np.cross(axes[:, 0, 0], axes[:, 1, 0]), axis=-1), times(0, 0))
     along, length = (axes[:, 1, 0] * way).sum(-1), np.linalg.norm(way, axis=-1)
     return np.choose(joints.kind, [angle, along, leaning, np.zeros(len(joints)), length])
+
+
+def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """[J, NUMBERS] and the targets [J] as the compiled step takes them, of joints that were told `drive` since."""
+    number = joints.number if drive is None else drive
+    target, effort = state[:, TARGET], number[:, MOTOR] == EFFORT
+    if not effort.any():
+        return number, target
+    number = number.copy()
+    number[effort, MOTOR], number[effort, MOST] = TO_SPEED, np.abs(target[effort])
+    return number, np.where(effort, NEVER * np.sign(target), target)
 
 
 def stored(joints: Joints, state: np.ndarray) -> float:

@@ -94,8 +94,9 @@ class Spring:
 
 @dataclass(frozen=True)
 class Motor:
-    """Of a hinge (rad, N m) or a slider (m, N): it keeps `speed`, or goes to `position`, of which one is None, with at
-    most the torque or force `most`; what is left of the way shrinks by a factor e in `time` s."""
+    """Of a hinge (rad, N m) or a slider (m, N): it keeps `speed`, or goes to `position`, with at most the torque or
+    force `most`; what is left of the way shrinks by a factor e in `time` s. Where both are None it does nothing until
+    it is told a place."""
 
     most: float
     speed: float | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,7 +18,7 @@ from sdfsim.simulate.steppers import Stepper
 Numbers = Sequence[float] | np.ndarray
 
 
-class LiveScene:
+class LiveScene(ABC):
     """A scene in motion, in model units. It records which bodies the user changes, to announce them to the stepper."""
 
     scene: Scene
@@ -32,18 +33,46 @@ class LiveScene:
 
     @property
     def state(self) -> State:
-        """Bodies and how they move. Give it another one to start from there, or to change bodies:
-        `simulator.state = replace(simulator.state, velocity=...)`; its arrays are not to be written into."""
+        """All that a run goes on from: poses and velocities, forces that pull, contacts, who sleeps, joints with what
+        their motors are told, and the time. `restore` goes on from it, and `state.save("state.npz")` keeps it. It holds
+        neither `options`, gravity among them, nor what the scene says.
+
+        Give it another one to start from there, or to change bodies: `simulator.state = replace(simulator.state,
+        velocity=...)`; its arrays are not to be written into. Raises SimulationError where what was changed cannot be.
+        """
+        self._accept()  # a state that is kept must know of every change, or what slept would sleep on
         return self._state
 
     @state.setter
     def state(self, state: State) -> None:
+        self._fits(state)
         self._state, self._handed = state, True
+
+    def _fits(self, state: State) -> None:
+        """Raises SdfsimError for what is no state of this scene."""
+        if not isinstance(state, State):
+            told = f"state: must be a State, such as simulator.state was before (got a {type(state).__name__})"
+            raise SdfsimError(told, "what step() returns is in metres and seconds, and too little to go on from")
+        given = len(state.position), 0 if state.joints is None else len(state.joints)
+        known = len(self.bodies), 0 if self.bodies.joints is None else len(self.bodies.joints)
+        if given != known:
+            told = "state: is of another scene (it has {} bodies and {} joints, this one {} and {})"
+            raise SdfsimError(told.format(*given, *known))
+
+    @property
+    def now(self) -> State:
+        """The state, of which the stepper has not heard what was changed since the last step: many changes in a row
+        are announced at once."""
+        return self._state
 
     def change(self, row: int, **fields: np.ndarray | None) -> None:
         """Replace fields of the state, of which only those of one body differ."""
         self._state = replace(self._state, **fields)
         self._changed.add(row)
+
+    @abstractmethod
+    def _accept(self) -> None:
+        """Check what the user has changed, and announce it to the stepper."""
 
 
 @dataclass(frozen=True)
@@ -147,12 +176,14 @@ class BodyHandle:
         if at is not None and self._simulator.options.rotation:
             sim, row = self._simulator, self._row
             turn = np.cross(_vector("at", at) - self.centre, given)
-            axes = pose.to_matrix(sim.state.orientation[row])
+            axes = pose.to_matrix(sim.now.orientation[row])
             self.angular_velocity = self.angular_velocity + np.linalg.solve(axes @ self.inertia @ axes.T, turn)
 
-    def pull(self, force: Numbers, at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)) -> None:
-        """Let a force [3] N and a torque [3] N m act from now on, in world axes, until the next call or `reset`; zero
-        ends them.
+    def pull(
+        self, force: Numbers = (0.0, 0.0, 0.0), at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Let a force [3] N and a torque [3] N m act from now on, in world axes, until the next call or `reset`;
+        `pull()` ends both.
 
         The force acts `at` [3] m, world, now, or at the centre of mass. Its moment about the centre of mass stays as it
         is, however the body moves: pull again after a step to follow the point. The torque comes on top of it. Raises
@@ -165,14 +196,14 @@ class BodyHandle:
         given, moment = _vector("force", force), _vector("torque", torque)
         if at is not None:
             moment = moment + np.cross(_vector("at", at) - self.centre, given)
-        u, state = sim.units, sim.state
+        u, state = sim.units, sim.now
         load = np.zeros((len(sim.bodies), 6)) if state.load is None else state.load.copy()
         load[self._row, :3] = given / (u.mass * u.acceleration)
         load[self._row, 3:] = moment / u.energy
         sim.change(self._row, load=load if load.any() else None)
 
     def _of(self, name: str) -> np.ndarray:
-        return getattr(self._simulator.state, name)[self._row].copy()
+        return getattr(self._simulator.now, name)[self._row].copy()
 
     def _arm(self, quat: np.ndarray) -> np.ndarray:
         """[3] m from the shape's origin to the centre of mass, world."""
@@ -183,7 +214,7 @@ class BodyHandle:
         sim = self._simulator
         if sim.scene.bodies[self._row].motion == "kinematic" or "velocity" in name:
             self._must_move(f"be given a {name.replace('_', ' ')}")
-        array = getattr(sim.state, name).copy()
+        array = getattr(sim.now, name).copy()
         array[self._row] = value
         sim.change(self._row, **{name: array})
 

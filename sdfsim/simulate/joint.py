@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
+import warnings
+from numbers import Real
+
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.physics.joint_columns import BROKEN, COORD, PULL, SPEED, TARGET, TWIST
-from sdfsim.scene.scene import Joint
+from sdfsim.physics.bodies import State
+from sdfsim.physics.joint_columns import (
+    BROKEN,
+    COORD,
+    DAMPING,
+    DRAG,
+    MOST,
+    MOTOR,
+    NOTHING,
+    PULL,
+    SPEED,
+    TARGET,
+    TIME,
+    TO_PLACE,
+    TO_SPEED,
+    TWIST,
+)
+from sdfsim.physics.joints import EFFORT
+from sdfsim.scene.scene import Joint, Motor
 from sdfsim.simulate.body import LiveScene
 
 
 class JointHandle:
-    """One joint of a simulator, by its `name`: read it, and tell its motor what to aim at, which counts from the next
-    step on."""
+    """One joint of a simulator, by its `name`: read it, and drive it, by `target` or by `effort`, which counts from the
+    next step on until you change it. Radians and N m of a hinge, metres and N of a slider."""
 
     __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
 
@@ -44,10 +64,18 @@ class JointHandle:
         u = self._simulator.units
         return self._state[PULL : PULL + 3] * u.mass * u.acceleration
 
+    @force.setter
+    def force(self, value: float) -> None:
+        raise SdfsimError(f"joint {self.name!r}: force is what the joint has done", "set `effort` to drive it")
+
     @property
     def torque(self) -> np.ndarray:
         """[3] N m, world: likewise the torque about the joint's anchor."""
         return self._state[TWIST : TWIST + 3] * self._simulator.units.energy
+
+    @torque.setter
+    def torque(self, value: float) -> None:
+        raise SdfsimError(f"joint {self.name!r}: torque is what the joint has done", "set `effort` to drive it")
 
     @property
     def broken(self) -> bool:
@@ -55,23 +83,97 @@ class JointHandle:
         return bool(self._state[BROKEN])
 
     @property
-    def target(self) -> float:
-        """What the motor aims at: rad/s or m/s where it keeps a speed, else rad or m. Raises SdfsimError where there is
-        no motor."""
-        return float(self._state[TARGET]) * self._aim
+    def target(self) -> float | None:
+        """What the motor aims at: rad/s or m/s where it keeps a speed, else rad or m; None where nobody has told it
+        yet, and while it gives an `effort`. None lets the motor go. Raises SdfsimError where there is no motor."""
+        unit, does = self._aim, int(self._number[MOTOR])
+        return float(self._told[TARGET]) * unit if does in (TO_SPEED, TO_PLACE) else None
 
     @target.setter
-    def target(self, value: float) -> None:
-        if not np.isfinite(value):
-            raise SdfsimError(f"joint {self.name!r}: target: must be a finite number (got {value!r})")
-        simulator, unit = self._simulator, self._aim
-        assert simulator.state.joints is not None
-        known = simulator.state.joints.copy()
-        known[self._row, TARGET] = value / unit
-        # Its bodies are told of, so that they wake.
-        for body in self._joint.bodies:
-            if body >= 0 and simulator.bodies.moves[body]:
-                simulator.change(body, joints=known)
+    def target(self, value: float | None) -> None:
+        unit = self._aim
+        if value is None:
+            return self._tell({MOTOR: NOTHING}, 0.0)
+        aim = self._finite("target", value)
+        does = TO_SPEED if self._keeps_speed else TO_PLACE
+        ends = self._joint.limits
+        if does == TO_PLACE and ends is not None and not ends[0] <= aim <= ends[1]:
+            # One that is out of reach is a way to press against a limit.
+            told = f"joint {self.name!r}: target {aim:g} is beyond the limits, {ends[0]:.4g} to {ends[1]:.4g}"
+            warnings.warn(told, stacklevel=2)
+        return self._tell({MOTOR: does}, aim / unit)
+
+    @property
+    def effort(self) -> float | None:
+        """The torque in N m about a hinge's axis, or the force in N along a slider's, that acts on the first body from
+        now on, whatever the speed, until it is set again; None where the motor goes to its `target` or does nothing.
+        Setting `target` ends it, and so does None. It is no larger than `most` of the motor where there is one. Raises
+        SdfsimError for any other joint."""
+        self._need("effort", "hinge", "slider")
+        return float(self._told[TARGET]) * self._strength if self._number[MOTOR] == EFFORT else None
+
+    @effort.setter
+    def effort(self, value: float | None) -> None:
+        self._need("effort", "hinge", "slider")
+        if value is None:
+            return self._tell({MOTOR: NOTHING}, 0.0)
+        most = self._number[MOST] or np.inf
+        return self._tell({MOTOR: EFFORT}, float(np.clip(self._finite("effort", value) / self._strength, -most, most)))
+
+    @property
+    def most(self) -> float:
+        """The largest torque in N m, or force in N, of the motor; 0 where there is none, which setting it changes.
+        Raises SdfsimError for what is no hinge or slider."""
+        self._need("most", "hinge", "slider")
+        return float(self._number[MOST]) * self._strength
+
+    @most.setter
+    def most(self, value: float) -> None:
+        self._need("most", "hinge", "slider")
+        most = self._finite("most", value, least=0.0) / self._strength
+        time = self._number[TIME] or Motor(1.0).time / self._simulator.units.time
+        self._tell({MOST: most, TIME: time})
+
+    @property
+    def time(self) -> float:
+        """s, in which what is left of the way shrinks by a factor e. Raises SdfsimError where there is no motor that
+        goes to a place."""
+        _ = self._aim
+        if self._keeps_speed:
+            raise SdfsimError(f"joint {self.name!r}: keeps a speed, which has no time", "see joints[].motor.position")
+        return float(self._number[TIME]) * self._simulator.units.time
+
+    @time.setter
+    def time(self, value: float) -> None:
+        known, time = self.time, self._finite("time", value, least=0.0)
+        if not time > 0.0:
+            raise SdfsimError(f"joint {self.name!r}: time: must be above 0 (got {value!r}; now {known:g})")
+        self._tell({TIME: time / self._simulator.units.time})
+
+    @property
+    def damping(self) -> float:
+        """N m s/rad of a hinge or a ball, else N s/m. Raises SdfsimError for what is fixed, or a rod."""
+        self._need("damping", "hinge", "slider", "ball", "distance")
+        return float(self._number[DAMPING]) * self._strength / self._unit * self._simulator.units.time
+
+    @damping.setter
+    def damping(self, value: float) -> None:
+        self._need("damping", "hinge", "slider", "ball", "distance")
+        if self._joint.length is not None:
+            raise SdfsimError(f"joint {self.name!r}: is a rod, which has no damping")
+        found = self._finite("damping", value, least=0.0)
+        self._tell({DAMPING: found * self._unit / self._strength / self._simulator.units.time})
+
+    @property
+    def friction(self) -> float:
+        """N m of a hinge or a ball, N of a slider. Raises SdfsimError for any other joint."""
+        self._need("friction", "hinge", "slider", "ball")
+        return float(self._number[DRAG]) * self._strength
+
+    @friction.setter
+    def friction(self, value: float) -> None:
+        self._need("friction", "hinge", "slider", "ball")
+        self._tell({DRAG: self._finite("friction", value, least=0.0) / self._strength})
 
     @property
     def _joint(self) -> Joint:
@@ -79,24 +181,80 @@ class JointHandle:
 
     @property
     def _state(self) -> np.ndarray:
-        known = self._simulator.state.joints
-        if known is None:
+        """[STATE], with what has been changed."""
+        return self._known(self._simulator.state)
+
+    @property
+    def _told(self) -> np.ndarray:
+        """[STATE], of which what users tell is up to date."""
+        return self._known(self._simulator.now)
+
+    def _known(self, state: State) -> np.ndarray:
+        if state.joints is None:
             raise SdfsimError(f"joint {self.name!r}: joints are off in this scene", "see effects.joints")
-        return known[self._row]
+        return state.joints[self._row]
+
+    @property
+    def _number(self) -> np.ndarray:
+        """[NUMBERS], as somebody has told them last."""
+        state, joints = self._simulator.now, self._simulator.bodies.joints
+        self._known(state)
+        assert joints is not None
+        return (joints.number if state.drive is None else state.drive)[self._row]
+
+    def _tell(self, numbers: dict[int, float], target: float | None = None) -> None:
+        """Change numbers of the joint and what its motor aims at; its bodies wake where that is something new."""
+        simulator, row = self._simulator, self._row
+        known, number = self._told.copy(), self._number.copy()
+        if target is not None:
+            known[TARGET] = target
+        for column, value in numbers.items():
+            number[column] = value
+        if np.array_equal(known, self._told) and np.array_equal(number, self._number):
+            return
+        state, joints = simulator.now, simulator.bodies.joints
+        assert state.joints is not None and joints is not None
+        told, drive = state.joints.copy(), (joints.number if state.drive is None else state.drive).copy()
+        told[row], drive[row] = known, number
+        for body in self._joint.bodies:
+            if body >= 0 and simulator.bodies.moves[body]:
+                simulator.change(body, joints=told, drive=drive)
+
+    def _finite(self, name: str, value: float, *, least: float = -np.inf) -> float:
+        if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(value) or value < least:
+            what = "a finite number" if least < 0.0 else "a finite number of at least 0"
+            raise SdfsimError(f"joint {self.name!r}: {name}: must be {what} (got {value!r})")
+        return float(value)
 
     @property
     def _unit(self) -> float:
         return 1.0 if self._joint.kind in ("hinge", "ball") else self._simulator.units.length
 
     @property
+    def _strength(self) -> float:
+        """N m or N in one model unit of what drives or drags it."""
+        return self._simulator.units.energy / self._unit
+
+    @property
+    def _keeps_speed(self) -> bool:
+        return self._joint.motor is not None and self._joint.motor.speed is not None
+
+    @property
     def _aim(self) -> float:
         """rad or m, or rad/s or m/s, in one model unit of the target."""
-        motor = self._joint.motor
-        if motor is None or self._simulator.bodies.joints is None:
-            raise SdfsimError(f"joint {self.name!r}: has no motor", "give it one in the scene: joints[].motor")
-        return self._unit if motor.speed is None else self._unit / self._simulator.units.time
+        if not self._number[MOST] > 0.0:
+            hint = "give it one in the scene, joints[].motor, or set most; effort needs none"
+            raise SdfsimError(f"joint {self.name!r}: has no motor", hint)
+        return self._unit / self._simulator.units.time if self._keeps_speed else self._unit
+
+    def _need(self, what: str, *kinds: str) -> None:
+        if self._joint.kind not in kinds:
+            hint = {"angle": "read position", "position": "read angle"}.get(what, "")
+            fits = self._joint.kind in ("hinge", "ball", "slider", "distance")
+            raise SdfsimError(
+                f"joint {self.name!r}: is a {self._joint.kind}, which has no {what}", hint if fits else ""
+            )
 
     def _coordinate(self, what: str, *kinds: str) -> float:
-        if self._joint.kind not in kinds:
-            raise SdfsimError(f"joint {self.name!r}: is a {self._joint.kind}, which has no {what}")
+        self._need(what, *kinds)
         return float(self._state[COORD]) * self._unit

@@ -17,7 +17,8 @@ from sdfsim.base.parallel import Progress, parallel, silent, threads
 from sdfsim.base.version import __version__
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.learned.training_ranges import deep_starts
-from sdfsim.physics.bodies import State, from_scene
+from sdfsim.physics.bodies import Bodies, Moment, State, from_scene
+from sdfsim.physics.joint_columns import TARGET
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
@@ -143,7 +144,7 @@ class Simulator(LiveScene):
         self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
-        self._si: tuple[State, State] | None = None  # a state that others differ from in some rows, and the same in SI
+        self._si: tuple[State, Moment] | None = None  # a state that others differ from in some rows, and the same in SI
         self._options = Options(
             gravity=gravity,
             dt=self.model.dt,
@@ -174,14 +175,14 @@ class Simulator(LiveScene):
             raise SdfsimError(self._described(broken))
         self._good = self._start = self.state
 
-    def steps(self, count: int) -> Iterator[State]:
+    def steps(self, count: int) -> Iterator[Moment]:
         """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError for a state that
         cannot be; its `rollout` is one frame here, the last good state."""
         for _ in range(count):
             self._advance(1)
             yield self.si_state()
 
-    def step(self, count: int = 1) -> State:
+    def step(self, count: int = 1) -> Moment:
         """Advance by `count` steps; the state after them (SI units). Raises as `steps` does."""
         self._advance(count)
         return self.si_state()
@@ -233,7 +234,8 @@ class Simulator(LiveScene):
     def restore(self, state: State) -> None:
         """Go on from a state that steps have led to, here or in another simulator of the same scene, as they would have
         gone on there: to the last bit, and what slept sleeps on. For a state that you have changed set `state`. Raises
-        SdfsimError for a state that cannot be."""
+        SdfsimError for a state that cannot be, or of another scene."""
+        self._fits(state)
         if broken := first_fault(state, self._options.dt):
             raise SdfsimError(self._described(broken))
         self._state = self._good = state
@@ -336,13 +338,13 @@ class Simulator(LiveScene):
         )
         return self._rollout(frames, 0.0)
 
-    def si_state(self) -> State:
-        """Motion and time of the current state, in metres and seconds."""
+    def si_state(self) -> Moment:
+        """Motion and time of the current state, in metres and seconds; to go back to it later keep `state`."""
         u, state = self.units, self.state
 
-        def whole(state: State) -> State:
+        def whole(state: State) -> Moment:
             moved: dict[str, Any] = u.in_si(state)
-            return State(**moved, time=state.time * u.time)
+            return Moment(**moved, time=state.time * u.time)
 
         if (parts := state.parts) is None:
             return whole(state)
@@ -371,8 +373,7 @@ class Simulator(LiveScene):
         state, good, changed = self._state, self._good, np.zeros(len(self.bodies), bool)
         changed[list(self._changed)] = True
         if self._handed:
-            for name in MOTION:
-                changed |= (getattr(state, name) != getattr(good, name)).any(-1)
+            changed |= differing(self.bodies, state, good)
         self._handed = False
         self._changed.clear()
         found = first_fault(state, self._options.dt)
@@ -426,6 +427,21 @@ class Simulator(LiveScene):
             joint_force=frames.joint[:, :, 1:4] * u.mass * u.acceleration,
             joint_torque=frames.joint[:, :, 4:7] * u.energy,
         )
+
+
+def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
+    """[N] bool, the bodies that move, are pulled or are driven otherwise in the two states."""
+    found = np.zeros(len(bodies), bool)
+    for name in MOTION:
+        found |= np.any(getattr(state, name) != getattr(other, name), axis=-1)
+    pulled = [np.zeros((1, 6)) if one.load is None else one.load for one in (state, other)]
+    found |= np.any(pulled[0] != pulled[1], axis=-1)
+    if bodies.joints is not None and state.joints is not None and other.joints is not None:
+        told = [bodies.joints.number if one.drive is None else one.drive for one in (state, other)]
+        driven = (state.joints[:, TARGET] != other.joints[:, TARGET]) | np.any(told[0] != told[1], axis=-1)
+        held = bodies.joints.body[driven]
+        found[held[held >= 0]] = True
+    return found
 
 
 def varied(scene: Scene, variant: Variant) -> Scene:

@@ -92,7 +92,12 @@ class Compiled:
         if state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
-            self.held.each.state[:] = 0.0 if state.joints is None else state.joints
+            if state.joints is not None and self.bodies.joints is not None:
+                each = self.held.each
+                each.state[:] = state.joints
+                each.number[:], each.state[:, joint_columns.TARGET] = jointed.driven(
+                    self.bodies.joints, state.joints, state.drive
+                )
         if state.load is not self._load:
             self.work.wrench[:] = 0.0 if state.load is None else state.load
             self._load = state.load
@@ -123,7 +128,10 @@ class Compiled:
         )  # fmt: skip
         arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
         moved = {name: array[rows] for name, array in zip(MOTION, arrays, strict=True)}
-        known = None if state.joints is None else self.held.each.state.copy()
+        known = None
+        if state.joints is not None:
+            known = self.held.each.state.copy()
+            known[:, joint_columns.TARGET] = state.joints[:, joint_columns.TARGET]  # as `driven` was told it
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         asleep = int((motion.island[rows] >= 0).sum())
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
@@ -373,7 +381,7 @@ def held_by(bodies: Bodies) -> Held:
         graph=Graph(**vars(order)),
         factors=Factors(room(k, 6, 6), room(k, 6, 6), room(f, 6, 6), room(f, 6, 6), room(k, 6)),
         each=Each(
-            joints.body, joints.kind, joints.anchor, joints.axes, joints.number, room(j, joint_columns.STATE),
+            joints.body, joints.kind, joints.anchor, joints.axes, joints.number.copy(), room(j, joint_columns.STATE),
             room(j, 1, 12),
         ),
         rows=Rows(
