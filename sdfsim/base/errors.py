@@ -40,6 +40,10 @@ class SdfsimError(Exception):
         self.hint = hint
         self.exit_code = exit_code
 
+    def __str__(self) -> str:
+        """The message, and the hint in a line of its own."""
+        return f"{self.message}\nhint: {self.hint}" if self.hint else self.message
+
 
 class SceneError(SdfsimError):
     """A scene file that cannot be used; `problems` lists every fault found in it, one line each: `FILE:LINE: FIELD:
@@ -55,7 +59,7 @@ def run_main(main: Callable[[], None]) -> None:
     try:
         main()
     except SdfsimError as error:
-        print(f"error: {error}", *([f"hint: {error.hint}"] if error.hint else []), sep="\n", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)

@@ -185,7 +185,7 @@ def load_pieces(path: str | Path) -> list[Mesh]:
     try:
         return [convex_hull(np.array(group)) for group in groups if group]
     except (SdfsimError, ValueError) as error:
-        raise SdfsimError(f"{path}: {error}") from error
+        raise SdfsimError(f"{path}: {getattr(error, 'message', error)}") from error
 
 
 def wavefront(pieces: list[Mesh]) -> str:
@@ -205,4 +205,4 @@ def _reading(path: Path, fault: str = "damaged or cut short") -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise SdfsimError(f"{path}: {fault} ({error})") from error
+        raise SdfsimError(f"{path}: {fault} ({getattr(error, 'message', error)})") from error
