@@ -253,9 +253,12 @@ def mjcf_rest(
         if joint.motor.speed is not None:
             _add(into["actuator"], "velocity", kv=_text(speed), **keys)
             controls.append(joint.motor.speed)
-        else:
+        elif joint.motor.position is not None:
             _add(into["actuator"], "position", kp=_text(speed / joint.motor.time), kv=_text(speed), **keys)
-            controls.append(float(joint.motor.position or 0.0))
+            controls.append(joint.motor.position)
+        else:  # nobody has told it what to do
+            _add(into["actuator"], "motor", **keys)
+            controls.append(0.0)
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
         told.append("that a cone bounds the lean of a ball only: MuJoCo bounds its whole turn")
     for tag in tags:
@@ -364,14 +367,15 @@ def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[st
     drive = physics.DriveAPI.Apply(made.GetPrim(), "angular" if joint.kind == "hinge" else "linear")
     drive.CreateTypeAttr("force")
     if joint.motor is not None:
-        keen = KEEN * joint.motor.most
+        told_none = joint.motor.speed is None and joint.motor.position is None
+        keen = 0.0 if told_none else KEEN * joint.motor.most
         drive.CreateMaxForceAttr(joint.motor.most)
         drive.CreateDampingAttr(keen / degrees)
         drive.CreateStiffnessAttr(0.0 if joint.motor.position is None else keen / joint.motor.time / degrees)
         if joint.motor.speed is not None:
             drive.CreateTargetVelocityAttr(joint.motor.speed * degrees)
-        else:
-            drive.CreateTargetPositionAttr(float(joint.motor.position or 0.0) * degrees)
+        elif joint.motor.position is not None:
+            drive.CreateTargetPositionAttr(joint.motor.position * degrees)
         return [
             *told,
             *([f"spring and damping beside the motor of joint {joint.name}"] * bool(joint.spring or joint.damping)),

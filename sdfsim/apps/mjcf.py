@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.robot import Held, Link, Part, Robot, moved, named, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Held, Link, Part, Robot, moved, named, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
@@ -86,6 +86,11 @@ class _Reader:
         for counter, what in COUNTED.items():
             if count := int(getattr(model, counter, 0)):
                 self.left.append(f"{what} ({count})")
+        roots = [b for b in range(1, model.nbody) if model.body_weldid[b] == 0 and model.body_mocapid[b] < 0]
+        held = [b for b in roots if any(p == b and model.body_weldid[c] for c, p in enumerate(model.body_parentid))]
+        if held:
+            told = "bodies without a joint to the world stand still, and hold what moves (<freejoint/> lets them go)"
+            self.notes.append(named(told, [self._body_name(b) for b in held]))
         if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):
             self.left.append("the air: density, viscosity and wind")
         if np.any(model.body_gravcomp):
@@ -272,35 +277,59 @@ class _Reader:
         return sorted({int(self.model.dof_jntid[dof]) for dof in dofs})
 
     def _motors(self) -> dict[str, dict[str, float]]:
-        """Actuators that keep a speed or a place with a largest force, by their joints."""
+        """Actuators of hinges and slides, by their joints: those that keep a speed or a place, and those that give a
+        torque, which do nothing until they are told."""
         model, mj = self.model, self.mj
         found: dict[str, dict[str, float]] = {}
-        others = []
-        for k in range(model.nactuator if hasattr(model, "nactuator") else model.nu):
-            one = model.actuator(k)
+        others, freely, idle = [], [], []
+        for k in range(model.nu):
+            called = model.actuator(k).name or f"number {k}"
             joint = int(model.actuator_trnid[k, 0])
             of_joint = int(model.actuator_trntype[k]) == int(mj.mjtTrn.mjTRN_JOINT)
             kind = mj.mjtJoint(int(model.jnt_type[joint])) if of_joint else None
-            gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
-            linear = int(model.actuator_gaintype[k]) == int(mj.mjtGain.mjGAIN_FIXED)
-            linear &= int(model.actuator_biastype[k]) == int(mj.mjtBias.mjBIAS_AFFINE)
-            most = float(model.actuator_forcerange[k, 1]) if model.actuator_forcelimited[k] else 0.0
-            straight = model.actuator_gear[k, 0] == 1.0 and bias[0] == 0.0 and most > 0.0
             turns = kind in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE)
             name = self._joint_name(joint) if of_joint else ""
-            if not (turns and linear and straight) or name in found or bias[2] > 0 or bias[1] > 0:
-                others.append(one.name or f"number {k}")
+            gear, gain, bias = (array[k].copy() for array in (
+                model.actuator_gear[:, 0], model.actuator_gainprm, model.actuator_biasprm
+            ))  # fmt: skip
+            linear = int(model.actuator_gaintype[k]) == int(mj.mjtGain.mjGAIN_FIXED)
+            linear &= int(model.actuator_dyntype[k]) == int(mj.mjtDyn.mjDYN_NONE)
+            affine = int(model.actuator_biastype[k]) == int(mj.mjtBias.mjBIAS_AFFINE)
+            alone = int(model.actuator_biastype[k]) == int(mj.mjtBias.mjBIAS_NONE)
+            bias = np.zeros(3) if alone else bias
+            plain = (affine and bias[0] == 0.0) or alone
+            if not (turns and linear and plain and gear) or name in found or bias[1] > 0 or bias[2] > 0:
+                others.append(called)
                 continue
+            torque = not (bias[1] or bias[2])
+            # Its force at the joint is gear x (gain x control + bias[1] x gear x place + bias[2] x gear x speed).
+            bounds = [abs(gear) * np.abs(model.actuator_forcerange[k]).max()] * bool(model.actuator_forcelimited[k])
+            bounds += [np.abs(model.jnt_actfrcrange[joint]).max()] * bool(model.jnt_actfrclimited[joint])
+            reach = np.abs(model.actuator_ctrlrange[k]).max() * abs(gear * gain[0])
+            bounds += [reach] * bool(torque and model.actuator_ctrllimited[k])
+            most = float(min(bounds, default=0.0))
+            if not most > 0.0:
+                most = UNBOUNDED
+                freely.append(called)
             wanted = gain[0] * float(self.data.ctrl[k])
-            if bias[1] < 0:
-                found[name] = {"position": wanted / -bias[1], "most": most}
+            if torque:
+                found[name] = {"most": most}
+                idle.append(called)
+            elif bias[1] < 0:
+                goal = wanted / (-bias[1] * gear)
+                if model.jnt_limited[joint] and goal != (near := float(np.clip(goal, *model.jnt_range[joint]))):
+                    self.notes.append(f"actuator {called} aims at {goal:.6g}: {near:.6g} is the nearest of its limits")
+                    goal = near
+                found[name] = {"position": goal, "most": most}
                 found[name] |= {"time": float(bias[2] / bias[1])} if bias[2] < 0 else {}
-            elif bias[2] < 0:
-                found[name] = {"speed": wanted / -bias[2], "most": most}
             else:
-                others.append(one.name or f"number {k}")
+                found[name] = {"speed": wanted / (-bias[2] * gear), "most": most}
+        if idle:
+            self.notes.append(named("motors do nothing until their joint gets an effort or a target", idle))
+        if freely:
+            self.notes.append(named(f"actuators without a bound of force get one of {UNBOUNDED:g}", freely))
         if others:
-            told = "actuators that are not a position or velocity one of a joint with a forcerange"
+            told = "actuators that are not a motor, position or velocity one of a hinge or slide"
             self.left.append(named(told, others))
         return found
 

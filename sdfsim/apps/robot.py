@@ -28,6 +28,7 @@ OVERLAP = 2e-3  # of the smaller size: links that are deeper in each other at th
 SWATCH = 16  # pixels of a colour in the texture of what is shown
 MOST_NAMED = 6  # in a line of the report
 GREY = (180, 180, 185)
+UNBOUNDED = 1e6  # N m or N, of a motor that the file gives no bound
 
 PartKind = Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh"]
 
@@ -83,7 +84,7 @@ class Held:
     start: float = 0.0  # rad or m
     limits: tuple[float, float] | None = None  # rad or m; of a ball the cone, of a distance a rope
     spring: tuple[float, float] | None = None  # stiffness, and where it is at rest
-    motor: dict[str, float] | None = None  # speed or position (rad or m), most, time
+    motor: dict[str, float] | None = None  # speed or position (rad or m) or neither, most, time
     others: dict[str, Any] = field(default_factory=dict)  # further keys of scene.yaml
     loop: bool = False  # closes a loop: its links may touch
 
@@ -169,10 +170,9 @@ def write_scene(
         motion |= {key: _round(value) for key, value in speeds.items() if np.any(value) and not link.still}
         quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
         turned = {} if abs(quat[3]) > 1 - 1e-15 else {"quat_xyzw": _round(quat)}
-        scene.add(
-            link.name, **keys, position=_round(pose[:3, 3] + lift), **turned, **motion, **surface,
-            **({} if touches is None else {"collides_with": touches}),
-        )  # fmt: skip
+        touched = {} if touches is None else {"collides_with": touches}
+        keys = keys | {"position": _round(pose[:3, 3] + lift)} | turned | motion | surface | touched
+        scene.add(link.name, **keys)
     for joint in whole.joints:
         _join(scene, joint, names, lift)
     return [scene.save(out), *folders], notes

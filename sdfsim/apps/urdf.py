@@ -15,7 +15,7 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.robot import Held, Link, Part, Robot, moved, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Held, Link, Part, Robot, moved, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
@@ -376,14 +376,24 @@ class _Reader:
         else:
             pose = pose @ np.eye(4)
             pose[:3, :3] = Rotation.from_rotvec(start * along).as_matrix() @ turn
+        effort = self._effort(element)
         held |= {"anchor": pose[:3, 3], "axis": along, "start": start, "limits": limits, "others": others}
+        held |= {"motor": {"most": effort} if effort > 0.0 else None}
         return replace(links[child], pose=pose), [Held(kind=KINDS[kind], **held)]  # type: ignore[arg-type]
+
+    def _effort(self, element: Element) -> float:
+        """N m or N, the most that its motor gives; 0 where the file tells none."""
+        limit = self.child(element, "limit")
+        if limit is None or "effort" not in limit.attrib:
+            return 0.0
+        effort = limit.get("effort", "").strip().lower().removeprefix("+")
+        # Written by programs that mean: any.
+        return UNBOUNDED if effort in ("inf", "infinity") else min(self.number(limit, "effort", least=0.0), UNBOUNDED)
 
     def _limits(self, element: Element, name: str, kind: str) -> tuple[float, float] | None:
         limit = self.child(element, "limit")
         if limit is not None:
-            for key in ("effort", "velocity"):
-                self.left[f"{key} of <limit>"] += key in limit.attrib
+            self.left["velocity of <limit>"] += "velocity" in limit.attrib
         if kind == "continuous":
             return None
         if limit is None:

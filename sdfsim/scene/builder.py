@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import yaml
+from pydantic import ValidationError
 
-from sdfsim.base.errors import SceneError, nearest
+from sdfsim.base.errors import SceneError
 from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent
-from sdfsim.scene.load import load_scene
-from sdfsim.scene.scene import WORLD, Scene
-from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, ShapeTable
+from sdfsim.scene.bundled import find_scene
+from sdfsim.scene.document import NOTHING, Numeral, as_written
+from sdfsim.scene.keys import BodyKeys, JointKeys
+from sdfsim.scene.load import load_scene, read_scene
+from sdfsim.scene.scene import WORLD, JointKind, Scene
+from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, ShapeTable, meant
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")
+_ANY: dict[str, Any] = {"sphere": {"radius": 1.0}}  # where an entry is checked alone, for shapes that are not there yet
+_BALL = {"shape": "a"}
 _HERE = "<scene>"  # the name in messages of a scene without a file
 
 
@@ -29,38 +36,65 @@ class SceneBuilder:
         known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies", "joints")]
         _check(settings, known, "a scene")
         self._settings = _plain(settings)
+        body = {"name": "a", "plane": {}}
+        _refuse({"version": VERSION, **self._settings, "bodies": [body]}, "a scene", {(key,): "" for key in settings})
         self._shapes: dict[str, dict[str, Any]] = {}
         self._bodies: list[dict[str, Any]] = []
         self._joints: list[dict[str, Any]] = []
 
-    def add(self, name: str, **keys: Any) -> SceneBuilder:
+    @classmethod
+    def read(cls, path: Path | str, *, allow_outside: bool = False) -> SceneBuilder:
+        """The scene of a file, or of a sample by its name, to be gone on with: `Scene.read("arm.yaml").add(...)`.
+        Raises SceneError as `load_scene` does, with one line for every fault."""
+        path = find_scene(path)
+        document = read_scene(path, allow_outside=allow_outside)[1].data
+        scene, home = cls(), path.parent
+        for key in ("shapes", "bodies", "joints"):
+            setattr(scene, f"_{key}", _values(document.pop(key, {} if key == "shapes" else [])))
+        scene._settings = {key: value for key, value in _values(document).items() if key != "version"}
+        for entry in scene._shapes.values():
+            entry |= {key: str(home / entry[key]) for key in _PATHS if key in entry}
+        if str(scene._settings.get("model", "")).endswith(".safetensors"):
+            scene._settings["model"] = str(home / scene._settings["model"])
+        return scene
+
+    def add(self, name: str, **keys: Unpack[BodyKeys]) -> SceneBuilder:
         """Add a body, or many copies of one, and return the scene.
 
         Keys are of the body and of its shape, which has the same name, as docs/scene.md has them, such as
         sphere={"radius": 0.1}, position=(0, 0, 1). Paths of meshes and folders start at the current folder. A body that
-        looks like an earlier one takes shape="name of that one". Raises SceneError for no such key; values are checked
-        by `load`, all at once.
+        looks like an earlier one takes shape="name of that one". Raises SceneError for no such key, or a value that it
+        cannot have; whether all fit together is checked by `load`.
         """
         _check(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], f"body {name!r}")
-        shape = {key: value for key, value in keys.items() if key in _OF_SHAPE}
-        body = {key: value for key, value in keys.items() if key not in _OF_SHAPE}
-        if shape:
-            self._shapes[name] = _plain(shape)
-            body = {"shape": name, **body}
-        self._bodies.append(_plain({"name": name, **body}))
+        if any(body["name"] == name for body in self._bodies):
+            raise SceneError([f"body {name!r}: two bodies are called so"], "give each a name of its own")
+        shape = _plain({key: value for key, value in keys.items() if key in _OF_SHAPE})
+        body = _plain({"name": name, **({"shape": name} if shape else {}),
+                       **{key: value for key, value in keys.items() if key not in _OF_SHAPE}})  # fmt: skip
+        shapes = {name: shape} if shape else {key: self._shapes.get(key, _ANY) for key in [body.get("shape")] if key}
+        lone = {"version": VERSION, "shapes": shapes, "bodies": [_without(body, "collides_with")]}
+        _refuse(lone, f"body {name!r}", {("shapes", name): "", ("bodies", 0): ""} if shape else {("bodies", 0): ""})
+        self._shapes |= {name: shape} if shape else {}
+        self._bodies.append(body)
         return self
 
-    def join(self, name: str, type: str, *bodies: str, **keys: Any) -> SceneBuilder:
+    def join(self, name: str, type: JointKind, *bodies: str, **keys: Unpack[JointKeys]) -> SceneBuilder:
         """Add a joint between two bodies, the second of which may be "world" and is so where only one is given, and
         return the scene.
 
         Keys are those of `joints` in docs/scene.md: `join("door", "hinge", "leaf", anchor=(0, 0, 1), axis=(0, 0, 1))`.
-        Raises SceneError for no such key; values are checked by `load`, all at once.
+        Raises SceneError for no such key, or a value that it cannot have; whether there are such bodies is checked by
+        `load`.
         """
         given = ("name", "type", "bodies")
         _check(keys, [key for key in JointTable.model_fields if key not in given], f"joint {name!r}")
         held = [*bodies, WORLD] if len(bodies) == 1 else list(bodies)
-        self._joints.append(_plain({"name": name, "type": type, "bodies": held, **keys}))
+        joint = _plain({"name": name, "type": type, "bodies": held, **keys})
+        own: list[dict[str, Any]] = [{"name": one, **_BALL} for one in dict.fromkeys(map(str, held)) if one != WORLD]
+        lone = {"version": VERSION, "shapes": {"a": _ANY}, "bodies": own or [{"name": "a", **_BALL}], "joints": [joint]}
+        _refuse(lone, f"joint {name!r}", {("joints", 0): ""})
+        self._joints.append(joint)
         return self
 
     def load(self, on_progress: Progress = silent) -> Scene:
@@ -100,8 +134,48 @@ class SceneBuilder:
         return yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=10**9)
 
 
-def _check(keys: dict[str, Any], known: list[str], what: str) -> None:
-    wrong = [f"{what}: unknown key {key!r}{nearest(key, known)}" for key in keys if key not in known]
+def _refuse(data: dict[str, Any], what: str, places: dict[tuple, str]) -> None:
+    """Raise SceneError with a line for every fault of a scene that lies below one of `places`, behind `what`."""
+    found = []
+    try:
+        SceneTable.model_validate(_numerals(data), context={"folder": Path(), "allow_outside": True})
+    except ValidationError as error:
+        for e in error.errors(include_url=False):
+            for place in places:
+                if e["loc"][: len(place)] == place:
+                    rest = e["loc"][len(place) :] if len(place) > 1 else e["loc"]
+                    where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in rest)[1:]
+                    found.append(f"{what}: {where}: {e['msg']}" if where else f"{what}: {e['msg']}")
+    if found:
+        raise SceneError(list(dict.fromkeys(found)), "docs/scene.md has every key")
+
+
+def _without(entry: dict[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key not in keys}
+
+
+def _numerals(value: Any) -> Any:
+    """Plain values as a scene file has them."""
+    if isinstance(value, dict):
+        return {key: _numerals(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_numerals(entry) for entry in value]
+    return NOTHING if value is None else as_written(repr(value)) if isinstance(value, int | float) else value
+
+
+def _values(value: Any) -> Any:
+    """The other way round."""
+    if isinstance(value, dict):
+        return {key: _values(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_values(entry) for entry in value]
+    if isinstance(value, Numeral):
+        return int(value) if value.lstrip("+-").isdigit() else float(value)
+    return {} if value is NOTHING else value
+
+
+def _check(keys: Mapping[str, Any], known: list[str], what: str) -> None:
+    wrong = [f"{what}: unknown key {key!r}{meant(key, known)}" for key in keys if key not in known]
     if wrong:
         raise SceneError(wrong, f"known are {', '.join(known)}")
 

@@ -25,6 +25,11 @@ class Numeral(str):
     """A number without quotes, as the file writes it. YAML 1.1 guesses: `1:30` would become 90, and `1e-3` a text."""
 
 
+def as_written(text: str) -> str:
+    """A value without quotes: a number or a text."""
+    return (Numeral if _NUMBER.fullmatch(text) else str)(text)
+
+
 NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
 
 
@@ -67,7 +72,7 @@ class Document:
         if isinstance(node, yaml.ScalarNode):
             if node.style is not None:
                 return node.value
-            return NOTHING if node.value in _NULL else (Numeral if _NUMBER.fullmatch(node.value) else str)(node.value)
+            return NOTHING if node.value in _NULL else as_written(node.value)
         found: dict[str, Any] = {}
         for key_node, child in node.value:
             key, line = key_node.value, key_node.start_mark.line + 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -55,6 +56,35 @@ def _shown(value: Any) -> str:
     return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
 
 
+_LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names"}
+_LENGTHS = {"quat_xyzw": 4, "quat_wxyz": 4, "limits": 2, "limits_deg": 2, "grid": 3}
+
+
+def _many(value: Any, name: str) -> str:
+    """How many entries a list of that name has; all that are not named here are vectors."""
+    if name == "bodies" and not any(isinstance(entry, str) for entry in value):
+        return "have at least one body"
+    return _LISTS.get(name) or f"be {_LENGTHS.get(name, 3)} numbers"
+
+
+# What other programs call keys that have another name here; the first that is known counts.
+_TURNS = "quat_xyzw, quat_wxyz or euler_xyz_deg"
+_MEANT = {
+    "rotation": _TURNS, "orientation": _TURNS, "quat": _TURNS, "quaternion": _TURNS, "euler": _TURNS, "rpy": _TURNS,
+    "pose": "position, and " + _TURNS, "pos": "position", "xyz": "position", "origin": "position", "mu": "friction",
+    "weight": "mass", "fixed": "motion: static", "static": "motion: static", "kinematic": "motion: kinematic",
+    "bounce": "restitution", "file": "mesh", "effort": "most", "target": "position, position_deg or speed",
+    "parent": "bodies", "child": "bodies", "limit": "limits or limits_deg", "range": "limits or limits_deg",
+}  # fmt: skip
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """What a key that is not known is called here, for a message; an empty text where nobody can tell."""
+    known = list(known)
+    told = _MEANT.get(name.lower(), "")
+    return f" (give {told})" if any(key in known for key in re.findall(r"\w+", told)) else nearest(name, known)
+
+
 def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("value", "{text}", {"text": text})
 
@@ -68,7 +98,7 @@ def _told(error: Any, table: type[Table]) -> str:
         return "is required"
     key = error["loc"][0]
     if kind == "extra_forbidden":
-        return f"unknown key{nearest(key, known) or '; known here: ' + (', '.join(known) or 'none')}"
+        return f"unknown key{meant(key, known) or '; known here: ' + (', '.join(known) or 'none')}"
     extra, limits = known[key].json_schema_extra, error.get("ctx", {})
     unit = extra.get("unit", "") if isinstance(extra, dict) else ""
     got, allowed = _shown(error["input"]), limits.get("expected", "").replace("'", "").replace(" or ", ", ")
@@ -79,8 +109,8 @@ def _told(error: Any, table: type[Table]) -> str:
         "greater_than": f"must be > {limits.get('gt', 0):g} (got {got}{unit and ' '}{unit})",
         "greater_than_equal": f"must be >= {limits.get('ge', 0):g} (got {got}{unit and ' '}{unit})",
         "less_than_equal": f"must be <= {limits.get('le', 0):g} (got {got}{unit and ' '}{unit})",
-        "too_short": f"must have a length of at least {limits.get('min_length')} (got {limits.get('actual_length')})",
-        "too_long": f"must have a length of at most {limits.get('max_length')} (got {limits.get('actual_length')})",
+        "too_short": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
+        "too_long": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
         "literal_error": f"must be one of {allowed} (got {got})",
         "list_type": f"must be a list (got {got})",
         "dict_type": f"must be a mapping (got {got})",
@@ -461,19 +491,19 @@ class SpringTable(Table):
 
 class MotorTable(Table):
     """A motor of a hinge or a slider: it keeps a speed, or goes to a place and holds it there, as far as it is strong
-    enough."""
+    enough. Without either it does nothing until it is told in Python: `simulator.joint(NAME).target` or `effort`."""
 
     speed: Number | None = key("of the first body against the second; of a hinge in rad/s, else in m/s", None)
     position: Number | None = key("where a slider is to go", None, "m")
     position_deg: Number | None = key("where a hinge is to go", None, "degrees")
     most: Number = key("the largest torque of a hinge in N m, the largest force of a slider in N", gt=0)
-    time: Number = key("what is left of the way shrinks to a third in this time; goes with a place", 0.1, "s", gt=0)
+    time: Number = key("what is left of the way shrinks by a factor e in this time; not with speed", 0.1, "s", gt=0)
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
-        yield from _one_of(data, ("speed", "position", "position_deg"), required=True)
+        yield from _one_of(data, ("speed", "position", "position_deg"))
         if "time" in data and "speed" in data:
-            yield ("time",), "goes with position and position_deg only"
+            yield ("time",), "does not go with speed"
 
 
 class BreaksTable(Table):
@@ -522,8 +552,8 @@ class JointTable(Table):
         f"names of two bodies; the second may be `{WORLD}`"
     )
     anchor: Vector | None = key(
-        "the point that both share; of a distance its end at the first body; the first body's origin without it", None,
-        "m",
+        "the point that both share; of a distance its end at the first body; required of hinges, balls and distances, "
+        "of others the first body's origin without it", None, "m",
     )  # fmt: skip
     to: Vector | None = key("of a distance: its end at the second body", None, "m")
     axis: Direction | None = key("of a hinge, a slider and the cone of a ball; of any length", None)
@@ -557,7 +587,9 @@ class JointTable(Table):
         for name in data:
             if name in cls.model_fields and name not in (*_OF_JOINT[kind], *_OF_ALL_JOINTS):
                 fit = ", ".join(k for k, keys in _OF_JOINT.items() if name in keys)
-                yield (name,), f"goes with {fit} only (this is a {kind})"
+                other = name.removesuffix("_deg") if name.endswith("_deg") else f"{name}_deg"
+                other = f"; give {other}" if other in _OF_JOINT[kind] else ""
+                yield (name,), f"goes with {fit} only (this is a {kind}{other})"
         for name in _NEEDED.get(kind, ()):
             if name not in data:
                 yield (name,), f"is required: this is a {kind}"
@@ -588,6 +620,25 @@ class JointTable(Table):
             if ends is not None and not ends[0] <= start <= ends[1]:
                 told = f"is beyond the limits, {ends[0]:g} to {ends[1]:g} {unit} (got {start:g} {unit})"
                 yield (name if name in self.model_fields_set else f"limits{name[5:]}",), told
+            goal = getattr(self.motor, f"position{name[5:]}", None)
+            if ends is not None and goal is not None and not ends[0] <= goal <= ends[1]:
+                told = f"is beyond the limits, {ends[0]:g} to {ends[1]:g} {unit} (got {goal:g} {unit})"
+                yield ("motor", f"position{name[5:]}"), told
+
+
+def _named(bodies: list, joints: Any) -> Iterator[tuple[Loc, str]]:
+    """Where lists of bodies and joints name bodies, and what they name, as far as they are lists."""
+    for of, entries, key in (("bodies", bodies, "collides_with"), ("joints", joints, "bodies")):
+        for i, entry in enumerate(entries if isinstance(entries, list) else ()):
+            names = entry.get(key) if isinstance(entry, dict) else None
+            for k, name in enumerate(names if isinstance(names, list) else ()):
+                if isinstance(name, str) and name.strip():
+                    yield (of, i, key, k), name
+
+
+def _no_body(name: str, known: Iterable[str]) -> str:
+    there = [*known][:20]
+    return f"no body is called {name!r}{nearest(name, known) or '; bodies are ' + ', '.join(there)}"
 
 
 class SceneTable(Table):
@@ -618,6 +669,11 @@ class SceneTable(Table):
             if shape.strip() and shape not in shapes:
                 there = f"; shapes are {', '.join([*shapes][:20])}" if shapes else "; the file has no shapes"
                 yield ("bodies", i, "shape"), f"no shape is called {shape!r}{nearest(shape, shapes) or there}"
+        grouped = {entry["name"] for entry in listed if isinstance(entry, dict) and isinstance(entry.get("name"), str)
+                   and {"count", "arrange"} & entry.keys()}  # fmt: skip
+        for where, name in _named(listed, data.get("joints")):
+            if name not in first and name != WORLD and name.partition("[")[0] not in grouped:
+                yield where, _no_body(name, first)
 
     def check_values(self) -> Iterator[Fault]:
         first = {body.name: i for i, body in enumerate(self.bodies)}
@@ -635,8 +691,8 @@ class SceneTable(Table):
                 if np.any(getattr(body, key)):
                     yield ("bodies", i, key), "must be zero: a static body does not move"
             for k, partner in enumerate(body.collides_with or []):
-                if partner not in first and partner not in copies:
-                    yield ("bodies", i, "collides_with", k), f"no body is called {partner!r}{nearest(partner, first)}"
+                if partner not in first and partner not in copies and "[" in partner:
+                    yield ("bodies", i, "collides_with", k), _no_body(partner, copies)
         yield from self._joint_faults()
 
     def _joint_faults(self) -> Iterator[Fault]:
@@ -656,8 +712,8 @@ class SceneTable(Table):
                     yield where, f"{WORLD} must be the second: it holds the first"
                 elif name in copies:
                     yield where, f"there are {copies[name]} bodies {name!r}: give one, such as {name}[0]"
-                elif name not in motion and name != WORLD:
-                    yield where, f"no body is called {name!r}{nearest(name, motion)}"
+                elif name not in motion and name != WORLD and "[" in name:
+                    yield where, _no_body(name, motion)
             if known and joint.bodies[0] == joint.bodies[1]:
                 yield ("joints", i, "bodies"), f"must be two (got {joint.bodies[0]!r} twice)"
             elif known and "dynamic" not in (motion.get(name) for name in joint.bodies):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
-from sdfsim import load_scene
+from sdfsim import Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.apps.recording import save_rollout
@@ -183,9 +183,73 @@ def test_urdf_tells_what_it_leaves_out_and_what_it_made_otherwise(tmp_path: Path
     assert [body.name for body in scene.bodies] == ["base", "upper", "slide", "tip"]
     assert scene.bodies[0].motion == "static"
     assert "<transmission> (1)" in report["left_out"]
-    assert any("effort" in line for line in report["left_out"])
+    assert any("velocity of <limit>" in line for line in report["left_out"])
     assert any("tool0" in line for line in report["notes"])
     assert any("shoulder starts at 0.2 rad" in line for line in report["notes"])
+
+
+def test_a_urdf_with_efforts_can_be_driven_and_is_limp_until_then(tmp_path: Path) -> None:
+    file = write(tmp_path, "arm.urdf", ARM)
+    scene, _ = imported(file, fixed=True)
+    shoulder = next(joint for joint in scene.joints if joint.name == "shoulder")
+    assert shoulder.motor is not None and shoulder.motor.most == pytest.approx(20.0)
+    assert shoulder.motor.position is None and shoulder.motor.speed is None
+    limp, driven = Simulator(scene), Simulator(scene)
+    driven.joint("shoulder").most = 5000.0
+    driven.joint("shoulder").target = 0.8
+    for sim in (limp, driven):
+        sim.step(sim.steps_in(1.5))
+    assert driven.joint("shoulder").angle == pytest.approx(0.8, abs=1e-3)
+    assert abs(limp.joint("shoulder").angle - 0.8) > 0.05
+
+
+ACTUATED = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos="0 0 1"><geom type="box" size=".1 .1 .1" mass="3"/>
+      <body name="a" pos="0 0 .2"><joint name="ja" axis="0 1 0" range="10 90" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/>
+        <body name="b" pos=".3 0 0"><joint name="jb" axis="0 1 0"/>
+          <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/>
+          <body name="c" pos=".3 0 0"><joint name="jc" type="slide" axis="1 0 0"/>
+            <geom type="box" size=".02 .02 .02" mass=".1"/></body></body></body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="pa" joint="ja" kp="50" kv="5" gear="2"/>
+    <motor name="mb" joint="jb" gear="-30" ctrlrange="-0.5 0.5" ctrllimited="true"/>
+    <velocity name="vc" joint="jc" kv="7" forcerange="-3 3" forcelimited="true"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_actuators_of_an_mjcf_become_motors_as_strong_as_theirs(tmp_path: Path) -> None:
+    scene, report = imported(write(tmp_path, "robot.xml", ACTUATED))
+    motors = {joint.name: joint.motor for joint in scene.joints}
+    assert motors["ja"].position == pytest.approx(np.radians(10)) and motors["ja"].time == pytest.approx(0.1)
+    assert (motors["jb"].most, motors["jb"].position, motors["jb"].speed) == (pytest.approx(15.0), None, None)
+    assert (motors["jc"].most, motors["jc"].speed) == (pytest.approx(3.0), 0.0)
+    told = "\n".join(report["notes"])
+    assert "bodies without a joint to the world stand still" in told and "base" in told
+    assert "motors do nothing until their joint gets an effort or a target (1: mb)" in told
+    assert "actuators without a bound of force get one of 1e+06 (1: pa)" in told
+    assert next(body for body in scene.bodies if body.name == "base").motion == "static"
+    sim = Simulator(scene)
+    sim.joint("jb").target = 0.5
+    sim.step(5)
+    assert sim.joint("jb").speed > 0.1
+
+
+def test_an_exported_motor_without_a_target_comes_back(tmp_path: Path) -> None:
+    built = SceneBuilder().add("arm", box={"size": (0.3, 0.1, 0.1)}, position=(0.15, 0, 1), mass=1.0)
+    built.join("pin", "hinge", "arm", anchor=(0, 0, 1), axis=(0, 1, 0), motor={"most": 7.0})
+    export(built.save(tmp_path / "scene.yaml"), tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert model.nu == 1 and model.actuator_forcerange[0] == pytest.approx([-7, 7]) and not model.actuator_biasprm.any()
+    again, _ = imported(tmp_path / "out.xml")
+    motor = again.joints[0].motor
+    assert (motor.most, motor.position, motor.speed) == (pytest.approx(7.0), None, None)
 
 
 def test_what_other_readers_pass_over_is_passed_over(tmp_path: Path) -> None:
@@ -226,7 +290,9 @@ def test_faults_name_file_line_and_element(tmp_path: Path, old: str, new: str, t
     assert file.read_text() != ARM
     with pytest.raises(SdfsimError) as error:
         import_robot(file, tmp_path / "scene.yaml")
-    assert told in error.value.message and error.value.message.startswith(f"{file}:") and "\n" not in str(error.value)
+    assert (
+        told in error.value.message and error.value.message.startswith(f"{file}:") and "\n" not in error.value.message
+    )
     assert not (tmp_path / "scene.yaml").exists()
 
 

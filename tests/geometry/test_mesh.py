@@ -37,7 +37,7 @@ def test_a_bad_file_is_one_clear_line_with_its_name(tmp_path: Path, name: str, c
         load_mesh(path)
     assert name in str(error.value)
     assert message in str(error.value)
-    assert "\n" not in str(error.value)
+    assert "\n" not in error.value.message
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "ply"])

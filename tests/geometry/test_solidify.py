@@ -218,7 +218,7 @@ def test_colours_go_with_what_is_added_and_cut() -> None:
 def test_what_is_open_is_refused_in_one_line_with_the_way_out(mesh: Mesh, message: str) -> None:
     with pytest.raises(SdfsimError, match=message) as error:
         solidify(mesh, name="thing")
-    assert str(error.value).startswith("thing: ") and "\n" not in str(error.value)
+    assert str(error.value).startswith("thing: ") and "\n" not in error.value.message
     assert "--cap" in error.value.hint and "--thicken" in error.value.hint
 
 

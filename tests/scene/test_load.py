@@ -22,7 +22,7 @@ BODY = [
     ("mass: 1, density: 2", "bodies[0].density: give only one of mass, density (got mass and density)"),
     ("restitution: 1.5", "bodies[0].restitution: must be <= 1 (got 1.5)"),
     ("positon: [0, 0, 0]", "bodies[0].positon: unknown key (did you mean 'position'?)"),
-    ("position: [0, 0]", "bodies[0].position: must have a length of at least 3 (got 2)"),
+    ("position: [0, 0]", "bodies[0].position: must be 3 numbers (got 2)"),
     ("position: [0, inf, 0]", "bodies[0].position[1]: must be a number in m (got 'inf')"),
     ("motion: static, velocity: [0, 0, 1]", "bodies[0].velocity: must be zero: a static body does not move"),
     ("motion: driven", "bodies[0].motion: must be one of static, dynamic, kinematic (got 'driven')"),
@@ -47,7 +47,7 @@ def test_a_wrong_body_is_reported_with_its_line(load, fields, fault):
 FILES = [
     ("", ["scene.yaml:1: the file is empty"]),
     ("- 1\n", ["scene.yaml:1: must be a mapping (got a list)"]),
-    ("version: 1\nbodies: []\n", ["scene.yaml:2: bodies: must have a length of at least 1 (got 0)"]),
+    ("version: 1\nbodies: []\n", ["scene.yaml:2: bodies: must have at least one body (got 0)"]),
     ("bodies: [{name: a, plane: {}}]\n", ["scene.yaml:1: version: is required"]),
     ("version: 1\n", ["scene.yaml:1: bodies: is required"]),
     ("version: 1\nversion: 1\nbodies: []\n", ["scene.yaml:2: version: the key appears twice (first on line 1)"]),
@@ -100,7 +100,7 @@ def test_every_fault_is_reported_at_once_in_file_order(load):
         "scene.yaml:6: bodies[0].shape: no shape is called 'bal' (did you mean 'ball'?)",
         "scene.yaml:6: bodies[0].mass: must be > 0 (got 0 kg)",
         "scene.yaml:7: bodies[1].name: two bodies are called 'a' (the first is bodies[0])",
-        "scene.yaml:9: bodies[1].velocity: must have a length of at least 3 (got 2)",
+        "scene.yaml:9: bodies[1].velocity: must be 3 numbers (got 2)",
     ]
 
 

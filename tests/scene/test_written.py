@@ -7,7 +7,9 @@ import pytest
 
 import sdfsim
 from sdfsim import SceneError
+from sdfsim.scene.keys import BodyKeys, JointKeys
 from sdfsim.scene.load import load_scene
+from sdfsim.scene.schema import BodyTable, JointTable, ShapeTable
 
 ROOT = Path(__file__).parents[2]
 
@@ -48,12 +50,103 @@ def test_unknown_keys_are_reported_at_once():
         sdfsim.Scene(gravitiy=(0, 0, 0))
 
 
-def test_wrong_values_are_reported_together_with_the_lines_that_print_shows():
-    scene = sdfsim.Scene(duration=-1).add("a", sphere={"radius": "x"}, mass=float("nan")).add("b", shape="c")
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ({"sphere": {"radius": "x"}, "mass": float("nan")}, [
+            "body 'a': sphere.radius: must be a number in m (got 'x')", "body 'a': mass: must be a number in kg"]),
+        ({"sphere": {"radius": 0.1}, "mass": -1}, ["body 'a': mass: must be > 0 (got -1 kg)"]),
+        ({"box": {"sise": (1, 2, 3)}}, ["box.sise: unknown key (did you mean 'size'?)", "box.size: is required"]),
+        ({"box": {"size": (1, 2)}}, ["body 'a': box.size: must be 3 numbers (got 2)"]),
+        ({"box": {"size": (1, 2, 3, 4)}}, ["body 'a': box.size: must be 3 numbers (got 4)"]),
+        ({"shape": "b", "quat_wxyz": (1, 0, 0)}, ["body 'a': quat_wxyz: must be 4 numbers (got 3)"]),
+        ({"shape": "b", "arrange": {"grid": [1, 2], "spacing": 1}}, ["arrange.grid: must be 3 numbers (got 2)"]),
+        ({"shape": "b", "rotation": (0, 0, 90)}, ["'rotation' (give quat_xyzw, quat_wxyz or euler_xyz_deg)"]),
+        ({"shape": "b", "motion": "moving"}, ["motion: must be one of static, dynamic, kinematic (got 'moving')"]),
+        ({}, ["body 'a': one of shape, plane is required"]),
+    ],
+)  # fmt: skip
+def test_a_wrong_body_is_refused_where_it_is_added(keys, told):
+    with pytest.raises(SceneError) as caught:
+        sdfsim.Scene().add("a", **keys)
+    assert all(any(part in problem for problem in caught.value.problems) for part in told)
+    assert all(problem.startswith("body 'a': ") for problem in caught.value.problems)
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys", "told"),
+    [
+        ("hinge", {"anchor": (0, 0, 0)}, "joint 'j': axis: is required: this is a hinge"),
+        ("hinge", {"anchor": (0, 0, 0), "axis": (0, 0, 1), "limits": (0, 1)},
+         "limits: goes with slider only (this is a hinge; give limits_deg)"),
+        ("slider", {"axis": (0, 0, 1), "start_deg": 3},
+         "start_deg: goes with hinge only (this is a slider; give start)"),
+        ("hinge", {"anchor": (0, 0), "axis": (0, 0, 1)}, "anchor: must be 3 numbers (got 2)"),
+        ("slider", {"axis": (0, 0, 1), "limits": [1.0]}, "limits: must be 2 numbers (got 1)"),
+        ("slider", {"axis": (0, 0, 1), "limits": (0, 1), "motor": {"position": 1.5, "most": 3}},
+         "motor.position: is beyond the limits, 0 to 1 m (got 1.5 m)"),
+        ("hing", {}, "type: must be one of hinge, slider"),
+    ],
+)  # fmt: skip
+def test_a_wrong_joint_is_refused_where_it_is_added(kind, keys, told):
+    with pytest.raises(SceneError) as caught:
+        sdfsim.Scene().join("j", kind, "a", **keys)
+    assert any(told in problem for problem in caught.value.problems)
+
+
+def test_two_bodies_of_one_name_and_settings_are_refused():
+    with pytest.raises(SceneError, match="body 'a': two bodies are called so"):
+        sdfsim.Scene().add("a", sphere={"radius": 1}).add("a", sphere={"radius": 2})
+    with pytest.raises(SceneError, match=r"a scene: duration: must be > 0 \(got -1 s\)"):
+        sdfsim.Scene(duration=-1)
+
+
+def test_missing_bodies_are_told_beside_other_faults_and_with_those_that_there_are(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text(
+        "version: 1\nduration: -1\nbodies:\n  - {name: floor, plane: {}}\n"
+        "  - {name: wall, plane: {}, collides_with: [x9]}\n"
+        "joints:\n  - {name: j, type: ball, bodies: [leg, world], anchor: [0, 0, 0]}\n"
+    )
+    with pytest.raises(SceneError) as caught:
+        load_scene(file)
+    told = "\n".join(caught.value.problems)
+    assert "duration: must be > 0" in told and len(caught.value.problems) == 3
+    assert "joints[0].bodies[0]: no body is called 'leg'; bodies are floor, wall" in told
+    assert "bodies[1].collides_with[0]: no body is called 'x9'; bodies are floor, wall" in told
+
+
+def test_a_scene_of_a_file_can_be_gone_on_with(tmp_path):
+    written().save(tmp_path / "scene.yaml")
+    scene = sdfsim.Scene.read(tmp_path / "scene.yaml", allow_outside=True)
+    first, again = written().load(), scene.load()
+    assert [b.name for b in first.bodies] == [b.name for b in again.bodies]
+    assert first.duration == again.duration and first.effects == again.effects
+    for one, other in zip(first.bodies, again.bodies, strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+        assert one.mass == other.mass
+    scene.add("post", box={"size": (0.1, 0.1, 0.1)}, position=(2, 0, 1))
+    scene.join("pin", "ball", "post", anchor=(2, 0, 1.05))
+    assert [j.name for j in sdfsim.Simulator(scene).scene.joints] == ["pin"]
+    with pytest.raises(SceneError, match="body 'ball': two bodies"):
+        scene.add("ball", sphere={"radius": 1})
+    assert sdfsim.Scene.read("door").load().joints[0].name == "door"
+    with pytest.raises(SceneError, match="no such file"):
+        sdfsim.Scene.read(tmp_path / "none.yaml")
+
+
+def test_type_checkers_know_the_keys_of_the_file():
+    of_shape = {*ShapeTable.model_fields, *BodyTable.model_fields} - {"name"}
+    assert set(BodyKeys.__annotations__) == of_shape
+    assert set(JointKeys.__annotations__) == set(JointTable.model_fields) - {"name", "type", "bodies"}
+
+
+def test_what_does_not_fit_together_is_reported_with_the_lines_that_print_shows():
+    scene = sdfsim.Scene().add("a", shape="c").add("b", shape="d", collides_with=["e"])
     with pytest.raises(SceneError) as caught:
         scene.load()
     lines = str(scene).splitlines()
     told = caught.value.problems
-    assert len(told) == 4
-    for problem, key in zip(told, ("duration", "radius", "nan", "shape: c"), strict=True):
+    assert len(told) == 3
+    for problem, key in zip(told, ("shape: c", "shape: d", "collides_with"), strict=True):
         assert problem.startswith("<scene>:") and key in lines[int(problem.split(":")[1]) - 1]

@@ -70,7 +70,7 @@ def test_a_motor_may_be_given_and_its_strength_changed():
     sim = free("hinge")
     joint = sim.joint("joint")
     assert joint.most == 0.0
-    with pytest.raises(SdfsimError, match="'joint': has no motor\nhint: .*set most"):
+    with pytest.raises(SdfsimError, match=r"'joint': has no motor\nhint: .*set most"):
         joint.target = 0.5
     joint.most = 20.0
     assert joint.target is None
