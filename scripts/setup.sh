@@ -106,7 +106,8 @@ fi
 
 say "installing Python packages (a few minutes the first time)"
 rm -f .venv/.set-up
-.venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" --editable ".${extras:+[$extras]}"
+.venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" \
+    --config-settings editable_mode=compat --editable ".${extras:+[$extras]}"  # a path, which type checkers find too
 .venv/bin/python -c 'import sdfsim; sdfsim.Simulator(sdfsim.load_scene("samples/tower.yaml"), "small").step(2)'
 printf '%s\n%s\n' "$made_from" "${extras//,/ }" >.venv/.set-up
 say "done: $(.venv/bin/python --version), $PWD/.venv"

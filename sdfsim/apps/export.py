@@ -129,7 +129,9 @@ def export(
     option that the format has no use for, a damaged source, an extra that is not installed, a shape without convex
     pieces, or a file that cannot be written.
     """
-    source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
+    wanted = 'export writes files of files: scene.save("scene.yaml") or rollout.save("run.npz") first'
+    source, out = _path("source", source, wanted), _path("out", out, "its ending names the format")
+    scene_file = _path("scene_file", scene_file, wanted) if scene_file else None
     kind = out.suffix.lower()
     if kind not in FORMATS:
         raise SdfsimError(f"{out}: unknown format {out.suffix or '(no ending)'}", "end it in " + " ".join(FORMATS))
@@ -159,6 +161,12 @@ def _extra(module: str) -> Any:
 
 
 # --- the source ---
+
+
+def _path(what: str, given: Any, wanted: str) -> Path:
+    if not isinstance(given, str | Path):
+        raise SdfsimError(f"{what}: must be a path (got a {type(given).__name__})", wanted)
+    return Path(given)
 
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:

@@ -18,6 +18,7 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics.rollout import Rollout
+from sdfsim.scene.builder import loaded
 from sdfsim.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -37,16 +38,20 @@ _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
 
 
 def render(
-    scene: Scene | SceneBuilder, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
-    look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
+    scene: Scene | SceneBuilder | Path | str, rollout: Rollout | Path | str, out: Path | str, *,
+    camera: Place | None = None, look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.
 
     Camera and what it looks at, [3] m each, are as in `eye_of`. Raises SdfsimError for another ending, a time outside
     of the run, a camera where it looks at, or a file that cannot be written.
     """
-    out, scene = Path(out), scene if isinstance(scene, Scene) else scene.load()
+    out, scene = Path(out), loaded(scene)
     check_format(out)
+    if isinstance(rollout, str | Path):
+        rollout = Rollout.load(rollout)
+    if not isinstance(rollout, Rollout):
+        raise SdfsimError(f"rollout: must be a Rollout or the path of a rollout.npz (got a {type(rollout).__name__})")
     if at is not None and not rollout.time[0] <= at <= rollout.time[-1] + rollout.meta["dt"]:
         raise SdfsimError(f"--at {at:g}: the run holds {rollout.time[0]:g} to {rollout.time[-1]:g} s")
     studio = Studio(scene, eye_of(scene, rollout, camera, look_at), framed(scene, rollout)[1])

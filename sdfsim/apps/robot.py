@@ -171,8 +171,15 @@ def write_scene(
         quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
         turned = {} if abs(quat[3]) > 1 - 1e-15 else {"quat_xyzw": _round(quat)}
         touched = {} if touches is None else {"collides_with": touches}
-        keys = keys | {"position": _round(pose[:3, 3] + lift)} | turned | motion | surface | touched
-        scene.add(link.name, **keys)
+        entry: dict[str, Any] = {
+            **keys,
+            "position": _round(pose[:3, 3] + lift),
+            **turned,
+            **motion,
+            **surface,
+            **touched,
+        }
+        scene.add(link.name, **entry)
     for joint in whole.joints:
         _join(scene, joint, names, lift)
     return [scene.save(out), *folders], notes

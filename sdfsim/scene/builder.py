@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from sdfsim.base.errors import SceneError
+from sdfsim.base.errors import SceneError, SdfsimError
 from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.bundled import find_scene
@@ -132,6 +132,19 @@ class SceneBuilder:
         if self._joints:
             document["joints"] = self._joints
         return yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=10**9)
+
+
+def loaded(scene: Any, on_progress: Progress = silent) -> Scene:
+    """A scene that is loaded, written in Python, in a file, or a sample by its name. Raises SdfsimError for anything
+    else, and as `load_scene` does."""
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, SceneBuilder):
+        return scene.load(on_progress)
+    if isinstance(scene, str | Path):
+        return load_scene(scene, on_progress)
+    told = f"scene: must be a Scene, the path of a scene.yaml or the name of a sample (got a {type(scene).__name__})"
+    raise SdfsimError(told)
 
 
 def _refuse(data: dict[str, Any], what: str, places: dict[tuple, str]) -> None:

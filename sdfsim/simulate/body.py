@@ -84,6 +84,8 @@ class ContactPoint:
         point: [3] m, world, on the surface of the first.
         normal: [3] unit vector from the second to the first.
         impulse: [3] N s on the first in the last inner step of the contact solve, opposite on the second.
+        force: [3] N, the mean in that inner step. Of a body that touches at many points only the sum of the forces and
+            their moment are told apart by physics; how they are spread over the points is one choice of many.
         penetration: m, how deep they are in each other; below 0 where they are still apart.
     """
 
@@ -92,6 +94,7 @@ class ContactPoint:
     point: np.ndarray
     normal: np.ndarray
     impulse: np.ndarray
+    force: np.ndarray
     penetration: float
 
 

@@ -24,6 +24,7 @@ from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.units import inner_steps
 from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
+from sdfsim.scene.builder import loaded
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
@@ -80,7 +81,8 @@ class Simulator(LiveScene):
     `restore` goes back to a `state` of before.
 
     Args:
-        scene: bodies, shapes, gravity; one written in Python is loaded first.
+        scene: bodies, shapes, gravity; one written in Python, or the path of a file or the name of a sample, is loaded
+            first.
         model: bundled name, path or `Model`; None takes the scene's, else the default one.
         device: "cpu", "cuda" or "auto".
         seed: of torch's generator (nothing in a step draws from it today; it is recorded).
@@ -102,7 +104,7 @@ class Simulator(LiveScene):
 
     def __init__(
         self,
-        scene: Scene | SceneBuilder,
+        scene: Scene | SceneBuilder | Path | str,
         model: str | Path | Model | None = None,
         device: str = "cpu",
         seed: int | None = None,
@@ -110,8 +112,7 @@ class Simulator(LiveScene):
         dt: float | None = None,
         free_flight: FreeFlight = "exact",
     ) -> None:
-        scene = scene if isinstance(scene, Scene) else scene.load()
-        self.scene = scene
+        self.scene = scene = loaded(scene)
         check_device(device)
         effects = plan(scene)
         model = model if model is not None else scene.model
@@ -178,13 +179,13 @@ class Simulator(LiveScene):
     def steps(self, count: int) -> Iterator[Moment]:
         """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError for a state that
         cannot be; its `rollout` is one frame here, the last good state."""
-        for _ in range(count):
+        for _ in range(_whole(count)):
             self._advance(1)
             yield self.si_state()
 
     def step(self, count: int = 1) -> Moment:
         """Advance by `count` steps; the state after them (SI units). Raises as `steps` does."""
-        self._advance(count)
+        self._advance(_whole(count))
         return self.si_state()
 
     def frames(self, count: int, at_once: int | None = None) -> Iterator[Rollout]:
@@ -277,6 +278,7 @@ class Simulator(LiveScene):
                 point=found.point[k] * u.length,
                 normal=found.normal[k],
                 impulse=found.impulse[k] * u.mass * u.velocity,
+                force=found.impulse[k] * u.mass * u.velocity * self._options.substeps / self.dt,
                 penetration=-float(found.gap[k]) * u.length,
             )
             for k in range(len(found.pair))
@@ -427,6 +429,12 @@ class Simulator(LiveScene):
             joint_force=frames.joint[:, :, 1:4] * u.mass * u.acceleration,
             joint_torque=frames.joint[:, :, 4:7] * u.energy,
         )
+
+
+def _whole(count: int) -> int:
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
+        raise SdfsimError(f"steps: must be a whole number >= 0 (got {count!r})", "steps_in(seconds) tells how many")
+    return int(count)
 
 
 def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
