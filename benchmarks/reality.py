@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from time import process_time
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -34,7 +35,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_json, write_text
 from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.evaluation.engines import NotInstalled, engine_module
-from sdfsim.evaluation.harness import Line, Panel, draw, markdown, number, one_thread
+from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, one_thread
 from sdfsim.evaluation.metrics import interval
 from sdfsim.learned.impulse import ImpulseNetwork
 from sdfsim.scene.load import load_scene
@@ -357,37 +358,76 @@ def trained(
         run.advance()
         if run.step % (STEPS // LOOKS) == 0:
             network = cast("ImpulseNetwork", run.averaged())
-            off = float(sum(error.mean() for error in errors(rolled(network, task, starts), truth)))
-            best = min(best, (off, network), key=lambda one: one[0])
+            best = min(best, (summed(rolled(network, task, starts), truth), network), key=lambda one: one[0])
     run.close()
     return cast("ImpulseNetwork", best[1]), best[0]
 
 
-def networks(groups: tuple[list[Toss], list[Toss], list[Toss]], scene: Scene, gravity: float) -> dict[str, Any]:
-    """Of each number of tosses, errors [TEST] on the tosses that judge as means over seeds, those of each seed, and how
-    far the chosen states are off on the tosses that choose."""
+def summed(found: Motion, truth: Motion) -> float:
+    """By which states of a training are chosen: mean errors, % and degrees added up."""
+    return float(sum(error.mean() for error in errors(found, truth)))
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a network is trained on, and what chooses and judges it."""
+
+    known: list[Recording]  # that may be trained on
+    scene: Scene  # as identified
+    # starts and what was recorded from there: of the tosses that choose, and of those that judge
+    chooses: tuple[list[Start], Motion]
+    judges: tuple[list[Start], Motion]
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One row of the table of networks."""
+
+    preset: str
+    tosses: int
+
+
+NETWORKS = {f"on the solve, {count} tosses": Trained("impacts", count) for count in TRAINED}
+
+
+def learnt(how: Trained, seed: int, lesson: Lesson) -> dict[str, Any]:
+    """One network: errors [2, TEST] on the tosses that judge, and how far it is off on those that choose."""
+    rows = np.random.default_rng([seed, how.tosses]).choice(len(lesson.known), how.tosses, replace=False)
+    task = MotionTask([lesson.known[k] for k in rows], lesson.scene, noisy=True)
+    began = process_time()
+    network, off = trained(task, seed, *lesson.chooses, how.preset)
+    taken = process_time() - began
+    starts, truth = lesson.judges
+    return {"test": np.array(errors(rolled(network, task, starts), truth)).tolist(), "chosen": off, "seconds": taken}
+
+
+def networks(groups: tuple[list[Toss], list[Toss], list[Toss]], scene: Path, gravity: float, out: Path) -> Results:
+    """Every network of `NETWORKS` with every seed by (seed, name), each kept in a file under `out`; and the solve
+    without any. The tosses that parameters were found on are trained on too."""
     fit, test, rest = groups
     pool = [*fit, *rest]
     free, held = pool[: max(TRAINED)], pool[max(TRAINED) :]
-    known = recordings_of(free, scene)
-    (chooses, seen), (judges, truth) = (
-        ([fitted_start(toss, gravity) for toss in some], recorded(some)) for some in (held, test)
-    )
-    found: dict[str, Any] = {}
-    for count in TRAINED:
-        both, chosen = [], []
-        for seed in range(SEEDS):
-            rows = np.random.default_rng([seed, count]).choice(len(free), count, replace=False)
-            task = MotionTask([known[k] for k in rows], scene, noisy=True)
-            network, off = trained(task, seed, chooses, seen)
-            both.append(np.array(errors(rolled(network, task, judges), truth)))
-            chosen.append(off)
-            told = " / ".join(number(error) for error in both[-1].mean(1))
-            progress(len(found) / len(TRAINED), f"network, {count} tosses, seed {seed}: {told}")
-        found[f"network on sdfsim, {count} tosses"] = {
-            "test": np.mean(both, 0), "seeds": np.mean(both, 2).tolist(), "chosen": chosen,
-        }  # fmt: skip
-    return found
+    known = load_scene(scene)
+    chooses, judges = (([fitted_start(toss, gravity) for toss in some], recorded(some)) for some in (held, test))
+    lesson = Lesson(recordings_of(free, known), known, chooses, judges)
+    told = [scene.read_text(encoding="utf-8"), gravity, free, held, test]
+    jobs = [
+        Job(f"seed {seed}", name, [how, PRESETS[how.preset], STEPS, LOOKS, seed, *told], learnt, (how, seed, lesson))
+        for seed in range(SEEDS)
+        for name, how in NETWORKS.items()
+    ]
+    return measure([Job("-", SOLVE, told, solved, (lesson, known)), *jobs], out, on_progress=progress)
+
+
+SOLVE = "the solve alone"
+
+
+def solved(lesson: Lesson, scene: Scene) -> dict[str, Any]:
+    """The same of the solve without a network."""
+    found = [ours(starts, lesson.known[0].dt, scene) for starts, _ in (lesson.chooses, lesson.judges)]
+    return {
+        "test": np.array(errors(found[1], lesson.judges[1])).tolist(), "chosen": summed(found[0], lesson.chooses[1])
+    }  # fmt: skip
 
 
 # Where engines look for their parameters: lower and upper bound. Sizes are in sides, heights in m, times in s, inertias
@@ -423,11 +463,14 @@ def identified(loss: Callable[[dict[str, float]], float], bounds: dict[str, tupl
 
 
 @one_thread()
-def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
+def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bool = False) -> None:
     """Identify and judge every engine; the section of the page, `reality.json` with every toss's errors, the scene that
-    was identified, and pictures."""
+    was identified, and pictures. Then the networks; `networks_only` where DIR holds that scene already."""
     known = load_tosses(tosses)
     groups = split(known)
+    if networks_only:
+        write_networks(groups, out, gravity)
+        return
     (fit, fit_truth), (test, test_truth) = (
         ([fitted_start(toss, gravity) for toss in group], recorded(group)) for group in groups[:2]
     )
@@ -457,29 +500,26 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
         name: {"values": values, "fit": errors(fitted, fit_truth), "test": errors(judged, test_truth)}
         for name, (values, fitted, judged) in moved.items()
     }
-    learnt = networks(groups, scene, gravity)
     falls, sure = fall(known)
     every = [*fit, *test]
     off = 1e3 * np.median([start.off for start in every])
     turned_off = np.degrees(np.median([start.turned_off for start in every]))
     seen = shown(recordings_of(known, scene))
     kept = {"gravity": gravity, "fall": [falls, sure], "shown": seen, "engines": _plain(result)}
-    kept["networks"] = {name: one | {"test": one["test"].tolist()} for name, one in learnt.items()}
     write_json(out / "reality.json", kept)
     pictures(moved, test_truth, dt, out)
-    chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
     text = (
         f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
         f"95 % intervals; sdfsim less the other is toss by toss. Starts fit the free flight to {off:.2f} mm "
         f"and {turned_off:.2f} degrees (medians of root mean squares); recorded cubes fall with {falls:.3f} +- "
-        f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}\n\nNetworks on sdfsim with these numbers, {SEEDS} each, "
-        f"{STEPS} steps of a training; the best of {LOOKS} states of each on {chosen} tosses more.\n\n"
-        f"{markdown(network_table(learnt, result[OURS]['test']))}"
+        f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
     )
-    write_section("reality", "python benchmarks/reality.py TOSSES -o DIR", text)
+    write_section("reality", COMMAND, text)
+    write_networks(groups, out, gravity)
 
 
 OURS = "sdfsim"
+COMMAND = "python benchmarks/reality.py TOSSES -o DIR"
 
 
 def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
@@ -534,14 +574,36 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def network_table(learnt: dict[str, Any], solve: Sequence[np.ndarray]) -> list[tuple[str, ...]]:
-    """Means over seeds, and what networks change of the solve alone, toss by toss."""
-    rows: list[tuple[str, ...]] = [("network", "position, %", "rotation, degrees", "less the solve alone", "seeds")]
-    for name, one in learnt.items():
-        apart = " / ".join(_told(its - own) for its, own in zip(one["test"], solve, strict=True))
-        seeds = "; ".join(" / ".join(map(number, of)) for of in one["seeds"])
-        rows.append((name, *map(_told, one["test"]), apart, seeds))
-    return rows
+def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path, gravity: float) -> None:
+    """Train and judge all networks on the scene that was identified; their section of the page."""
+    found = networks(groups, out / "identified.yaml", gravity, out / "networks")
+    chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
+    text = (
+        f"Networks on the solve that was identified, {SEEDS} seeds each: {STEPS} steps of a training, of which the best of "
+        f"{LOOKS} states on {chosen} tosses is taken, and judged once on {TEST} others. Means over seeds, with 95 % "
+        "intervals over tosses; less the solve is toss by toss.\n\n"
+        f"{markdown(network_table(found))}"
+    )
+    write_section("reality networks", f"{COMMAND} --networks-only", text)
+
+
+def network_table(found: Results) -> list[tuple[str, ...]]:
+    """Means over seeds, and what networks change of the solve alone, toss by toss; whoever loses most comes first."""
+    solve = found["-", SOLVE]
+    own = np.array(solve["test"])
+    head = ("network", "position, %", "rotation, degrees", "less the solve", "position, % / degrees of each seed")
+    rows = []
+    for name in dict.fromkeys(method for _, method in found if method != SOLVE):
+        seeds = [one for (_, method), one in found.items() if method == name]
+        test = np.array([one["test"] for one in seeds])
+        mean = test.mean(0)
+        apart = " / ".join(_told(change) for change in mean - own)
+        each = "; ".join(" / ".join(map(number, of)) for of in test.mean(2).tolist())
+        on = " / ".join(number(one["chosen"]) for one in seeds)
+        rows.append((float((mean - own).sum(0).mean()), (name, *map(_told, mean), apart, each, on)))
+    rows.sort(key=lambda row: -row[0])
+    on = f"both errors on the tosses that choose (solve: {number(solve['chosen'])})"
+    return [(*head, on), *(row for _, row in rows), (SOLVE, *map(_told, own), "", "", "")]
 
 
 def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> None:
