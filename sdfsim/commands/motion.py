@@ -33,12 +33,25 @@ def simulate(
         bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")] = False,
+    beside: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RECORDING",
+            help="A recorded motion of the scene, as identify reads it, FILE[K] of many: begin as it does, show both.",
+        ),
+    ] = None,
     allow_outside: Outside = False,
     device: str = "auto",
 ) -> None:
     """Scene -> motion, in a run folder."""
     from sdfsim.apps import run
 
+    recorded = None
+    if beside is not None:
+        from sdfsim.apps.observed import load_beside
+
+        shapes = partial(session.stage_progress, "shapes")
+        recorded = load_beside(beside, scene, allow_outside=allow_outside, on_progress=shapes)
     report = run.simulate(
         scene,
         out,
@@ -49,6 +62,7 @@ def simulate(
         allow_outside=allow_outside,
         until_settled=until_settled,
         resume=resume,
+        beside=recorded,
         device=device,
         on_progress=session.stage_progress,
         say=session.say,
@@ -59,6 +73,7 @@ def simulate(
         + ("" if median is None else f" (median {median:.1f} ms a step)"),
         f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
         *run.ending_lines(report),
+        *run.beside_lines(report),
         *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
         f"wrote {out}",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
@@ -147,12 +162,14 @@ def render(
     if at is not None and out.suffix != ".png":
         raise SdfsimError("--at goes with a picture, -o FILE.png", exit_code=EXIT_USAGE)
     from sdfsim.apps import render as room
+    from sdfsim.apps.beside import beside_of
     from sdfsim.apps.run import read_run
 
     room.check_format(out)
     shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
     loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
-    room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, on_progress=frames)
+    beside = beside_of(source, loaded)
+    room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, beside=beside, on_progress=frames)
     session.report({"picture" if out.suffix == ".png" else "movie": out}, [f"wrote {out}"])
 
 
