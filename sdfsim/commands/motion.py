@@ -347,6 +347,12 @@ def train(
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
+    first: Annotated[
+        str | None,
+        typer.Option(
+            "--from", metavar="MODEL", help="Begin with the weights of a model of this preset.", show_default=False
+        ),
+    ] = None,
     workers: Annotated[
         int, typer.Option(help="Processes that draw batches ahead, for networks on surface nodes on a GPU.", min=0)
     ] = 0,
@@ -355,7 +361,7 @@ def train(
     """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene}
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene, "first": first}
     session.report(run_training(data, out, **how, on_progress=session.progress))
 
 
