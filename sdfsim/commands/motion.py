@@ -16,7 +16,8 @@ from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
-    list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
+    list[str] | None,
+    typer.Option(help="Bundled model or path; may be given again (default: those on the solve)."),
 ]
 
 
