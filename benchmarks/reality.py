@@ -368,7 +368,7 @@ def trained(how: Trained, seed: int, rows: Sequence[int], lesson: Lesson) -> tup
                 return partial(on_surfaces, run.export(plan.kind, []), lesson)
             return partial(rolled, cast("ImpulseNetwork", run.averaged()), task)
 
-        start = load_model(TEACHERS.format(seed=seed)) if how.teacher else None
+        start = load_model(TEACHERS[seed]) if how.teacher else None
         run = Run(plan, task, how.steps, seed, torch.device("cpu"), first=start)
         states = [] if how.steps else [judged(run)]
         while run.step < how.steps:
@@ -424,7 +424,12 @@ Judged = Callable[[Sequence[Start]], Motion]
 BODIES = 1.87  # m, the middle of the sizes of MOVi-B's bodies
 NODES = 32  # of a cube, at most
 SURFACE_STEPS = 800  # of networks on surface nodes, which have one seed
-TEACHERS = str(Path(__file__).with_name("models") / "alone-{seed}.safetensors")  # each trained on 2,000 trajectories
+HERE = Path(__file__).with_name("models")
+TEACHERS = [
+    HERE / "alone-0.safetensors",
+    "gnn",
+    HERE / "alone-2.safetensors",
+]  # each of 2,000 trajectories (docs/gpu.md)
 NETWORKS = {f"on the solve, {count} tosses": Trained("impacts", count) for count in TRAINED}
 NETWORKS |= {
     "alone, 256 tosses": Trained("alone", 256),
@@ -675,9 +680,9 @@ def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path,
     chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
     text = (
         f"Networks in the scene that was identified, {SEEDS} seeds each: {STEPS} steps of a training ({SURFACE_STEPS}, "
-        f"and one seed, of networks on surface nodes), of which the best of {LOOKS} states on {chosen} tosses is taken, "
-        f"and judged once on {TEST} others. Means over seeds, with 95 % intervals over tosses; less the solve is toss by "
-        "toss. Seconds are of one core, for one training.\n\n"
+        f"and one seed, of networks on surface nodes), of which the best of {LOOKS} states on {chosen} tosses is "
+        f"taken, and judged once on {TEST} others. Means over seeds, with 95 % intervals over tosses; less the solve "
+        "is toss by toss. Seconds are of one core, for one training.\n\n"
         f"{markdown(network_table(found))}"
     )
     write_section("reality networks", f"{COMMAND} --networks-only", text)
@@ -691,6 +696,9 @@ def network_table(found: Results) -> list[tuple[str, ...]]:
     rows = []
     for name in dict.fromkeys(method for _, method in found if method != SOLVE):
         seeds = [one for (_, method), one in found.items() if method == name]
+        if why := next((one["failed"] for one in seeds if "failed" in one), ""):
+            rows.append((np.inf, (name, why, *[""] * (len(head) - 1))))
+            continue
         test = np.array([one["test"] for one in seeds])
         mean = test.mean(0)
         apart = " / ".join(_told(change) for change in mean - own)
