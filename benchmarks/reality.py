@@ -679,10 +679,10 @@ def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path,
     found = networks(groups, out / "identified.yaml", gravity, out / "networks")
     chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
     text = (
-        f"Networks in the scene that was identified, {SEEDS} seeds each: {STEPS} steps of a training ({SURFACE_STEPS}, "
-        f"and one seed, of networks on surface nodes), of which the best of {LOOKS} states on {chosen} tosses is "
-        f"taken, and judged once on {TEST} others. Means over seeds, with 95 % intervals over tosses; less the solve "
-        "is toss by toss. Seconds are of one core, for one training.\n\n"
+        f"Networks in the scene that was identified: {STEPS} steps of a training ({SURFACE_STEPS} of networks on "
+        f"surface nodes), of which the best of {LOOKS} states on {chosen} tosses is taken, and judged once on {TEST} "
+        "others. Means over the seeds that are listed, with 95 % intervals over tosses; less the solve is toss by toss, "
+        "seconds are of one core, for one training.\n\n"
         f"{markdown(network_table(found))}"
     )
     write_section("reality networks", f"{COMMAND} --networks-only", text)
