@@ -681,8 +681,8 @@ def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path,
     text = (
         f"Networks in the scene that was identified: {STEPS} steps of a training ({SURFACE_STEPS} of networks on "
         f"surface nodes), of which the best of {LOOKS} states on {chosen} tosses is taken, and judged once on {TEST} "
-        "others. Means over the seeds that are listed, with 95 % intervals over tosses; less the solve is toss by toss, "
-        "seconds are of one core, for one training.\n\n"
+        "others. Means over the seeds that are listed, with 95 % intervals over tosses. Less the solve: toss by toss. "
+        "Seconds of one core, for one training.\n\n"
         f"{markdown(network_table(found))}"
     )
     write_section("reality networks", f"{COMMAND} --networks-only", text)
