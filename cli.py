@@ -1,7 +1,5 @@
 """The command line: puts the commands of all rooms together."""
 
-from __future__ import annotations
-
 import gc
 from typing import Annotated
 

@@ -10,8 +10,6 @@ figure is the median of the repeats. PyBullet collides convex pieces (a bowl of 
 distances; both make five inner steps a step. Loading, and what a simulator keeps for its recording, is left out.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 import time

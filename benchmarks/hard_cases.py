@@ -7,8 +7,6 @@ the table and the pictures of docs/stability.md, and benchmarks/hard_cases_ratch
 what the slow test runs. With --quick the table is that of the short form too.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

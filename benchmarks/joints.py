@@ -6,8 +6,6 @@ Rows are what joints hold: three for a ball, five for a hinge. MuJoCo works in t
 inner step of ours, with its implicit integrator and its Newton solver.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path

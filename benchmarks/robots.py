@@ -6,8 +6,6 @@ Of each file: bodies and joints of the scene; the largest distance (mm) and angl
 scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import re

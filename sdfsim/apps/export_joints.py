@@ -1,7 +1,5 @@
 """Joints of a scene in the formats of `export`: nested bodies of MJCF, links of URDF, joints of UsdPhysics."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`import`: a URDF or MJCF file becomes a scene.yaml."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

@@ -1,8 +1,6 @@
 """MJCF -> links and joints, as `robot` turns them into a scene. MuJoCo itself reads the file: its compiler knows all
 defaults, frames, inertias and includes, and what it refuses is no MJCF."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the command plan tells: which effects are in play, why, and what a step costs."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from dataclasses import asdict

@@ -1,8 +1,6 @@
 """Links and joints, as files of robots have them -> a scene: its scene.yaml, and a Shape folder for each link that is
 more than one primitive. `urdf` and `mjcf` read the files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

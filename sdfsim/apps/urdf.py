@@ -1,7 +1,5 @@
 """URDF -> links and joints, as `robot` turns them into a scene."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter

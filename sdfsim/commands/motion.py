@@ -1,8 +1,6 @@
 """The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train,
 evaluate; tradeoff, stress."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """Error against time: our models with their settings, and other engines."""
 
-from __future__ import annotations
-
 import csv
 import io
 import time

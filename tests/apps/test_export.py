@@ -1,7 +1,5 @@
 """Exports, read back by the programs that they are for: trimesh, OpenUSD, MuJoCo, PyBullet, and our own `identify`."""
 
-from __future__ import annotations
-
 import csv
 import json
 import struct

@@ -1,7 +1,5 @@
 """Many meshes at once: in processes, on a cluster."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

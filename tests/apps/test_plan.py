@@ -1,7 +1,5 @@
 """`plan` explains a scene."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

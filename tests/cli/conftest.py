@@ -1,7 +1,5 @@
 """What the commands are given, and how they are run."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The command line from outside: exit codes, one line an error, one JSON object, run folders."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The scenes are what they are called, and the measures are right on motions whose figures are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 

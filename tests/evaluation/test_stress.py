@@ -1,7 +1,5 @@
 """The hard cases as a whole: resumed, reported, and held by the ratchet."""
 
-from __future__ import annotations
-
 import functools
 import json
 from dataclasses import replace

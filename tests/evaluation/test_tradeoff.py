@@ -1,7 +1,5 @@
 """The trade-off study: what variants change, what a scene becomes, and the whole study in small."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

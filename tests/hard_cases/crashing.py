@@ -1,7 +1,5 @@
 """Commands in a process of their own that ends at a chosen moment, as by a power cut, and tiny settings for them."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Files that claim more than they hold: weights, arrays, archives, pictures and meshes."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zipfile

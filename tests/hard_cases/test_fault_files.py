@@ -1,7 +1,5 @@
 """Weights, shapes and checkpoints that are cut short or changed, and two runs in one folder: one clear line each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

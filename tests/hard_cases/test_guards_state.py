@@ -1,7 +1,5 @@
 """What cannot be is an error that names step, body and last good state, and what was computed stays readable."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

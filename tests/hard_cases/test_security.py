@@ -1,7 +1,5 @@
 """Files from strangers reach nothing outside, run nothing and take no absurd memory; viewers stay on this machine."""
 
-from __future__ import annotations
-
 import ast
 import json
 import sys

@@ -1,7 +1,5 @@
 """Small fields, and rays to train them with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Small scenes and untrained networks: what must hold holds whatever the weights are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -3,8 +3,6 @@
 They are drawn with the ray caster and the textures of samples/photos/make.py, smaller and coarser.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil

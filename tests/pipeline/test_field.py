@@ -1,7 +1,5 @@
 """The field's formulas against closed forms, and the trainer's determinism."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paper's field: starts as a sphere, learns, resumes, and is read back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

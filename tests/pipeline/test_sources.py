@@ -1,7 +1,5 @@
 """What can be given: folders, masks, transforms.json, COLMAP models; against cameras that we know."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How far a surface can be trusted, against closed forms and renderings whose answer is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Joints of scene files: what is refused, with its line, and what the others become."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
