@@ -7,9 +7,7 @@ import mujoco  # noqa: TID253
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
-import cli
 from benchmarks.robots import poses
 from sdfsim import load_scene
 from sdfsim.apps.export import export
@@ -20,6 +18,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Scene
+from tests.helpers.command import run
 from tests.helpers.runs import read
 
 LINK = """
@@ -431,8 +430,8 @@ def test_usd_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
 
 def test_the_command_imports(tmp_path: Path) -> None:
     file = write(tmp_path, "arm.urdf", ARM)
-    run = CliRunner().invoke(cli.app, ["import", str(file), "-o", str(tmp_path / "scene.yaml"), "--fixed", "--json"])
-    assert run.exit_code == 0, run.output
+    done = run("import", file, "-o", tmp_path / "scene.yaml", "--fixed", "--json")
+    assert done.exit_code == 0, done.output
     assert load_scene(tmp_path / "scene.yaml").bodies[0].motion == "static"
 
 

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from sdfsim.data.dataset import Trajectory
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box
-from sdfsim.learned.model import Model, new_network
 from sdfsim.shape.make import analytic_shape
+from tests.helpers.scenes import tiny_model
 
 WRITING = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate")
 BALL = 0.5  # m
@@ -333,9 +332,7 @@ def works(tmp_path_factory) -> dict[str, Work]:
     home = tmp_path_factory.mktemp("inputs")
     (home / "box.ply").write_bytes(write_ply(box()))
     (home / "scene.yaml").write_text(SCENE)
-    torch.manual_seed(0)
-    network = new_network("impulse", {"width": 8, "rounds": 1})
-    Model("untrained", "impulse", network, 0.02, 10.0, 1.0, 0.1).save(home / "untrained.safetensors")
+    tiny_model(home / "untrained.safetensors")
     write_cubes(home / "data")
     (home / "photos").mkdir()
     for k in range(4):
