@@ -11,11 +11,7 @@ from sdfsim.commands import motion
 YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
 
 app = typer.Typer(
-    name="sdfsim",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
+    name="sdfsim", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
 )
 
 

@@ -32,10 +32,7 @@ CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anyt
 SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others
 APART = 15.0  # degrees between the photos proposed
 LEAST = 0.01  # share of the surface that a photo has to help, else it is not worth the way
-NEARBY, SLIGHT = (
-    35.0,
-    0.04,
-)  # degrees up to which a way is described in metres; share of the distance not mentioned
+NEARBY, SLIGHT = (35.0, 0.04)  # degrees up to which a way is described in metres; share of the distance not mentioned
 
 
 @dataclass(frozen=True)

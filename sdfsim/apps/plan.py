@@ -22,12 +22,7 @@ TRIAL_STEPS = 5
 
 
 def describe(
-    scene_file: Path,
-    *,
-    model: str | None,
-    device: str,
-    on_progress: StageProgress,
-    allow_outside: bool = False,
+    scene_file: Path, *, model: str | None, device: str, on_progress: StageProgress, allow_outside: bool = False
 ) -> dict[str, Any]:
     """The plan of a scene with its units, and what a step costs in the first few: pairs by what filters them; contacts,
     nodes, edges, time and memory. Raises SdfsimError for bad input."""

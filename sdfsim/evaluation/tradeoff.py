@@ -322,12 +322,7 @@ def _times(run: Callable[[], Timing], cases: Cases) -> dict[str, Any]:
 
 
 def tradeoff(
-    source: Path | None,
-    out: Path,
-    *,
-    models: Sequence[str] = (),
-    quick: bool = False,
-    on_progress: StageProgress,
+    source: Path | None, out: Path, *, models: Sequence[str] = (), quick: bool = False, on_progress: StageProgress
 ) -> dict[str, Any]:
     """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
 

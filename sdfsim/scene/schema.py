@@ -27,14 +27,7 @@ from sdfsim.base.errors import nearest
 from sdfsim.geometry.primitives import PRIMITIVES
 from sdfsim.scene.document import NOTHING, Loc, Numeral
 from sdfsim.scene.scene import WORLD, JointKind, Motion, Switch
-from sdfsim.shape.shape import (
-    DEFAULT_RESOLUTION,
-    MESH_FILE,
-    RECORD_FILE,
-    SKIN_FILE,
-    WEIGHTS_FILE,
-    SdfKind,
-)
+from sdfsim.shape.shape import DEFAULT_RESOLUTION, MESH_FILE, RECORD_FILE, SKIN_FILE, WEIGHTS_FILE, SdfKind
 
 VERSION = 1
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}

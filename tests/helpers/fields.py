@@ -7,9 +7,7 @@ import numpy as np
 import torch
 
 from pipeline.cameras import PosedPhotos, Similarity, Sparse, View
-from pipeline.field.grid_field import (
-    FieldSize,
-)
+from pipeline.field.grid_field import FieldSize
 from pipeline.field.training import Rays
 from pipeline.inputs.photos import save_photos
 
