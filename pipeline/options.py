@@ -18,7 +18,7 @@ COMMAND = "reconstruct"
 METRES = (1e-4, 1e5)  # smallest and largest length that can be given
 
 
-Preset = Literal["quick", "standard", "fine", "volsdf"]
+Preset = Literal["quick", "standard", "fine", "volsdf"]  # what each is: PRESETS in pipeline/field/training.py
 
 
 def option(default: Any, stages: Sequence[str], about: str = "", kind: Any = None, metavar: str | None = None,
