@@ -4,8 +4,6 @@ Pose frames are the shapes' own origins in every format. The report's `left_out`
 docs/export.md says it of each format.
 """
 
-from __future__ import annotations
-
 import csv
 import importlib
 import io
@@ -92,7 +90,7 @@ class Take:
         """m to each side, of the sheet that is shown for a plane."""
         return 6.0 * framed(self.scene)[1]
 
-    def at_rate(self, fps: float) -> Take:
+    def at_rate(self, fps: float) -> "Take":
         """The same motion at so many evenly spaced times in a second, between frames as if moved evenly."""
         count = int(np.floor((self.time[-1] - self.time[0]) * fps + 1e-6)) + 1
         time = self.time[0] + np.arange(count) / fps

@@ -1,7 +1,5 @@
 """The keys of scene.yaml as pydantic models. `python -m sdfsim.scene.schema` writes docs/scene.md, their reference."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -52,7 +50,7 @@ def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("value", "{text}", {"text": text})
 
 
-def _told(error: Any, table: type[Table]) -> str:
+def _told(error: Any, table: "type[Table]") -> str:
     """What pydantic found in a table, in our words."""
     kind, known = error["type"], table.model_fields
     if kind == "value":
