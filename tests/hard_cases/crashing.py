@@ -177,6 +177,7 @@ def tiny_reconstruct() -> None:
     from pipeline import stages
     from pipeline.field import training
     from pipeline.field.grid_field import FieldSize
+    from pipeline.mesh import meshing
 
     small = FieldSize((8, 16), (2, 2), 16, 8)
     training.PRESETS["quick"] = replace(
@@ -184,6 +185,7 @@ def tiny_reconstruct() -> None:
     )
     # One thread: its sums do not depend on how busy the machine is.
     training.train.__kwdefaults__ |= {"checkpoint_every": 0.0, "threads": 1}
+    meshing.RESOLUTION["quick"] = 64  # four times that of the field
     stages.STAGES["poses"] = replace(stages.STAGES["poses"], run=_given_poses)
     tiny_fit()
 
@@ -341,7 +343,7 @@ def works(tmp_path_factory) -> dict[str, Work]:
     reconstruct = ("reconstruct", str(home / "photos"), "--preset", "quick")
     simulate = ("simulate", str(home / "scene.yaml"), "--viewer", "none")
     return {
-        "reconstruct": Work(reconstruct, (), tiny_reconstruct, of_reconstruct, 3),
+        "reconstruct": Work(reconstruct, (), tiny_reconstruct, of_reconstruct),
         "fit": Work(("fit", str(home / "box.ply")), (), tiny_fit, of_fit, 3),
         "simulate": Work(simulate, ("--resume",), tiny_simulate, of_simulate),
         "train": Work(("train", "--data", str(home / "data")), ("--resume",), tiny_train, of_train),
