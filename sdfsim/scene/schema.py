@@ -519,7 +519,7 @@ class JointTable(Table):
     to: Vector | None = key("of a distance: its end at the second body", None, "m")
     axis: Direction | None = key("of a hinge, a slider and the cone of a ball; of any length", None)
     frame: Text = key(
-        f"where anchor, to and axis are told: `{WORLD}`, as bodies lie at the start, or the name of one of both "
+        f"where anchor, to and axis are given: `{WORLD}`, as bodies lie at the start, or the name of one of both "
         "bodies: from its shape's origin along its axes",
         WORLD,
     )
