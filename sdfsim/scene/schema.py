@@ -558,7 +558,7 @@ class JointTable(Table):
             if not {"rod", "rope", "spring"} & data.keys():
                 yield (), "one of rod, rope, spring is required: this is a distance"
         if "cone_deg" in data and "axis" not in data:
-            yield ("axis",), "is required: cone_deg is told from it"
+            yield ("axis",), "is required: cone_deg is measured from it"
         if "restitution" in data and not {"limits", "limits_deg", "cone_deg", "rope"} & data.keys():
             yield ("restitution",), "goes with limits or a rope only"
         if kind == "distance" and "damping" in data and "rod" in data:

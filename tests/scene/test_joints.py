@@ -65,7 +65,7 @@ HINGE = "name: door, type: hinge, anchor: [0.9, 0, 0], axis: [0, 0, 1]"
         ),
         (
             "{name: a, type: ball, bodies: [leaf, world], anchor: [1, 0, 0], cone_deg: 20}",
-            "axis: is required: cone_deg is told from it",
+            "axis: is required: cone_deg is measured from it",
         ),
         (
             "{name: a, type: weld, bodies: [leaf, world]}",
