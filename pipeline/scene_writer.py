@@ -1,5 +1,7 @@
 """Meshes -> a scene: Shape folders with compact SDFs, the scene.yaml, and a place to drop a body onto it."""
 
+from __future__ import annotations
+
 import hashlib
 import itertools
 import shutil
@@ -187,7 +189,7 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
     return found
 
 
-def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: "Slab | None", *, scenery: bool = True,
+def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0
                ) -> str:  # fmt: skip
     """The text of scene.yaml: a floor at a height, m, the scenery, the bodies that were found at their origins [3] m,
