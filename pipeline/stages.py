@@ -1,5 +1,7 @@
 """The stages from photos to a scene: each in its own folder, skipped when nothing changed, resumed when killed."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os
