@@ -16,12 +16,12 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
-from xml.etree.ElementTree import SubElement as add
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps import export_joints as jointed
+from sdfsim.apps.export_joints import add
 from sdfsim.apps.observed import COLUMNS
 from sdfsim.apps.recording import body_colors, framed, shown, sunk, with_normals
 from sdfsim.apps.run import read_run

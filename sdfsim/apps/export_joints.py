@@ -4,8 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
-from xml.etree.ElementTree import Element
-from xml.etree.ElementTree import SubElement as add
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -160,6 +159,10 @@ def left_out(joints: Sequence[Joint], *, breaks: bool = True, spring_of: Sequenc
 
 def _text(*values: Any) -> str:
     return " ".join(f"{value + 0.0:.12g}" for value in np.concatenate([np.ravel(value) for value in values]))
+
+
+def add(parent: Element, tag: str, **attributes: str) -> Element:
+    return SubElement(parent, tag, attributes)
 
 
 def mjcf_pose(scene: Scene, tree: Trees, k: int) -> tuple[np.ndarray, np.ndarray]:
