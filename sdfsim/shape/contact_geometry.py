@@ -4,8 +4,6 @@ A shape that is convex, or made of convex pieces, collides as solids; any other 
 A thousand bodies of one shape share one geometry.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the gates run on: the contact solve, every bundled network, and the devices that there are."""
 
-from __future__ import annotations
-
 import pytest
 
 from sdfsim.learned.model import SOLVER, Model, bundled_models, load_model, model_names
