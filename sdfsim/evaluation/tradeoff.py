@@ -27,7 +27,7 @@ from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import energy_gain, errors
 from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
-from sdfsim.learned.model import SOLVER, Model, load_model, model_names
+from sdfsim.learned.model import SOLVER, Model, load_model, sound_models
 from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -330,7 +330,7 @@ def tradeoff(
         source: dataset folder, or a scene file, which the teacher then simulates; None takes a random scene of
             boxes and balls.
         out: folder to write; results that it holds already are kept.
-        models: names or paths (none: the solver and all bundled networks).
+        models: names or paths (none: the solver and the bundled networks on it).
         quick: fewer variants on fewer, shorter scenes.
 
     Returns:
@@ -342,7 +342,7 @@ def tradeoff(
     """
     if source and not source.exists():
         raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
-    names = list(models) or model_names()
+    names = list(models) or sound_models()
     with locked(out), one_thread():
         on_progress("scenes", 0.0, "reading scenes and shapes")
         if source and source.is_dir():
