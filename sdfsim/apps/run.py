@@ -1,7 +1,5 @@
 """`simulate`: a scene file becomes a run folder; and what is kept there so that a killed run goes on."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable

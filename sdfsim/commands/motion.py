@@ -1,8 +1,6 @@
 """The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train,
 evaluate; tradeoff, stress."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -219,8 +217,7 @@ def import_(
         Path, typer.Option("-o", "--out", metavar="FILE", help="The scene.yaml to write.", show_default=False)
     ],
     packages: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of the packages that package:// names (URDF); may be given again."),
+        list[Path] | None, typer.Option(help="Folder of the packages that package:// names (URDF); may be given again.")
     ] = None,
     fixed: Annotated[bool, typer.Option("--fixed", help="The root never moves (URDF).")] = False,
     floor: Annotated[bool, typer.Option("--floor", help="Add a floor at z = 0, and stand all on it.")] = False,
@@ -376,8 +373,7 @@ def evaluate(
         Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: of published networks).")
     ] = "exact",
     chaos_floor: Annotated[
-        bool,
-        typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet)."),
+        bool, typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet).")
     ] = False,
     device: str = "auto",
 ) -> None:

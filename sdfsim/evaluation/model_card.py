@@ -1,7 +1,5 @@
 """Evaluate a model, write its card and bundle it: `python -m sdfsim.evaluation.model_card MODEL DATA --name NAME`."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The hard cases run with models, the teacher and other engines; their table, plots and report."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What the gates run on: the contact solve, every bundled network on top of it, and the devices that there are."""
 
-from __future__ import annotations
-
 import pytest
 
 from sdfsim.learned.model import SOLVER, Model, load_model, sound_models
