@@ -100,10 +100,12 @@ def begun(tosses: Sequence[Links], dt: float, scene: Scene) -> list[tuple[Links,
     for toss, r in zip(
         tosses, with_velocities([cleaned(str(k), dt, p, scene) for k, p in enumerate(poses)], scene), strict=True
     ):
-        last = flight(toss) - 2  # the one before the impact may be half in it
-        held = np.flatnonzero(~r.flying[: max(0, last)].all(1))
+        rows = np.flatnonzero(r.flying[: flight(toss)].all(1))
+        if not len(rows) or flight(toss) - rows[-1] > FLIGHT:
+            continue
+        held = np.flatnonzero(~r.flying[: rows[-1]].all(1))
         first = int(held[-1]) + 1 if len(held) else 0
-        if last - first >= FLIGHT and len(toss.position) - first > FRAMES:
+        if rows[-1] + 1 - first >= FLIGHT and len(toss.position) - first > FRAMES:
             found.append((Links(*(part[first:] for part in toss)), _from(r, first)))
     return found
 

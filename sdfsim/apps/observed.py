@@ -31,6 +31,7 @@ BEYOND = 5.0  # deviations of the noise that are no noise
 # Trackers that smooth are off more in a flight than from frame to frame: by so much of a size (and rad) at most, and
 # so many deviations of that.
 ROUGH, SMOOTHED = 3e-3, 30.0
+LEVER = 2.0  # of what trackers are off on one body: where the bodies of a tree are depends on each other's turns
 FINEST = 2e-6  # of a body's size (and rad): poses are not expected to be more exact
 WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
 ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
@@ -314,15 +315,16 @@ def _swings(done: list[Recording], numbers: Sequence[int], rows: list[int], scen
     tree = tree_of(scene, rows)
     mass = np.array([b.mass for b in tree.bodies])
     size = max(largest_extent(tree.shapes[b.shape]) * b.scale for b in tree.bodies)
+    rough = LEVER * ROUGH
     gravity = np.asarray(scene.gravity)
     flights: dict[float, list[tuple[int, int, int, Swing]]] = {}
     for k in numbers:
-        r, seen = done[k], done[k].seen[:, rows].all(1)
+        r, seen = done[k], np.asarray(done[k].seen[:, rows].all(1))
         place, turn = (array[:, rows] for array in r.goal)
         middle = (mass[:, None] * place).sum(1) / mass.sum()
         sigma = _noise(middle, seen, FINEST * size), r.noise[1]
         flies = _nearby(middle, turn[:, 0], seen, r.dt, gravity, sigma)[2]
-        most = max(BEYOND * sigma[0], min(ROUGH * size, SMOOTHED * sigma[0]))
+        most = max(BEYOND * sigma[0], min(rough * size, SMOOTHED * sigma[0]))
         for a, b in _flights(flies, seen, middle, r.dt, gravity, most):
             some = np.arange(a, b)[seen[a:b]]
             swing = Swing(r.dt * (some - a), place[some], turn[some], r.noise)
@@ -330,7 +332,7 @@ def _swings(done: list[Recording], numbers: Sequence[int], rows: list[int], scen
     for dt, some in flights.items():
         for (k, a, b, swing), (path, off, turned_off) in zip(some, swung([s for *_, s in some], dt, tree), strict=True):
             r, seen = done[k], a + np.round(swing.time / dt).astype(int)
-            if off > max(BEYOND * r.noise[0], ROUGH * size) or turned_off > max(BEYOND * r.noise[1], 2.0 * ROUGH):
+            if off > max(BEYOND * r.noise[0], rough * size) or turned_off > max(BEYOND * r.noise[1], 2.0 * rough):
                 continue  # something turned it
             middle = (mass[:, None] * swing.position).sum(1) / mass.sum()
             (at, fast), _ = _parabola(seen, middle, dt, gravity, np.arange(a, b))

@@ -22,6 +22,7 @@ from sdfsim.simulate.steppers import stepper_of
 
 ROUNDS = 5  # of Gauss and Newton, for the flight of a tree
 BEGIN = 8  # frames of a flight that tell where its fit begins
+SINGULAR = 1e-3  # of the strongest way to change a flight: ways that joints do not allow are weaker
 OUTLIER = 3.0  # deviations: poses that are farther off count less than squared
 
 Frames = tuple[
@@ -175,11 +176,12 @@ def swung(swings: Sequence[Swing], dt: float, scene: Scene) -> list[tuple[Frames
             break
         for f, swing in enumerate(swings):
             off = _off(swing, [path[f] for path in paths], dt, share).reshape(1 + len(ways), -1)
-            slope = (off[1:] - off[0]) / step[f][:, None]
-            weight = (1.0 + np.square(off[0] / OUTLIER)) ** -0.25
-            change = np.linalg.lstsq((slope * weight).T, -off[0] * weight, rcond=1e-6)[0]
+            slope = off[1:] - off[0]  # by a step each, which makes turns and rates comparable
+            usual = max(1.0, 1.48 * float(np.median(np.abs(off[0]))))  # trackers are less exact in motion than at rest
+            weight = (1.0 + np.square(off[0] / (OUTLIER * usual))) ** -0.25
+            change = np.linalg.lstsq((slope * weight).T, -off[0] * weight, rcond=SINGULAR)[0]
             for w, way in enumerate(ways):
-                _nudge(guess, f, None, way, change[w])
+                _nudge(guess, f, None, way, change[w] * step[f, w])
     found = []
     for f, swing in enumerate(swings):
         own = cast("Frames", tuple(path[f, 0, : last[f] + 1] for path in paths))
@@ -231,7 +233,7 @@ def _flown(begun: tuple[np.ndarray, ...], dt: float, frames: int, scene: Scene) 
         for j in scene.joints
     )
     whole = replace(scene, bodies=tuple([*scene.bodies] * count), joints=joints)
-    bodies, state = side_by_side(whole, np.repeat(np.arange(count), many), u)
+    bodies, state = side_by_side(whole, np.repeat(np.arange(count), many).tolist(), u)
     place, turn, speed, spin = (array.reshape(count * many, -1) for array in begun)
     state = placed(state, place / u.length, turn, speed / u.velocity, spin * u.time)
     if bodies.joints is not None:
