@@ -71,8 +71,8 @@ def load_tosses(folder: Path) -> tuple[float, list[Links]]:
 
 def flight(toss: Links) -> int:
     """How many frames pass before the lowest corner is as near to the table as `CLEAR`."""
-    near = (lowest(toss) < CLEAR).any(1)
-    return int(near.argmax()) if near.any() else len(near)
+    near = np.any(lowest(toss) < CLEAR, axis=1)
+    return int(np.argmax(near)) if near.any() else len(toss.position)
 
 
 def gravity_of(tosses: Sequence[Links], dt: float) -> np.ndarray:
@@ -148,6 +148,101 @@ def errors(found: Motion, truth: Motion) -> np.ndarray:
 
 def cost(found: Motion, truth: Motion) -> float:
     return float(np.minimum(errors(found, truth)[:2], FAR).mean(1).sum())
+
+
+# --- what recordings say without any engine ---
+
+CORNERS = 0.5 * LINK * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+ALONE, AWAY = 0.008, 0.003  # m: how much lower an impact's corner is than the next; how high all are after it
+BEFORE, AFTER = 9, 6  # frames that tell the velocities before and after an impact
+
+
+class Moving(NamedTuple):
+    """Both links at one time: turns, and places [2, 3] and velocities [2, 3] about their mass centre, which moves with
+    `speed` [3]."""
+
+    turns: tuple[Rotation, Rotation]
+    place: np.ndarray  # m
+    velocity: np.ndarray  # m/s
+    spin: np.ndarray  # rad/s
+    speed: np.ndarray  # m/s
+
+    def corner(self, link: int, corner: int) -> np.ndarray:
+        """[3] m, about the mass centre."""
+        return self.place[link] + self.turns[link].apply(CORNERS[corner])
+
+    def velocity_of(self, link: int, point: np.ndarray) -> np.ndarray:
+        return self.speed + self.velocity[link] + np.cross(self.spin[link], point - self.place[link])
+
+    def turning(self) -> np.ndarray:
+        """[3] N m s, the angular momentum of solid links about the mass centre."""
+        inertia = (turn.as_matrix() @ np.diag(EVEN) @ turn.as_matrix().T for turn in self.turns)
+        own = sum(i @ w for i, w in zip(inertia, self.spin, strict=True))
+        return own + MASS * np.cross(self.place, self.velocity).sum(0)
+
+
+def moving(toss: Links, frames: np.ndarray, at: float, dt: float, gravity: np.ndarray) -> Moving:
+    """By parabolas through these frames, at the time `at` in frames."""
+    time = dt * (frames - at)[:, None]
+    powers = time ** np.arange(3)
+    one, two = (Rotation.from_quat(toss.quat_xyzw[frames, k]) for k in (0, 1))
+    turn, rate = np.linalg.lstsq(powers, (one * one[0].inv()).as_rotvec(), rcond=None)[0][:2]
+    first, tiny = Rotation.from_rotvec(turn) * one[0], 1e-5
+    spin = (Rotation.from_rotvec(turn + tiny * rate) * Rotation.from_rotvec(turn).inv()).as_rotvec() / tiny
+    bent = np.linalg.lstsq(powers, np.unwrap((one.inv() * two).as_rotvec()[:, 1]), rcond=None)[0]
+    second = first * Rotation.from_rotvec([0.0, bent[0], 0.0])
+    spins = np.stack([spin, spin + bent[1] * first.apply([0.0, 1.0, 0.0])])
+    arms = first.apply(PIVOT), second.apply(ARM)
+    apart, fast = sum(arms), sum(np.cross(w, arm) for w, arm in zip(spins, arms, strict=True))
+    middle = toss.position[frames].mean(1) - 0.5 * time**2 * gravity
+    speed = np.linalg.lstsq(powers[:, :2], middle, rcond=None)[0][1]
+    half = 0.5 * np.array([[-1.0], [1.0]])
+    return Moving((first, second), half * apart, half * fast, spins, speed)
+
+
+def impacts(tosses: Sequence[Links], dt: float, gravity: np.ndarray) -> dict[str, list[float]]:
+    """Of first impacts of one corner after which nothing touches for a while, each as quartiles and their number:
+    restitution of that corner, impulse along the table over that across it, and how much of the change of angular
+    momentum an impulse at that corner does not make."""
+    found: dict[str, list[float]] = {}
+    for toss in tosses:
+        first = flight(toss)
+        turns = Rotation.from_quat(toss.quat_xyzw.reshape(-1, 4)).as_matrix().reshape(-1, 2, 3, 3)
+        height = (toss.position[:, :, None] + np.einsum("tkij,cj->tkci", turns, CORNERS))[..., 2].reshape(-1, 16)
+        low = height.min(1)
+        if first < BEFORE + 1 or first + 2 >= len(low):
+            continue
+        at = first - 1 + int(np.argmin(low[first - 1 : first + 2]))
+        after = np.arange(at + 1, at + 1 + AFTER)
+        if after[-1] >= len(low) or low[after[1:]].min() < AWAY or np.diff(np.sort(height[at])[:2])[0] < ALONE:
+            continue
+        # Between frames: a fifth of one before the lowest.
+        a, b = (moving(toss, k, at - 0.2, dt, gravity) for k in (np.arange(first - BEFORE - 1, first - 1), after))
+        link, corner = divmod(int(height[at].argmin()), 8)
+        push, arm = 2.0 * MASS * (b.speed - a.speed), a.corner(link, corner)
+        if push[2] < 0.3:  # N s; the table throws back at least so much
+            continue
+        turned = b.turning() - a.turning()
+        came, went = (one.velocity_of(link, one.corner(link, corner))[2] for one in (a, b))
+        told = -went / came, np.hypot(*push[:2]) / push[2]
+        left = np.linalg.norm(turned - np.cross(arm, push)) / np.linalg.norm(turned)
+        names = "restitution", "impulse along over across", "angular momentum that is left"
+        for name, value in zip(names, (*told, left), strict=True):
+            found.setdefault(name, []).append(float(value))
+    return {name: [*np.percentile(values, [25, 50, 75]).tolist(), len(values)] for name, values in found.items()}
+
+
+def growth(found: Motion, truth: Motion, flights: Sequence[int]) -> dict[int, tuple[float, float]]:
+    """By frames after the last before the first impact: medians of the distance of the links in mm and of their turn in
+    degrees."""
+    way = 1e3 * np.sqrt(np.square(found.position - truth.position).sum(-1).mean(-1))
+    one, other = (Rotation.from_quat(m.quat_xyzw.reshape(-1, 4)) for m in (found, truth))
+    angle = np.degrees((one * other.inv()).magnitude().reshape(found.position.shape[:3]).mean(-1))
+    told = {}
+    for frame in (0, 1, 2, 4, 8, 16, 32):
+        rows = [(k, n - 2 + frame) for k, n in enumerate(flights) if 0 <= n - 2 + frame < FRAMES]  # poses from 1 on
+        told[frame] = tuple(float(np.median([of[row] for row in rows])) for of in (way, angle))
+    return told
 
 
 # --- engines ---
@@ -285,14 +380,19 @@ def main(tosses: Path, out: Path, rounds: int, only: Sequence[str]) -> None:
     (fit, fit_truth), (test, test_truth) = (
         ([start_of(r) for _, r in group], recorded([toss for toss, _ in group])) for group in groups
     )
+    flights = [flight(toss) for toss, _ in groups[1]]
     result: dict[str, Any] = {}
+    for name, (low, middle, high, count) in impacts(known, dt, gravity).items():
+        print(f"first impacts of one corner, {name}: {middle:.3f} ({low:.3f} to {high:.3f}), {count:.0f} of them")
     if "sdfsim" in only:
         progress(0.0, "sdfsim: identify")
         own = identify([r for _, r in groups[0]], scene, on_progress=progress)
         write_scene(own, out / "scene.yaml", out / "identified.yaml")
         found = load_scene(out / "identified.yaml")
         values = {"bodies": own.scene_values, "joints": own.joint_values}
-        result["sdfsim"] = values, *(errors(ours(s, dt, found), t) for s, t in ((fit, fit_truth), (test, test_truth)))
+        moved = [ours(starts, dt, found) for starts in (fit, test)]
+        result["sdfsim"] = values, *(errors(m, t) for m, t in zip(moved, (fit_truth, test_truth), strict=True))
+        print("sdfsim, mm and degrees by frames from the first impact:", growth(moved[1], test_truth, flights))
         write_json(out / "identified.json", own.report())
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
         if name not in only:

@@ -1,7 +1,7 @@
 """MuJoCo's own system identification on the recorded tosses of a cube, beside `sdfsim identify`: docs/identify.md.
 
     pip install 'mujoco[sysid]'
-    python benchmarks/sysid.py TOSSES
+    python benchmarks/sysid.py TOSSES [--frames N ...]
 
 MuJoCo's least squares (`mujoco.sysid.optimize`) move the parameters that benchmarks/reality.py searches for, from the
 middle of their bounds, until 60 tosses go as recorded; over so many frames of them as are given. All is judged on the
@@ -15,6 +15,7 @@ import contextlib
 import io
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ SHORT = (25, 40, FRAMES)  # frames that are fitted
 
 
 @one_thread()
-def main(tosses: Path) -> None:
+def main(tosses: Path, horizons: Sequence[int]) -> None:
     toolbox: Any = engine_module("mujoco.sysid", "MuJoCo's sysid", "bench")
     if not hasattr(toolbox, "optimize"):  # it swallows what is missing
         raise SdfsimError("MuJoCo's sysid is not installed", "pip install 'mujoco[sysid]'")
@@ -44,7 +45,7 @@ def main(tosses: Path) -> None:
         ([fitted_start(toss, GRAVITY) for toss in group], recorded(group)) for group in groups
     )
     turns = Rotation.from_quat(fit_truth.quat_xyzw.reshape(-1, 4))
-    for frames in SHORT:
+    for frames in horizons:
         runs = [0]
 
         def off(x: np.ndarray, _: Any, frames: int = frames, runs: list[int] = runs) -> tuple[list, None, None]:
@@ -81,5 +82,6 @@ def main(tosses: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("tosses", type=Path)
+    parser.add_argument("--frames", type=int, nargs="+", default=list(SHORT), help="that are fitted")
     args = parser.parse_args()
-    run_main(lambda: main(args.tosses))
+    run_main(lambda: main(args.tosses, args.frames))

@@ -260,16 +260,16 @@ def identify(
     scene = scene or next((path / "scene.yaml" for path in public), None)
     motions, known = load_recordings(paths, scene, allow_outside=allow_outside, on_progress=shapes)
     found = room.identify(motions, known, profiles=out is not None, on_progress=fit)
-    lines, wrote = room.report_lines(found), []
+    lines, wrote = room.report_lines(found), {}
     if out is not None and known.path is not None:
         lines += [*room.write_scene(found, known.path, out), f"wrote {out}"]
-        wrote, drawn = [out], out.with_suffix(".png")
+        wrote, drawn = {"wrote": out}, out.with_suffix(".png")
         if missing := picture(found, drawn):
             lines.append(f"no {drawn.name}: {missing}")
         else:
-            wrote.append(drawn)
+            wrote["picture"] = drawn
             lines.append(f"wrote {drawn}: the loss against each parameter")
-    session.report(found.report() | ({"wrote": wrote} if wrote else {}), lines)
+    session.report(found.report() | wrote, lines)
 
 
 @command

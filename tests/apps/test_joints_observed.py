@@ -172,7 +172,6 @@ def test_bodies_on_a_hinge_that_were_thrown_have_the_velocities_of_their_flight(
     assert flying_trees(made) == [[0, 1]]
     (found,) = with_velocities([cleaned("throw", dt, poses, made)], made)
     assert found.flying.all() and found.known.all()
-    # Fits to seven frames are ten times as far off at the ends.
     assert found.velocity == pytest.approx(speeds[..., :3], abs=0.006)
     assert found.angular_velocity == pytest.approx(speeds[..., 3:], abs=0.08)
 
