@@ -19,6 +19,7 @@ from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.hollows import hollow
+from pipeline.mesh.joint import JOINT, load_held
 from pipeline.mesh.placement import GRAVITY, Placement, Up, located_bodies, measured_scale, place
 from pipeline.mesh.supports import complete, on_any
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
@@ -64,7 +65,14 @@ def make_meshes(
         up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
     if capture is not None and scale is None and options.size is None:
         scale = 1 / to_unit.scale, f"metres of {capture.app}"
+    held = load_held(photos / JOINT)
+    if held is not None and scale is None and options.size is None:
+        scale = held.metres / to_unit.scale, held.size_from
     placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
+    if held is not None:
+        if placement.size_from == held.size_from:
+            placement = replace(placement, size_assumed=held.size_assumed)
+        held.moved(placement.to_metres.after(to_unit)).save(out / JOINT)
     level, known, completed = placement.to_metres.rotation[2], None, []
     if not alone:
         on_progress(0.45, "looking for level surfaces without texture")
