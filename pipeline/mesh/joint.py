@@ -30,13 +30,15 @@ POINTS, MOST_POINTS = 8_000, 64_000  # on each surface: at first, and where litt
 ENOUGH = 2_500  # points that move are enough
 STILL = 0.02  # of the size: what is nearer to the other state's surface does not move
 LEAST = 0.01  # of the surface: less of it that moves is noise
-FAR = 0.05  # of the size: a point that is farther off counts as so far
-HIDDEN = 0.3  # of that, for a point that would be where the other state's photos do not look
+# In units of what counts as still:
+FAR = 2.5  # a point that is farther off counts as so far
+HIDDEN = 0.3  # how far off a point counts that would be where the other state's photos do not look
+COARSE, FINE = 5.0, 0.5  # how far ICP looks for partners, first and last
+WIDE = 0.2  # of the part's size, how far it looks first at least
+FIT = 0.5  # mean distance of points, of a motion that fits
 MOST = 0.9  # of the surface: where more of it moves, nothing tells where the rest is
-COARSE, FINE = 0.1, 0.01  # of the size: how far ICP looks for partners, first and last
 ROUNDS = 10  # of ICP at each reach
 FEW, BEST = 400, 10  # points with which all starts are tried, and how many of these go on with all
-FIT = 0.01  # of the size: mean distance of points, of a motion that fits
 ALIKE = 1.5  # times the least such distance: motions that fit as well, as those of a thing with symmetries do
 EXACT = 2e-5  # of the size: what fits better fits as well
 DIP = math.radians(10.0)  # motions that differ by a smaller turn are one, found less or more exactly
@@ -121,7 +123,9 @@ def find_joint(
     surfaces = _Surfaces(on, clear, part, there, pairs, near, size)
     few = surfaces.some(FEW)
     starts = _starts(part[0], there[0]) if len(part[0]) and len(there[0]) else []
-    rough = [surfaces.rated(few.laid(start), few) for start in [*([] if shown is None else [shown]), *starts]]
+    width = max([0.0, *(float(np.linalg.norm(np.ptp(some[0], axis=0))) for some in (part, there) if len(some[0]))])
+    reach = max(COARSE, WIDE * width / near)
+    rough = [surfaces.rated(few.laid(start, (reach, 0.5 * reach, 0.25 * reach)), few) for start in [*([] if shown is None else [shown]), *starts]]
     rough.sort(key=lambda entry: entry.cost)
     if shown is not None:
         # What is alike by its looks is the same place, however many other places are shaped alike.
@@ -132,13 +136,11 @@ def find_joint(
     mid = part[0].mean(0) if len(part[0]) else pairs[0].mean(0)
     found = [surfaces.rated(surfaces.laid(entry.motion, FINISH), surfaces) for entry in rough[:BEST]]
     least = max(min(entry.off for entry in found), EXACT * size)
-    if least > FIT * size:
+    if least > FIT * near:
         more = "give two states between which one thing has moved"
         raise SdfsimError(f"no motion carries the part that moves onto its second place (best: {least:.3g} m off)", more)
     # Of motions that fit as well, which a thing with symmetries has: a hinge or a slider before a screw, a hinge beside
     # its part before one in the air, and then the least motion.
-    width = float(np.linalg.norm(np.ptp(part[0] if len(part[0]) else there[0], axis=0)))
-
     def unlikely(entry: _Rated) -> tuple[bool, bool, float]:
         angle, axis, point, slide = _screw(entry.motion, mid)
         across = (part[0] if len(part[0]) else pairs[0]) - point
@@ -148,7 +150,7 @@ def find_joint(
         return screw, astray, 0.5 * angle * width + abs(slide)
 
     lowest = max(min(entry.cost for entry in found), EXACT * size)
-    fitting = [entry for entry in found if entry.cost <= ALIKE * lowest and entry.off <= FIT * size]
+    fitting = [entry for entry in found if entry.cost <= ALIKE * lowest and entry.off <= FIT * near]
     chosen = min(fitting or found, key=unlikely)
     # Several starts lead into one dip: the deepest place of it counts.
     same = [entry for entry in fitting or found if _screw(entry.motion @ np.linalg.inv(chosen.motion), mid)[0] < DIP]
@@ -165,8 +167,9 @@ def find_joint(
     doubt = _doubt(surfaces, motion, mid, rng)
     back = np.linalg.inv(motion)
     seen = tuple(
-        points[surfaces.carried(points, way, k) <= near]
+        points[(away <= near) | hidden]
         for points, way, k in ((part[0], motion, 1), (there[0], back, 0))
+        for away, hidden in [surfaces.carried(points, way, k)]
     )
     moving = _faces(one, motion, on[1], near)
     return FoundJoint(kind, anchor, axis, travel, motion[:3, :3], motion[:3, 3], moving, rated.off, doubt,
@@ -272,6 +275,12 @@ def _starts(moving: np.ndarray, moved: np.ndarray) -> list[np.ndarray]:
         start = np.eye(4)
         start[:3, :3], start[:3, 3] = turn, moved.mean(0) - turn @ moving.mean(0)
         found.append(start)
+    # Of a slide the middles tell little either: the one or the other end along each axis may be what both show.
+    ends = [[(points @ frames[1]).min(0), (points @ frames[1]).max(0)] for points in (moving, moved)]
+    for which in np.ndindex(2, 2, 2):
+        start = np.eye(4)
+        start[:3, 3] = frames[1] @ [ends[1][end][k] - ends[0][end][k] for k, end in enumerate(which)]
+        found.append(start)
     return found
 
 
@@ -285,8 +294,7 @@ def _everywhere(points: np.ndarray) -> np.ndarray:
 
 
 Points = tuple[np.ndarray, np.ndarray]  # [P, 3] m of a surface, with the normals there
-Reaches = tuple[float, ...]  # of the size, how far partners may be, one after the other
-START: Reaches = (COARSE, 0.5 * COARSE, 0.25 * COARSE)
+Reaches = tuple[float, ...]  # how far partners may be, in units of what counts as still, one after the other
 FINISH: Reaches = (3.0 * FINE, FINE, FINE, FINE)
 
 
@@ -375,13 +383,14 @@ class _Surfaces:
         pairs = self.pairs[0][::step], self.pairs[1][::step]
         return replace(self, part=few(self.part), there=few(self.there), pairs=pairs)
 
-    def carried(self, points: np.ndarray, motion: np.ndarray, state: int) -> np.ndarray:
-        """[P] m, how far points, moved, are from a state's surface; 0 where they are where its photos do not look."""
+    def carried(self, points: np.ndarray, motion: np.ndarray, state: int) -> tuple[np.ndarray, np.ndarray]:
+        """[P] m, how far points, moved, are from a state's surface, and whether they are where its photos do not look
+        and so may have one."""
         moved = points @ motion[:3, :3].T + motion[:3, 3]
         away = _away(self.on[state], moved)
-        far = away > self.near
-        far[far] = ~self.empty[state](moved[far])
-        return np.where(far, 0.0, away)
+        hidden = away > self.near
+        hidden[hidden] = ~self.empty[state](moved[hidden])
+        return away, hidden
 
     def rated(self, motion: np.ndarray, by: _Surfaces) -> _Rated:
         """How well a motion fits, both ways: nothing of either part is to be left over."""
@@ -389,12 +398,10 @@ class _Surfaces:
         for (points, _), way, state in ((by.part, motion, 1), (by.there, np.linalg.inv(motion), 0)):
             if not len(points):
                 continue
-            moved = points @ way[:3, :3].T + way[:3, 3]
-            away = np.minimum(_away(self.on[state], moved), FAR * self.size)
-            hidden = away > self.near
-            hidden[hidden] = ~self.empty[state](moved[hidden])
-            costs.append(float(np.where(hidden, np.minimum(away, HIDDEN * FAR * self.size), away).mean()))
-            offs.append(float(away[~hidden].mean()) if (~hidden).mean() > LEAST else FAR * self.size)
+            away, hidden = self.carried(points, way, state)
+            away = np.minimum(away, FAR * self.near)
+            costs.append(float(np.where(hidden, HIDDEN * self.near, away).mean()))
+            offs.append(float(away[~hidden].mean()) if (~hidden).mean() > LEAST else FAR * self.near)
             follow, count = follow + float((hidden | (away <= self.near)).sum()), count + len(points)
         agreed = 0.0
         if len(by.pairs[0]):
@@ -402,20 +409,33 @@ class _Surfaces:
             agreed = float((np.linalg.norm(apart, axis=1) <= self.near).mean())
         return _Rated(motion, max(costs), max(offs), follow / max(count, 1), agreed)
 
-    def laid(self, start: np.ndarray, reaches: Reaches = START, *, turns: bool = True) -> np.ndarray:
+    def laid(self, start: np.ndarray, reaches: Reaches, *, turns: bool = True) -> np.ndarray:
         """[4, 4] by ICP, points to planes: of the part in the first state on the second's surface, and of the part in
         the second state on the first's, looking ever nearer; and of pairs of places on each other. Edges of a part that
         lies flush in the one state are seen in the other. Without `turns` the part keeps its orientation."""
         motion = start.copy()
         for reach in reaches:
+            shown = self._shown(motion)
             for _ in range(ROUNDS):
-                step = self._step(motion, reach * self.size, turns)
+                step = shown._step(motion, reach * self.near, turns)
                 if step is None:
                     break
                 motion = step[0] @ motion
                 if step[1] < 1e-6 * self.size:
                     break
         return motion
+
+    def _shown(self, motion: np.ndarray) -> _Surfaces:
+        """The same without points that a motion carries to where the other state's photos do not look. There is no
+        surface for them, and the nearest one is another's."""
+        if self.empty == (_everywhere, _everywhere):
+            return self
+        some = [
+            (points[~hidden], normals[~hidden])
+            for (points, normals), way, state in ((self.part, motion, 1), (self.there, np.linalg.inv(motion), 0))
+            for hidden in [self.carried(points, way, state)[1]]
+        ]
+        return replace(self, part=some[0], there=some[1])
 
     def _step(self, motion: np.ndarray, reach: float, turns: bool) -> tuple[np.ndarray, float] | None:
         """A step [4, 4] of ICP and how long it is, m; None where too little has a partner."""
