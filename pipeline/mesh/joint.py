@@ -27,7 +27,7 @@ from sdfsim.geometry.mesh import Mesh, sample_surface
 
 JOINT, PART = "joint.json", "part"  # the file, and the name of the body
 POINTS, MOST_POINTS = 8_000, 64_000  # on each surface: at first, and where little of it moves
-ENOUGH = 2_500  # points that move are enough
+ENOUGH = 1_500  # points that move are enough
 STILL = 0.02  # of the size: what is nearer to the other state's surface does not move
 LEAST = 0.01  # of the surface: less of it that moves is noise
 # In units of what counts as still:
@@ -50,6 +50,7 @@ SPECK = 0.1  # of the largest patch that moves: a smaller one is noise
 SURE = 0.9  # of what moves: where less of it goes with the motion, what was found says so
 FOLLOWS = 0.6  # of what moves: where less of it goes with one motion, more than one thing has moved
 AGREED = 12  # features at least that show the same motion
+BY_CHANCE = 0.05  # of the features that look alike: so many lie right by chance
 DRAWS = 8  # of patches of the surface, and features, by which the doubt is measured
 
 
@@ -121,24 +122,35 @@ def find_joint(
     if paired is not None:
         shown, pairs = _agreed(paired(part[0], there[0]), near)
     surfaces = _Surfaces(on, clear, part, there, pairs, near, size)
-    few = surfaces.some(FEW)
-    starts = _starts(part[0], there[0]) if len(part[0]) and len(there[0]) else []
-    width = max([0.0, *(float(np.linalg.norm(np.ptp(some[0], axis=0))) for some in (part, there) if len(some[0]))])
-    reach = max(COARSE, WIDE * width / near)
-    rough = [surfaces.rated(few.laid(start, (reach, 0.5 * reach, 0.25 * reach)), few) for start in [*([] if shown is None else [shown]), *starts]]
-    rough.sort(key=lambda entry: entry.cost)
-    if shown is not None:
-        # What is alike by its looks is the same place, however many other places are shaped alike.
-        best = max(entry.agreed for entry in rough)
-        rough = [entry for entry in rough if entry.agreed >= 0.5 * best]
-    if not rough:
-        raise SdfsimError("the part that moves is seen in one state only", "photograph it from the same sides in both")
+    few, width = surfaces.some(FEW), max(_extent(part[0]), _extent(there[0]))
     mid = part[0].mean(0) if len(part[0]) else pairs[0].mean(0)
-    found = [surfaces.rated(surfaces.laid(entry.motion, FINISH), surfaces) for entry in rough[:BEST]]
+
+    def tried(starts: list[np.ndarray]) -> list[_Rated]:
+        """The best of the motions to which these lead, each once."""
+        reach = max(COARSE, WIDE * width / near)
+        rough = [surfaces.rated(few.laid(start, (reach, 0.5 * reach, 0.25 * reach)), few) for start in starts]
+        best: list[np.ndarray] = []
+        for entry in sorted(rough, key=lambda entry: entry.cost):
+            apart = [np.linalg.inv(entry.motion) @ other for other in best]
+            if len(best) < BEST and not any(
+                _screw(step, mid)[0] < SLIDES and np.linalg.norm(step[:3, :3] @ mid + step[:3, 3] - mid) < near
+                for step in apart
+            ):
+                best.append(entry.motion)
+        return [surfaces.rated(surfaces.laid(motion, FINISH), surfaces) for motion in best]
+
+    # What is alike by its looks is the same place, however many other places are shaped alike.
+    found = [] if shown is None else tried([shown])
+    if not found or found[0].off > FIT * near:
+        if not len(part[0]) or not len(there[0]):
+            message = "what moves is seen in one state only"
+            raise SdfsimError(message, "photograph it from the same sides in both")
+        found += tried(_starts(part[0], there[0]))
     least = max(min(entry.off for entry in found), EXACT * size)
     if least > FIT * near:
         more = "give two states between which one thing has moved"
         raise SdfsimError(f"no motion carries the part that moves onto its second place (best: {least:.3g} m off)", more)
+
     # Of motions that fit as well, which a thing with symmetries has: a hinge or a slider before a screw, a hinge beside
     # its part before one in the air, and then the least motion.
     def unlikely(entry: _Rated) -> tuple[bool, bool, float]:
@@ -289,6 +301,11 @@ def _away(surface: ClosestPoint, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(surface(points)[0] - points, axis=1) if len(points) else np.zeros(0)
 
 
+def _extent(points: np.ndarray) -> float:
+    """m, the diagonal of the box around points."""
+    return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+
+
 def _everywhere(points: np.ndarray) -> np.ndarray:
     return np.ones(len(points), bool)
 
@@ -345,7 +362,7 @@ def _agreed(pairs: Pairs, near: float) -> tuple[np.ndarray | None, Pairs]:
     motion = np.asarray(found.transformation)
     there = pairs[0] @ motion[:3, :3].T + motion[:3, 3]
     good = np.linalg.norm(there - pairs[1], axis=1) < near
-    if good.sum() < AGREED:
+    if good.sum() < max(AGREED, BY_CHANCE * len(good)):
         return None, (nothing, nothing)
     return motion, (pairs[0][good], pairs[1][good])
 
