@@ -71,7 +71,9 @@ def reconstruct(
     With --joint, photos of one thing in two states (door shut and open) -> a scene in which the door turns.
     """
     if joint != (other is not None):
-        message = "--joint takes two folders of photos, one for each state" if joint else f"{other}: one folder too many"
+        message = (
+            "--joint takes two folders of photos, one for each state" if joint else f"{other}: one folder too many"
+        )
         hint = "sdfsim reconstruct SHUT OPEN --joint -o DIR"
         raise SdfsimError(message, hint, exit_code=EXIT_USAGE)
     common = {**_given(options), "budget": budget, "device": device, "from_stage": first, "until_stage": last,

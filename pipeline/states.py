@@ -85,7 +85,9 @@ def reconstruct_states(
         check_plain(state)
     if resolved.distance is not None:
         scaled = measured_in(states, resolved.distance)
-        states[scaled] = replace(states[scaled], options=states[scaled].options.changed({"distance": resolved.distance}))
+        states[scaled] = replace(
+            states[scaled], options=states[scaled].options.changed({"distance": resolved.distance})
+        )
     else:
         scaled = 0
     made = [_record(state, "photos")["made"] for state in states]
@@ -102,7 +104,9 @@ def reconstruct_states(
     check_tied(states, together)
     posed = _record(together, "poses")["made"]
     for number, state in enumerate(states):
-        state.instead["poses"] = Instead(lambda _, work, number=number: take_poses(states, together, number, work), posed)
+        state.instead["poses"] = Instead(
+            lambda _, work, number=number: take_poses(states, together, number, work), posed
+        )
         state.started = time.monotonic()
         report = run_all(state, wanted("poses", "distill", "mesh"))
     if last < number_of("mesh"):
@@ -181,7 +185,9 @@ def check_tied(states: Sequence[Project], together: Project) -> None:
     for number, state in enumerate(states):
         views, count = _of_state(poses, together, states, number), len(load_photos(state.place("photos")))
         if len(views) < POSED * count:
-            message = f"{state.options.photos}: only {len(views)} of {count} photos could be posed with the other state's"
+            message = (
+                f"{state.options.photos}: only {len(views)} of {count} photos could be posed with the other state's"
+            )
             raise SdfsimError(message, TIE, exit_code=EXIT_QUALITY)
         shown[number, poses.sparse.point_of[np.isin(poses.sparse.view_of, views)]] = True
     if shown.all(0).sum() < TIED:

@@ -149,7 +149,9 @@ def find_joint(
     least = max(min(entry.off for entry in found), EXACT * size)
     if least > FIT * near:
         more = "give two states between which one thing has moved"
-        raise SdfsimError(f"no motion carries the part that moves onto its second place (best: {least:.3g} m off)", more)
+        raise SdfsimError(
+            f"no motion carries the part that moves onto its second place (best: {least:.3g} m off)", more
+        )
 
     # Of motions that fit as well, which a thing with symmetries has: a hinge or a slider before a screw, a hinge beside
     # its part before one in the air, and then the least motion.
@@ -315,7 +317,9 @@ Reaches = tuple[float, ...]  # how far partners may be, in units of what counts 
 FINISH: Reaches = (3.0 * FINE, FINE, FINE, FINE)
 
 
-def _moved(mesh: Mesh, other: ClosestPoint, empty: Empty, near: float, rng: np.random.Generator) -> tuple[Points, float]:
+def _moved(
+    mesh: Mesh, other: ClosestPoint, empty: Empty, near: float, rng: np.random.Generator
+) -> tuple[Points, float]:
     """Points of a surface that the other state does not have, and what share of it they are."""
     points, normals = sample_surface(mesh, POINTS, rng)
     gone = _gone(points, other, empty, near)
@@ -392,6 +396,7 @@ class _Surfaces:
 
     def some(self, count: int) -> _Surfaces:
         """The same with fewer points."""
+
         def few(points: Points) -> Points:
             step = max(1, len(points[0]) // count)
             return points[0][::step], points[1][::step]
@@ -502,7 +507,9 @@ class _Surfaces:
         def draw(points: Points) -> Points:
             if not len(points[0]):
                 return points
-            cell = np.unique(np.floor(points[0] / (3.0 * self.near)).astype(int), axis=0, return_inverse=True)[1].ravel()
+            cell = np.unique(np.floor(points[0] / (3.0 * self.near)).astype(int), axis=0, return_inverse=True)[
+                1
+            ].ravel()
             often = np.bincount(rng.integers(0, cell.max() + 1, cell.max() + 1), minlength=cell.max() + 1)[cell]
             return np.repeat(points[0], often, axis=0), np.repeat(points[1], often, axis=0)
 
