@@ -50,8 +50,8 @@ def reconstruct_states(
     """Photos of a thing in two states -> a scene in which what moves is a body of its own, on a hinge or a slider.
 
     Takes stages and options as `reconstruct` does, for both states; the size is that of the first state's scene.
-    Returns the report of the scene, or of the last stage that was wanted, and its folder. Raises SdfsimError as `reconstruct` and `find_joint` do, and where the photos cannot
-    be posed together, or come with cameras or masks.
+    Returns the report of the scene, or of the last stage that was wanted, and its folder. Raises SdfsimError as
+    `reconstruct` and `find_joint` do, and where the photos cannot be posed together, or come with cameras or masks.
     """
     out, given = Path(out), (Path(first), Path(second))
     if given[0].resolve() == given[1].resolve():
@@ -83,13 +83,10 @@ def reconstruct_states(
     for state in states:
         run_all(state, wanted("photos"))
         check_plain(state)
-    if resolved.distance is not None:
-        scaled = measured_in(states, resolved.distance)
-        states[scaled] = replace(
-            states[scaled], options=states[scaled].options.changed({"distance": resolved.distance})
-        )
-    else:
-        scaled = 0
+    scaled = 0
+    if (distance := resolved.distance) is not None:
+        scaled = measured_in(states, distance)
+        states[scaled].options = states[scaled].options.changed({"distance": distance})
     made = [_record(state, "photos")["made"] for state in states]
     together.instead["photos"] = Instead(lambda _, work: merge(states, work), made)
     try:

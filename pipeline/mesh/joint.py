@@ -8,7 +8,7 @@ hinge or a slider. Where it is known what the photos look through, what they do 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -51,6 +51,7 @@ SURE = 0.9  # of what moves: where less of it goes with the motion, what was fou
 FOLLOWS = 0.6  # of what moves: where less of it goes with one motion, more than one thing has moved
 AGREED = 12  # features at least that show the same motion
 BY_CHANCE = 0.05  # of the features that look alike: so many lie right by chance
+ONE = "give two states between which one thing has moved"
 DRAWS = 8  # of patches of the surface, and features, by which the doubt is measured
 
 
@@ -95,8 +96,8 @@ def find_joint(
     """The joint between two states of one thing, whose surfaces lie in one frame where nothing moves.
 
     What is within `near` m of the other state's surface stands still. `empty` tells of both states where photos see
-    through: what moves has left such a place, or come to it. Without it all that has no surface is empty. `paired` gives
-    places that are alike, some of them wrongly, from the points [P, 3] m that move in the one and in the other state.
+    through: what moves has left such a place, or come to it. Without it all that has no surface is empty. `paired`
+    gives places that are alike, some of them wrongly, from the points [P, 3] m that move in the one and in the other.
 
     Raises SdfsimError where nothing moves, all does, several things do, no motion carries the one part onto the other,
     or the motion is that of neither a hinge nor a slider.
@@ -148,10 +149,8 @@ def find_joint(
         found += tried(_starts(part[0], there[0]))
     least = max(min(entry.off for entry in found), EXACT * size)
     if least > FIT * near:
-        more = "give two states between which one thing has moved"
-        raise SdfsimError(
-            f"no motion carries the part that moves onto its second place (best: {least:.3g} m off)", more
-        )
+        told = f"no motion carries the part that moves onto its second place (best: {least:.3g} m off)"
+        raise SdfsimError(told, ONE)
 
     # Of motions that fit as well, which a thing with symmetries has: a hinge or a slider before a screw, a hinge beside
     # its part before one in the air, and then the least motion.
@@ -170,8 +169,8 @@ def find_joint(
     same = [entry for entry in fitting or found if _screw(entry.motion @ np.linalg.inv(chosen.motion), mid)[0] < DIP]
     rated = min(same, key=lambda entry: entry.cost)
     if empty is not None and rated.follows < FOLLOWS:
-        raise SdfsimError(f"more than one thing has moved: {1 - rated.follows:.0%} of what moved does not go with the rest",
-                          "give two states between which one thing has moved")  # fmt: skip
+        told = f"more than one thing has moved: {1 - rated.follows:.0%} of what moved does not go with the rest"
+        raise SdfsimError(told, ONE)
     angle, _, _, slide = _screw(rated.motion, mid)
     if angle > SLIDES and abs(slide) > PITCH * size:
         told = f"turns by {math.degrees(angle):.1f} degrees and slides by {slide:.3g} m along the same axis"
@@ -507,7 +506,7 @@ class _Surfaces:
         def draw(points: Points) -> Points:
             if not len(points[0]):
                 return points
-            cell = np.unique(np.floor(points[0] / (3.0 * self.near)).astype(int), axis=0, return_inverse=True)[
+            cell = np.unique(np.floor(points[0] / (APART * self.near)).astype(int), axis=0, return_inverse=True)[
                 1
             ].ravel()
             often = np.bincount(rng.integers(0, cell.max() + 1, cell.max() + 1), minlength=cell.max() + 1)[cell]

@@ -94,7 +94,7 @@ def landmarks(state: State, part: np.ndarray) -> Landmarks:
     """Features near some points [P, 3] of the surface in the photos that have most of them (SIFT, Lowe 2004)."""
     import cv2
 
-    finder, tree = cv2.SIFT_create(FEATURES, contrastThreshold=0.01), KDTree(part)
+    finder, tree = cv2.SIFT.create(FEATURES, contrastThreshold=0.01), KDTree(part)
     points, looks = [], []
     shows = [int(framed(view, part)[1].sum()) for view in state.views]
     for number in np.argsort(shows)[::-1][:ASKED]:

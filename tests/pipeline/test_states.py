@@ -60,7 +60,7 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path):
 
 def test_photos_with_nothing_in_common_are_not_posed_together(two, tmp_path):
     with pytest.raises(SdfsimError, match="cannot be posed together: camera poses: only 0 of 6 photos") as told:
-        reconstruct_states(*two, tmp_path / "out")
+        reconstruct_states(two[0], two[1], tmp_path / "out")
     assert told.value.exit_code == EXIT_QUALITY and "leave most of what the photos show as it is" in told.value.hint
 
 
@@ -141,7 +141,7 @@ def test_poses_of_mostly_one_state_or_without_common_points_are_refused(posed):
 
 SWING = Rotation.from_rotvec([0, 0, math.radians(-60)]).as_matrix()
 HINGE = np.array([0.3, 0.0, 0.0])
-HELD = HeldPart("hinge", HINGE + [0, 0, 0.2], np.array([0, 0, 1.0]), math.radians(60), SWING, HINGE - SWING @ HINGE,
+HELD = HeldPart("hinge", np.array([0.3, 0, 0.2]), np.array([0, 0, 1.0]), math.radians(60), SWING, HINGE - SWING @ HINGE,
                 1.0, "given: widest side = 2 m", False, 0.001, Doubt(0.01, 0.002, 0.01), 0.97, 2.0)  # fmt: skip
 
 
@@ -179,7 +179,7 @@ def test_the_scene_starts_in_the_first_state_and_goes_to_the_second(tmp_path):
     assert bodies["object1"].motion == "static" and bodies[PART].motion == "dynamic"
     assert np.allclose(bodies[PART].position, SWING @ (origins[PART] - HINGE) + HINGE, atol=1e-5)
     (joint,) = scene.joints
-    assert joint.kind == "hinge" and np.allclose(joint.limits, [0, math.radians(60)], atol=1e-6)
+    assert joint.kind == "hinge" and joint.limits == pytest.approx((0, math.radians(60)), abs=1e-6)
     turned = Rotation.from_quat(bodies[PART].quat_xyzw).as_matrix()
     assert np.allclose(turned, SWING, atol=1e-6)
     # The joint's own frame is kept in the axes of the bodies: back in the world it lies where it was found.
