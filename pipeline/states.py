@@ -158,20 +158,20 @@ def merge(states: Sequence[Project], work: Path) -> dict:
     """The prepared photos of both states in one folder, those of the first state first."""
     (work / "images").mkdir()
     photos: list[Photo] = []
-    for name, state in zip((FIRST, SECOND), states, strict=True):
+    for number, (name, state) in enumerate(zip((FIRST, SECOND), states, strict=True)):
         for photo in load_photos(state.place("photos")):
             called = f"{len(photos):04d}.jpg"
             _link(state.place("photos") / "images" / photo.name, work / "images" / called)
-            photos.append(replace(photo, name=called, source=f"{name}/{photo.source}", mask=False))
+            source = f"{name}/{photo.source}"
+            photos.append(replace(photo, name=called, source=source, mask=False, state=number))
     save_photos(photos, work)
     return {"count": len(photos), "notes": [], "masks": 0}
 
 
-def _of_state(poses: PosedPhotos, together: Project, states: Sequence[Project], number: int) -> list[int]:
+def _of_state(poses: PosedPhotos, together: Project, number: int) -> list[int]:
     """Which of the views show a state."""
-    borders = np.cumsum([0, *(len(load_photos(state.place("photos"))) for state in states)])
-    order = {photo.name: k for k, photo in enumerate(load_photos(together.place("photos")))}
-    return [k for k, view in enumerate(poses.views) if borders[number] <= order[view.name] < borders[number + 1]]
+    shows = {photo.name: photo.state for photo in load_photos(together.place("photos"))}
+    return [k for k, view in enumerate(poses.views) if shows[view.name] == number]
 
 
 def check_tied(states: Sequence[Project], together: Project) -> None:
@@ -180,7 +180,7 @@ def check_tied(states: Sequence[Project], together: Project) -> None:
     poses = load_poses(together.place("poses"))
     shown = np.zeros((2, len(poses.sparse.xyz)), bool)
     for number, state in enumerate(states):
-        views, count = _of_state(poses, together, states, number), len(load_photos(state.place("photos")))
+        views, count = _of_state(poses, together, number), len(load_photos(state.place("photos")))
         if len(views) < POSED * count:
             message = (
                 f"{state.options.photos}: only {len(views)} of {count} photos could be posed with the other state's"
@@ -195,7 +195,7 @@ def check_tied(states: Sequence[Project], together: Project) -> None:
 def take_poses(states: Sequence[Project], together: Project, number: int, work: Path) -> dict:
     """Those of the cameras and points found together that are a state's own."""
     poses, photos = load_poses(together.place("poses")), load_photos(states[number].place("photos"))
-    views = _of_state(poses, together, states, number)
+    views = _of_state(poses, together, number)
     first = sum(len(load_photos(state.place("photos"))) for state in states[:number])
     named = {f"{first + k:04d}.jpg": photo for k, photo in enumerate(photos)}
     some = only(poses, views)

@@ -16,6 +16,7 @@ from pipeline.cameras import Similarity, View, load_poses, save_views
 from pipeline.mesh.joint import PART, Doubt, HeldPart, load_held
 from pipeline.mesh.placement import Placement
 from pipeline.scene_writer import holder_of, scene_text
+from pipeline.sfm.worker import of_one_state
 from pipeline.states import check_tied, merge, reconstruct_states, take_poses
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
 from sdfsim.base.files import write_arrays, write_json
@@ -137,6 +138,12 @@ def test_poses_of_mostly_one_state_or_without_common_points_are_refused(posed):
     write_arrays(together.place("poses") / "sparse.npz", sparse)
     with pytest.raises(SdfsimError, match="only 1 of 4 photos could be posed with the other state's"):
         check_tied(states, together)
+
+
+def test_poses_are_judged_by_photos_of_one_state():
+    """What has moved between two states contradicts the right poses."""
+    pairs = [("a", "b", 1, 2), ("a", "c", 3, 4), ("d", "c", 5, 6)]
+    assert of_one_state({"states": {"a": 0, "b": 0, "c": 1, "d": 1}}, pairs) == [pairs[0], pairs[2]]
 
 
 SWING = Rotation.from_rotvec([0, 0, math.radians(-60)]).as_matrix()
