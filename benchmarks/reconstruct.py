@@ -22,8 +22,6 @@ render a cupboard with its door shut and open by 50 degrees, or a chest with its
 both states with `--joint`, and print how far the joint is from the true one.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
