@@ -28,6 +28,7 @@ CELLS = 3.0  # of the field's finest grid: what differs by less between two stat
 ASKED = 24  # photos of a state at most in which alike places are looked for
 FEATURES, DISTINCT = 3000, 0.8  # of a photo; how much nearer than the next a match has to be
 LIKELIER = 0.4  # of the way: a surface that is so much nearer to the other state's once it is moved does move
+BESIDE = 2.0  # times what counts as still: so near to the part's points what moves with it is
 EVERY = 2  # px between rays that tell what a photo shows
 
 
@@ -151,10 +152,12 @@ def which_move(mesh: Mesh, other: State, motion: np.ndarray, seen: np.ndarray) -
     empty, empty_moved = np.zeros(len(points), bool), np.zeros(len(points), bool)
     empty[may], empty_moved[may] = other.empty(points[may]), other.empty(moved[may])
     gone, nowhere = empty & (stays > near), empty_moved & (goes > near)
+    # What goes to where no photo looks may be the part's, even if it crosses a surface of the other state.
+    unsure = ~empty_moved & (goes > near) & (beside < BESIDE * near)
     result = np.full(len(points), UNKNOWN, np.uint8)
-    result[~may | nowhere | ((stays <= near) & (goes > LIKELIER * stays))] = 0
-    result[may & ~nowhere & ((gone & (beside < 4.0 * near)) | ((goes < LIKELIER * stays) & (goes < near)
-                                                             & (beside < 2.0 * near)))] = 1  # fmt: skip
+    result[~may | nowhere | ((stays <= near) & (goes > LIKELIER * stays) & ~unsure)] = 0
+    likelier = (goes < LIKELIER * stays) & (goes < near) & (beside < BESIDE * near)
+    result[may & ~nowhere & ((gone & (beside < 2.0 * BESIDE * near)) | likelier)] = 1
     return result
 
 

@@ -351,7 +351,7 @@ def state_poses(make: ModuleType, count: int, radius: float, rng: np.random.Gene
         tilt = np.radians((8, 28, 50)[number % 3] + rng.normal(0, 2))
         way = np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
         target = np.array([0.05, -0.1, 0.26]) + rng.normal(0, 0.02, 3)
-        poses.append(look(make, target + radius * (1 + rng.normal(0, 0.03)) * way, target))
+        poses.append(look(target + radius * (1 + rng.normal(0, 0.03)) * way, target))
     return poses
 
 
