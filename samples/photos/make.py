@@ -43,6 +43,7 @@ class Part:
         texture: [H, W, 3] float32 RGB in 0..1.
         mapping: "box" (each side its own part of the texture), "sheet" (x and y) or "lathe" (angle and height).
         texel: metres a texture pixel covers.
+        moved: turn [3, 3] and shift [3] m by which the part has moved since its texture was laid on it, if it has.
     """
 
     vertices: np.ndarray
@@ -50,6 +51,11 @@ class Part:
     texture: np.ndarray
     mapping: str
     texel: float
+    moved: tuple[np.ndarray, np.ndarray] | None = None
+
+    def before(self, points: np.ndarray) -> np.ndarray:
+        """Points [P, 3] where they were before the part moved."""
+        return points if self.moved is None else (points - self.moved[1]) @ self.moved[0]
 
 
 def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -166,17 +172,20 @@ def sample_texture(part: Part, points: np.ndarray, normals: np.ndarray) -> np.nd
     """Colours [P, 3] of a part at surface points [P, 3] with normals [P, 3]."""
     import cv2
 
+    vertices = part.before(part.vertices)
+    if part.moved is not None:
+        points, normals = part.before(points), normals @ part.moved[0]
     if part.mapping == "lathe":
         local = points - [*VASE_AT, TABLE_HEIGHT]
         angle = np.arctan2(local[:, 1], local[:, 0])
         inside = ((normals[:, :2] * local[:, :2]).sum(1) < 0) * 0.36
         u, v = (angle + np.pi) * 0.12, local[:, 2] + inside
     elif part.mapping == "sheet":
-        u, v = (points[:, :2] - part.vertices[:, :2].min(0)).T
+        u, v = (points[:, :2] - vertices[:, :2].min(0)).T
     else:
         axis = np.abs(normals).argmax(1)
         sign = np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0
-        low, high = part.vertices.min(0), part.vertices.max(0)
+        low, high = vertices.min(0), vertices.max(0)
         size = high - low
         local = points - low
         # The six sides lie below one another in the texture: bottom and top, then the upright ones.
