@@ -17,8 +17,6 @@ render a set with truth of tests/pipeline/photo_sets.py into DIR, reconstruct it
 these ways, and print the errors of every body.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

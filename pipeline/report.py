@@ -1,7 +1,5 @@
 """What a run reports: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path

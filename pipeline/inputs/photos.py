@@ -1,7 +1,5 @@
 """Whatever the user gave -> upright, sized photos with masks and focal priors."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """The mesh stage: a trained field becomes meshes in metres, a picture with their names, and a list of them."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Photos -> camera poses and sparse points, in at most three attempts, each checked for whether it can be trusted."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -4,8 +4,6 @@ A process of its own, because a native abort or an endless loop in here must not
 and started again with the same job, it goes on with the features and matches that its database holds.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

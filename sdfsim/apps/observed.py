@@ -4,6 +4,7 @@ that fits through smooth stretches tell."""
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.apps.beside import Beside
 from sdfsim.apps.observed_joints import held_together, jointed
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
@@ -19,6 +21,7 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import from_scene, largest_extent
 from sdfsim.physics.free_flight import torque_free
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Scene
@@ -69,12 +72,14 @@ def load_recordings(
     paths: Sequence[Path],
     scene_file: Path | None = None,
     *,
+    only: int | None = None,
     allow_outside: bool = False,
     on_progress: Progress = silent,
 ) -> tuple[list[Recording], Scene]:
     """Recordings of one scene, and the scene: of run folders and `rollout.npz`, whose scene is known; of CSVs and
     `npz` files of poses, whose positions are those of the shapes' own origins, as in a scene file; and of folders of
-    these. Raises SdfsimError for no scene, unreadable files, or a recording that is not of this scene."""
+    these. `only` is which of those in a file of many is wanted. Raises SdfsimError for no scene, unreadable files, or a
+    recording that is not of this scene."""
     files = [file for path in paths for file in _files(path)]
     scene, found = None, []
     if scene_file is not None:
@@ -97,10 +102,33 @@ def load_recordings(
         else:
             names = [body.name for body in movers(scene)]
             read = _csv(file, names) if file.suffix == ".csv" else _npz(file, names)
+            if only is not None and only >= len(read):
+                raise SdfsimError(f"{file}[{only}]: there are {len(read)} recordings", f"0 to {len(read) - 1}")
+            read = read if only is None else read[only : only + 1]
             found += [cleaned(name, dt, poses, scene) for name, dt, poses in read]
     if scene is None:
         raise SdfsimError("no recordings", "give run folders, or CSV or npz files of poses")
     return with_velocities(found, scene), scene
+
+
+def load_beside(path: Path, scene_file: Path, *, allow_outside: bool = False, on_progress: Progress = silent) -> Beside:
+    """One recording, to simulate a scene beside it: a run, a file of poses, or `FILE[K]` for that one of many in it. It
+    begins with the first frame whose velocities are known. Raises SdfsimError as `load_recordings` does, where which of
+    many is meant is not said, and where no velocities are known."""
+    numbered = None if path.exists() else re.fullmatch(r"(.+)\[(\d+)\]", str(path))
+    file, only = (Path(numbered[1]), int(numbered[2])) if numbered else (path, None)
+    found, scene = load_recordings([file], scene_file, only=only, allow_outside=allow_outside, on_progress=on_progress)
+    if len(found) > 1:
+        raise SdfsimError(f"{path}: {len(found)} recordings", f"say which one, as {found[0].name}")
+    one = found[0]
+    if not one.known.any():
+        raise SdfsimError(f"{one.name}: no stretch is smooth enough to tell a velocity", "give a longer recording")
+    first = int(one.known.argmax())
+    frames = first + np.flatnonzero(one.seen[first:].all(1))
+    return Beside(
+        one.name, tuple(body.name for body in movers(scene)), one.dt * (frames - first), one.goal[0][frames],
+        one.goal[1][frames], {name: getattr(one, name)[first] for name in MOTION},
+    )  # fmt: skip
 
 
 def _files(path: Path) -> list[Path]:

@@ -8,8 +8,6 @@ public_shapes.sha256 holds the sums of the files that the published figures were
 checked: packing it anew changes no shape.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tarfile
 import tempfile

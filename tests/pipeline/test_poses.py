@@ -1,7 +1,5 @@
 """The ladder of attempts, the child process, and what a killed run leaves."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
