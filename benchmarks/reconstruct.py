@@ -2,11 +2,12 @@
 
     python benchmarks/reconstruct.py -o DIR [--preset quick] [--budget MINUTES]
     python benchmarks/reconstruct.py -o DIR --capture record3d      # the same photos as a phone with depth exports them
+    python benchmarks/reconstruct.py room -o DIR [--capture record3d]    # or patches
 
-Runs the whole chain on samples/photos/table_vase (or takes what is already in the folder), moves the result onto the
-true cameras by a similarity, and prints pose errors, surface errors, how these go with the uncertainty that the run
-gave, and times. A folder of photos without
-`transforms.json` and `truth.ply` gets the report only.
+Runs the whole chain on samples/photos/table_vase, or on one of the sets that samples/photos/make.py draws, rendered
+into DIR-room (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
+prints pose errors, surface errors, how these go with the uncertainty that the run gave, and times. A folder of photos
+without `transforms.json` and `truth.ply` gets the report only.
 
     python benchmarks/reconstruct.py touching -o DIR
     python benchmarks/reconstruct.py shelf -o DIR [--kind clicks]
@@ -32,6 +33,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "samples" / "photos"))
 
 from benchmarks.results import ROOT, script
 from pipeline.cameras import Similarity, View, load_views
@@ -220,9 +222,8 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def captured(layout: str, out: Path) -> Path:
-    """The bundled photos as a phone's capture beside `out`, made where it is not there."""
-    sys.path.insert(0, str(PHOTOS.parent))
+def captured(layout: str, out: Path, photos: Path) -> Path:
+    """A rendered set as a phone's capture beside `out`, made where it is not there."""
     import phone
 
     if layout not in phone.LAYOUTS:
@@ -230,8 +231,22 @@ def captured(layout: str, out: Path) -> Path:
     place = out.with_name(f"{out.name}-{layout}" + (".r3d" if layout == "record3d" else ""))
     if not place.exists():
         place.parent.mkdir(parents=True, exist_ok=True)
-        phone.write(layout, place)
+        phone.write(layout, place, photos)
     return place / "transforms.json" if layout == "nerfstudio" else place
+
+
+def drawn(photos: Path, out: Path) -> Path:
+    """The folder of a set that make.py names: the bundled one, or one beside `out`, made where it is not there. Any
+    other folder as it is."""
+    import make
+
+    name = str(photos)
+    if name not in make.SETS:
+        return photos
+    folder = PHOTOS if name == make.BUNDLED else out.with_name(f"{out.name}-{name}")
+    if not (folder / "transforms.json").exists():
+        make.make_set(name, folder)
+    return folder
 
 
 def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
@@ -355,7 +370,8 @@ def main(
             session.report(joint_of(str(photos), out, **options, progress=session.stage_progress))
             return
         options |= {"size": size, "distance": distance and [*distance[:2], float(distance[2])]}
-        given = captured(capture, out) if capture else photos
+        photos = drawn(photos, out)
+        given = captured(capture, out, photos) if capture else photos
         report = reconstruct(given, out, **options, progress=session.stage_progress)
         if (photos / "truth.ply").exists():
             report["truth"] = evaluate(out, photos)
