@@ -38,6 +38,7 @@ LEVER = 2.0  # of what trackers are off on one body: where the bodies of a tree 
 FINEST = 2e-6  # of a body's size (and rad): poses are not expected to be more exact
 WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
 ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
+TOGETHER = 32  # flights of trees that are fitted side by side: their paths fill memory
 LOST = 3  # frames: the longest excursion of a tracker that is told from an impact
 
 
@@ -357,7 +358,8 @@ def _swings(done: list[Recording], numbers: Sequence[int], rows: list[int], scen
             some = np.arange(a, b)[seen[a:b]]
             swing = Swing(r.dt * (some - a), place[some], turn[some], r.noise)
             flights.setdefault(r.dt, []).append((k, a, b, swing))
-    for dt, some in flights.items():
+    parts = [(dt, some[c : c + TOGETHER]) for dt, some in flights.items() for c in range(0, len(some), TOGETHER)]
+    for dt, some in parts:
         for (k, a, b, swing), (path, off, turned_off) in zip(some, swung([s for *_, s in some], dt, tree), strict=True):
             r, seen = done[k], a + np.round(swing.time / dt).astype(int)
             if off > max(BEYOND * r.noise[0], rough * size) or turned_off > max(BEYOND * r.noise[1], 2.0 * rough):
