@@ -1,7 +1,5 @@
 """A scene as arrays in the model's units: what stays constant while it is simulated, and the state that changes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -166,7 +164,7 @@ class State(Motion):
         return path
 
     @classmethod
-    def read(cls, path: Path | str) -> State:
+    def read(cls, path: Path | str) -> "State":
         """What `save` has written. Raises SdfsimError where it is missing or none of ours."""
         try:
             return cls.of_arrays(read_arrays(Path(path), "a state"))
@@ -183,7 +181,7 @@ class State(Motion):
         return found
 
     @classmethod
-    def of_arrays(cls, arrays: dict[str, np.ndarray]) -> State:
+    def of_arrays(cls, arrays: dict[str, np.ndarray]) -> "State":
         """The state that has these `arrays`; others are left alone."""
 
         def known(kind: type, prefix: str) -> dict[str, np.ndarray]:

@@ -1,7 +1,5 @@
 """Scenes written in Python: the keys of scene.yaml as keyword arguments, and the same checks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +41,7 @@ class SceneBuilder:
         self._joints: list[dict[str, Any]] = []
 
     @classmethod
-    def read(cls, path: Path | str, *, allow_outside: bool = False) -> SceneBuilder:
+    def read(cls, path: Path | str, *, allow_outside: bool = False) -> "SceneBuilder":
         """The scene of a file, or of a sample by its name, to be gone on with: `Scene.read("arm.yaml").add(...)`.
         Raises SceneError as `load_scene` does, with one line for every fault."""
         path = find_scene(path)
@@ -58,7 +56,7 @@ class SceneBuilder:
             scene._settings["model"] = str(home / scene._settings["model"])
         return scene
 
-    def add(self, name: str, **keys: Unpack[BodyKeys]) -> SceneBuilder:
+    def add(self, name: str, **keys: Unpack[BodyKeys]) -> "SceneBuilder":
         """Add a body, or many copies of one, and return the scene.
 
         Keys are of the body and of its shape, which has the same name, as docs/scene.md has them, such as
@@ -79,7 +77,7 @@ class SceneBuilder:
         self._bodies.append(body)
         return self
 
-    def join(self, name: str, type: JointKind, *bodies: str, **keys: Unpack[JointKeys]) -> SceneBuilder:
+    def join(self, name: str, type: JointKind, *bodies: str, **keys: Unpack[JointKeys]) -> "SceneBuilder":
         """Add a joint between two bodies, the second of which may be "world" and is so where only one is given, and
         return the scene.
 

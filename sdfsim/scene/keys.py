@@ -1,8 +1,6 @@
 """The keys of bodies and joints of scene.yaml as arguments, for type checkers; `schema` says what they mean and checks
 their values, and a test that both have the same keys."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypedDict

@@ -325,8 +325,11 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
             near.away_all[p] = -math.inf
             return
     for side in range(2):
-        count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, since, scratch, count)
-    count = first_to_touch(rules, scratch.found, count)
+        count = nodes_near(
+            shapes, world, motion, matrix, rules.substep_dt, look, a, b, side, near, p, went, since, scratch, count
+        )
+    if known == 0:
+        count = first_to_touch(rules, scratch.found, count)
     manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, none > one)
     _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 
