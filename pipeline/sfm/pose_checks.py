@@ -150,8 +150,8 @@ def why_astray(views: list[View], astray: list[str]) -> str:
     near = angles.argmin(1)
     widest = max((k for k, view in enumerate(views) if view.name in astray), key=lambda k: angles[k].min())
     pair = sorted((views[widest].source, views[near[widest]].source))
-    few = (f"too few photos or too wide steps ({len(views)} photos, {step:.0f} degrees from one to the next): add some, "
-           f"first between {pair[0]} and {pair[1]}")  # fmt: skip
+    few = (f"too few photos or too wide steps ({len(views)} photos, {step:.0f} degrees from one to the next): "
+           f"add some, first between {pair[0]} and {pair[1]}")  # fmt: skip
     first, second = (few, zooms) if len(views) < GOOD_PHOTOS or step > WIDE_STEP else (zooms, few)
     return f"{first}; or else {second}"
 

@@ -78,7 +78,8 @@ def test_matches_astray_have_two_possible_causes_the_likelier_first(count, span,
     first, _, second = cause.partition("; or else ")
     few, zooms = (first, second) if few_first else (second, first)
     assert few.startswith(f"too few photos or too wide steps ({count} photos") and "between IMG_" in few
-    assert "of several zooms" in zooms and "Probably too few" in failure_message(verdict) or not few_first
+    assert "of several zooms" in zooms
+    assert ("Probably too few" in failure_message(verdict)) == few_first
     # What is measured of the photos astray, not of all.
     assert "lie 3.0 times as far" in verdict["failures"][0] and verdict["excess"] < 2
 
