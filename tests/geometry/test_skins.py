@@ -37,8 +37,11 @@ def sides(image: Image.Image, *, repeats: float = 1.0) -> Any:
                 vertices.append((normal + (2 * a - 1) * u + (2 * b - 1) * v) / 2)
                 uv.append((repeats * a, repeats * b))
             faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, baseColorFactor=[255, 255, 255, 255])
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    material = PBRMaterial(baseColorTexture=image, baseColorFactor=[255, 255, 255, 255])
+    visual = TextureVisuals(uv=uv, material=material)
     return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
 
 
