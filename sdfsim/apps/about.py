@@ -21,7 +21,7 @@ EXTRAS = {
     "coacd": ("export", "convex pieces, which .xml and .urdf need of shapes without any"),
     "pybullet": ("data", "data sets of the teacher, and runs beside it"),
     "mujoco": ("bench", "comparisons with MuJoCo"),
-    "matplotlib": ("bench", "plots of tradeoff and stress"),
+    "matplotlib": ("bench", "plots of tradeoff and stress, the picture of identify"),
     "imagecodecs": ("record3d", "depth of Record3D"),
     "OpenEXR": ("record3d", "depth of Record3D, in its other form"),
     "distributed": ("cluster", "work on a Dask cluster"),

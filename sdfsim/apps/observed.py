@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfsim.apps.beside import Beside
-from sdfsim.apps.observed_joints import held_together, jointed
+from sdfsim.apps.observed_joints import Swing, flying_trees, held_together, jointed, swung, tree_of
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, visible
@@ -34,9 +34,11 @@ BEYOND = 5.0  # deviations of the noise that are no noise
 # Trackers that smooth are off more in a flight than from frame to frame: by so much of a size (and rad) at most, and
 # so many deviations of that.
 ROUGH, SMOOTHED = 3e-3, 30.0
+LEVER = 2.0  # of what trackers are off on one body: where the bodies of a tree are depends on each other's turns
 FINEST = 2e-6  # of a body's size (and rad): poses are not expected to be more exact
 WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
 ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
+TOGETHER = 32  # flights of trees that are fitted side by side: their paths fill memory
 LOST = 3  # frames: the longest excursion of a tracker that is told from an impact
 
 
@@ -294,8 +296,8 @@ def _excursions(x: np.ndarray) -> np.ndarray:
 
 def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording]:
     """The recordings with the velocities of their smooth stretches: of flights by a parabola and a torque-free rotation
-    through all of a flight, elsewhere (a slide, a roll, rest) by a polynomial through the frames nearby. Those of a run
-    are known."""
+    through all of a flight (of bodies that joints hold together, by the motion of all of them), elsewhere (a slide, a
+    roll, rest) by a polynomial through the frames nearby. Those of a run are known."""
     bodies = movers(scene)
     inertia = from_scene(replace(scene, bodies=tuple(bodies), joints=()), scene_units(scene))[0].inertia
     size = [largest_extent(scene.shapes[b.shape]) * b.scale for b in bodies]
@@ -330,7 +332,47 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
             )
         )  # fmt: skip
     _rotations(done, flights, inertia)
-    return [r if given.known.any() else _held(r, scene) for r, given in zip(done, recordings, strict=True)]
+    done = [r if given.known.any() else _held(r, scene) for r, given in zip(done, recordings, strict=True)]
+    for rows in flying_trees(scene):
+        _swings(done, [k for k, given in enumerate(recordings) if not given.known.any()], rows, scene)
+    return done
+
+
+def _swings(done: list[Recording], numbers: Sequence[int], rows: list[int], scene: Scene) -> None:
+    """Write the flights of bodies that joints hold together: their mass centre falls along a parabola, and they swing
+    about it as the solve moves them. What does not fly so stays as it is."""
+    tree = tree_of(scene, rows)
+    mass = np.array([b.mass for b in tree.bodies])
+    size = max(largest_extent(tree.shapes[b.shape]) * b.scale for b in tree.bodies)
+    rough = LEVER * ROUGH
+    gravity = np.asarray(scene.gravity)
+    flights: dict[float, list[tuple[int, int, int, Swing]]] = {}
+    for k in numbers:
+        r, seen = done[k], np.asarray(done[k].seen[:, rows].all(1))
+        place, turn = (array[:, rows] for array in r.goal)
+        middle = (mass[:, None] * place).sum(1) / mass.sum()
+        sigma = _noise(middle, seen, FINEST * size), r.noise[1]
+        flies = _nearby(middle, turn[:, 0], seen, r.dt, gravity, sigma)[2]
+        most = max(BEYOND * sigma[0], min(rough * size, SMOOTHED * sigma[0]))
+        for a, b in _flights(flies, seen, middle, r.dt, gravity, most):
+            some = np.arange(a, b)[seen[a:b]]
+            swing = Swing(r.dt * (some - a), place[some], turn[some], r.noise)
+            flights.setdefault(r.dt, []).append((k, a, b, swing))
+    parts = [(dt, some[c : c + TOGETHER]) for dt, some in flights.items() for c in range(0, len(some), TOGETHER)]
+    for dt, some in parts:
+        for (k, a, b, swing), (path, off, turned_off) in zip(some, swung([s for *_, s in some], dt, tree), strict=True):
+            r, seen = done[k], a + np.round(swing.time / dt).astype(int)
+            if off > max(BEYOND * r.noise[0], rough * size) or turned_off > max(BEYOND * r.noise[1], 2.0 * rough):
+                continue  # something turned it
+            middle = (mass[:, None] * swing.position).sum(1) / mass.sum()
+            (at, fast), _ = _parabola(seen, middle, dt, gravity, np.arange(a, b))
+            for whole, values, more in zip(
+                (r.position, r.orientation, r.velocity, r.angular_velocity), path, (at, None, fast, None), strict=True
+            ):
+                whole[a:b, rows] = values if more is None else values + more[:, None]
+            r.flying[a:b, rows] = True
+            if len(rows) == r.seen.shape[1]:
+                r.known[a:b] = True
 
 
 def _held(r: Recording, scene: Scene) -> Recording:

@@ -246,30 +246,45 @@ def identify(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Run folders, rollout.npz, CSV or npz files of poses, folders of these (docs/identify.md).",
+            help="Run folders, rollout.npz, CSV or npz files of poses, folders of these (docs/identify.md); or "
+            "contactnets-cube or contactnets-elbow: public ones with their scene, downloaded once.",
             show_default=False,
         ),
     ],
     scene: OfRun = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="FILE", help="Write the scene with what was found.")
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="FILE", help="Write the scene with what was found, and a picture of it as FILE.png."
+        ),
     ] = None,
     allow_outside: Outside = False,
 ) -> None:
     """Recorded motions -> friction, restitution, sizes, masses, the lie of the ground."""
     from sdfsim.apps import identify as room
+    from sdfsim.apps.identify_picture import picture
     from sdfsim.apps.observed import load_recordings
     from sdfsim.base.files import check_writable
+    from sdfsim.data.public_tosses import public_tosses
 
     if out is not None:
         check_writable(out.parent)
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
-    motions, known = load_recordings(recordings, scene, allow_outside=allow_outside, on_progress=shapes)
-    found = room.identify(motions, known, on_progress=fit)
-    lines = room.report_lines(found)
+    paths = [public_tosses(path, partial(session.stage_progress, "fetch")) for path in recordings]
+    public = [path for path, given in zip(paths, recordings, strict=True) if path != given]
+    scene = scene or next((path / "scene.yaml" for path in public), None)
+    motions, known = load_recordings(paths, scene, allow_outside=allow_outside, on_progress=shapes)
+    found = room.identify(motions, known, profiles=out is not None, on_progress=fit)
+    lines, wrote = room.report_lines(found), {}
     if out is not None and known.path is not None:
         lines += [*room.write_scene(found, known.path, out), f"wrote {out}"]
-    session.report(found.report() | ({"wrote": out} if out else {}), lines)
+        wrote, drawn = {"wrote": out}, out.with_suffix(".png")
+        if missing := picture(found, drawn):
+            lines.append(f"no {drawn.name}: {missing}")
+        else:
+            wrote["picture"] = drawn
+            lines.append(f"wrote {drawn}: the loss against each parameter")
+    session.report(found.report() | wrote, lines)
 
 
 @command

@@ -286,3 +286,88 @@ def shoot_bodies(folder: Path, build: Callable[[ModuleType], tuple[list, list[st
                 Image.fromarray(255 * (labels == number).astype(np.uint8)).save(
                     folder / "masks" / name / f"{photo.stem}.png"
                 )
+
+
+def hinged(make: ModuleType, degrees: float) -> tuple[list, list[str]]:
+    """A cupboard with a shelf, a carton on it and one beside it, its door open by so many degrees; names of what moves.
+
+    The hinge is upright, through `HINGE`.
+    """
+    boards = [make.box(*ends) for ends in (
+        ((-0.25, 0.15, 0.0), (0.25, 0.17, 0.56)), ((-0.25, -0.15, 0.0), (-0.23, 0.15, 0.56)),
+        ((0.23, -0.15, 0.0), (0.25, 0.15, 0.56)), ((-0.23, -0.15, 0.0), (0.23, 0.15, 0.03)),
+        ((-0.23, -0.15, 0.53), (0.23, 0.15, 0.56)), ((-0.23, -0.11, 0.27), (0.23, 0.15, 0.29)),
+    )]  # fmt: skip
+    still = {f"board{k}": board for k, board in enumerate(boards)}
+    still["carton"] = make.box((-0.16, -0.1, 0.56), (0.06, 0.1, 0.68))
+    still["crate"] = make.box((0.31, -0.12, 0.0), (0.48, 0.1, 0.2))
+    moves = {"door": make.box((-0.25, -0.17, 0.02), (0.25, -0.15, 0.55)),
+             "handle": make.box((0.17, -0.2, 0.24), (0.195, -0.17, 0.36))}  # fmt: skip
+    a = np.radians(-degrees)
+    turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
+    return _with_moved(make, moves, still, (turn, HINGE - turn @ HINGE)), list(moves)
+
+
+HINGE = np.array([-0.25, -0.15, 0.0])  # m, a point of the axis of `hinged`
+
+
+def sliding(make: ModuleType, out: float) -> tuple[list, list[str]]:
+    """A chest with a crate on it and one beside it, its drawer out by so many metres, towards -y; names of what
+    moves."""
+    boards = [make.box(*ends) for ends in (
+        ((-0.25, 0.18, 0.0), (0.25, 0.2, 0.46)), ((-0.25, -0.18, 0.0), (-0.22, 0.18, 0.46)),
+        ((0.22, -0.18, 0.0), (0.25, 0.18, 0.46)), ((-0.22, -0.18, 0.0), (0.22, 0.18, 0.2)),
+        ((-0.22, -0.18, 0.43), (0.22, 0.18, 0.46)),
+    )]  # fmt: skip
+    still = {f"board{k}": board for k, board in enumerate(boards)}
+    still["carton"] = make.box((-0.05, -0.05, 0.46), (0.18, 0.13, 0.58))
+    still["crate"] = make.box((0.31, -0.12, 0.0), (0.48, 0.1, 0.2))
+    drawer = (
+        ((-0.215, -0.2, 0.21), (0.215, -0.18, 0.42)), ((-0.21, -0.18, 0.215), (0.21, 0.15, 0.235)),
+        ((-0.21, -0.18, 0.235), (-0.19, 0.15, 0.39)), ((0.19, -0.18, 0.235), (0.21, 0.15, 0.39)),
+        ((-0.19, 0.13, 0.235), (0.19, 0.15, 0.39)), ((-0.07, -0.225, 0.31), (0.07, -0.2, 0.33)),
+    )  # fmt: skip
+    moves = {f"drawer{k}": make.box(*ends) for k, ends in enumerate(drawer)}
+    return _with_moved(make, moves, still, (np.eye(3), np.array([0, -out, 0]))), list(moves)
+
+
+def _with_moved(make: ModuleType, moves: dict, still: dict, motion: tuple[np.ndarray, np.ndarray]) -> list:
+    """Parts in a room, the first of which have moved with their textures."""
+    wood, red, green = (0.6, 0.45, 0.28), (0.62, 0.2, 0.16), (0.2, 0.42, 0.3)
+    colors = dict.fromkeys(still, wood) | {"carton": red, "crate": green} | dict.fromkeys(moves, (0.3, 0.4, 0.6))
+    parts = in_room(make, moves | still, colors)
+    for part in parts[: len(moves)]:
+        part.vertices, part.moved = part.vertices @ motion[0].T + motion[1], motion
+    return parts
+
+
+def state_poses(make: ModuleType, count: int, radius: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """Poses around `hinged` and `sliding`, most of them in front."""
+    poses = []
+    for number in range(count):
+        # Two thirds of the way around is the front's half.
+        share = (number + rng.random()) / count
+        azimuth = -np.pi / 2 + 2 * np.pi * (share - 0.5) * (0.6 + 0.4 * abs(2 * share - 1))
+        tilt = np.radians((8, 28, 50)[number % 3] + rng.normal(0, 2))
+        way = np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
+        target = np.array([0.05, -0.1, 0.26]) + rng.normal(0, 0.02, 3)
+        poses.append(look(target + radius * (1 + rng.normal(0, 0.03)) * way, target))
+    return poses
+
+
+def shoot_state(
+    folder: Path, build: Callable[[ModuleType, float], tuple[list, list[str]]], state: float, *, seed: int,
+    count: int = 30, radius: float = 1.45,
+) -> None:  # fmt: skip
+    """Photos of `hinged` or `sliding` in one state, from all around, most of them from the front, at places of its
+    own; and the true surface of what moves and of the rest, `truth/moves.ply` and `truth/still.ply`."""
+    from sdfsim.geometry.mesh import Mesh, joined
+    from sdfsim.geometry.mesh_io import write_ply
+
+    make, rng = studio(640, 480, 620.0), np.random.default_rng(seed)
+    parts, names = build(make, state)
+    shoot(make, parts, state_poses(make, count, radius, rng), folder / "images")
+    (folder / "truth").mkdir()
+    meshes = [Mesh(part.vertices, part.faces) for part in parts[:-2]]
+    for name, some in (("moves", meshes[: len(names)]), ("still", meshes[len(names) :])):
+        (folder / "truth" / f"{name}.ply").write_bytes(write_ply(joined(some)))
