@@ -200,7 +200,7 @@ def fit(
         _run_stage(session, "fit", sources[0], then="scene", budget=budget, device=device, **options)
         return
     if options["sdf"] == "grid":
-        message = "--sdf grid goes without -o: a scene samples a mesh file itself (sdf: grid)"
+        message = "--sdf grid goes without -o: a scene samples a mesh file itself (mesh: FILE, sdf: grid)"
         raise SdfsimError(message, exit_code=EXIT_USAGE)
     from sdfsim.apps import fit as fitting
     from sdfsim.base.parallel import cluster as working_on

@@ -50,7 +50,8 @@ class Options(BaseModel):
     # None: a grid for the preset quick, where no recipe is given
     sdf: Literal["grid", "mlp"] | None = option(
         None, ["fit"],
-        "What distances become: samples on a grid, or a fitted network (a reconstruction: as its preset says).",
+        "What distances become: samples on a grid, or a fitted network (a reconstruction: as its preset says; "
+        "fit -o: a network, for a scene samples a mesh file itself: mesh: FILE, sdf: grid).",
     )  # fmt: skip
     distance: tuple[str, str, float] | None = option(
         None, ["mesh"],

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sdfsim.scene.load import load_scene
+from sdfsim.shape.shape import load_shape
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -50,11 +51,17 @@ def test_the_examples_for_robotics_do_what_they_say(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("page", "shape", "place", "bodies"), [("tutorial", "ring", "shapes/ring", 18), ("vfx", "vase", "vase", 13)]
 )
-def test_the_scene_of_a_page_loads(tmp_path, page, shape, place, bodies):
+def test_the_scene_of_a_page_loads(tmp_path, monkeypatch, page, shape, place, bodies):
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     block = re.search(r"^    version: 1\n(?:    .*\n)+", text, re.MULTILINE)
     assert block
     shutil.copytree(ROOT / "samples" / "shapes" / shape, tmp_path / place)
+    if page == "vfx":  # a mesh in place of a folder
+        import trimesh
+
+        mesh = load_shape(tmp_path / place).mesh
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "vase.glb")
+        monkeypatch.setattr("sdfsim.shape.make.user_cache", lambda name: tmp_path / name)
     (tmp_path / "mine.yaml").write_text("".join(line[4:] for line in block[0].splitlines(keepends=True)))
     assert len(load_scene(tmp_path / "mine.yaml").bodies) == bodies
 

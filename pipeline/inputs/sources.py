@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 
 from pipeline.inputs.captures import ARCHIVES, Capture, find_capture, levels, read_capture
 from pipeline.inputs.known_cameras import KnownCamera, below, read_cameras
@@ -104,6 +105,9 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
             raise SdfsimError(f"{message}; below it are {some}{more}", "give the folder that holds the photos")
         if models := [place for level in levels(folder) for place in level if is_model(place)]:
             raise SdfsimError(f"{message}; {models[0]} holds cameras", "give that folder")
+        if films := [path for path in _files(folder) if path.suffix.lower() in VIDEOS]:
+            told = f"{message}; it holds the video {films[0].name}"
+            raise SdfsimError(told, f"give the video: sdfsim reconstruct {quote(str(films[0]))} -o ROOM")
         raise SdfsimError(message, notes[0] if notes else "take photos all around, each overlapping the one before")
     return found, notes
 

@@ -77,10 +77,16 @@ def choose_frames(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
 def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
     """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError where the video
     cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
+    import cv2
+
     moved, sharp = follow(path)
     if len(sharp) < FEWEST:
-        message = f"{path}: only {len(sharp)} frames can be decoded (at least {FEWEST} are needed)"
-        raise SdfsimError(message, "check that the video is complete, convert it to MP4 (H.264), or film for longer")
+        told = int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT))
+        if len(sharp) >= 0.9 * told:  # the file is whole, and short
+            message = f"{path}: a clip of only {len(sharp)} frames (at least {FEWEST} are needed)"
+            raise SdfsimError(message, "film for longer: half a minute, all the way around the object")
+        message = f"{path}: only {len(sharp)} of {told} frames can be decoded (at least {FEWEST} are needed)"
+        raise SdfsimError(message, "check that the video is complete, or convert it to MP4 (H.264)")
     if moved[-1] < LEAST_MOTION:
         message = f"{path}: the picture hardly moves (by {moved[-1]:.2f} picture widths in all)"
         raise SdfsimError(message, "walk around the object while filming", exit_code=EXIT_QUALITY)

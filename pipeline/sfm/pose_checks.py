@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.cameras import View, spread_angle, view_of, view_span
+from pipeline.cameras import View, focus, spread_angle, view_of, view_span
 from pipeline.inputs.photos import Photo
 from pipeline.sfm.agreement import ENOUGH, contradicting, excess, excess_of_photos
 
@@ -22,6 +22,8 @@ MANY_CONTRADICTIONS = 0.35
 # wrong focal length or of two zooms taken for one 2.8 and more. Of single photos right ones have up to 1.9, and a few
 # may be off.
 MOST_EXCESS, FEW_ASTRAY = 2.0, 0.1
+# Fewer photos, or neighbours that stand farther apart (degrees, as seen from the scene), are doubtful.
+GOOD_PHOTOS, WIDE_STEP = 20, 18.0
 STILL = 0.5  # of a pair's matches not moving: the background stands still
 ONE_SIDE = 150.0  # degrees of view points around the scene below which it is seen from one side only
 COMPONENT_NAMED = 3
@@ -105,7 +107,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         "contradictions": round(contradicting(against), 4), "excess": round(excess(against), 3),
         "components": [len(c) for c in found.components],
         "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
-        "causes": diagnose(result, found, failures), "failures": failures, "warnings": warnings,
+        "causes": diagnose(result, views, found, failures), "failures": failures, "warnings": warnings,
     }  # fmt: skip
 
 
@@ -132,7 +134,26 @@ def photos_astray(result: dict) -> list[str]:
     agreement = result.get("agreement", [])
     photos = excess_of_photos(agreement)
     astray = [name for name, times in photos.items() if times > MOST_EXCESS]
-    return astray if excess(agreement) > MOST_EXCESS or len(astray) > FEW_ASTRAY * len(photos) else []
+    if excess(agreement) > MOST_EXCESS:
+        return astray or list(photos)
+    return astray if len(astray) > FEW_ASTRAY * len(photos) else []
+
+
+def why_astray(views: list[View], astray: list[str]) -> str:
+    """What may have put the matches of photos astray, the likelier first: photos that are too few or too far apart, or
+    several zooms. Neither is certain."""
+    zooms = "photos of several zooms, or cropped ones: give those of one zoom, or as the camera stored them, with EXIF"
+    rays = focus(views)[1]
+    angles = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
+    np.fill_diagonal(angles, np.inf)
+    step = float(np.median(angles.min(1)))
+    near = angles.argmin(1)
+    widest = max((k for k, view in enumerate(views) if view.name in astray), key=lambda k: angles[k].min())
+    pair = sorted((views[widest].source, views[near[widest]].source))
+    few = (f"too few photos or too wide steps ({len(views)} photos, {step:.0f} degrees from one to the next): "
+           f"add some, first between {pair[0]} and {pair[1]}")  # fmt: skip
+    first, second = (few, zooms) if len(views) < GOOD_PHOTOS or step > WIDE_STEP else (zooms, few)
+    return f"{first}; or else {second}"
 
 
 def check_errors(result: dict, astray: list[str], failures: list[str], warnings: list[str]) -> None:
@@ -148,8 +169,11 @@ def check_errors(result: dict, astray: list[str], failures: list[str], warnings:
     elif against > MANY_CONTRADICTIONS / 2:
         warnings.append(f"{against:.0%} of the matches contradict the poses: a texture may repeat")
     if astray:
-        failures.append(f"the matches of {len(astray)} of {posed} photos do not lie where the poses put them: "
-                        f"{excess(agreement):.1f} times as far off as they must be")  # fmt: skip
+        times = sorted(excess_of_photos(agreement)[name] for name in astray)
+        far = f"{times[0]:.1f}" if times[-1] - times[0] < 0.05 else f"{times[0]:.1f} to {times[-1]:.1f}"
+        failures.append(f"in {len(astray)} of {posed} photos, points that two photos share lie {far} times as far from "
+                        "where all poses together put them as from where the two photos alone would "
+                        f"(up to {MOST_EXCESS:g} is usual)")  # fmt: skip
 
 
 def left_out_reason(photo: Photo, result: dict, found: Findings) -> dict:
@@ -174,7 +198,7 @@ def left_out_reason(photo: Photo, result: dict, found: Findings) -> dict:
     return reason("disagrees", f"its {best} matches do not agree with the rest of the reconstruction")
 
 
-def diagnose(result: dict, found: Findings, failures: list[str]) -> list[str]:
+def diagnose(result: dict, views: list[View], found: Findings, failures: list[str]) -> list[str]:
     """What is the matter with the photos as a set, likeliest first; nothing where the poses are good."""
     causes = []
     if found.still > 0.5:
@@ -198,8 +222,8 @@ def diagnose(result: dict, found: Findings, failures: list[str]) -> list[str]:
     elif contradicting(result.get("agreement", [])) > MANY_CONTRADICTIONS or unposed:
         causes.append("a texture that repeats makes different places look the same: cover it, or lay something unlike "
                       "on it")  # fmt: skip
-    elif photos_astray(result):
-        causes.append("the focal lengths are wrong: give photos of one zoom, or as the camera stored them, with EXIF")
+    elif views and (astray := photos_astray(result)):
+        causes.append(why_astray(views, astray))
     elif len(linked) < len(result["counts"]) / 2:
         causes.append("most photos overlap too little with the others")
     return causes

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.apps import export_joints as jointed
 from sdfsim.apps.export_joints import add
 from sdfsim.apps.observed import COLUMNS
-from sdfsim.apps.recording import body_colors, framed, shown, sunk, with_normals
+from sdfsim.apps.recording import body_colors, framed, is_infinite, shown, with_normals
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, write_bytes, write_text
@@ -91,8 +91,9 @@ class Take:
         return 6.0 * framed(self.scene)[1]
 
     def at_rate(self, fps: float) -> "Take":
-        """The same motion at so many evenly spaced times in a second, between frames as if moved evenly."""
-        count = int(np.floor((self.time[-1] - self.time[0]) * fps + 1e-6)) + 1
+        """The same motion at so many evenly spaced times in a second, between frames as if moved evenly. The last of
+        them is not before the end: it has the last pose."""
+        count = int(np.ceil((self.time[-1] - self.time[0]) * fps - 1e-3)) + 1
         time = self.time[0] + np.arange(count) / fps
         after = np.clip(np.searchsorted(self.time, time), min(1, len(self.time) - 1), len(self.time) - 1)
         before = np.maximum(after - 1, 0)
@@ -170,7 +171,7 @@ def _path(what: str, given: Any, wanted: str) -> Path:
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
     progress = partial(on_progress, "shapes")
-    run, source = None, source if source.exists() else find_scene(source)
+    run, source = None, source if source.exists() else find_scene(source, or_run=True)
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:
@@ -181,6 +182,8 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
         scene = SceneBuilder().add(shape.name, asset=source, motion=moves).load(progress)
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, progress, allow_outside=allow_outside)
+    elif not source.exists():
+        raise SdfsimError(f"{source}: there is no such folder or file", "give a run folder, scene.yaml or Shape folder")
     else:
         raise SdfsimError(f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder")
     if run is not None:
@@ -201,7 +204,8 @@ def plain_names(names: list[str]) -> list[str]:
     used: set[str] = set(RESERVED)
     plain = []
     for name in names:
-        stem = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+        # What is no letter at the end goes: `cup[3]` becomes `cup_3`.
+        stem = re.sub(r"\W", "_", re.sub(r"\W+$", "", name, flags=re.ASCII), flags=re.ASCII) or "_"
         stem = f"_{stem}" if stem[0].isdigit() else stem
         # Names that differ in case alone are one file on some systems.
         choice = next(c for k in range(len(used) + 1) if (c := f"{stem}_{k}" if k else stem).lower() not in used)
@@ -298,14 +302,15 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
 def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     file = GltfWriter()
     # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
-    numbers: dict[int, tuple[dict[str, int], int]] = {}
-    drawn: dict[str, int] = {}
+    numbers: dict[tuple[int, int], tuple[dict[str, int], int]] = {}
+    drawn: dict[tuple[str, tuple[int, int]], int] = {}
     time = file.array(take.time) if take.moving else 0
     samplers, channels = [], []
     for k, (name, body, shape, color) in enumerate(take.each()):
-        seen = shown(shape, take.plane_size())
+        seen = shown(take.scene, k, take.plane_size())
+        form = (body.shape, k if is_infinite(shape) else -1)  # planes differ by what lies in them
         own = seen.colors is not None or seen.texture is not None
-        if body.shape not in numbers:
+        if form not in numbers:
             mesh, normals = with_normals(seen)
             attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
             if mesh.uv is not None:
@@ -313,15 +318,14 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             if mesh.colors is not None:  # in 16 bits: 8 are too few for dark colours once they count light
                 shades = np.pad(light(mesh.colors), ((0, 0), (0, 1)), constant_values=1.0)
                 attributes["COLOR_0"] = file.array(np.round(65535 * shades), "<u2")
-            numbers[body.shape] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
+            numbers[form] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
-        if key not in drawn:
+        if (key, form) not in drawn:
             material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8, lit=True)
-            drawn[key] = file.mesh(key, *numbers[body.shape], material)
+            drawn[key, form] = file.mesh(key, *numbers[form], material)
         place, turn = take.position[:, k], take.quat_xyzw[:, k]
-        place = place - Rotation.from_quat(turn).apply([0.0, 0.0, sunk(take.scene, k)])
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
-        file.nodes.append({"name": name, "mesh": drawn[key], **node})
+        file.nodes.append({"name": name, "mesh": drawn[key, form], **node})
         if take.moving and body.motion != "static":
             for path, values in (("translation", place), ("rotation", turn)):
                 channels.append({"sampler": len(samplers), "target": {"node": k, "path": path}})

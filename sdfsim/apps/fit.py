@@ -11,11 +11,11 @@ from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, locked, read_json, visible
 from sdfsim.base.parallel import Progress, parallel, silent
-from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_textured
 from sdfsim.scene.schema import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall
 from sdfsim.sdf.fit import FIT_VERSION, Recipe
-from sdfsim.shape.make import fit_mesh, remarks
+from sdfsim.shape.make import dressed, fit_mesh, remarks
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
 
 ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "sign_errors")
@@ -69,12 +69,17 @@ def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_pr
     has the folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether
     it was missed. Raises SdfsimError where the mesh cannot be used, the folder cannot be written, or another run is
     writing to it."""
-    where, mesh = pick_device(device), load_mesh(mesh_file)
+    where, loaded = pick_device(device), load_textured(mesh_file)
+    mesh = loaded.mesh
     metres = UNITS[options.units or "m"]
     told = remarks(mesh_file, mesh, metres, given=options.units is not None)
     mesh = replace(mesh, vertices=mesh.vertices * metres)
     # A mesh file names others, so its own bytes do not tell.
-    request = hashlib.sha256(f"{mesh.digest()}|{options}|{FIT_VERSION}".encode()).hexdigest()
+    skin, lost = dressed(loaded, thicken=options.thicken)
+    skin = skin and replace(skin, vertices=skin.vertices * metres)
+    told = [*lost, *told]
+    described = mesh.digest() + ("" if skin is None else skin.digest())
+    request = hashlib.sha256(f"{described}|{options}|{FIT_VERSION}".encode()).hexdigest()
     check_writable(out)
     shape = _kept(out, request)
     if shape is None:
@@ -86,9 +91,9 @@ def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_pr
             wall = unseen_wall(shape.sdf, baked(shape.sdf, shape.nodes))
             source = shape.source | {"request": request}
             if wall is not None:
-                told = f"walls of at most {wall:.2g} m: things may pass through; --thicken helps"
-                source["notes"] = [*source.get("notes", []), told]
-            shape = replace(shape, source=source, certificate=certificate)
+                thin = f"walls of at most {wall:.2g} m: things may pass through; --thicken helps"
+                source["notes"] = [*source.get("notes", []), thin]
+            shape = replace(shape, source=source, certificate=certificate, skin=skin)
             shape.save(out)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
     notes = [*shape.source.get("notes", []), *told]

@@ -15,7 +15,7 @@ import numpy as np
 from sdfsim.apps.beside import COLOR, OPACITY, Beside
 from sdfsim.apps.recording_joints import AXIS_COLOR, ends, marks, shown_joints
 from sdfsim.base.files import write_bytes
-from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.geometry.mesh import Mesh, face_normals, sample_surface, vertex_normals
 from sdfsim.geometry.primitives import plane
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import EARTH
@@ -56,6 +56,8 @@ _TEXTURE_PIXELS = 2048
 MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
 COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
 _CREASE = np.cos(np.radians(40.0))
+# Of a plane in which scenery lies: cells along the longer side of that, and points on it that tell which it covers.
+_FLOOR_CELLS, _FLOOR_POINTS = 48, 40_000
 _MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
 LONGEST = 5.0  # sizes of its body, an arrow
 LEAST, TOLD, MANY_LEAST = 0.05, 100, 3.0  # weights that an arrow stands for at least; of more bodies only for hits
@@ -137,8 +139,8 @@ class Playback:
         for k, path in self._alone:
             body, com = scene.bodies[k], self._com[k]
             shape = scene.shapes[body.shape]
-            mesh = shown(shape, 6 * self._radius)
-            placed = replace(mesh, vertices=mesh.vertices * body.scale - com - [0.0, 0.0, sunk(self._scene, k)])
+            mesh = shown(scene, k, 6 * self._radius)
+            placed = replace(mesh, vertices=mesh.vertices * body.scale - com)
             self.stream.log(f"{path}/mesh", _shaded(rr, placed, colors[k]), static=True)
             if len(shape.nodes):
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
@@ -445,40 +447,74 @@ def is_infinite(shape: Shape) -> bool:
     return not np.isfinite(shape.sdf.bounds).all()
 
 
-def sunk(scene: Scene, row: int) -> float:
-    """m by which a plane is shown lower than it is: where scenery of another kind lies in it, as a floor that photos
-    show lies in the one below it that ends nowhere, the two would flicker through each other."""
+def shown(scene: Scene, row: int, half: float) -> Mesh:
+    """The mesh that is shown of a body at scale 1; of a plane a square, `half` m to each side.
+
+    A plane is shown where it collides, but lower where other scenery lies in it, as a floor that photos show lies in
+    the one that ends nowhere: the two would flicker through each other.
+    """
     body = scene.bodies[row]
-    if not is_infinite(scene.shapes[body.shape]):
-        return 0.0
-    up, most, lower = _turned(np.array([0.0, 0.0, 1.0]), body.quat_xyzw), 0.02 * framed(scene)[1], 0.0
+    shape = scene.shapes[body.shape]
+    if not is_infinite(shape):
+        return shape.shown
+    most = 0.02 * framed(scene)[1]
+    back = body.quat_xyzw * [-1.0, -1.0, -1.0, 1.0]
+    found = [np.zeros((0, 3))]
     for other in scene.bodies:
-        shape = scene.shapes[other.shape]
-        if other.motion == "static" and not isinstance(shape.sdf, ClosedForm):
-            corners = other.position + _turned(shape.shown.vertices * other.scale, other.quat_xyzw)
-            height = (corners - body.position) @ up
-            near = np.abs(height) < most
-            if near.any():
-                lower = max(lower, 0.05 * most - float(np.quantile(height[near], 0.01)))
-    return lower
-
-
-def shown(shape: Shape, half: float) -> Mesh:
-    """The mesh that is shown at scale 1; of a plane a square, `half` m to each side."""
-    return plane(half) if is_infinite(shape) else shape.shown
+        of = scene.shapes[other.shape]
+        if other.motion == "static" and not isinstance(of.sdf, ClosedForm):
+            places = other.position + _turned(of.shown.vertices * other.scale, other.quat_xyzw)
+            mesh = Mesh(_turned(places - body.position, back), of.shown.faces)
+            flat = mesh.faces[(np.abs(mesh.vertices[mesh.faces, 2]) < most).all(1)]
+            found += [mesh.vertices[np.abs(mesh.vertices[:, 2]) < most]]
+            if len(flat):  # the insides of large faces, too
+                found += [sample_surface(Mesh(mesh.vertices, flat), _FLOOR_POINTS, np.random.default_rng(0))[0]]
+    near = np.concatenate(found)
+    if not len(near):
+        return plane(half)
+    lower = max(0.0, 0.05 * most - float(np.quantile(near[:, 2], 0.01)))
+    low, high = near[:, :2].min(0), near[:, :2].max(0)
+    cell = max(float((high - low).max()) / _FLOOR_CELLS, most)
+    count = np.ceil((high - low) / cell).astype(int) + 1
+    covered = np.zeros(count + 2, dtype=bool)  # with a border around them
+    covered[tuple(((near[:, :2] - low) / cell).astype(int).T + 1)] = True
+    beside = np.pad(covered, 1)  # and the cells around them, so that no gap is seen
+    beside = np.any([np.roll(beside, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)[1:-1, 1:-1]
+    x, y = (
+        np.clip(np.r_[-half, start + cell * np.arange(-1, n + 2), half], -half, half)
+        for start, n in zip(low, count, strict=True)
+    )
+    at = np.arange(len(x) * len(y)).reshape(len(x), len(y))
+    quads = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1)
+    level = np.pad(~covered, 1, constant_values=True)
+    upper, under = quads[level], quads[1:-1, 1:-1][beside] + at.size
+    corners = np.concatenate([upper, under])
+    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    vertices = np.concatenate([np.column_stack([grid, np.full(len(grid), z)]) for z in (0.0, -lower)])
+    used, label = np.unique(corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), return_inverse=True)
+    return Mesh(vertices[used], label.reshape(-1, 3))
 
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    welded, label = mesh, np.arange(len(mesh.vertices))
     if mesh.uv is not None:  # its vertices are doubled where its texture is cut, and that is no crease
         _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
-        return mesh, vertex_normals(Mesh(mesh.vertices[first], label.reshape(-1)[mesh.faces]))[label.reshape(-1)]
-    normals = _corner_normals(mesh)
+        label = label.reshape(-1)
+        welded = Mesh(mesh.vertices[first], label[mesh.faces])
+    normals = _corner_normals(welded)
     if normals is None:
-        return mesh, vertex_normals(mesh)
-    colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
-    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
-    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
+        return mesh, vertex_normals(welded)[label]
+    corners = mesh.faces.reshape(-1)
+    if mesh.uv is not None:  # no more vertices than creases ask for
+        rows = np.column_stack([corners, np.round(normals, 4)])
+        _, kept, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        kept, faces = corners[kept], place.reshape(-1, 3)
+        split = np.empty((len(kept), 3))
+        split[faces.reshape(-1)] = normals
+        return Mesh(mesh.vertices[kept], faces, None, mesh.uv[kept], mesh.texture), split
+    colors = None if mesh.colors is None else mesh.colors[corners]
+    return Mesh(mesh.vertices[corners], np.arange(len(corners)).reshape(-1, 3), colors), normals
 
 
 def _corner_normals(mesh: Mesh) -> np.ndarray | None:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.beside import COLOR, OPACITY, Beside
-from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, sunk, with_normals
+from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, with_normals
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
 from sdfsim.base.parallel import Progress, silent
@@ -166,9 +166,9 @@ class Studio:
         self._floors = np.array([is_infinite(shape) for shape in shapes])
         self._models: list[_Model] = []
         for k, (body, shape, color) in enumerate(zip(scene.bodies, shapes, body_colors(scene), strict=True)):
-            mesh, normals = with_normals(shown(shape, 40.0 * radius))
+            mesh, normals = with_normals(shown(scene, k, 40.0 * radius))
             colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
-            vertices = body.scale * (mesh.vertices - shape.com) - [0.0, 0.0, sunk(scene, k)]
+            vertices = body.scale * (mesh.vertices - shape.com)
             self._models.append((replace(mesh, vertices=vertices, colors=colors), normals))
         self._ghosts: list[_Model] = []
         for k in () if beside is None else beside.rows(scene):

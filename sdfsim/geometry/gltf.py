@@ -17,6 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from sdfsim.geometry.mesh_formats import FileMesh, looked_up, read_image, side_file, strip
+from sdfsim.geometry.skins import Painted
 
 # What z up is to the y up of glTF: columns of a matrix [4, 4].
 _Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
@@ -141,7 +142,7 @@ def read_gltf(path: Path) -> FileMesh:
     nodes where these place them, with their colours. Raises ValueError where it is damaged, or needs an extension that
     is not read."""
     file = _GltfReader(path)
-    parts, count = [], 0
+    parts, painted, count = [], [], 0
     for node, matrix in file.placed():
         for primitive in file.header["meshes"][node["mesh"]]["primitives"]:
             part = file.part(primitive)
@@ -154,7 +155,10 @@ def read_gltf(path: Path) -> FileMesh:
                 vertices = part.vertices @ place[:3, :3].T + place[:3, 3]
                 mirrored = np.linalg.det(place[:3, :3]) < 0
                 faces = part.faces[:, ::-1] if mirrored else part.faces
-                parts.append(part._replace(vertices=vertices @ Z_UP.T, faces=faces))
+                moved = part._replace(vertices=vertices @ Z_UP.T, faces=faces)
+                parts.append(moved)
+                paint = part.painted[0]
+                painted.append(paint and paint._replace(vertices=moved.vertices, faces=faces))
     if not parts:
         return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -166,6 +170,7 @@ def read_gltf(path: Path) -> FileMesh:
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
         colors,
+        painted=tuple(painted) if file.textured else (),
     )
 
 
@@ -188,6 +193,8 @@ class _GltfReader:
         self.buffers = [self._bytes(entry, own if k == 0 else None) for k, entry in enumerate(self._list("buffers"))]
         self._arrays: dict[int, np.ndarray] = {}
         self._images: dict[int, np.ndarray | None] = {}
+        self._tinted: dict[tuple, np.ndarray] = {}  # images by their number (-1 of plain colours) and their factor
+        self.textured = False  # whether a part that was read has an image
 
     def _list(self, name: str) -> list[dict[str, Any]]:
         return self.header.get(name, [])
@@ -308,15 +315,21 @@ class _GltfReader:
             faces = np.stack([np.broadcast_to(corners[:1], len(corners[2:])), corners[1:-1], corners[2:]], axis=1)
         else:
             raise ValueError(f"a primitive of mode {mode}, which glTF does not have")
-        return FileMesh(vertices, faces, self._colors(primitive, attributes, len(vertices)))
+        colors, uv, image = self._surface(primitive, attributes, len(vertices))
+        paint = None if image is None else Painted(vertices, faces, uv, image)
+        return FileMesh(vertices, faces, colors, painted=(paint,))
 
-    def _colors(self, primitive: dict[str, Any], attributes: dict[str, int], count: int) -> np.ndarray | None:
-        """[V, 3] uint8: texture, colour of the material and those of the vertices, multiplied as light."""
-        factors = []
+    def _surface(
+        self, primitive: dict[str, Any], attributes: dict[str, int], count: int
+    ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
+        """Texture, colour of the material and those of the vertices, multiplied as light: at the vertices [V, 3] uint8;
+        and as places [V, 2] in an image, None where the vertices' own colours differ."""
+        factors, tint, uv, number = [], np.ones(3), np.zeros((count, 2)), -1
         if "material" in primitive:
             surface = self.header["materials"][_index(primitive["material"])].get("pbrMetallicRoughness", {})
             if surface.get("baseColorFactor", WHITE)[:3] != WHITE:
-                factors.append(np.tile(np.array(surface["baseColorFactor"], dtype=np.float64)[:3], (count, 1)))
+                tint = np.array(surface["baseColorFactor"], dtype=np.float64)[:3]
+                factors.append(np.tile(tint, (count, 1)))
             texture = surface.get("baseColorTexture", {})
             moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
             places = f"TEXCOORD_{moved.get('texCoord', texture.get('texCoord', 0))}"
@@ -325,10 +338,29 @@ class _GltfReader:
                 uv = self.array(attributes[places]).astype(np.float64)[:, :2]
                 uv = uv * moved.get("scale", [1.0, 1.0]) + moved.get("offset", [0.0, 0.0])
                 factors.append(light(looked_up(image, uv)))
-        if "COLOR_0" in attributes:
-            factors.append(self.array(attributes["COLOR_0"]).astype(np.float64)[:, :3])
+                number, self.textured = texture["index"], True
+        own = self.array(attributes["COLOR_0"]).astype(np.float64)[:, :3] if "COLOR_0" in attributes else None
+        own = own if own is not None and own.shape == (count, 3) else None
+        factors += [own] if own is not None else []
         factors = [factor for factor in factors if factor.shape == (count, 3)]
-        return srgb(np.nan_to_num(np.prod(factors, axis=0))) if factors else None
+        colors = srgb(np.nan_to_num(np.prod(factors, axis=0))) if factors else None
+        if own is not None:
+            if np.ptp(own, axis=0).max() > 1e-6:
+                return colors, uv, None
+            tint = tint * own[0]
+        return colors, uv, self._tint(number, tint)
+
+    def _tint(self, texture: int, tint: np.ndarray) -> np.ndarray:
+        """[H, W, 3] uint8 of a texture, of -1 one white pixel, times a factor [3] of its light."""
+        key = (texture, *tint.tolist())
+        if key not in self._tinted:
+            image = self._image(texture) if texture >= 0 else None
+            image = np.full((1, 1, 3), 255, np.uint8) if image is None else image
+            if not (tint == 1.0).all():
+                tables = srgb(light(np.arange(256))[:, None] * tint)  # [256, 3]
+                image = np.stack([tables[image[..., k], k] for k in range(3)], axis=-1)
+            self._tinted[key] = image
+        return self._tinted[key]
 
     def _image(self, texture: int) -> np.ndarray | None:
         """[H, W, 3] uint8 of a texture, None where it is of a kind that is not read."""

@@ -30,9 +30,9 @@ class Mesh:
     texture: np.ndarray | None = None
 
     def digest(self) -> str:
-        """SHA-256 of vertices, faces and colours, in hexadecimal."""
+        """SHA-256 of what it has, in hexadecimal."""
         digest = hashlib.sha256()
-        for array in (self.vertices, self.faces, self.colors):
+        for array in (self.vertices, self.faces, self.colors, self.uv, self.texture):
             if array is not None:
                 digest.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sdfsim.geometry.skins import Painted
+
 KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "int64": "i8", "uint64": "u8",
@@ -45,6 +47,8 @@ class FileMesh(NamedTuple):
     # [F, 3, 2] places in a texture of the corners of faces, upper left (0, 0), and the name of its file
     places: np.ndarray | None = None
     texture: str = ""
+    # Parts with an image or a plain colour each, None where a part has neither; empty where nothing has an image
+    painted: tuple[Painted | None, ...] = ()
 
 
 Element = dict[str, Any]  # columns [N] by their names, or `Ragged`
@@ -475,8 +479,18 @@ def plain_stl(content: bytes) -> bytes:
 def by_trimesh(path: Path, content: bytes) -> Any:
     """A trimesh of `content`, whose side files stay in the folder of `path`."""
     import trimesh
+
+    return trimesh.load(io.BytesIO(content), **_how(path), force="mesh")
+
+
+def scene_by_trimesh(path: Path, content: bytes) -> Any:
+    """Likewise a scene of trimesh's, with a mesh for each material."""
+    import trimesh
+
+    return trimesh.load_scene(io.BytesIO(content), **_how(path))
+
+
+def _how(path: Path) -> dict[str, Any]:
     from trimesh.resolvers import FilePathResolver
 
-    resolver = FilePathResolver(str(path))
-    kind = path.suffix.lower()[1:]
-    return trimesh.load(io.BytesIO(content), file_type=kind, resolver=resolver, force="mesh", process=False)
+    return {"file_type": path.suffix.lower()[1:], "resolver": FilePathResolver(str(path)), "process": False}

@@ -4,11 +4,12 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.base.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError, nearest
+from sdfsim.base.files import visible
 from sdfsim.geometry.gltf import GltfWriter, read_gltf
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, require_whole
 from sdfsim.geometry.mesh_formats import (
@@ -22,35 +23,71 @@ from sdfsim.geometry.mesh_formats import (
     ply_surface,
     read_image,
     read_ply,
+    scene_by_trimesh,
     side_file,
 )
+from sdfsim.geometry.skins import Painted, one_skin
 
 # trimesh logs what it skips, sometimes with tracebacks. Callers may add a handler to see that.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 GLTF = (".glb", ".gltf")
+OTHERS = {
+    ".fbx": "FBX",
+    ".blend": "Blender's own format",
+    ".usd": "USD",
+    ".usda": "USD",
+    ".usdc": "USD",
+    ".usdz": "USD",
+}
+OTHERS |= {".dae": "COLLADA", ".3ds": "3DS", ".abc": "Alembic", ".step": "STEP", ".stp": "STEP", ".3mf": "3MF"}
+
+
+class Loaded(NamedTuple):
+    """What a mesh file holds."""
+
+    mesh: Mesh  # cleaned by `clean`; a texture is looked up at its vertices
+    skin: Mesh | None = None  # the same triangles with their texture, where they have one
+    notes: tuple[str, ...] = ()  # what of it is lost, a line each
 
 
 def load_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
     Raises SdfsimError for a file that is missing, cut short or not a mesh, that needs an unsupported extension, or that
     has no faces, vertices that are not finite or indices out of range."""
+    return load_textured(path).mesh
+
+
+def load_textured(path: str | Path) -> Loaded:
+    """As `load_mesh`, with the texture."""
     path = Path(path)
-    if not path.is_file():
-        raise SdfsimError(f"{path}: no such mesh file")
     suffix = path.suffix.lower()
+    if not path.is_file():
+        around = visible(path.parent) if path.parent.is_dir() else []
+        near = nearest(path.name, [file.name for file in around if file.suffix.lower() in MESH_SUFFIXES])
+        raise SdfsimError(f"{path}: no such mesh file{near}", f"it was looked for in {path.parent.resolve()}")
     if suffix not in MESH_SUFFIXES:
-        raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
+        kind = OTHERS.get(suffix)
+        told = f"{kind} is not read" if kind else f"not a mesh file ({path.suffix or 'no suffix'})"
+        how = "export glb from Blender; " if kind else ""
+        raise SdfsimError(f"{path}: {told}", f"{how}use " + " ".join(MESH_SUFFIXES))
     try:
-        mesh = _read(path, suffix)
+        mesh, painted = _read(path, suffix)
+        mesh = clean(mesh, name=str(path))
+        if not painted:
+            return Loaded(mesh)
+        skin = None if None in painted else one_skin([part for part in painted if part is not None])
+        return Loaded(mesh, skin, () if skin is not None else ("its texture becomes colours of its vertices",))
+    except SdfsimError:
+        raise
     except Exception as error:  # readers raise errors of many types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise SdfsimError(f"{path}: not a readable mesh ({reason})") from error
-    return clean(mesh, name=str(path))
 
 
-def _read(path: Path, suffix: str) -> Mesh:
+def _read(path: Path, suffix: str) -> tuple[Mesh, tuple[Painted | None, ...]]:
+    """The triangles of a file, and the parts with their images; none where there are no images."""
     if suffix in GLTF:
         found = read_gltf(path)
     elif suffix == ".ply":
@@ -58,11 +95,12 @@ def _read(path: Path, suffix: str) -> Mesh:
     elif suffix == ".off":
         found = off_surface(path.read_bytes())
     else:
-        plain = plain_obj if suffix == ".obj" else plain_stl
-        loaded = by_trimesh(path, plain(path.read_bytes()))
+        plain = (plain_obj if suffix == ".obj" else plain_stl)(path.read_bytes())
+        loaded = by_trimesh(path, plain)
         vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        return Mesh(vertices, _faces(loaded), _vertex_colors(loaded, len(vertices)))
-    colors = found.colors
+        mesh = Mesh(vertices, _faces(loaded), _vertex_colors(loaded, len(vertices)))
+        return mesh, _painted(path, plain) if suffix == ".obj" and b"mtllib" in plain else ()
+    colors, painted = found.colors, found.painted
     if found.places is not None:
         try:
             image = read_image(side_file(path, found.texture))
@@ -70,7 +108,37 @@ def _read(path: Path, suffix: str) -> Mesh:
             image = None
         if image is not None:
             colors = averaged(looked_up(image, found.places), found.faces, len(found.vertices))
-    return Mesh(found.vertices, found.faces, colors)
+            corners = np.concatenate([found.vertices[found.faces], found.places], axis=2).reshape(-1, 5)
+            corners, label = np.unique(corners, axis=0, return_inverse=True)
+            painted = (Painted(corners[:, :3], label.reshape(-1, 3), corners[:, 3:], image),)
+    return Mesh(found.vertices, found.faces, colors), painted
+
+
+def _painted(path: Path, content: bytes) -> tuple[Painted, ...]:
+    """The parts of an OBJ file by their materials; none where no material has an image."""
+    parts, textured = [], False
+    for drawn in scene_by_trimesh(path, content).geometry.values():
+        faces = _faces(drawn)
+        if not len(faces):
+            continue
+        vertices, visual = np.array(drawn.vertices, dtype=np.float64), drawn.visual
+        uv, image = np.zeros((len(vertices), 2)), np.full((1, 1, 3), 255, np.uint8)
+        if getattr(visual, "kind", None) == "texture":
+            picture = _picture(visual)
+            if picture is not None:
+                # trimesh counts up from the lower edge of a texture.
+                uv, image = np.asarray(visual.uv) * [1.0, -1.0] + [0.0, 1.0], np.asarray(picture.convert("RGB"))
+                textured = True
+            else:
+                image[:] = np.asarray(visual.material.main_color)[:3]
+        parts.append(Painted(vertices, faces, uv, image))
+    return tuple(parts) if textured else ()
+
+
+def _picture(visual: Any) -> Any:
+    """The image of a material of trimesh's, None where it has none that is read."""
+    image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
+    return None if image is None or image.format not in TEXTURES or visual.uv is None else image
 
 
 def _faces(loaded: Any) -> np.ndarray:
@@ -81,8 +149,7 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
     """[V, 3] uint8 when the file carries colours; a texture is looked up at each vertex."""
     visual: Any = getattr(loaded, "visual", None)
     if getattr(visual, "kind", None) == "texture":
-        image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
-        if image is None or image.format not in TEXTURES or visual.uv is None:
+        if _picture(visual) is None:
             return None
         visual = visual.to_color()
     elif getattr(visual, "kind", None) not in ("vertex", "face"):

@@ -30,7 +30,9 @@ COARSE, FINE = 0.1, 0.008
 # A sheet thinner than this is below what a fit resolves (mean errors of 0.0015 near the surface are allowed).
 THINNEST = 0.01
 THICKEST = 2.0  # likewise, of what is thickened
-HINT = "--cap (cap: on) closes openings of any size, --thicken METRES (thicken: METRES) gives a sheet a thickness"
+THICKEN = "--thicken METRES (thicken: METRES) gives a sheet a thickness"
+HINT = f"--cap (cap: on) closes openings of any size, {THICKEN}"
+SHEET = 1e-3  # thinner than this part of its size, and a surface is a flat sheet, of which no cap makes a solid
 # [P, 3] points of faces and the unit normals there -> [P] int: 0 where that is no boundary, else of how many layers in
 # the same place, negative where it is wound inwards.
 Side = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -127,7 +129,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
     except SdfsimError:
         pass
     count = "1 face encloses" if len(before) == 1 else f"{len(before)} faces enclose"
-    raise SdfsimError(f"{name}: {count} no volume (a flat sheet?)", HINT)
+    raise SdfsimError(f"{name}: {count} no volume (a flat sheet?)", THICKEN)
 
 
 def _plain(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
@@ -222,7 +224,10 @@ def _require_tight(vertices: np.ndarray, faces: np.ndarray, winding: Winding, sc
     loops = [vertices[loop, :3] for loop in openings(faces)]
     across = max(float(np.ptp(loop, axis=0).max()) for loop in loops) * scale
     count = "an opening" if len(loops) == 1 else f"{len(loops)} openings, the largest"
-    raise SdfsimError(f"{name}: not a solid: the surface has {count} {across:.3g} m across", HINT)
+    points = vertices[np.unique(faces), :3]
+    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    flat = spread[-1] < SHEET * spread[0]
+    raise SdfsimError(f"{name}: not a solid: the surface has {count} {across:.3g} m across", THICKEN if flat else HINT)
 
 
 def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:

@@ -21,14 +21,17 @@ def samples() -> dict[str, str]:
     return lines
 
 
-def find_scene(given: Path | str) -> Path:
+def find_scene(given: Path | str, *, or_run: bool = False) -> Path:
     """The scene file that is meant: a path, or the name of a sample where there is no file of that name. Raises
-    SdfsimError where it can be neither."""
+    SdfsimError where it can be neither; `or_run`: a run or shape folder of that name would have done as well."""
     path = Path(given)
     if path.suffix or len(path.parts) != 1 or path.is_file():
         return path
     known = samples()
     if path.name not in known:
+        if or_run:
+            told = f"{path}: there is no run folder, Shape folder, scene file or sample of this name"
+            raise SdfsimError(told + nearest(path.name, known), "sdfsim samples lists the samples")
         told = f"{path}: neither a scene file nor a sample{nearest(path.name, known)}"
         raise SdfsimError(told, f"give a scene.yaml, or one of {', '.join(known)}")
     return sample_folder() / f"{path.name}.yaml"

@@ -19,7 +19,7 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, lattice
-from sdfsim.geometry.mesh_io import GLTF, load_mesh
+from sdfsim.geometry.mesh_io import GLTF, Loaded, load_textured
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.fit import FIT_VERSION, Recipe
@@ -149,15 +149,25 @@ def shape_from_mesh(
     lists what was done to the mesh, and `remarks`. Raises SdfsimError where the mesh cannot be used.
     """
     path = Path(path)
-    mesh = load_mesh(path)
+    loaded = load_textured(path)
+    mesh = loaded.mesh
     # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
     key = mesh.digest()
     metres = 1.0 if units is None else units
     how = {"cap": cap, "thicken": None if thicken is None else thicken / metres, "on_progress": on_progress}
     shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, file=str(path), **how)
-    notes = [*shape.source.get("notes", []), *remarks(path, mesh, metres, given=units is not None)]
+    skin, lost = dressed(loaded, thicken=thicken)
+    notes = [*shape.source.get("notes", []), *lost, *remarks(path, mesh, metres, given=units is not None)]
     source = {**shape.source, "file": path.name, "sha256": key} | ({"notes": notes} if notes else {})
-    return scaled(replace(shape, name=name or path.stem, source=source), metres)
+    return scaled(replace(shape, name=name or path.stem, source=source, skin=skin), metres)
+
+
+def dressed(loaded: Loaded, *, thicken: float | None) -> tuple[Mesh | None, list[str]]:
+    """The textured mesh that is shown for a mesh file, in the file's units; and notes on what is lost of it. A sheet
+    that is thickened is shown as the solid that it becomes."""
+    if loaded.skin is None or thicken is None:
+        return loaded.skin, list(loaded.notes)
+    return None, ["its texture becomes colours of its vertices, since thicken gives it other surfaces"]
 
 
 def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:

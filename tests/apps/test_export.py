@@ -11,9 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
-from sdfsim.apps.export import export
+from sdfsim.apps.export import Take, export
 from sdfsim.apps.observed import load_recordings
 from sdfsim.geometry.mesh import Mesh
+from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import load_shape
@@ -217,13 +218,23 @@ def test_motion_has_the_rate_that_was_asked_for(dropped, tmp_path, fps):
     time = values(tree, binary, animation["samplers"][0]["input"])[:, 0]
     end = dropped.rollout.time[-1]
     np.testing.assert_allclose(time, np.arange(len(time)) / fps, atol=1e-6)
-    assert end - 1 / fps < time[-1] <= end + 1e-6
+    assert end - 1e-3 / fps <= time[-1] < end + 1 / fps
     node = next(k for k, n in enumerate(tree["nodes"]) if n["name"] == "ball")
     channel = next(c for c in animation["channels"] if c["target"] == {"node": node, "path": "translation"})
     place = values(tree, binary, animation["samplers"][channel["sampler"]]["output"])
     true = dropped.rollout.position[:, dropped.index("ball")]  # the centre of a ball is its origin
     for axis in range(3):
         np.testing.assert_allclose(place[:, axis], np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
+
+
+@pytest.mark.parametrize(("end", "keys"), [(3.0, 73), (3.0 - 1 / 120, 73), (2.0, 49), (2.01, 50)])
+def test_keys_reach_the_end_of_the_motion(end, keys):
+    scene = SceneBuilder().add("ring", asset=SHAPES / "ring", density=900).load()
+    time = np.append(np.arange(0.0, end, 1 / 120), end)
+    turn = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1, 1))
+    place = np.tile(time[:, None, None], (1, 1, 3))
+    take = Take(scene, ["ring"], [], np.zeros((1, 3)), time, place, turn).at_rate(24)
+    assert len(take.time) == keys and take.position[-1, 0, 0] == pytest.approx(end)
 
 
 def test_options_that_a_format_has_no_use_for_are_refused(dropped, tmp_path):

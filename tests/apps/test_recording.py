@@ -20,7 +20,7 @@ from sdfsim.apps.recording import (
     framed,
     save_reconstruction,
     save_rollout,
-    sunk,
+    shown,
     with_normals,
 )
 from sdfsim.geometry.mesh import Mesh
@@ -152,12 +152,12 @@ def test_nodes_contacts_and_forces_are_hidden_until_switched_on(scene, tmp_path,
 
 
 def test_a_plot_with_nothing_to_show_is_not_there(scene, tmp_path, rollout):
-    for empty, shown in (((), ("network", "milliseconds")), (("nodes", "edges"), ("milliseconds", "contacts"))):
+    for empty, kept in (((), ("network", "milliseconds")), (("nodes", "edges"), ("milliseconds", "contacts"))):
         nothing = {key: np.zeros(STEPS + 1) for key in empty}
         save_rollout(scene, replace(rollout, counters=rollout.counters | nothing), tmp_path / "rollout.rrd")
         told = blueprint(tmp_path / "rollout.rrd")
         views = re.findall(r"\[TimeSeries\] .*?\[(.+?)\]", told)
-        assert set(shown) <= set(views) and ("network" in views) == (not empty)
+        assert set(kept) <= set(views) and ("network" in views) == (not empty)
 
 
 def test_forces_are_weights_and_those_that_stand_still_are_marked(scene, tmp_path):
@@ -185,21 +185,34 @@ def test_forces_are_weights_and_those_that_stand_still_are_marked(scene, tmp_pat
 
 def test_a_plane_lies_below_scenery_that_lies_in_it_and_stays_elsewhere(scene):
     """So that a floor from photos, uneven by millimetres, does not flicker through the floor without end."""
-    assert all(sunk(scene, k) == 0.0 for k in range(len(scene.bodies)))  # a brick of closed form beside it
+    for k, body in enumerate(scene.bodies):  # a brick of closed form beside it
+        if scene.shapes[body.shape].name == "plane":
+            assert (shown(scene, k, 9.0).vertices[:, 2] == 0.0).all()
     rng = np.random.default_rng(0)
-    places = np.stack(np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30)), -1).reshape(-1, 2)
-    uneven = np.column_stack([places, rng.uniform(-0.01, 0.01, len(places))])
-    ground = replace(
-        scene.shapes[1], mesh=Mesh(uneven, np.array([[0, 1, 2]])), sdf=load_shape("samples/shapes/bowl").sdf
-    )
+    side = np.linspace(-2, 2, 30)
+    uneven = np.column_stack([np.stack(np.meshgrid(side, side), -1).reshape(-1, 2), rng.uniform(-0.01, 0.01, 900)])
+    at = np.arange(900).reshape(30, 30)[:-1, :-1].reshape(-1, 1)
+    faces = np.concatenate([at + np.array([0, 1, 31]), at + np.array([0, 31, 30])])
+    ground = replace(scene.shapes[1], mesh=Mesh(uneven, faces), sdf=load_shape("samples/shapes/bowl").sdf)
     below = replace(scene, shapes=(scene.shapes[0], ground, *scene.shapes[2:]))
     names = [shape.name for shape in scene.shapes]
     assert names[0] == "plane" and names[1] == "brick"
     below = replace(
         below, bodies=tuple(replace(b, position=np.zeros(3)) if b.name == "shelf" else b for b in scene.bodies)
     )
-    down = sunk(below, 0)
-    assert (uneven[:, 2] + down > 0).mean() > 0.98 and down < 0.05
+    plane = shown(below, 0, 9.0)
+    corners = plane.vertices[plane.faces]
+    height, middle = corners[..., 2], corners.mean(1)
+    assert (np.ptp(height, axis=1) == 0.0).all()
+    inside = (np.abs(middle[:, :2]) < 1.9).all(1)
+    down = -height[inside]
+    assert inside.any() and (down == down[0, 0]).all() and (uneven[:, 2] + down[0, 0] > 0).mean() > 0.98
+    assert down[0, 0] < 0.05
+    # Where nothing lies in it, it is shown where bodies meet it; and all of it is there, with no gap between the two.
+    away = (np.abs(middle[:, :2]) > 2.3).any(1)
+    assert (height[away] == 0.0).all()
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    assert area[away].sum() + 4.6**2 >= 18.0**2 - 5.0 and area[height[:, 0] == 0.0].sum() < 18.0**2 - 3.8**2
 
 
 def test_a_reconstruction_shows_cameras_photos_points_and_surface(tmp_path):

@@ -128,6 +128,7 @@ def test_a_scene_that_names_files_with_backslashes_is_read(tmp_path):
 
 
 def test_no_exported_file_has_the_name_of_a_device():
+    assert plain_names(["torus[0]", "torus[1]", "the ring", "!", "a_"]) == ["torus_0", "torus_1", "the_ring", "_", "a_"]
     assert plain_names(["con", "NUL", "com1", "cup"]) == ["con_1", "NUL_1", "com1_1", "cup"]
 
 

@@ -69,11 +69,16 @@ def test_clicks_give_the_options_to_paste(photos, tmp_path):
             browser.wait("document.getElementById('photo').complete")
             browser.click(*dot(browser.picture(tmp_path / "page.png")))
 
-        assert option() == ["sdfsim", "reconstruct", str(photos), "-o", "room"]
+        command = ["sdfsim", "reconstruct", str(photos), "-o", "room", "--preset", "quick"]
+        assert option() == command
+        for part in ("nav", "main"):
+            wide = f"document.querySelector('{part}').scrollWidth - document.querySelector('{part}').clientWidth"
+            assert browser.value(wide) == 0
         browser.value("document.getElementById('metres').value = 1.25")
         click_dot("wide & big.jpg")
         click_dot("turned.jpg")
-        flag, first, second, metres = option()
+        *start, flag, first, second, metres = option()
+        assert start == command
         assert flag == "--distance" and metres == "1.25"
         check_distance((first, second, float(metres)), found)  # as the command checks it
         browser.value("document.getElementById('body').click(); document.getElementById('name').value = 'cup'")
@@ -86,7 +91,7 @@ def test_clicks_give_the_options_to_paste(photos, tmp_path):
             long_side = max(next(photo.original for photo in found if photo.source == name))
             assert np.abs(at - DOTS[name]).max() < 0.003 * long_side + 1
         browser.value("document.getElementById('undo').click()")
-        assert option()[0] == "--distance" and len(option()) == 4
+        assert option()[:-4] == command and option()[-4] == "--distance"
         assert not browser.errors
 
 

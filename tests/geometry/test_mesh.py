@@ -38,6 +38,18 @@ def test_a_bad_file_is_one_clear_line_with_its_name(tmp_path: Path, name: str, c
     assert "\n" not in error.value.message
 
 
+def test_what_is_missing_or_of_another_kind_comes_with_a_way_out(tmp_path: Path) -> None:
+    (tmp_path / "vase.obj").write_text(TETRAHEDRON)
+    with pytest.raises(SdfsimError, match=r"vaze\.obj: no such mesh file \(did you mean 'vase\.obj'\?\)") as error:
+        load_mesh(tmp_path / "vaze.obj")
+    assert str(tmp_path) in error.value.hint
+    for name, kind in (("a.fbx", "FBX"), ("b.USDZ", "USD"), ("c.blend", "Blender")):
+        (tmp_path / name).write_bytes(b"Kaydara")
+        with pytest.raises(SdfsimError, match=f"{kind}.* is not read") as error:
+            load_mesh(tmp_path / name)
+        assert "glb" in error.value.hint and "Blender" in error.value.hint
+
+
 @pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "ply"])
 def test_every_format_gives_the_same_closed_solid(tmp_path: Path, suffix: str) -> None:
     import trimesh

@@ -217,7 +217,13 @@ def test_what_is_open_is_refused_in_one_line_with_the_way_out(mesh: Mesh, messag
     with pytest.raises(SdfsimError, match=message) as error:
         solidify(mesh, name="thing")
     assert str(error.value).startswith("thing: ") and "\n" not in error.value.message
-    assert "--cap" in error.value.hint and "--thicken" in error.value.hint
+    assert "--thicken" in error.value.hint
+    # No cap makes a solid of a flat sheet.
+    assert ("--cap" in error.value.hint) == ("opening" in message)
+    if "opening" not in message:
+        with pytest.raises(SdfsimError) as error:
+            solidify(mesh, name="thing", cap=True)
+        assert "--thicken" in error.value.hint and "--cap" not in error.value.hint
 
 
 def test_capping_gives_exactly_the_closed_solid() -> None:

@@ -63,17 +63,31 @@ def test_matches_farther_from_their_lines_than_they_have_to_be_are_wrong_focal_l
     """Within half a pixel or so, where each pair alone would be within a quarter: no pair contradicts the poses."""
     verdict = check(astray(result(10, 10), 3.0), PHOTOS)
     assert verdict["contradictions"] == 0 and verdict["excess"] == pytest.approx(3.0)
-    assert "10 of 10 photos do not lie where the poses put them" in verdict["failures"][0]
-    assert "focal lengths are wrong" in verdict["causes"][0]
+    assert "in 10 of 10 photos, points that two photos share lie 3.0 times as far" in verdict["failures"][0]
     assert check(astray(result(10, 10), 1.7), PHOTOS)["failures"] == []  # what right poses of real photos have
     # Cameras that a phone tracked are off by some pixels.
     assert check(astray(result(10, 10), 3.0), PHOTOS, known=True)["failures"] == []
 
 
+@pytest.mark.parametrize(("count", "span", "few_first"), [(16, 360.0, True), (40, 360.0, False), (25, 80.0, False)])
+def test_matches_astray_have_two_possible_causes_the_likelier_first(count, span, few_first):
+    verdict = check(
+        astray(result(count, count, span=span), 3.0, slice(0, count // 3)), [photo(k) for k in range(count)]
+    )
+    (cause,) = verdict["causes"]
+    first, _, second = cause.partition("; or else ")
+    few, zooms = (first, second) if few_first else (second, first)
+    assert few.startswith(f"too few photos or too wide steps ({count} photos") and "between IMG_" in few
+    assert "of several zooms" in zooms
+    assert ("Probably too few" in failure_message(verdict)) == few_first
+    # What is measured of the photos astray, not of all.
+    assert "lie 3.0 times as far" in verdict["failures"][0] and verdict["excess"] < 2
+
+
 def test_a_third_of_the_photos_wrong_does_not_pass_however_right_the_rest_is():
     photos = [photo(k) for k in range(20)]
     verdict = check(astray(result(20, 20), 4.0, slice(0, 5)), photos)
-    assert verdict["excess"] < 1.5 and "5 of 20 photos" in verdict["failures"][0]
+    assert verdict["excess"] < 1.5 and "in 5 of 20 photos" in verdict["failures"][0]
 
 
 def contradicted(found: dict, count: int, matches: int) -> dict:

@@ -59,6 +59,21 @@ def test_a_film_without_motion_is_refused_with_the_reason(tmp_path):
     assert caught.value.exit_code == EXIT_QUALITY
 
 
+def test_a_short_clip_is_told_to_be_short(tmp_path):
+    film(tmp_path / "a.mp4", np.arange(12) * 6)
+    with pytest.raises(SdfsimError, match="a clip of only 12 frames") as caught:
+        prepare_photos(tmp_path / "a.mp4", tmp_path)
+    assert "film for longer" in caught.value.hint and "convert" not in caught.value.hint
+
+
+def test_a_folder_with_a_video_alone_names_the_command(tmp_path):
+    (tmp_path / "shots").mkdir()
+    (tmp_path / "shots" / "walk.MOV").write_bytes(b"x")
+    with pytest.raises(SdfsimError, match="photos found: 0") as caught:
+        prepare_photos(tmp_path / "shots", tmp_path)
+    assert f"sdfsim reconstruct {tmp_path / 'shots' / 'walk.MOV'} -o" in caught.value.hint
+
+
 def test_what_is_no_video_is_named(tmp_path, capfd):
     (tmp_path / "a.mp4").write_bytes(b"nothing of the kind" * 100)
     with pytest.raises(SdfsimError, match=r"a\.mp4: "):

@@ -33,6 +33,13 @@ def test_commands_take_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = run("export", "tower", "-o", "tower.csv", "--json")
     assert done.exit_code == 0 and json.loads(done.stdout)["bodies"] == 5
+    done = run("export", "nosuchrun", "-o", "x.glb")
+    assert (
+        done.exit_code == 1 and "nosuchrun: there is no run folder, Shape folder, scene file or sample" in done.stderr
+    )
+    assert "pile" not in done.stderr
+    done = run("export", "runs/none", "-o", "x.glb")
+    assert done.exit_code == 1 and "none: there is no such folder or file" in done.stderr
     done = run("simulate", "towr", "-o", "run")
     assert done.exit_code == 1 and "towr: neither a scene file nor a sample (did you mean 'tower'?)" in done.stderr
     listed = run("samples").stdout

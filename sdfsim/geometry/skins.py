@@ -1,0 +1,71 @@
+"""One mesh with one texture, out of the parts of a file that are painted with an image each."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
+
+LARGEST = 8192  # px, of the longer side of what several images, or repetitions of one, are put into
+SWATCH = 8  # px to each side, of a plain colour beside images
+EDGE = 1e-4  # of an image: places outside it by no more than this are on its border
+
+
+class Painted(NamedTuple):
+    """Triangles with an image."""
+
+    vertices: np.ndarray  # [V, 3] float64
+    faces: np.ndarray  # [F, 3] int64
+    uv: np.ndarray  # [V, 2] places in the image from its upper left (0, 0) to its lower right (1, 1); it repeats itself
+    image: np.ndarray  # [H, W, 3] uint8; of one pixel for a plain colour
+
+
+def one_skin(parts: Sequence[Painted]) -> Mesh | None:
+    """The parts as one mesh; their images side by side, where there are several. None where an image repeats itself
+    too often to be written out."""
+    from PIL import Image
+
+    places, tiles, images = [], {}, {}
+    for part in parts:
+        uv = np.nan_to_num(part.uv)
+        uv = uv - np.floor(uv.min(0) + EDGE)
+        places.append(uv)
+        key, often = id(part.image), np.maximum(np.ceil(uv.max(0) - EDGE), 1)
+        images[key], tiles[key] = part.image, np.maximum(tiles.get(key, 1), often)
+    sheets = {}
+    for key, image in images.items():
+        if image.shape[:2] == (1, 1):
+            tiles[key], image = np.ones(2), np.broadcast_to(image, (SWATCH, SWATCH, 3))
+        often = tiles[key].astype(int)
+        if often.max() > 1 and (often * image.shape[1::-1]).max() > LARGEST:
+            return None
+        sheets[key] = np.tile(image, (often[1], often[0], 1))
+    if len(sheets) > 1:
+        wide = sum(sheet.shape[1] for sheet in sheets.values())
+        factor = min(1.0, LARGEST / max(wide, *(sheet.shape[0] for sheet in sheets.values())))
+        for key, sheet in sheets.items() if factor < 1.0 else ():
+            size = [max(1, int(factor * length)) for length in sheet.shape[1::-1]]
+            sheets[key] = np.asarray(Image.fromarray(sheet).resize(size, Image.Resampling.BOX))
+    texture = np.zeros(
+        (max(s.shape[0] for s in sheets.values()), sum(s.shape[1] for s in sheets.values()), 3), np.uint8
+    )
+    left, at = 0, {}
+    for key, sheet in sheets.items():
+        texture[: sheet.shape[0], left : left + sheet.shape[1]] = sheet
+        at[key], left = left, left + sheet.shape[1]
+    whole = np.array(texture.shape[1::-1])
+    placed = []
+    for part, uv in zip(parts, places, strict=True):
+        key = id(part.image)
+        size = np.array(sheets[key].shape[1::-1])
+        pixel = uv / tiles[key] * size
+        if len(sheets) > 1:  # no colour of the image beside it
+            pixel = np.clip(pixel, 0.5, size - 0.5) + np.array([at[key], 0.0])
+        placed.append(np.clip(pixel / whole, 0.0, 1.0))
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    welded = Mesh(vertices, np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces])
+    solid = is_closed(welded) and signed_volume(Mesh(vertices, faces)) < 0
+    return Mesh(vertices, faces[:, ::-1].copy() if solid else faces, None, np.concatenate(placed), texture)
