@@ -64,6 +64,7 @@ from sdfsim.physics.solver.impulses import (
     remembered,
 )
 from sdfsim.physics.solver.islands import join, root
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
@@ -171,27 +172,6 @@ class Held(NamedTuple):
     calm: np.ndarray  # [N] bool, whether joints hold a body that nothing else touches
 
 
-class Moving(NamedTuple):
-    """What joints ask of bodies: of `World`, `Motion` and `Work`. All arrays that a function is given are copied, one
-    number after the other, which takes longer to compile than most of what is done to them."""
-
-    moves: np.ndarray
-    isotropic: np.ndarray
-    inverse_mass: np.ndarray
-    inertia: np.ndarray
-    inverse_inertia: np.ndarray
-    position: np.ndarray
-    orientation: np.ndarray
-    velocity: np.ndarray
-    angular: np.ndarray
-    matrix: np.ndarray
-    inverse: np.ndarray
-    free: np.ndarray
-    change: np.ndarray
-    touching: np.ndarray
-    island: np.ndarray
-
-
 # Kinds of bounded rows: of contacts, normal and tangential (two rows); of joints, limits, motors with friction, and the
 # friction of a ball (three rows).
 NORMAL_ROW, TANGENT_ROW, STOP_ROW, DRIVE_ROW, GRIP_ROW = range(5)
@@ -217,16 +197,6 @@ class Bounded(NamedTuple):
     now: np.ndarray  # [R] the change so far
     known: np.ndarray  # [R] the impulses before
     see: np.ndarray  # [R, R] or [0, 0]: what a unit of impulse does along all rows, through the joints
-
-
-@njit(**FAST)
-def _moving(world, work, motion):
-    """Not one of `BARE`: these do not count the references to arrays that they return."""
-    return Moving(
-        world.moves, world.isotropic, world.inverse_mass, world.inertia, world.inverse_inertia, motion.position,
-        motion.orientation, motion.velocity, motion.angular, work.matrix, work.inverse, work.free, work.change,
-        motion.touching, motion.island,
-    )  # fmt: skip
 
 
 @njit(**BARE)
@@ -435,7 +405,7 @@ def _eased(moves, inverse_mass, inverse, rotation, line, j, e, a, b, out):
 
 
 @njit(**BARE)
-def _springs(bodies, rules, each, lines, j):
+def _springs(world, work, motion, rules, each, lines, j):
     """Springs and damping as soft rows: a force in the middle of what it is before and after the inner step."""
     number, state, kind, h = each.number, each.state, each.kind[j], rules.substep_dt
     stiff, damping = number[j, STIFFNESS], number[j, DAMPING]
@@ -452,13 +422,11 @@ def _springs(bodies, rules, each, lines, j):
         z = (
             damping
             * h
-            * _eased(
-                bodies.moves, bodies.inverse_mass, bodies.inverse, rules.rotation, lines.line, j, e, a, b, lines.eased
-            )
+            * _eased(world.moves, world.inverse_mass, work.inverse, rules.rotation, lines.line, j, e, a, b, lines.eased)
         )
         late = 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
         give = h * (0.25 * stiff * h + damping * late)
-        before = _reads(lines.line, j, e, bodies.velocity, bodies.angular, a, b)
+        before = _reads(lines.line, j, e, motion.velocity, motion.angular, a, b)
         lines.active[j, e] = 2
         lines.soft[j, e] = 1.0 / give
         away = state[j, COORD] - number[j, REST] if stiff > 0.0 else 0.0
@@ -469,37 +437,36 @@ def _springs(bodies, rules, each, lines, j):
 def assemble(world, work, motion, rules, held, springs):
     """Write the rows of all joints that are awake, and factor what they make of velocities. Where rows do not hold,
     bodies are moved. `springs`: whether these are among them."""
-    bodies = _moving(world, work, motion)
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
     for c in range(len(graph.comp) - 1):
-        if asleep(bodies.island, graph, c):
+        if asleep(motion.island, graph, c):
             continue
         for attempt in range(3):
             worst = 0.0
             for k in range(graph.comp[c], graph.comp[c + 1]):
                 if graph.node[k] < 0:
                     j = -1 - graph.node[k]
-                    _coordinate(each, bodies.position, bodies.matrix, j)
+                    _coordinate(each, motion.position, work.matrix, j)
                     if each.state[j, BROKEN] > 0.0:
                         for e in range(ROWS):
                             lines.active[j, e] = 0
                             lines.error[j, e] = lines.soft[j, e] = 0.0
                         continue
-                    _rows(each, lines, bodies.position, bodies.matrix, j)
-                    _errors(each, bodies.position, bodies.matrix, j, lines.error)
+                    _rows(each, lines, motion.position, work.matrix, j)
+                    _errors(each, motion.position, work.matrix, j, lines.error)
                     for e in range(ROWS):
                         lines.wanted[j, e] = each.state[j, BEND + e] if springs else 0.0
                         worst = max(worst, abs(lines.error[j, e]))
                     if springs:
-                        _springs(bodies, rules, each, lines, j)
-            _factor(bodies, rules, graph, factors, each, lines, c)
+                        _springs(world, work, motion, rules, each, lines, j)
+            _factor(world, work, motion, rules, graph, factors, each, lines, c)
             if worst <= STRETCH or attempt == 2:
                 break
-            _mend(bodies, work.gone, world.radius, rules, graph, factors, lines, c)
+            _mend(world, work, motion, rules, graph, factors, lines, c)
 
 
 @njit(**BARE)
-def _mend(bodies, gone, radius, rules, graph, factors, lines, c):
+def _mend(world, work, motion, rules, graph, factors, lines, c):
     """Move bodies so that rows hold: as little as their masses ask for."""
     for k in range(graph.comp[c], graph.comp[c + 1]):
         for e in range(6):
@@ -521,18 +488,18 @@ def _mend(bodies, gone, radius, rules, graph, factors, lines, c):
         b = graph.node[k]
         if b >= 0:
             moved, turned = get(factors.x, k), (factors.x[k, 3], factors.x[k, 4], factors.x[k, 5])
-            put(bodies.position, b, along(get(bodies.position, b), moved, share))
+            put(motion.position, b, along(get(motion.position, b), moved, share))
             if rules.rotation:
-                q = turned_by(scale(turned, share), bodies.orientation, b)
+                q = turned_by(scale(turned, share), motion.orientation, b)
                 for x in range(4):
-                    bodies.orientation[b, x] = q[x]
-                to_matrix(bodies.orientation, b, bodies.matrix)
-            if radius[b] < math.inf:
-                gone[b] += share * (norm(moved) + norm(turned) * radius[b])
+                    motion.orientation[b, x] = q[x]
+                to_matrix(motion.orientation, b, work.matrix)
+            if world.radius[b] < math.inf:
+                work.gone[b] += share * (norm(moved) + norm(turned) * world.radius[b])
 
 
 @njit(**BARE)
-def _factor(bodies, rules, graph, factors, each, lines, c):
+def _factor(world, work, motion, rules, graph, factors, each, lines, c):
     """The matrix of masses and rows, factored block by block."""
     first, last = graph.comp[c], graph.comp[c + 1]
     for k in range(first, last):
@@ -546,12 +513,12 @@ def _factor(bodies, rules, graph, factors, each, lines, c):
         b = graph.node[k]
         if b >= 0:
             for x in range(3):
-                factors.diagonal[k, x, x] = 1.0 / bodies.inverse_mass[b]
+                factors.diagonal[k, x, x] = 1.0 / world.inverse_mass[b]
                 for y in range(3):
                     total = 0.0
                     for u in range(3):
                         for w in range(3):
-                            total += bodies.matrix[b, x, u] * bodies.inertia[b, u, w] * bodies.matrix[b, y, w]
+                            total += work.matrix[b, x, u] * world.inertia[b, u, w] * work.matrix[b, y, w]
                     factors.diagonal[k, 3 + x, 3 + y] = total
     for k in range(first, last):
         if graph.node[k] >= 0:
@@ -561,9 +528,9 @@ def _factor(bodies, rules, graph, factors, each, lines, c):
             factors.diagonal[k, e, e] = -1.0
             if lines.active[j, e] > 0:
                 eased = _eased(
-                    bodies.moves,
-                    bodies.inverse_mass,
-                    bodies.inverse,
+                    world.moves,
+                    world.inverse_mass,
+                    work.inverse,
                     rules.rotation,
                     lines.line,
                     j,
@@ -670,10 +637,10 @@ def _substitute(graph, factors, c, first):
 
 
 @njit(**BARE)
-def _project(bodies, graph, factors, each, lines, c, change, whole):
+def _project(world, work, motion, graph, factors, each, lines, c, change, whole):
     """Let the rows hold: what `change` lacks is added. `whole`: of all velocities, as the rows want them; else of the
     change alone, which is to be none along them."""
-    free = bodies.free
+    free = work.free
     for k in range(graph.comp[c], graph.comp[c + 1]):
         n = graph.node[k]
         for e in range(6):
@@ -686,7 +653,7 @@ def _project(bodies, graph, factors, each, lines, c, change, whole):
                     continue
                 now = _reads_six(lines.line, j, e, change, a, b)
                 if whole:
-                    now += _reads(lines.line, j, e, bodies.velocity, bodies.angular, a, b)
+                    now += _reads(lines.line, j, e, motion.velocity, motion.angular, a, b)
                     now += _reads_six(lines.line, j, e, free, a, b)
                     now += lines.soft[j, e] * lines.impulse[j, e] - lines.wanted[j, e]
                 factors.x[k, e] = now
@@ -702,19 +669,19 @@ def _project(bodies, graph, factors, each, lines, c, change, whole):
 
 
 @njit(**BARE)
-def _bend(bodies, rules, graph, each, lines, trial, c):
+def _bend(world, work, motion, rules, graph, each, lines, trial, c):
     """Move the bodies as far as the inner step would, and let rows turn by as much as they do not hold there; returns
     the largest error."""
     h = rules.substep_dt
     for k in range(graph.comp[c], graph.comp[c + 1]):
         n = graph.node[k]
         if n >= 0:
-            _tried(bodies, rules, trial, n)
+            _tried(world, work, motion, rules, trial, n)
             continue
         for s in range(2):
             b = each.body[-1 - n, s]
             if b >= 0 and graph.of_body[b] < 0:
-                _tried(bodies, rules, trial, b)
+                _tried(world, work, motion, rules, trial, b)
     worst = 0.0
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] < 0:
@@ -731,24 +698,24 @@ def _bend(bodies, rules, graph, each, lines, trial, c):
 
 
 @njit(**BARE)
-def _tried(bodies, rules, trial, b):
+def _tried(world, work, motion, rules, trial, b):
     """Where a body would be after the inner step."""
-    h, change, free = rules.substep_dt, bodies.change, bodies.free
-    v, w = get(bodies.velocity, b), get(bodies.angular, b)
+    h, change, free = rules.substep_dt, work.change, work.free
+    v, w = get(motion.velocity, b), get(motion.angular, b)
     for x in range(4):
-        trial.orientation[b, x] = bodies.orientation[b, x]
+        trial.orientation[b, x] = motion.orientation[b, x]
     for x in range(3):
         for y in range(3):
-            trial.frame[b, x, y] = bodies.matrix[b, x, y]
-    if bodies.moves[b]:
+            trial.frame[b, x, y] = work.matrix[b, x, y]
+    if world.moves[b]:
         v = add(v, add((free[b, 0], free[b, 1], free[b, 2]), (change[b, 0], change[b, 1], change[b, 2])))
         w = add(w, add((free[b, 3], free[b, 4], free[b, 5]), (change[b, 3], change[b, 4], change[b, 5])))
-    put(trial.position, b, along(get(bodies.position, b), v, h))
-    if not rules.rotation and bodies.moves[b]:
+    put(trial.position, b, along(get(motion.position, b), v, h))
+    if not rules.rotation and world.moves[b]:
         return
     put(trial.angular, b, w)
-    if bodies.moves[b] and not bodies.isotropic[b]:
-        torque_free(bodies, trial, trial.frame, h, trial.turned, trial.tried, b)
+    if world.moves[b] and not world.isotropic[b]:
+        torque_free(world, trial.orientation, trial.angular, trial.frame, h, trial.turned, trial.tried, b)
     elif w[0] != 0.0 or w[1] != 0.0 or w[2] != 0.0:
         q = turned_by(scale(w, h), trial.orientation, b)
         for x in range(4):
@@ -757,7 +724,7 @@ def _tried(bodies, rules, trial, b):
 
 
 @njit(**BARE)
-def _limited(bodies, rules, graph, each, c, rows, count, steady):
+def _limited(world, work, motion, rules, graph, each, c, rows, count, steady):
     """Write the bounded rows of joints behind `count` others; returns how many there are then. `steady`: only limits
     that hold, as they are after an inner step."""
     h, number, state = rules.substep_dt, each.number, each.state
@@ -768,8 +735,8 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
         if state[j, BROKEN] > 0.0:
             continue
         a, b, coord = each.body[j, 0], each.body[j, 1], state[j, COORD]
-        before = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
-        free = before + _reads_six(each.axis, j, 0, bodies.free, a, b)
+        before = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
+        free = before + _reads_six(each.axis, j, 0, work.free, a, b)
         for side in range(2):
             end = number[j, LOW + side]
             sign = 1.0 - 2.0 * side
@@ -788,7 +755,7 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
                 aim, left = number[j, BOUNCE] * approach, math.inf
             for x in range(12):
                 rows.row[count, x] = sign * each.axis[j, 0, x]
-            _begin(bodies, rules, each, rows, count, STOP_ROW, j, aim, then)
+            _begin(world, work, motion, rules, each, rows, count, STOP_ROW, j, aim, then)
             rows.impulse[count] = 0.0 if steady else max(0.0, sign * state[j, STOP])
             rows.strong[count], rows.grip[count] = left, sign
             count += 1
@@ -804,10 +771,10 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
                 rows.row[count, 3 + e], rows.row[count, 9 + e] = 1.0, -1.0
                 now = 0.0
                 if a >= 0:
-                    now += bodies.angular[a, e] + bodies.free[a, 3 + e]
+                    now += motion.angular[a, e] + work.free[a, 3 + e]
                 if b >= 0:
-                    now -= bodies.angular[b, e] + bodies.free[b, 3 + e]
-                _begin(bodies, rules, each, rows, count, GRIP_ROW, j, 0.0, now)
+                    now -= motion.angular[b, e] + work.free[b, 3 + e]
+                _begin(world, work, motion, rules, each, rows, count, GRIP_ROW, j, 0.0, now)
                 rows.impulse[count], rows.grip[count] = state[j, DRIVE + e], grip
                 count += 1
         elif grip > 0.0 or most > 0.0:
@@ -818,14 +785,14 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
                 aim = (state[j, TARGET] - coord) / max(number[j, TIME], h)
             for x in range(12):
                 rows.row[count, x] = each.axis[j, 0, x]
-            _begin(bodies, rules, each, rows, count, DRIVE_ROW, j, aim, free)
+            _begin(world, work, motion, rules, each, rows, count, DRIVE_ROW, j, aim, free)
             rows.impulse[count], rows.grip[count], rows.strong[count] = state[j, DRIVE], grip, most
             count += 1
     return count
 
 
 @njit(**BARE)
-def _begin(bodies, rules, each, rows, r, kind, j, aim, base):
+def _begin(world, work, motion, rules, each, rows, r, kind, j, aim, base):
     rows.kind[r], rows.of[r] = kind, j
     rows.body[r, 0], rows.body[r, 1] = each.body[j, 0], each.body[j, 1]
     rows.base[r], rows.want[r] = base, aim - base
@@ -835,11 +802,11 @@ def _begin(bodies, rules, each, rows, r, kind, j, aim, base):
         b = each.body[j, s]
         for x in range(6):
             rows.row[r, 12 + 6 * s + x] = 0.0
-        if b >= 0 and bodies.moves[b]:
+        if b >= 0 and world.moves[b]:
             first = 6 * s
-            spin = turn(bodies.inverse, b, (rows.row[r, first + 3], rows.row[r, first + 4], rows.row[r, first + 5]))
+            spin = turn(work.inverse, b, (rows.row[r, first + 3], rows.row[r, first + 4], rows.row[r, first + 5]))
             for x in range(3):
-                rows.row[r, 12 + first + x] = bodies.inverse_mass[b] * rows.row[r, first + x]
+                rows.row[r, 12 + first + x] = world.inverse_mass[b] * rows.row[r, first + x]
                 rows.row[r, 15 + first + x] = spin[x] if rules.rotation else 0.0
             for x in range(6):
                 rows.give[r] += rows.row[r, first + x] * rows.row[r, 12 + first + x]
@@ -893,7 +860,7 @@ def _give(moves, rows, r, impulse, change):
 
 
 @njit(**BARE)
-def _see(bodies, graph, factors, reply, rows, count):
+def _see(world, work, motion, graph, factors, reply, rows, count):
     """What a unit of impulse along each row does along all, through the joints."""
     for r in range(count):
         for s in range(2):
@@ -905,10 +872,10 @@ def _see(bodies, graph, factors, reply, rows, count):
         one = other = -1
         for s in range(2):
             b = rows.body[r, s]
-            if b < 0 or not bodies.moves[b]:
+            if b < 0 or not world.moves[b]:
                 continue
             k = graph.of_body[b]
-            if k < 0 or bodies.island[b] >= 0:
+            if k < 0 or motion.island[b] >= 0:
                 for x in range(6):
                     reply[b, x] += rows.row[r, 12 + 6 * s + x]
                 continue
@@ -1024,51 +991,51 @@ def _sweep(moves, cone, rows, count, change):
 
 
 @njit(**BARE)
-def _all_rows(bodies, rules, system, graph, each, comps, lo, hi, island, rows):
+def _all_rows(world, work, motion, rules, system, graph, each, comps, lo, hi, island, rows):
     """The bounded rows of an island, and what was known of their impulses, given to the bodies."""
-    count = _touched(bodies.inverse_mass, system, island, rows)
+    count = _touched(world.inverse_mass, system, island, rows)
     for i in range(lo, hi):
-        count = _limited(bodies, rules, graph, each, comps[i], rows, count, False)
+        count = _limited(world, work, motion, rules, graph, each, comps[i], rows, count, False)
     for r in range(count):
         if rows.impulse[r] != 0.0:
-            _give(bodies.moves, rows, r, rows.impulse[r], bodies.change)
+            _give(world.moves, rows, r, rows.impulse[r], work.change)
     return count
 
 
 @njit(**BARE)
-def _hold(bodies, rules, held, comps, lo, hi, rows, count, steady):
+def _hold(world, work, motion, rules, held, comps, lo, hi, rows, count, steady):
     """Solve for all impulses of an island so that its rows hold after the inner step."""
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
-    change, h = bodies.change, rules.substep_dt
+    change, h = work.change, rules.substep_dt
     for i in range(lo, hi):
         for k in range(graph.comp[comps[i]], graph.comp[comps[i] + 1]):
             if graph.node[k] < 0:
                 for e in range(ROWS):
                     lines.impulse[-1 - graph.node[k], e] = 0.0
-        _project(bodies, graph, factors, each, lines, comps[i], change, True)
+        _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
     for _ in range(ROUNDS):
         if count:
             for r in range(count):
                 rows.known[r] = rows.impulse[r]
                 rows.now[r] = _read(rows, r, change)
             for _ in range(rules.rounds):
-                worst = _sweep(bodies.moves, rules.cone, rows, count, change)
+                worst = _sweep(world.moves, rules.cone, rows, count, change)
                 if len(rows.see) == 0:
                     for i in range(lo, hi):
-                        _project(bodies, graph, factors, each, lines, comps[i], change, True)
+                        _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
                 if worst <= EXACT * rules.exact:
                     break
             if len(rows.see):
                 for r in range(count):
                     if rows.impulse[r] != rows.known[r]:
-                        _give(bodies.moves, rows, r, rows.impulse[r] - rows.known[r], change)
+                        _give(world.moves, rows, r, rows.impulse[r] - rows.known[r], change)
                 for i in range(lo, hi):
-                    _project(bodies, graph, factors, each, lines, comps[i], change, True)
+                    _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
         if steady:
             return
         worst = 0.0
         for i in range(lo, hi):
-            worst = max(worst, _bend(bodies, rules, graph, each, lines, held.trial, comps[i]))
+            worst = max(worst, _bend(world, work, motion, rules, graph, each, lines, held.trial, comps[i]))
         for r in range(count):
             if rows.kind[r] == STOP_ROW and rows.impulse[r] > 0.0 and rows.strong[r] < math.inf:
                 j = rows.of[r]
@@ -1084,7 +1051,7 @@ def _hold(bodies, rules, held, comps, lo, hi, rows, count, steady):
         if worst <= HOLDS:
             return
         for i in range(lo, hi):
-            _project(bodies, graph, factors, each, lines, comps[i], change, True)
+            _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
 
 
 @njit(**BARE)
@@ -1110,7 +1077,7 @@ def _room(count):
 
 
 @njit(**FAST)
-def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
+def _solve_island(world, work, motion, rules, system, held, comps, lo, hi, island):
     """An island that joints hold together: as `impulses._solve`, through the joints."""
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
     contacts = system.start[island + 1] - system.start[island]
@@ -1123,18 +1090,24 @@ def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
         deep = deep or system.wanted[c] > 0.0
         lively = lively or system.row[c, 0, WANTED] > system.calm[c, 0]
     if deep:
-        _resolve_penetration(bodies.inverse_mass, rules, system, shift, island)
+        _resolve_penetration(world.inverse_mass, rules, system, work.shift, island)
         for i in range(lo, hi):
-            _project(bodies, graph, factors, each, lines, comps[i], shift, False)
+            _project(world, work, motion, graph, factors, each, lines, comps[i], work.shift, False)
     room = _room(most)
-    count = _all_rows(bodies, rules, system, graph, each, comps, lo, hi, island, room)
-    rows = _seen(room, count if count <= DENSE else 0)
+    count = _all_rows(world, work, motion, rules, system, graph, each, comps, lo, hi, island, reference(room))
+    bounded = _seen(room, count if count <= DENSE else 0)
+    _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island, bounded, count, lively, deep)
+
+
+@njit(**BARE)
+def _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island, bounded, count, lively, deep):
+    graph, factors, each, lines, rows = held.graph, held.factors, held.each, held.rows, reference(bounded)
     if len(rows.see):
-        _see(bodies, graph, factors, held.reply, rows, count)
+        _see(world, work, motion, graph, factors, held.reply, rows, count)
     for _ in range(BREAKS):
         share = 0.5
         while True:
-            _hold(bodies, rules, held, comps, lo, hi, rows, count, False)
+            _hold(world, work, motion, rules, held, comps, lo, hi, rows, count, False)
             for r in range(count):
                 c = rows.of[r]
                 if rows.kind[r] == NORMAL_ROW:
@@ -1142,9 +1115,9 @@ def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
                     if rows.grip[r] > 0.0:
                         system.row[c, 1, IMPULSE] = rows.impulse[r + 1]
                         system.row[c, 2, IMPULSE] = rows.impulse[r + 2]
-            if not lively or share < 0.0 or not _gains(rules, system, bodies.change, island):
+            if not lively or share < 0.0 or not _gains(rules, system, work.change, island):
                 break
-            _clear(graph, system, island, comps, lo, hi, bodies.change)
+            _clear(graph, system, island, comps, lo, hi, work.change)
             for r in range(count):
                 rows.impulse[r] = 0.0
                 c = rows.of[r]
@@ -1158,21 +1131,21 @@ def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
             struck = rows.kind[r] == STOP_ROW and rows.strong[r] == math.inf
             touched = touched or ((rows.kind[r] == NORMAL_ROW or struck) and rows.impulse[r] > 0.0)
         for i in range(lo, hi):
-            _told(bodies, rules, graph, each, lines, held.calm, comps[i], touched or deep)
+            _told(world, work, motion, rules, graph, each, lines, held.calm, comps[i], touched or deep)
         for r in range(count):
             if rows.kind[r] >= STOP_ROW:
-                _tell(bodies, rules, each, rows, r)
+                _tell(world, work, motion, rules, each, rows, r)
         broke = False
         for i in range(lo, hi):
             if _broken(graph, each, lines, comps[i]):
                 broke = True
-                _factor(bodies, rules, graph, factors, each, lines, comps[i])
+                _factor(world, work, motion, rules, graph, factors, each, lines, comps[i])
         if not broke:
             break
         # What broke has not held: all impulses are found once more.
-        _clear(graph, system, island, comps, lo, hi, bodies.change)
+        _clear(graph, system, island, comps, lo, hi, work.change)
         if len(rows.see):
-            _see(bodies, graph, factors, held.reply, rows, count)
+            _see(world, work, motion, graph, factors, held.reply, rows, count)
         for r in range(count):
             rows.impulse[r] = 0.0
             if rows.kind[r] >= STOP_ROW and each.state[rows.of[r], BROKEN] > 0.0:
@@ -1188,7 +1161,7 @@ def _seen(rows, count):
 
 
 @njit(**BARE)
-def _told(bodies, rules, graph, each, lines, calm, c, touched):
+def _told(world, work, motion, rules, graph, each, lines, calm, c, touched):
     """Write down what the rows that hold have done."""
     h, state = rules.substep_dt, each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
@@ -1196,13 +1169,13 @@ def _told(bodies, rules, graph, each, lines, calm, c, touched):
         if n >= 0:
             calm[n] = not touched
             if touched:
-                bodies.touching[n] = True
+                motion.touching[n] = True
             continue
         j = -1 - n
         a, b = each.body[j, 0], each.body[j, 1]
-        speed = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
-        state[j, SPEED] = speed + _reads_six(each.axis, j, 0, bodies.free, a, b)
-        state[j, SPEED] += _reads_six(each.axis, j, 0, bodies.change, a, b)
+        speed = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
+        state[j, SPEED] = speed + _reads_six(each.axis, j, 0, work.free, a, b)
+        state[j, SPEED] += _reads_six(each.axis, j, 0, work.change, a, b)
         for x in range(3):
             state[j, PULL + x] = state[j, TWIST + x] = state[j, DRIVE + x] = state[j, SOFT + x] = 0.0
         state[j, STOP] = state[j, FRESH] = 0.0
@@ -1212,7 +1185,7 @@ def _told(bodies, rules, graph, each, lines, calm, c, touched):
                 continue
             if lines.active[j, e] == 2:
                 state[j, SOFT + (e - 3 if each.kind[j] == BALL else 0)] = lines.impulse[j, e]
-            _add_pull(bodies.matrix, each, j, lines.line, j, e, lines.impulse[j, e] / h)
+            _add_pull(work.matrix, each, j, lines.line, j, e, lines.impulse[j, e] / h)
 
 
 @njit(**BARE)
@@ -1226,12 +1199,12 @@ def _add_pull(matrix, each, j, line, i, e, force):
 
 
 @njit(**BARE)
-def _tell(bodies, rules, each, rows, r):
+def _tell(world, work, motion, rules, each, rows, r):
     """Write down what a bounded row of a joint has done."""
     j, kind, impulse, h, state = rows.of[r], rows.kind[r], rows.impulse[r], rules.substep_dt, each.state
     pull = (rows.row[r, 0], rows.row[r, 1], rows.row[r, 2])
     twist = sub(
-        (rows.row[r, 3], rows.row[r, 4], rows.row[r, 5]), cross(_arm(bodies.matrix, each.body, each.anchor, j, 0), pull)
+        (rows.row[r, 3], rows.row[r, 4], rows.row[r, 5]), cross(_arm(work.matrix, each.body, each.anchor, j, 0), pull)
     )
     for x in range(3):
         state[j, PULL + x] += impulse / h * pull[x]
@@ -1241,7 +1214,7 @@ def _tell(bodies, rules, each, rows, r):
     elif kind == DRIVE_ROW:
         state[j, DRIVE] = impulse
         if rows.strong[r] > 0.0:
-            before = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, each.body[j, 0], each.body[j, 1])
+            before = _reads(each.axis, j, 0, motion.velocity, motion.angular, each.body[j, 0], each.body[j, 1])
             mean = 0.5 * (before + state[j, SPEED])
             own = impulse + (rows.grip[r] if mean > 0.0 else -rows.grip[r])
             state[j, DRIVE + 1] = min(max(own, -rows.strong[r]), rows.strong[r])
@@ -1272,14 +1245,14 @@ def _broken(graph, each, lines, c):
 
 
 @njit(**FAST)
-def _islands(bodies, parent, number, graph, where):
+def _islands(world, work, motion, graph, where):
     """Contacts and connected joints ordered by island: bodies that move, joined by both.
 
     Returns:
         start [I + 1] and order [C] of contacts, and the same of what joints connect, of which those that sleep are left
         out.
     """
-    connected = len(graph.comp) - 1
+    parent, number, connected = work.parent, work.number, len(graph.comp) - 1
     for k in range(len(graph.node)):
         if graph.node[k] >= 0:
             parent[graph.node[k]], number[graph.node[k]] = graph.node[k], -1
@@ -1294,11 +1267,11 @@ def _islands(bodies, parent, number, graph, where):
                 if own[c] >= 0:
                     join(parent, own[c], graph.node[k])
                 own[c] = graph.node[k]
-        if asleep(bodies.island, graph, c):
+        if asleep(motion.island, graph, c):
             own[c] = -1
     for c in range(len(where)):
         a, b = where[c, 2], where[c, 3]
-        if bodies.moves[a] and bodies.moves[b]:
+        if world.moves[a] and world.moves[b]:
             join(parent, a, b)
     islands = 0
     label, group = np.empty(len(where), np.int64), np.empty(connected, np.int64)
@@ -1340,17 +1313,17 @@ def _sorted(label, count):
 @njit(**FAST)
 def solve_with_joints(world, work, motion, rules, manifolds, held):
     """Solve for the impulses of all contacts and joints, as `impulses.solve_contacts`, which it returns what of."""
-    bodies = _moving(world, work, motion)
     graph = held.graph
     found = _equations(world, work, motion, rules, manifolds)
-    start, order, begin, comps = _islands(bodies, work.parent, work.number, graph, found.where)
+    start, order, begin, comps = _islands(world, work, motion, graph, found.where)
     system = System(found.where, found.row, found.friction, found.wanted, found.pushed, found.calm, start, order)
+    equations = reference(system)
     for i in range(len(start) - 1):
         if begin[i + 1] > begin[i]:
-            _solve_island(bodies, work.shift, rules, system, held, comps, begin[i], begin[i + 1], np.int64(i))
+            _solve_island(world, work, motion, rules, equations, held, comps, begin[i], begin[i + 1], np.int64(i))
         else:
-            _solve(bodies.inverse_mass, rules, system, bodies.change, work.shift, np.int64(i))
-    remembered(manifolds, system)
+            _solve(world.inverse_mass, rules, equations, work.change, work.shift, np.int64(i))
+    remembered(manifolds, equations)
     return system
 
 
@@ -1384,7 +1357,7 @@ def _resting(touching, graph, c):
 
 
 @njit(**BARE)
-def _kick(bodies, rules, graph, each, lines, c, share):
+def _kick(world, work, motion, rules, graph, each, lines, c, share):
     """A share of what springs, damping, motors and friction have given in the last inner step, to velocities."""
     state = each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
@@ -1404,46 +1377,44 @@ def _kick(bodies, rules, graph, each, lines, c, share):
                 line = lines.line
                 _write_turn(line, j, row, _unit(e))
             eased = _eased(
-                bodies.moves, bodies.inverse_mass, bodies.inverse, rules.rotation, line, i, row, a, b, lines.eased
+                world.moves, world.inverse_mass, work.inverse, rules.rotation, line, i, row, a, b, lines.eased
             )
             if each.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # of which the motor's work is told
-                before = _reads(line, i, row, bodies.velocity, bodies.angular, a, b)
+                before = _reads(line, i, row, motion.velocity, motion.angular, a, b)
                 state[j, GIVEN] += share * state[j, DRIVE + 1] * (before + 0.5 * impulse * eased)
             for s in range(2):
                 body = each.body[j, s]
-                if body >= 0 and bodies.moves[body]:
+                if body >= 0 and world.moves[body]:
                     for x in range(3):
-                        bodies.velocity[body, x] += impulse * lines.eased[0, 12 + 6 * s + x]
-                        bodies.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
+                        motion.velocity[body, x] += impulse * lines.eased[0, 12 + 6 * s + x]
+                        motion.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
 
 
 @njit(**FAST)
 def begin_step(world, work, motion, rules, held):
     """Velocities at an instant become those of the inner step before it, see `advance._shifted`. Where nothing is known
     of impulses they are found first."""
-    bodies = _moving(world, work, motion)
     graph, each, lines = held.graph, held.each, held.rows
     fresh = False
     for j in range(len(each.body)):
         each.state[j, GIVEN] = 0.0
         fresh = fresh or each.state[j, FRESH] > 0.0
     for c in range(len(graph.comp) - 1):
-        if not asleep(bodies.island, graph, c):
+        if not asleep(motion.island, graph, c):
             _ready(world, work, rules, graph, c, 1.0)
     if fresh:
         _find_first(world, work, motion, rules, held)
     for c in range(len(graph.comp) - 1):
-        if not asleep(bodies.island, graph, c) and not _resting(bodies.touching, graph, c):
+        if not asleep(motion.island, graph, c) and not _resting(motion.touching, graph, c):
             for k in range(graph.comp[c], graph.comp[c + 1]):
                 if graph.node[k] < 0:
-                    _coordinate(each, bodies.position, bodies.matrix, -1 - graph.node[k])
-            _kick(bodies, rules, graph, each, lines, c, -0.5)
+                    _coordinate(each, motion.position, work.matrix, -1 - graph.node[k])
+            _kick(world, work, motion, rules, graph, each, lines, c, -0.5)
 
 
 @njit(**FAST)
 def _find_first(world, work, motion, rules, held):
     """The impulses of joints that nothing is known of, as if there were no contact."""
-    bodies = _moving(world, work, motion)
     graph, each = held.graph, held.each
     from_contacts = System(
         np.empty((0, 4), np.int64), np.empty((0, 3, WIDTH)), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)),
@@ -1455,53 +1426,59 @@ def _find_first(world, work, motion, rules, held):
         fresh = False
         for k in range(graph.comp[c], graph.comp[c + 1]):
             fresh = fresh or (graph.node[k] < 0 and each.state[-1 - graph.node[k], FRESH] > 0.0)
-        if not fresh or asleep(bodies.island, graph, c):
+        if not fresh or asleep(motion.island, graph, c):
             continue
         one[0] = c
-        _solve_island(bodies, work.shift, rules, from_contacts, held, one, np.int64(0), np.int64(1), np.int64(0))
+        _solve_island(
+            world, work, motion, rules, reference(from_contacts), held, one, np.int64(0), np.int64(1), np.int64(0)
+        )
         for k in range(graph.comp[c], graph.comp[c + 1]):
             if graph.node[k] >= 0:
-                bodies.touching[graph.node[k]] = False
+                motion.touching[graph.node[k]] = False
             else:
                 each.state[-1 - graph.node[k], GIVEN] = 0.0
+
+
+@njit(**BARE)
+def _hold_steady(world, work, motion, rules, held, one, bounded, count):
+    rows = reference(bounded)
+    if len(rows.see):
+        _see(world, work, motion, held.graph, held.factors, held.reply, rows, count)
+    _hold(world, work, motion, rules, held, one, np.int64(0), np.int64(1), rows, count, True)
 
 
 @njit(**FAST)
 def end_step(world, work, motion, rules, held):
     """Velocities of the last inner step become those at its end, which joints let be."""
-    bodies = _moving(world, work, motion)
-    graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
+    graph, each, lines = held.graph, held.each, held.rows
     one = np.empty(1, np.int64)
     for c in range(len(graph.comp) - 1):
-        if not asleep(bodies.island, graph, c):
+        if not asleep(motion.island, graph, c):
             _ready(world, work, rules, graph, c, 0.0)
     assemble(world, work, motion, rules, held, False)
     for c in range(len(graph.comp) - 1):
-        if asleep(bodies.island, graph, c) or _resting(bodies.touching, graph, c):
+        if asleep(motion.island, graph, c) or _resting(motion.touching, graph, c):
             continue
-        _kick(bodies, rules, graph, each, lines, c, 0.5)
+        _kick(world, work, motion, rules, graph, each, lines, c, 0.5)
         one[0] = c
         rows = _room(np.int64(2 * (graph.comp[c + 1] - graph.comp[c])))
-        count = _limited(bodies, rules, graph, each, c, rows, np.int64(0), True)
-        rows = _seen(rows, count if count <= DENSE else 0)
-        if len(rows.see):
-            _see(bodies, graph, factors, held.reply, rows, count)
-        _hold(bodies, rules, held, one, np.int64(0), np.int64(1), rows, count, True)
+        count = _limited(world, work, motion, rules, graph, each, c, reference(rows), np.int64(0), True)
+        _hold_steady(world, work, motion, rules, held, one, _seen(rows, count if count <= DENSE else 0), count)
         for k in range(graph.comp[c], graph.comp[c + 1]):
             n = graph.node[k]
             if n >= 0:
                 for x in range(3):
-                    bodies.velocity[n, x] += bodies.change[n, x]
+                    motion.velocity[n, x] += work.change[n, x]
                     if rules.rotation:
-                        bodies.angular[n, x] += bodies.change[n, 3 + x]
+                        motion.angular[n, x] += work.change[n, 3 + x]
             else:
                 j = -1 - n
                 a, b = each.body[j, 0], each.body[j, 1]
-                speed = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
-                each.state[j, SPEED] = speed + _reads_six(each.axis, j, 0, bodies.change, a, b)
+                speed = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
+                each.state[j, SPEED] = speed + _reads_six(each.axis, j, 0, work.change, a, b)
     for j in range(len(each.body)):
         a, b = each.body[j, 0], each.body[j, 1]
-        each.state[j, SPEED] = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
+        each.state[j, SPEED] = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
 
 
 @njit(**BARE)

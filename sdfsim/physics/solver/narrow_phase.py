@@ -25,7 +25,6 @@ from sdfsim.physics.solver.distance import (
     SIZE,
     SPHERE,
     distance_alone,
-    solids,
 )
 from sdfsim.physics.solver.manifold import (
     FOUND,
@@ -37,6 +36,7 @@ from sdfsim.physics.solver.manifold import (
     thinned,
     write,
 )
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.surface_distance import (
     KEYS,
     at_least,
@@ -98,7 +98,7 @@ class Near(NamedTuple):
 
 
 @njit(**FAST)
-def broad_phase(shapes, world, work, motion, rules, span, old):
+def broad_phase(shapes, world, work, motion, rules, span, old, threads):
     """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
 
     Of `work` it sets how far each body may go until it must be looked around again, and who has somebody near.
@@ -109,7 +109,7 @@ def broad_phase(shapes, world, work, motion, rules, span, old):
     swept(world, work, motion, rules, span)
     pairs = near_pairs(world, motion, work.low, work.high)
     manifolds = carried(world, motion, pairs, old)
-    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin)
+    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin, threads)
     for p in range(len(pairs)):
         if near.count[p, 0] + near.count[p, 1] > 0:
             work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True
@@ -119,7 +119,7 @@ def broad_phase(shapes, world, work, motion, rules, span, old):
 @njit(**BARE)
 def pair_kind(shapes, s, t):
     """How two shapes are looked at."""
-    table, start = shapes.table, shapes.piece_start
+    table, start = shapes.table, shapes.solids.start
     one, other = is_round(table, s), is_round(table, t)
     first, second = start[s + 1] > start[s], start[t + 1] > start[t]
     if one or other:
@@ -132,8 +132,8 @@ def pair_kind(shapes, s, t):
     return SOLIDS if (first or table[s, KIND] == PLANE) and (second or table[t, KIND] == PLANE) else SURFACES
 
 
-@njit(**FAST)
-def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
+@njit(**FAST, inline="always")
+def near_parts(shapes, world, motion, matrix, pairs, ways, reach, threads):
     """What of P pairs is nearer than the bodies may go; [N] `ways` of each."""
     count = len(pairs)
     start = np.zeros((count, 2), np.int64)
@@ -147,8 +147,8 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
             if way == SURFACES and not is_round(shapes.table, own):
                 total += shapes.clump_leaf[shapes.clump_start[own + 1]] - shapes.clump_leaf[shapes.clump_start[own]]
             elif way == SOLIDS and side == 0:
-                pieces = shapes.piece_start[s + 1] - shapes.piece_start[s]
-                total += pieces * max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
+                pieces = shapes.solids.start[s + 1] - shapes.solids.start[s]
+                total += pieces * max(1, shapes.solids.start[t + 1] - shapes.solids.start[t])
     wide = 0
     for leaf in range(len(shapes.leaf_node) - 1):
         wide = max(wide, shapes.leaf_node[leaf + 1] - shapes.leaf_node[leaf])
@@ -157,18 +157,14 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
         np.full(count, -math.inf), np.full(count, -math.inf), np.empty(total, np.int32), np.empty(total * wide),
         np.empty(total, np.bool_), np.empty((total, 3)), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
-    _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, world.threads)
-    return near
-
-
-@njit(**INLINED)
-def _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, threads):
-    if threads.ndim > 1:  # known when it is compiled
+    parts = reference(near)
+    if threads is not None:  # known when it is compiled
         if len(pairs) >= MANY:
-            _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
-            return
+            _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts)
+            return near
     for p in range(len(pairs)):
-        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
+        _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p)
+    return near
 
 
 @njit(parallel=True, **FAST)
@@ -227,7 +223,7 @@ def origin(position, matrix, coms, body):
 @njit(**BARE)
 def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
     """The pairs of convex pieces whose balls are near each other."""
-    convex = solids(shapes)
+    convex = shapes.solids
     s, t = world.shape[a], world.shape[b]
     offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
     plane, up = shapes.table[t, KIND] == PLANE, turn(matrix, b, (0.0, 0.0, 1.0))
@@ -257,18 +253,13 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
     near.count[p, 0] = at - near.start[p, 0]
 
 
-@njit(**BARE)
-def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
+@njit(**BARE, inline="always")
+def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, threads):
     """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
 
     `gone` [N] is how far any point of a body may have moved since `near` was made.
     """
-    _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, world.threads)
-
-
-@njit(**INLINED)
-def _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, threads):
-    if threads.ndim > 1:  # known when it is compiled
+    if threads is not None:  # known when it is compiled
         if len(near.start) >= MANY:
             _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
             return
@@ -278,8 +269,13 @@ def _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
 @njit(parallel=True, **FAST)
 def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
     for i in prange(SHARES):
-        t, scratch = np.int64(i), scratch_room()
-        _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, t, np.int64(SHARES))
+        _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch_room(), np.int64(i))
+
+
+@njit(**BARE)
+def _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first):
+    room = reference(scratch)
+    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, room, first, np.int64(SHARES))
 
 
 @njit(**BARE)
@@ -289,7 +285,7 @@ def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, s
         _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
 
 
-@njit(**INLINED)
+@njit(**BARE, inline="always")
 def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     if near.count[p, 0] + near.count[p, 1] == 0:
@@ -402,7 +398,7 @@ def _approach_margin(world, motion, rules, a, b):
 @njit(**BARE)
 def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p):
     """The points at which the convex pieces of two bodies touch or may soon; how many."""
-    convex, found, polygons = solids(shapes), scratch.found, scratch.polygons
+    convex, found, polygons = shapes.solids, scratch.found, scratch.polygons
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
     offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
@@ -508,7 +504,7 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
     where all are farther, and any that is less than `enough`. `went` is how much nearer two points may have come since
     `near` was made; whether the poses are those of the bodies, so that `near` may take up how far parts are
     (`refresh`)."""
-    table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, solids(shapes)
+    table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, shapes.solids
     s, t = shape[pairs[p, 0]], shape[pairs[p, 1]]
     way = pair_kind(shapes, s, t)
     if way == SOLIDS:

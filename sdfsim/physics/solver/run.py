@@ -11,9 +11,11 @@ from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
 from sdfsim.physics.solver.joints import given, stored
 from sdfsim.physics.solver.record import no_edges
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.survey import broken, energy, touching
 from sdfsim.physics.solver.vectors import BARE, ENTRY, add, dot, get, put, sub
 
+HELD, THREADS, NOTE = 6, 7, 8  # the places of those arguments of `run_steps` that may be None
 ROOM = 64  # contact points that a recording has room for at first
 
 
@@ -39,11 +41,15 @@ class Kept(NamedTuple):
 
 
 @njit(**ENTRY, nogil=True)
-def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most, kept, within, steps):
+def run_steps(shapes, world, work, motion, rules, manifolds, held, threads, note, script, most, kept, within, steps):
     """Advance `motion`, and what `held` knows of joints, by so many steps, in place; the first state that cannot be
     ends it early.
 
     Args:
+        held: None where no joint holds bodies; what these need is then not compiled.
+        threads: None, or True where there may be so many pairs that they are worth their while: loops on all cores take
+            a quarter of the time in which all is compiled.
+        note: True where what contacts did in the step is wanted, see `record`, else None.
         most: [5] what a state may be, see `survey.broken`.
         within: bodies that are no farther apart touch.
 
@@ -53,6 +59,9 @@ def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most,
         it; where that body was before that step; what pulls have given; and of all steps that are kept, one after the
         other, the pairs of bodies that touch [C, 2] and the points [C, 3] where they do.
     """
+    shapes, world, work, motion, rules = (
+        reference(shapes), reference(world), reference(work), reference(motion), reference(rules),
+    )  # fmt: skip
     going, dt = world.going, rules.substep_dt * rules.substeps
     place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
     pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
@@ -65,7 +74,7 @@ def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most,
         for i in range(len(going)):
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
-        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds, held)
+        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds, held, threads, note)
         for s in range(len(script.body)):
             b = script.body[s]
             for x in range(3):
@@ -80,17 +89,20 @@ def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most,
                 )
                 if wrong >= 0:
                     return manifolds, edges, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
-        pulled = _pulled(going, work.wrench, motion, place, spin, dt) + given(held.each)
+        pulled = _pulled(going, work.wrench, motion, place, spin, dt)
+        if held is not None:
+            pulled += given(held.each)
         total += pulled
         if len(kept.depth):
             kept.position[k], kept.orientation[k] = motion.position, motion.orientation
             kept.velocity[k], kept.angular_velocity[k] = motion.velocity, motion.angular
             kept.energy[k, 0], kept.energy[k, 1] = _energies(world, motion, rules)
-            kept.energy[k, 1] += stored(held.each)
-            for j in range(len(held.each.body)):
-                kept.joint[k, j, 0] = held.each.state[j, COORD]
-                for x in range(6):
-                    kept.joint[k, j, 1 + x] = held.each.state[j, PULL + x]
+            if held is not None:
+                kept.energy[k, 1] += stored(held.each)
+                for j in range(len(held.each.body)):
+                    kept.joint[k, j, 0] = held.each.state[j, COORD]
+                    for x in range(6):
+                        kept.joint[k, j, 1 + x] = held.each.state[j, PULL + x]
             kept.energy[k, 2] = pulled
             here = touching(manifolds, motion.position, motion.orientation, within)
             while found + len(here.pair) > len(pair):
