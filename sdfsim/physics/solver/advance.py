@@ -39,12 +39,11 @@ from sdfsim.physics.solver.vectors import (
 
 
 @njit(**FAST, inline="always")
-def advance(shapes, world, work, motion, rules, manifolds, held, threads, note):
+def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note):
     """Advance `motion` by one step, in place, and what is known of the joints that hold bodies; time is that of
     the bodies that go, however many others there are.
 
-    All but `manifolds` and `held` are references. `held` is None where there is no joint: what asks for it is then not
-    compiled. So is `threads` where there are too few bodies for them, and `note` where nobody asks what contacts did.
+    All structures but `manifolds` and `held` are references. For what may be None see `run_steps`.
 
     Returns:
         The manifolds at its end; what contacts did, where it is to be noted; and counts: pairs looked at, contacts of
@@ -56,14 +55,14 @@ def advance(shapes, world, work, motion, rules, manifolds, held, threads, note):
     for b in world.going:
         to_matrix(motion.orientation, b, matrix)
         work.met[b] = False
-    manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, threads)
+    manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
     stirred = rules.sleep
     while stirred:
         stirred = woken(world, motion, reference(manifolds), reference(near))
         if held is not None:
             stirred = stirred or roused(world, motion, joints)
         if stirred:
-            manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, threads)
+            manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
     contacts, edges = 0, no_edges()
     _shifted(world, work, motion, rules, -0.5)
@@ -73,7 +72,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, threads, note):
         for b in world.going:
             if work.gone[b] > work.ways[b] and world.moves[b]:
                 left = rules.substep_dt * (rules.substeps - k)
-                manifolds, near = broad_phase(shapes, world, work, motion, rules, left, manifolds, threads)
+                manifolds, near = broad_phase(shapes, world, work, motion, rules, left, manifolds, surfaces, threads)
                 break
         # Both are used again at the end of the step, so that the references hold.
         points, parts = reference(manifolds), reference(near)
@@ -90,7 +89,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, threads, note):
                 _prepare(world, motion, matrix, inverse, work.wrench, rules, free, b)
         if held is not None:
             assemble(world, work, motion, rules, joints, True)
-        narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.gone, work.scratch, threads)
+        narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.gone, work.scratch, surfaces, threads)
         heed_supports(shapes, world, work, motion, rules, points, parts, work.scratch)
         if held is not None:
             system = solve_with_joints(world, work, motion, rules, points, joints)
@@ -99,7 +98,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, threads, note):
         contacts = len(system.where)
         if note is not None:
             edges = noted(motion, matrix, points, system, k / rules.substeps, edges)
-        time_of_impact(shapes, world, work, motion, rules, points, parts, work.scratch)
+        time_of_impact(shapes, world, work, motion, rules, points, parts, work.scratch, surfaces)
         if held is not None:
             kept_together(joints, work.part)
         for b in world.going:

@@ -24,7 +24,7 @@ ROUGH = 0.5  # cells, by which a grid is off at an edge at most
 LEVEL = 4.0  # slops: so much higher than the support a body may reach and be no wall
 
 
-@njit(**BARE)
+@njit(**BARE, inline="always")
 def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
     """Give contacts with what lies below a support, and beside it, the support's normal, or void them."""
     latest, following = work.latest, near.following

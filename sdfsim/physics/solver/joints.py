@@ -80,6 +80,7 @@ from sdfsim.physics.solver.vectors import (
     to_matrix,
     turn,
     turned_by,
+    vector,
 )
 
 ROWS = 6
@@ -208,17 +209,16 @@ def asleep(island, graph, c):
 
 
 @njit(**BARE)
-def _arm(matrix, body, anchor, j, s):
-    b = body[j, s]
-    a = (anchor[j, s, 0], anchor[j, s, 1], anchor[j, s, 2])
-    return a if b < 0 else turn(matrix, b, a)
+def _in_world(matrix, b, v):
+    """A vector [3] in the axes of body b (below 0 for the world) along those of the world."""
+    return vector(v) if b < 0 else turn(matrix, b, vector(v))
 
 
 @njit(**BARE)
-def _axis(matrix, body, axes, j, s, k):
-    b = body[j, s]
-    a = (axes[j, s, k, 0], axes[j, s, k, 1], axes[j, s, k, 2])
-    return a if b < 0 else turn(matrix, b, a)
+def _arms(each, matrix, j):
+    """From the centres of mass to the anchors of a joint."""
+    body, anchor = each.body, each.anchor
+    return _in_world(matrix, body[j, 0], anchor[j, 0]), _in_world(matrix, body[j, 1], anchor[j, 1])
 
 
 @njit(**BARE)
@@ -243,9 +243,8 @@ def _unit(k):
 def _errors(each, position, matrix, j, out):
     """By how much the rows of a joint do not hold."""
     kind = each.kind[j]
-    way = _between(
-        position, each.body, j, _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
-    )
+    arm, other = _arms(each, matrix, j)
+    way = _between(position, each.body, j, arm, other)
     for e in range(ROWS):
         out[j, e] = 0.0
     if kind == DISTANCE:
@@ -254,77 +253,77 @@ def _errors(each, position, matrix, j, out):
         return
     first = 3
     if kind == SLIDER:
-        out[j, 0] = dot(_axis(matrix, each.body, each.axes, j, 1, 1), way)
-        out[j, 1] = dot(_axis(matrix, each.body, each.axes, j, 1, 2), way)
+        out[j, 0] = dot(_in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]), way)
+        out[j, 1] = dot(_in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]), way)
         first = 2
     else:
         out[j, 0], out[j, 1], out[j, 2] = way[0], way[1], way[2]
     if kind == HINGE:
-        a = _axis(matrix, each.body, each.axes, j, 0, 0)
-        out[j, 3] = dot(a, _axis(matrix, each.body, each.axes, j, 1, 1))
-        out[j, 4] = dot(a, _axis(matrix, each.body, each.axes, j, 1, 2))
+        a = _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0])
+        out[j, 3] = dot(a, _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]))
+        out[j, 4] = dot(a, _in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]))
     elif kind != BALL:
         for k in range(3):
             out[j, first + k] = dot(
-                _axis(matrix, each.body, each.axes, j, 0, (k + 1) % 3),
-                _axis(matrix, each.body, each.axes, j, 1, (k + 2) % 3),
+                _in_world(matrix, each.body[j, 0], each.axes[j, 0, (k + 1) % 3]),
+                _in_world(matrix, each.body[j, 1], each.axes[j, 1, (k + 2) % 3]),
             )
 
 
 @njit(**BARE)
-def _write(line, j, e, pull, arm, other):
-    """A row along a direction at two places."""
+def _write(row, pull, arm, other):
+    """A row [12] along a direction at two places."""
     one, two = cross(arm, pull), cross(other, pull)
     for x in range(3):
-        line[j, e, x], line[j, e, 3 + x], line[j, e, 6 + x], line[j, e, 9 + x] = pull[x], one[x], -pull[x], -two[x]
+        row[x], row[3 + x], row[6 + x], row[9 + x] = pull[x], one[x], -pull[x], -two[x]
 
 
 @njit(**BARE)
-def _write_turn(line, j, e, axis):
-    """A row about an axis."""
+def _write_turn(row, axis):
+    """A row [12] about an axis."""
     for x in range(3):
-        line[j, e, x] = line[j, e, 6 + x] = 0.0
-        line[j, e, 3 + x], line[j, e, 9 + x] = axis[x], -axis[x]
+        row[x] = row[6 + x] = 0.0
+        row[3 + x], row[9 + x] = axis[x], -axis[x]
 
 
 @njit(**BARE)
 def _coordinate(each, position, matrix, j):
     """The angle, position or length of a joint, and the row along which it changes."""
     kind, state = each.kind[j], each.state
-    arm, other = _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
+    arm, other = _arms(each, matrix, j)
     way = _between(position, each.body, j, arm, other)
-    one = each.axis
     if kind == HINGE:
         a, b, c = (
-            _axis(matrix, each.body, each.axes, j, 0, 1),
-            _axis(matrix, each.body, each.axes, j, 1, 1),
-            _axis(matrix, each.body, each.axes, j, 1, 2),
+            _in_world(matrix, each.body[j, 0], each.axes[j, 0, 1]),
+            _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]),
+            _in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]),
         )
         angle = math.atan2(dot(a, c), dot(a, b))
         turns = math.floor((state[j, COORD] - angle) / (2.0 * math.pi) + 0.5)
         state[j, COORD] = angle + 2.0 * math.pi * turns
-        _write_turn(one, j, 0, _axis(matrix, each.body, each.axes, j, 0, 0))
+        _write_turn(each.axis[j, 0], _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0]))
     elif kind == SLIDER:
-        a = _axis(matrix, each.body, each.axes, j, 1, 0)
+        a = _in_world(matrix, each.body[j, 1], each.axes[j, 1, 0])
         state[j, COORD] = dot(a, way)
-        _write(one, j, 0, a, arm, add(other, way))
+        _write(each.axis[j, 0], a, arm, add(other, way))
     elif kind == BALL:
-        a, b = _axis(matrix, each.body, each.axes, j, 0, 0), _axis(matrix, each.body, each.axes, j, 1, 0)
+        a = _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0])
+        b = _in_world(matrix, each.body[j, 1], each.axes[j, 1, 0])
         n = cross(a, b)
         s = norm(n)
         state[j, COORD] = math.atan2(s, dot(a, b))
-        _write_turn(one, j, 0, scale(n, -1.0 / s) if s > 1e-9 else (0.0, 0.0, 0.0))
+        _write_turn(each.axis[j, 0], scale(n, -1.0 / s) if s > 1e-9 else (0.0, 0.0, 0.0))
     elif kind == DISTANCE:
         length = norm(way)
         state[j, COORD] = length
-        _write(one, j, 0, scale(way, 1.0 / length) if length > 1e-12 else (0.0, 0.0, 1.0), arm, other)
+        _write(each.axis[j, 0], scale(way, 1.0 / length) if length > 1e-12 else (0.0, 0.0, 1.0), arm, other)
 
 
 @njit(**BARE)
 def _rows(each, lines, position, matrix, j):
     """The rows that hold, as bodies are now."""
     kind, line, active = each.kind[j], lines.line, lines.active
-    arm, other = _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
+    arm, other = _arms(each, matrix, j)
     for e in range(ROWS):
         active[j, e] = 0
         lines.soft[j, e] = 0.0
@@ -337,70 +336,69 @@ def _rows(each, lines, position, matrix, j):
     first = 3
     if kind == SLIDER:
         far = add(other, _between(position, each.body, j, arm, other))
-        _write(line, j, 0, _axis(matrix, each.body, each.axes, j, 1, 1), arm, far)
-        _write(line, j, 1, _axis(matrix, each.body, each.axes, j, 1, 2), arm, far)
+        _write(line[j, 0], _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]), arm, far)
+        _write(line[j, 1], _in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]), arm, far)
         first = 2
     else:
         for k in range(3):
-            _write(line, j, k, _unit(k), arm, other)
+            _write(line[j, k], _unit(k), arm, other)
     for e in range(first):
         active[j, e] = 1
     if kind == HINGE:
-        a = _axis(matrix, each.body, each.axes, j, 0, 0)
+        a = _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0])
         for k in range(2):
-            _write_turn(line, j, 3 + k, cross(a, _axis(matrix, each.body, each.axes, j, 1, 1 + k)))
+            _write_turn(line[j, 3 + k], cross(a, _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1 + k])))
             active[j, 3 + k] = 1
     elif kind != BALL:
         for k in range(3):
             one, two = (
-                _axis(matrix, each.body, each.axes, j, 0, (k + 1) % 3),
-                _axis(matrix, each.body, each.axes, j, 1, (k + 2) % 3),
+                _in_world(matrix, each.body[j, 0], each.axes[j, 0, (k + 1) % 3]),
+                _in_world(matrix, each.body[j, 1], each.axes[j, 1, (k + 2) % 3]),
             )
-            _write_turn(line, j, first + k, cross(one, two))
+            _write_turn(line[j, first + k], cross(one, two))
             active[j, first + k] = 1
 
 
 @njit(**BARE)
-def _reads(line, j, e, velocity, angular, a, b):
-    """What a row says of velocities [N, 3] of both bodies."""
+def _reads(row, motion, a, b):
+    """What a row [12] says of the velocities of both bodies."""
     total = 0.0
     for x in range(3):
         if a >= 0:
-            total += line[j, e, x] * velocity[a, x] + line[j, e, 3 + x] * angular[a, x]
+            total += row[x] * motion.velocity[a, x] + row[3 + x] * motion.angular[a, x]
         if b >= 0:
-            total += line[j, e, 6 + x] * velocity[b, x] + line[j, e, 9 + x] * angular[b, x]
+            total += row[6 + x] * motion.velocity[b, x] + row[9 + x] * motion.angular[b, x]
     return total
 
 
 @njit(**BARE)
-def _reads_six(line, j, e, change, a, b):
+def _reads_six(row, change, a, b):
     """Likewise of [N, 6]."""
     total = 0.0
     for x in range(6):
         if a >= 0:
-            total += line[j, e, x] * change[a, x]
+            total += row[x] * change[a, x]
         if b >= 0:
-            total += line[j, e, 6 + x] * change[b, x]
+            total += row[6 + x] * change[b, x]
     return total
 
 
 @njit(**BARE)
-def _eased(moves, inverse_mass, inverse, rotation, line, j, e, a, b, out):
-    """Write what a unit of impulse along a row makes of both bodies' velocities by themselves; returns what that does
-    along the row."""
+def _eased(world, work, rules, row, a, b, out):
+    """Write what a unit of impulse along a row [12] makes of both bodies' velocities by themselves, behind the first 12
+    numbers of `out` [24]; returns what that does along the row."""
     total = 0.0
     for s in range(2):
-        body = a if s == 0 else b
+        body, first = (a, 0) if s == 0 else (b, 6)
         for x in range(6):
-            out[0, 12 + 6 * s + x] = 0.0
-        if body >= 0 and moves[body]:
-            first = 6 * s
-            spin = turn(inverse, body, (line[j, e, first + 3], line[j, e, first + 4], line[j, e, first + 5]))
+            out[12 + first + x] = 0.0
+        if body >= 0 and world.moves[body]:
+            spin = turn(work.inverse, body, (row[first + 3], row[first + 4], row[first + 5]))
             for x in range(3):
-                out[0, 12 + first + x] = inverse_mass[body] * line[j, e, first + x]
-                out[0, 15 + first + x] = spin[x] if rotation else 0.0
+                out[12 + first + x] = world.inverse_mass[body] * row[first + x]
+                out[15 + first + x] = spin[x] if rules.rotation else 0.0
             for x in range(6):
-                total += line[j, e, first + x] * out[0, 12 + first + x]
+                total += row[first + x] * out[12 + first + x]
     return total
 
 
@@ -415,18 +413,14 @@ def _springs(world, work, motion, rules, each, lines, j):
     for k in range(3 if kind == BALL else 1):
         e = 3 + k if kind == BALL else (5 if kind != DISTANCE else 1)
         if kind == BALL:
-            _write_turn(lines.line, j, e, _unit(k))
+            _write_turn(lines.line[j, e], _unit(k))
         else:
             for x in range(12):
                 lines.line[j, e, x] = each.axis[j, 0, x]
-        z = (
-            damping
-            * h
-            * _eased(world.moves, world.inverse_mass, work.inverse, rules.rotation, lines.line, j, e, a, b, lines.eased)
-        )
+        z = damping * h * _eased(world, work, rules, lines.line[j, e], a, b, lines.eased[0])
         late = 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
         give = h * (0.25 * stiff * h + damping * late)
-        before = _reads(lines.line, j, e, motion.velocity, motion.angular, a, b)
+        before = _reads(lines.line[j, e], motion, a, b)
         lines.active[j, e] = 2
         lines.soft[j, e] = 1.0 / give
         away = state[j, COORD] - number[j, REST] if stiff > 0.0 else 0.0
@@ -527,18 +521,7 @@ def _factor(world, work, motion, rules, graph, factors, each, lines, c):
         for e in range(ROWS):
             factors.diagonal[k, e, e] = -1.0
             if lines.active[j, e] > 0:
-                eased = _eased(
-                    world.moves,
-                    world.inverse_mass,
-                    work.inverse,
-                    rules.rotation,
-                    lines.line,
-                    j,
-                    e,
-                    each.body[j, 0],
-                    each.body[j, 1],
-                    lines.eased,
-                )
+                eased = _eased(world, work, rules, lines.line[j, e], each.body[j, 0], each.body[j, 1], lines.eased[0])
                 factors.diagonal[k, e, e] = -lines.soft[j, e] - SOFTEN * eased
                 if eased == 0.0:
                     factors.diagonal[k, e, e] = -1.0
@@ -613,27 +596,27 @@ def _subtract(out, t, low, p, block, q):
 @njit(**BARE)
 def _substitute(graph, factors, c, first):
     """Solve for the right side `x`, which is 0 before node `first`."""
-    x, last = factors.x, graph.comp[c + 1]
+    x, low, last = factors.x, factors.low, graph.comp[c + 1]
     for k in range(first, last):
         for p in range(graph.below[k], graph.below[k + 1]):
-            r = graph.row[p]
-            for i in range(6):
-                total = 0.0
-                for u in range(6):
-                    total += factors.low[p, i, u] * x[k, u]
-                x[r, i] -= total
+            _take_off(x, graph.row[p], low[p], k)
     for k in range(last - 1, graph.comp[c] - 1, -1):
         a, b, d, e, f, g = x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5]
         for i in range(6):
             m = factors.inverse[k, i]
             x[k, i] = m[0] * a + m[1] * b + m[2] * d + m[3] * e + m[4] * f + m[5] * g
         for p in range(graph.below[k], graph.below[k + 1]):
-            r = graph.row[p]
-            for i in range(6):
-                total = 0.0
-                for u in range(6):
-                    total += factors.low[p, u, i] * x[r, u]
-                x[k, i] -= total
+            _take_off(x, k, low[p].T, graph.row[p])
+
+
+@njit(**BARE)
+def _take_off(x, k, block, of):
+    """Take from row k of x [K, 6] what a block [6, 6] makes of another row."""
+    for i in range(6):
+        total = 0.0
+        for u in range(6):
+            total += block[i, u] * x[of, u]
+        x[k, i] -= total
 
 
 @njit(**BARE)
@@ -651,10 +634,10 @@ def _project(world, work, motion, graph, factors, each, lines, c, change, whole)
             for e in range(ROWS):
                 if lines.active[j, e] == 0:
                     continue
-                now = _reads_six(lines.line, j, e, change, a, b)
+                now = _reads_six(lines.line[j, e], change, a, b)
                 if whole:
-                    now += _reads(lines.line, j, e, motion.velocity, motion.angular, a, b)
-                    now += _reads_six(lines.line, j, e, free, a, b)
+                    now += _reads(lines.line[j, e], motion, a, b)
+                    now += _reads_six(lines.line[j, e], free, a, b)
                     now += lines.soft[j, e] * lines.impulse[j, e] - lines.wanted[j, e]
                 factors.x[k, e] = now
     _substitute(graph, factors, c, graph.comp[c])
@@ -735,8 +718,8 @@ def _limited(world, work, motion, rules, graph, each, c, rows, count, steady):
         if state[j, BROKEN] > 0.0:
             continue
         a, b, coord = each.body[j, 0], each.body[j, 1], state[j, COORD]
-        before = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
-        free = before + _reads_six(each.axis, j, 0, work.free, a, b)
+        before = _reads(each.axis[j, 0], motion, a, b)
+        free = before + _reads_six(each.axis[j, 0], work.free, a, b)
         for side in range(2):
             end = number[j, LOW + side]
             sign = 1.0 - 2.0 * side
@@ -797,19 +780,7 @@ def _begin(world, work, motion, rules, each, rows, r, kind, j, aim, base):
     rows.body[r, 0], rows.body[r, 1] = each.body[j, 0], each.body[j, 1]
     rows.base[r], rows.want[r] = base, aim - base
     rows.strong[r] = rows.grip[r] = 0.0
-    rows.give[r] = 0.0
-    for s in range(2):
-        b = each.body[j, s]
-        for x in range(6):
-            rows.row[r, 12 + 6 * s + x] = 0.0
-        if b >= 0 and world.moves[b]:
-            first = 6 * s
-            spin = turn(work.inverse, b, (rows.row[r, first + 3], rows.row[r, first + 4], rows.row[r, first + 5]))
-            for x in range(3):
-                rows.row[r, 12 + first + x] = world.inverse_mass[b] * rows.row[r, first + x]
-                rows.row[r, 15 + first + x] = spin[x] if rules.rotation else 0.0
-            for x in range(6):
-                rows.give[r] += rows.row[r, first + x] * rows.row[r, 12 + first + x]
+    rows.give[r] = _eased(world, work, rules, rows.row[r], each.body[j, 0], each.body[j, 1], rows.row[r])
 
 
 @njit(**BARE)
@@ -1173,9 +1144,9 @@ def _told(world, work, motion, rules, graph, each, lines, calm, c, touched):
             continue
         j = -1 - n
         a, b = each.body[j, 0], each.body[j, 1]
-        speed = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
-        state[j, SPEED] = speed + _reads_six(each.axis, j, 0, work.free, a, b)
-        state[j, SPEED] += _reads_six(each.axis, j, 0, work.change, a, b)
+        speed = _reads(each.axis[j, 0], motion, a, b)
+        state[j, SPEED] = speed + _reads_six(each.axis[j, 0], work.free, a, b)
+        state[j, SPEED] += _reads_six(each.axis[j, 0], work.change, a, b)
         for x in range(3):
             state[j, PULL + x] = state[j, TWIST + x] = state[j, DRIVE + x] = state[j, SOFT + x] = 0.0
         state[j, STOP] = state[j, FRESH] = 0.0
@@ -1185,14 +1156,15 @@ def _told(world, work, motion, rules, graph, each, lines, calm, c, touched):
                 continue
             if lines.active[j, e] == 2:
                 state[j, SOFT + (e - 3 if each.kind[j] == BALL else 0)] = lines.impulse[j, e]
-            _add_pull(work.matrix, each, j, lines.line, j, e, lines.impulse[j, e] / h)
+            _add_pull(work.matrix, each, j, lines.line[j, e], lines.impulse[j, e] / h)
 
 
 @njit(**BARE)
-def _add_pull(matrix, each, j, line, i, e, force):
-    """Add what a row does to the force and the torque on the first body, about its anchor."""
-    pull = (line[i, e, 0], line[i, e, 1], line[i, e, 2])
-    twist = sub((line[i, e, 3], line[i, e, 4], line[i, e, 5]), cross(_arm(matrix, each.body, each.anchor, j, 0), pull))
+def _add_pull(matrix, each, j, row, force):
+    """Add what a row [12] does to the force and the torque on the first body, about its anchor."""
+    arm, _ = _arms(each, matrix, j)
+    pull = vector(row)
+    twist = sub((row[3], row[4], row[5]), cross(arm, pull))
     for x in range(3):
         each.state[j, PULL + x] += force * pull[x]
         each.state[j, TWIST + x] += force * twist[x]
@@ -1202,19 +1174,13 @@ def _add_pull(matrix, each, j, line, i, e, force):
 def _tell(world, work, motion, rules, each, rows, r):
     """Write down what a bounded row of a joint has done."""
     j, kind, impulse, h, state = rows.of[r], rows.kind[r], rows.impulse[r], rules.substep_dt, each.state
-    pull = (rows.row[r, 0], rows.row[r, 1], rows.row[r, 2])
-    twist = sub(
-        (rows.row[r, 3], rows.row[r, 4], rows.row[r, 5]), cross(_arm(work.matrix, each.body, each.anchor, j, 0), pull)
-    )
-    for x in range(3):
-        state[j, PULL + x] += impulse / h * pull[x]
-        state[j, TWIST + x] += impulse / h * twist[x]
+    _add_pull(work.matrix, each, j, rows.row[r], impulse / h)
     if kind == STOP_ROW:
         state[j, STOP] += rows.grip[r] * impulse
     elif kind == DRIVE_ROW:
         state[j, DRIVE] = impulse
         if rows.strong[r] > 0.0:
-            before = _reads(each.axis, j, 0, motion.velocity, motion.angular, each.body[j, 0], each.body[j, 1])
+            before = _reads(each.axis[j, 0], motion, each.body[j, 0], each.body[j, 1])
             mean = 0.5 * (before + state[j, SPEED])
             own = impulse + (rows.grip[r] if mean > 0.0 else -rows.grip[r])
             state[j, DRIVE + 1] = min(max(own, -rows.strong[r]), rows.strong[r])
@@ -1302,7 +1268,9 @@ def _sorted(label, count):
             start[label[c] + 1] += 1
     for i in range(count):
         start[i + 1] += start[i]
-    fill, order = start[:-1].copy(), np.empty(len(label), np.int64)
+    fill, order = np.empty(count, np.int64), np.empty(len(label), np.int64)
+    for i in range(count):
+        fill[i] = start[i]
     for c in range(len(label)):
         if label[c] >= 0:
             order[fill[label[c]]] = c
@@ -1310,7 +1278,7 @@ def _sorted(label, count):
     return start, order
 
 
-@njit(**FAST)
+@njit(**FAST, inline="always")
 def solve_with_joints(world, work, motion, rules, manifolds, held):
     """Solve for the impulses of all contacts and joints, as `impulses.solve_contacts`, which it returns what of."""
     graph = held.graph
@@ -1371,16 +1339,13 @@ def _kick(world, work, motion, rules, graph, each, lines, c, share):
             impulse = share * (state[j, SOFT + e] + state[j, DRIVE + e])
             if impulse == 0.0:
                 continue
-            line, i, row = each.axis, j, 0
+            row = each.axis[j, 0]
             if each.kind[j] == BALL:
-                row = 3 + e
-                line = lines.line
-                _write_turn(line, j, row, _unit(e))
-            eased = _eased(
-                world.moves, world.inverse_mass, work.inverse, rules.rotation, line, i, row, a, b, lines.eased
-            )
+                row = lines.line[j, 3 + e]
+                _write_turn(row, _unit(e))
+            eased = _eased(world, work, rules, row, a, b, lines.eased[0])
             if each.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # of which the motor's work is told
-                before = _reads(line, i, row, motion.velocity, motion.angular, a, b)
+                before = _reads(row, motion, a, b)
                 state[j, GIVEN] += share * state[j, DRIVE + 1] * (before + 0.5 * impulse * eased)
             for s in range(2):
                 body = each.body[j, s]
@@ -1390,7 +1355,7 @@ def _kick(world, work, motion, rules, graph, each, lines, c, share):
                         motion.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
 
 
-@njit(**FAST)
+@njit(**FAST, inline="always")
 def begin_step(world, work, motion, rules, held):
     """Velocities at an instant become those of the inner step before it, see `advance._shifted`. Where nothing is known
     of impulses they are found first."""
@@ -1447,7 +1412,7 @@ def _hold_steady(world, work, motion, rules, held, one, bounded, count):
     _hold(world, work, motion, rules, held, one, np.int64(0), np.int64(1), rows, count, True)
 
 
-@njit(**FAST)
+@njit(**FAST, inline="always")
 def end_step(world, work, motion, rules, held):
     """Velocities of the last inner step become those at its end, which joints let be."""
     graph, each, lines = held.graph, held.each, held.rows
@@ -1474,11 +1439,11 @@ def end_step(world, work, motion, rules, held):
             else:
                 j = -1 - n
                 a, b = each.body[j, 0], each.body[j, 1]
-                speed = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
-                each.state[j, SPEED] = speed + _reads_six(each.axis, j, 0, work.change, a, b)
+                speed = _reads(each.axis[j, 0], motion, a, b)
+                each.state[j, SPEED] = speed + _reads_six(each.axis[j, 0], work.change, a, b)
     for j in range(len(each.body)):
         a, b = each.body[j, 0], each.body[j, 1]
-        each.state[j, SPEED] = _reads(each.axis, j, 0, motion.velocity, motion.angular, a, b)
+        each.state[j, SPEED] = _reads(each.axis[j, 0], motion, a, b)
 
 
 @njit(**BARE)

@@ -98,7 +98,7 @@ class Near(NamedTuple):
 
 
 @njit(**FAST)
-def broad_phase(shapes, world, work, motion, rules, span, old, threads):
+def broad_phase(shapes, world, work, motion, rules, span, old, surfaces, threads):
     """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
 
     Of `work` it sets how far each body may go until it must be looked around again, and who has somebody near.
@@ -109,7 +109,7 @@ def broad_phase(shapes, world, work, motion, rules, span, old, threads):
     swept(world, work, motion, rules, span)
     pairs = near_pairs(world, motion, work.low, work.high)
     manifolds = carried(world, motion, pairs, old)
-    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin, threads)
+    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin, surfaces, threads)
     for p in range(len(pairs)):
         if near.count[p, 0] + near.count[p, 1] > 0:
             work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True
@@ -133,7 +133,7 @@ def pair_kind(shapes, s, t):
 
 
 @njit(**FAST, inline="always")
-def near_parts(shapes, world, motion, matrix, pairs, ways, reach, threads):
+def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, threads):
     """What of P pairs is nearer than the bodies may go; [N] `ways` of each."""
     count = len(pairs)
     start = np.zeros((count, 2), np.int64)
@@ -154,16 +154,18 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, threads):
         wide = max(wide, shapes.leaf_node[leaf + 1] - shapes.leaf_node[leaf])
     near = Near(
         start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total), np.zeros((total, 3)),
-        np.full(count, -math.inf), np.full(count, -math.inf), np.empty(total, np.int32), np.empty(total * wide),
+        np.empty(count), np.empty(count), np.empty(total, np.int32), np.empty(total * wide),
         np.empty(total, np.bool_), np.empty((total, 3)), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
+    for p in range(count):
+        near.looked[p] = near.away_all[p] = -math.inf
     parts = reference(near)
     if threads is not None:  # known when it is compiled
         if len(pairs) >= MANY:
             _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts)
             return near
     for p in range(len(pairs)):
-        _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p)
+        _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p, surfaces)
     return near
 
 
@@ -171,12 +173,11 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, threads):
 def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near):
     for i in prange(len(pairs)):
         p = np.int64(i)  # that of a parallel loop is unsigned, for which all would be compiled once more
-        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
+        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, True)
 
 
 @njit(**BARE)
-def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
-    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces):
     a, b = pairs[p, 0], pairs[p, 1]
     most = ways[a] + ways[b] + reach
     way = pair_kind(shapes, world.shape[a], world.shape[b])
@@ -189,11 +190,19 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
         other = b if one == a else a
         w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         k = world.scale[other]
-        d = distance_alone(table, brick, sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
+        d = distance_alone(shapes.table, shapes.brick, shapes.sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
         s = world.shape[one]
         size = (shapes.table[s, SIZE] + shapes.table[s, SIZE + 1]) * world.scale[one]
         near.count[p, 0] = 1 if d * k - size <= most else 0
         return
+    if surfaces is not None:
+        _near_leaves(shapes, world, motion, matrix, pairs, most, near, p)
+
+
+@njit(**BARE)
+def _near_leaves(shapes, world, motion, matrix, pairs, most, near, p):
+    """The leaves of either surface that are near the other."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
     for side in range(2):
         one, other = pairs[p, side], pairs[p, 1 - side]
         s, t = world.shape[one], world.shape[other]
@@ -254,7 +263,7 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
 
 
 @njit(**BARE, inline="always")
-def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, threads):
+def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, surfaces, threads):
     """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
 
     `gone` [N] is how far any point of a body may have moved since `near` was made.
@@ -263,7 +272,9 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
         if len(near.start) >= MANY:
             _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
             return
-    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1))
+    _collide_some(
+        shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1), surfaces
+    )
 
 
 @njit(parallel=True, **FAST)
@@ -275,18 +286,18 @@ def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
 @njit(**BARE)
 def _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first):
     room = reference(scratch)
-    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, room, first, np.int64(SHARES))
+    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, room, first, np.int64(SHARES), True)
 
 
 @njit(**BARE)
-def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, step):
+def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, step, surfaces):
     """Every so many pairs, from the first on."""
     for p in range(first, len(near.start), step):
-        _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+        _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p, surfaces)
 
 
 @njit(**BARE, inline="always")
-def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p):
+def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p, surfaces):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     if near.count[p, 0] + near.count[p, 1] == 0:
         manifolds.count[p] = 0
@@ -310,6 +321,14 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
             count = first_to_touch(rules, scratch.found, count)
         manifolds.count[p] = renewed(rules, manifolds.point, p, known, scratch, count)
         return
+    if surfaces is not None:
+        _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, went, since, first, scratch, p)
+
+
+@njit(**BARE)
+def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, went, since, first, scratch, p):
+    """The manifold of a pair of which at least one is neither convex nor made of convex pieces."""
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     known = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
     manifolds.count[p] = known
     # Numbers of one type, or all would be compiled once more.
@@ -499,7 +518,7 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
 
 
 @njit(**BARE)
-def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh, room):
+def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh, room, surfaces):
     """The least distance of pair p with its two bodies at `place` and `frame`, of the parts that were near; `least`
     where all are farther, and any that is less than `enough`. `went` is how much nearer two points may have come since
     `near` was made; whether the poses are those of the bodies, so that `near` may take up how far parts are
@@ -532,34 +551,48 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
         return least
     for side in range(2):
         s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
-        w, c = map_between(place, frame, scales, coms, side, 1 - side)
-        k = scales[1 - side]
         if is_round(table, s) and way == ROUND:
-            half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
+            w, c = map_between(place, frame, scales, coms, side, 1 - side)
+            k, half = scales[1 - side], table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
             for e in range(-2, 3):
                 d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
-        elif near.count[p, side] > 0 and not is_round(table, s):
-            first, last = near.start[p, side], near.start[p, side] + near.count[p, side]
-            front = first
-            if refresh:
-                for i in range(first, last):
-                    if near.away[i] - went < least:
-                        near.away[i] = went + beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
-                        front = i if near.away[i] < near.away[front] else front
-            # The nearest leaf first: the others are then seldom near enough to be looked into.
-            for n in range(first - 1, last):
-                i = front if n < first else n
-                if n == front or near.away[i] - went >= least:
-                    continue
-                e = near.leaf[i]
-                if refresh or beyond(shapes, t, w, c, k, scales[side], e) < least:
-                    there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
-                    for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
-                        p_u = get(shapes.node, u)
-                        if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
-                            d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
-                            least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
-                    if least < enough:
-                        return least
+        elif surfaces is not None:
+            if way == SURFACES and near.count[p, side] > 0 and not is_round(table, s):
+                least = _nearest_node(
+                    shapes, s, t, place, frame, scales, coms, side, near, p, went, least, enough, refresh
+                )
+                if least < enough:
+                    return least
+    return least
+
+
+@njit(**BARE)
+def _nearest_node(shapes, s, t, place, frame, scales, coms, side, near, p, went, least, enough, refresh):
+    """`nearest` of the nodes of one body's near leaves to the other."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    w, c = map_between(place, frame, scales, coms, side, 1 - side)
+    k = scales[1 - side]
+    first, last = near.start[p, side], near.start[p, side] + near.count[p, side]
+    front = first
+    if refresh:
+        for i in range(first, last):
+            if near.away[i] - went < least:
+                near.away[i] = went + beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
+                front = i if near.away[i] < near.away[front] else front
+    # The nearest leaf first: the others are then seldom near enough to be looked into.
+    for n in range(first - 1, last):
+        i = front if n < first else n
+        if n == front or near.away[i] - went >= least:
+            continue
+        e = near.leaf[i]
+        if refresh or beyond(shapes, t, w, c, k, scales[side], e) < least:
+            there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
+            for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
+                p_u = get(shapes.node, u)
+                if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
+                    d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
+                    least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
+            if least < enough:
+                return least
     return least

@@ -23,7 +23,7 @@ from sdfsim.physics.solver.edges import nodes_within
 from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows, Trial
 from sdfsim.physics.solver.manifold import scratch_room
 from sdfsim.physics.solver.record import Edges
-from sdfsim.physics.solver.run import HELD, NOTE, THREADS, Kept, Script, run_steps
+from sdfsim.physics.solver.run import HELD, NOTE, SURFACES, THREADS, Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.physics.validity import NO_LIMITS, Fault, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -71,6 +71,8 @@ class Compiled:
             scratch=scratch_room(),
         )  # fmt: skip
         self.held = held_by(self.bodies)
+        # Threads are not for one kind of pairs alone.
+        self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
         self._announced: set[bool] = set()  # with and without what contacts did
         self._load: np.ndarray | None = None
         self._latest: State | None = None  # what `_motion` and `_manifolds` are the arrays of
@@ -89,9 +91,20 @@ class Compiled:
         )  # fmt: skip
         if note not in self._announced:
             self._announced.add(note)
-            _announce(joints > 0, self.threads is not None, note)
+            _announce(joints > 0, self.surfaces is not None, self.threads is not None, note)
         # An integer of another kind would be compiled for anew.
-        bodies = (self.shapes, self.world, self.work, motion, rules, manifolds, self.held, self.threads, note or None)
+        bodies = (
+            self.shapes,
+            self.world,
+            self.work,
+            motion,
+            rules,
+            manifolds,
+            self.held,
+            self.surfaces,
+            self.threads,
+            note or None,
+        )
         return *run_steps(*bodies, script, most, kept, TOUCHING, int(steps)), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
@@ -140,11 +153,12 @@ class Compiled:
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
 
 
-def _announce(joints: bool, threads: bool, note: bool) -> None:
+def _announce(joints: bool, surfaces: bool, threads: bool, note: bool) -> None:
     """Tell that the step is about to be compiled for such scenes, where it is."""
-    given = [word for word, some in (("joints", joints), ("many bodies", threads), ("a network", note)) if some]
-    what = "the contact step" + (f" for scenes with {' and '.join(given)}" if given else "")
-    missing = {HELD: not joints, THREADS: not threads, NOTE: not note}
+    words = {"joints": joints, "hollow shapes": surfaces and not threads, "many bodies": threads, "a network": note}
+    given = [word for word, some in words.items() if some]
+    what = "the contact step" + (f" for scenes with {', '.join(given)}" if given else "")
+    missing = {HELD: not joints, SURFACES: not surfaces, THREADS: not threads, NOTE: not note}
     warn_compiling(run_steps, what, "two minutes" if joints else "a minute", missing)
 
 
@@ -255,13 +269,17 @@ def _manifolds(touch: Touch | None) -> compiled.Manifolds:
     return compiled.Manifolds(touch.pair, touch.count, touch.point)
 
 
+def meet_as_surfaces(shapes: Sequence[ContactGeometry]) -> bool:
+    """Whether any is: where all are convex, or made of convex pieces, they collide as solids."""
+    return any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
+
+
 def compiled_shapes(shapes: Sequence[ContactGeometry]) -> kinds.Shapes:
     """The shapes of a scene, baked where they have no closed form."""
     table = np.zeros((len(shapes), kinds.FIELDS))
     table[:, kinds.CELL], table[:, kinds.PATCH] = 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
-    # Where all shapes are convex, or made of convex pieces, none is met as a surface.
-    met = any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
+    met = meet_as_surfaces(shapes)
     surfaces = [shape.surface if met else NO_SURFACE for shape in shapes]
     for row, shape, surface in zip(table, shapes, surfaces, strict=True):
         row[kinds.THICKNESS] = shape.thickness

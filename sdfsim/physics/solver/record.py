@@ -71,7 +71,7 @@ def gathered(world, motion, matrix, manifolds, pairs, when, edges):
         last = e
         twin = _twin(whole.value, first, kept, edges.value, e)
         if twin < 0:
-            whole.pair[kept], whole.value[kept] = edges.pair[e], edges.value[e]
+            _carry(edges, e, whole, kept)
             kept += 1
         elif edges.value[e, WEIGHT] > 0.0:
             _merge(whole.value, twin, edges.value, e)
@@ -84,8 +84,15 @@ def _longer(edges, more):
     count = len(edges.pair)
     longer = Edges(np.empty((count + more, 2), np.int64), np.empty((count + more, WIDTH)))
     for e in range(count):
-        longer.pair[e], longer.value[e] = edges.pair[e], edges.value[e]
+        _carry(edges, e, longer, e)
     return longer, count
+
+
+@njit(**BARE)
+def _carry(edges, e, to, k):
+    to.pair[k, 0], to.pair[k, 1] = edges.pair[e, 0], edges.pair[e, 1]
+    for x in range(WIDTH):
+        to.value[k, x] = edges.value[e, x]
 
 
 @njit(**BARE)

@@ -82,7 +82,7 @@ def touching(manifolds, position, orientation, within):
             if point[GAP] <= within:
                 n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
                 drag = (point[TANGENTIAL], point[TANGENTIAL + 1], point[TANGENTIAL + 2])
-                pair[e], gap[e] = manifolds.pair[m], point[GAP]
+                pair[e, 0], pair[e, 1], gap[e] = first, manifolds.pair[m, 1], point[GAP]
                 put(place, e, add(get(position, first), rotated(orientation, first, vector(point), 1.0)))
                 put(normal, e, n)
                 put(impulse, e, add(scale(n, point[NORMAL_IMPULSE]), drag))
