@@ -1,7 +1,5 @@
 """The command line: puts the commands of all rooms together."""
 
-from __future__ import annotations
-
 import gc
 from typing import Annotated
 
@@ -13,11 +11,7 @@ from sdfsim.commands import motion
 YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
 
 app = typer.Typer(
-    name="sdfsim",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
+    name="sdfsim", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
 )
 
 

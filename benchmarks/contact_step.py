@@ -10,8 +10,6 @@ figure is the median of the repeats. PyBullet collides convex pieces (a bowl of 
 distances; both make five inner steps a step. Loading, and what a simulator keeps for its recording, is left out.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 import time
@@ -33,7 +31,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
+from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene, timed
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.physics.units import scene_units
@@ -65,10 +63,7 @@ def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
     simulator = Simulator(scene, "solver")
     options = replace(simulator.options, sleep=False)
     simulator.options = replace(options, dt=dt / simulator.units.time) if dt else options
-    simulator.step()  # not timed: it prepares shapes
-    began = time.perf_counter()
-    simulator.step(steps)
-    return 1e3 * (time.perf_counter() - began) / steps
+    return timed(simulator.step, steps + 1).wall_ms  # without the first, which prepares shapes
 
 
 def asleep(scene: Scene) -> tuple[float, float]:
@@ -78,9 +73,7 @@ def asleep(scene: Scene) -> tuple[float, float]:
         simulator = Simulator(scene, "solver")
         simulator.options = replace(simulator.options, sleep=sleep)
         simulator.step(REST)
-        began = time.perf_counter()
-        simulator.step(SLIDE)
-        taken.append(1e3 * (time.perf_counter() - began) / SLIDE)
+        taken.append(timed(simulator.step, SLIDE + 1).wall_ms)
     return taken[0], taken[1]
 
 
@@ -126,9 +119,7 @@ def user_steps(model: str) -> tuple[float, float]:
         simulator = Simulator(with_far(count), model)
         simulator.options = replace(simulator.options, sleep=False)
         simulator.step(2)  # not timed: it prepares shapes
-        began = time.process_time()
-        deque(simulator.steps(SLIDE), maxlen=0)
-        taken.append(1e3 * (time.process_time() - began) / SLIDE)
+        taken.append(timed(lambda count, of=simulator: deque(of.steps(count), maxlen=0), SLIDE + 1).cpu_ms)
     return taken[0], taken[1]
 
 

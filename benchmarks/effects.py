@@ -6,8 +6,6 @@ Sample scenes with one effect at a time switched off; one thread, processor time
 "The same" says whether the bodies end, to a hundredth of their size, where they end with all effects on.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import fields, replace

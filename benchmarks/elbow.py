@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,13 +22,13 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.reality import CLEAR, FAR, FIT, FLIGHT, FRAMES, GRAVITY, IMPRATIO, INNER, SEED, SOFT, SOLID, TEST
+from benchmarks.reality import CLEAR, FAR, FIT, FLIGHT, FRAMES, IMPRATIO, INNER, SEED, SOFT, SOLID, TEST
 from benchmarks.results import progress
 from sdfsim.apps.identify import identify, repeated, write_scene
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
-from sdfsim.apps.observed_joints import held_together
 from sdfsim.base.errors import SdfsimError, run_main
 from sdfsim.base.files import read_arrays, write_json, write_text
+from sdfsim.data.public_tosses import ARM, ELBOW, LINK, PIVOT, Links, links_of, lowest, upright
 from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.evaluation.engines import engine_module
 from sdfsim.evaluation.harness import one_thread
@@ -36,24 +36,10 @@ from sdfsim.evaluation.metrics import interval
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 
-SIZE, MASS = np.array([0.1, 0.05, 0.05]), 0.37  # m and kg of a link
-PIVOT, ARM = np.array([-0.035, 0.06, 0.0]), np.array([0.035, 0.0, 0.0])  # m: link 1 to the hinge, that to link 2
-EVEN = MASS / 12.0 * np.array([SIZE[b] ** 2 + SIZE[c] ** 2 for b, c in ((1, 2), (2, 0), (0, 1))])  # kg m^2, solid
-LONGEST = 12  # frames of flight that a start is fitted to
-HELD, PULLED = 0.002, 2.0  # m and m/s^2: a flight that is farther off a parabola, or falls so differently, is none
+MASS = 0.37  # kg of a link
+EVEN = MASS / 12.0 * np.array([LINK[b] ** 2 + LINK[c] ** 2 for b, c in ((1, 2), (2, 0), (0, 1))])  # kg m^2, solid
+LONGEST, HELD = 10, 0.002  # frames and m: flights that tell gravity are longer, and nearer to a parabola
 ROUNDS, CROWD = 15, 25
-SCENE = """version: 1
-model: solver
-effects: {{sleep: off}}
-gravity: {gravity}
-shapes: {{link: {{box: {{size: [0.1, 0.05, 0.05]}}}}}}
-bodies:
-  - {{name: table, plane: {{}}, friction: 1, restitution: 1}}
-  - {{name: one, shape: link, position: [0, 0, 0.2], mass: 0.37}}
-  - {{name: two, shape: link, position: [0, 0.06, 0.2], mass: 0.37}}
-joints:
-  - {{name: elbow, type: hinge, bodies: [two, one], anchor: [-0.035, 0.06, 0.2], axis: [0, 1, 0]}}
-"""
 
 
 class Motion(NamedTuple):
@@ -73,88 +59,76 @@ class Start:
     angular_velocity: np.ndarray  # [2, 3] rad/s, world
 
 
-def load_tosses(folder: Path) -> tuple[float, list[Motion]]:
-    """Frame spacing s, and both links' poses [1, T, 2, *] of every toss."""
+def load_tosses(folder: Path) -> tuple[float, list[Links]]:
+    """Frame spacing s, and both links' poses in every toss, in axes that stand on the table."""
     found = read_arrays(folder / "elbow.npz", "recorded tosses", "give the folder that holds elbow.npz")
     tosses = []
-    for a, b in zip(found["start"][:-1], found["start"][1:], strict=True):
-        place, angle = found["position"][a:b].astype(np.float64), found["hinge"][a:b].astype(np.float64)
-        one = Rotation.from_quat(found["quat_xyzw"][a:b].astype(np.float64))
-        two = one * Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0])
-        other = place + one.apply(PIVOT) + two.apply(ARM)
-        turns = np.stack([one.as_quat(), two.as_quat()], 1)
-        tosses.append(Motion(np.stack([place, other], 1)[None], turns[None]))
+    for number, a, b in zip(found["number"], found["start"][:-1], found["start"][1:], strict=True):
+        place, turn, angle = (found[name][a:b].astype(np.float64) for name in ("position", "quat_xyzw", "hinge"))
+        tosses.append(upright(links_of(place, Rotation.from_quat(turn), angle), int(number)))
     return float(found["dt"]), tosses
 
 
-def flight(toss: Motion) -> int:
+def flight(toss: Links) -> int:
     """How many frames pass before the lowest corner is as near to the table as `CLEAR`."""
-    turn = Rotation.from_quat(toss.quat_xyzw[0].reshape(-1, 4)).as_matrix()[:, 2]
-    low = toss.position[0, :, :, 2] - 0.5 * (np.abs(turn) @ SIZE).reshape(-1, 2)
-    near = (low < CLEAR).any(1)
-    return int(near.argmax()) if near.any() else len(near)
+    near = np.any(lowest(toss) < CLEAR, axis=1)
+    return int(np.argmax(near)) if near.any() else len(toss.position)
 
 
-def fall(toss: Motion, dt: float) -> tuple[np.ndarray, float]:
-    """[3] m/s^2, the acceleration of the mass centre of both links until the first impact, and how far it is off a
-    parabola at most, m."""
-    count = flight(toss)
-    time = dt * np.arange(count)
-    powers = np.stack([np.ones_like(time), time, 0.5 * time**2], 1)
-    middle = toss.position[0, :count].mean(1)
-    fit = np.linalg.lstsq(powers, middle, rcond=None)[0]
-    return fit[2], float(np.linalg.norm(middle - powers @ fit, axis=1).max())
+def gravity_of(tosses: Sequence[Links], dt: float) -> np.ndarray:
+    """[3] m/s^2, with which recorded elbows fall: the median over tosses of the acceleration of the mass centre of both
+    links until the first impact, where a parabola fits it. Some begin in the hand."""
+    found = []
+    for toss in tosses:
+        count = flight(toss)
+        if count < LONGEST:
+            continue
+        time = dt * np.arange(count)
+        powers = np.stack([np.ones_like(time), time, 0.5 * time**2], 1)
+        middle = toss.position[:count].mean(1)
+        fit = np.linalg.lstsq(powers, middle, rcond=None)[0]
+        if np.linalg.norm(middle - powers @ fit, axis=1).max() < HELD:
+            found.append(fit[2])
+    return np.median(found, axis=0)
 
 
-def free(toss: Motion, dt: float) -> bool:
-    """Whether it falls freely until the first impact."""
-    pull, off = fall(toss, dt)
-    return bool(off < HELD and np.linalg.norm(pull + np.array([0.0, 0.0, GRAVITY])) < PULLED)
+def begun(tosses: Sequence[Links], dt: float, scene: Scene) -> list[tuple[Links, Recording]]:
+    """Tosses, and what `sdfsim identify` makes of them, from the first frame of the flight that ends in the first
+    impact: those that have such a flight, and last long enough."""
+    poses = [np.concatenate(toss, -1) for toss in tosses]
+    found = []
+    for toss, r in zip(
+        tosses, with_velocities([cleaned(str(k), dt, p, scene) for k, p in enumerate(poses)], scene), strict=True
+    ):
+        rows = np.flatnonzero(r.flying[: flight(toss)].all(1))
+        if not len(rows) or flight(toss) - rows[-1] > FLIGHT:
+            continue
+        held = np.flatnonzero(~r.flying[: rows[-1]].all(1))
+        first = int(held[-1]) + 1 if len(held) else 0
+        if rows[-1] + 1 - first >= FLIGHT and len(toss.position) - first > FRAMES:
+            found.append((Links(*(part[first:] for part in toss)), _from(r, first)))
+    return found
 
 
-def gravity_of(tosses: Sequence[Motion], dt: float) -> np.ndarray:
-    """[3] m/s^2, with which recorded elbows fall, medians over tosses: the recordings' axes are not upright."""
-    return np.median([fall(toss, dt)[0] for toss in tosses], axis=0)
+def _from(r: Recording, first: int) -> Recording:
+    names = ("position", "orientation", "velocity", "angular_velocity", "known", "flying", "seen")
+    return replace(r, goal=(r.goal[0][first:], r.goal[1][first:]), **{n: getattr(r, n)[first:] for n in names})
 
 
-def fitted_start(toss: Motion, dt: float, scene: Scene) -> Start:
-    """The mass centre of both on its parabola; the turn of the one link and the angle of the hinge as cubics in time;
-    all through the flight before the first impact."""
-    count = min(flight(toss), LONGEST)
-    time = dt * np.arange(count)[:, None]
-    place, turn = toss.position[0, :count], toss.quat_xyzw[0, :count]
-    fallen = place.mean(1) - 0.5 * time**2 * scene.gravity
-    middle = np.linalg.lstsq(np.concatenate([np.ones_like(time), time], 1), fallen, rcond=None)[0]
-    powers = time ** np.arange(4 if count >= 10 else 3)
-    one, two = (Rotation.from_quat(turn[:, k]) for k in (0, 1))
-    turned = np.linalg.lstsq(powers, (one * one[0].inv()).as_rotvec(), rcond=None)[0]
-    angle = np.unwrap((one.inv() * two).as_rotvec()[:, 1])
-    bent = np.linalg.lstsq(powers, angle, rcond=None)[0]
-    first = Rotation.from_rotvec(turned[0]) * one[0]
-    second = first * Rotation.from_rotvec([0.0, bent[0], 0.0])
-    spins = np.stack([turned[1], turned[1] + bent[1] * first.apply([0.0, 1.0, 0.0])])
-    arms = first.apply(PIVOT), second.apply(ARM)
-    apart = arms[0] + arms[1]
-    fast = np.cross(spins[0], arms[0]) + np.cross(spins[1], arms[1])
-    places = np.stack([middle[0] - 0.5 * apart, middle[0] + 0.5 * apart])
-    speeds = np.stack([middle[1] - 0.5 * fast, middle[1] + 0.5 * fast])
-    arrays = places[None], np.stack([first.as_quat(), second.as_quat()])[None], speeds[None], spins[None]
-    # The bodies of the scene are in the order of the links; the joint has the second first.
-    return Start(*(array[0] for array in held_together(arrays, scene)))
+def split(tosses: Sequence[tuple[Links, Recording]]) -> tuple[list, list]:
+    """Tosses to find parameters on, and others to judge by."""
+    if len(tosses) < FIT + TEST:
+        raise SdfsimError(f"{len(tosses)} tosses are long enough (at least {FIT + TEST})")
+    order = np.random.default_rng(SEED).permutation(len(tosses))
+    return [tosses[k] for k in order[:FIT]], [tosses[k] for k in order[FIT : FIT + TEST]]
 
 
-def split(tosses: Sequence[Motion], dt: float) -> tuple[list[Motion], list[Motion]]:
-    """Tosses to find parameters on, and others to judge by; such as are long enough, and fly freely from their first
-    frame on: some begin in the hand."""
-    usable = [toss for toss in tosses if toss.position.shape[1] > FRAMES and flight(toss) >= FLIGHT and free(toss, dt)]
-    if len(usable) < FIT + TEST:
-        raise SdfsimError(f"{len(usable)} tosses are long enough (at least {FIT + TEST})")
-    order = np.random.default_rng(SEED).permutation(len(usable))
-    return [usable[k] for k in order[:FIT]], [usable[k] for k in order[FIT : FIT + TEST]]
+def start_of(r: Recording) -> Start:
+    return Start(r.position[0], r.orientation[0], r.velocity[0], r.angular_velocity[0])
 
 
-def recorded(tosses: Sequence[Motion]) -> Motion:
-    return Motion(*(np.concatenate([getattr(t, n)[:, 1 : FRAMES + 1] for t in tosses]) for n in Motion._fields))
+def recorded(tosses: Sequence[Links]) -> Motion:
+    return Motion(*(np.stack([getattr(t, n)[1 : FRAMES + 1] for t in tosses]) for n in Motion._fields))
 
 
 def errors(found: Motion, truth: Motion) -> np.ndarray:
@@ -169,11 +143,106 @@ def errors(found: Motion, truth: Motion) -> np.ndarray:
         for m in (found, truth)
     ]
     hinge = (bent[0] * bent[1].inv()).magnitude().reshape(angle.shape[:2])
-    return np.stack([100.0 / SIZE[0] * np.sqrt(way), np.degrees(angle.mean((1, 2))), np.degrees(hinge.mean(1))])
+    return np.stack([100.0 / LINK[0] * np.sqrt(way), np.degrees(angle.mean((1, 2))), np.degrees(hinge.mean(1))])
 
 
 def cost(found: Motion, truth: Motion) -> float:
     return float(np.minimum(errors(found, truth)[:2], FAR).mean(1).sum())
+
+
+# --- what recordings say without any engine ---
+
+CORNERS = 0.5 * LINK * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+ALONE, AWAY = 0.008, 0.003  # m: how much lower an impact's corner is than the next; how high all are after it
+BEFORE, AFTER = 9, 6  # frames that tell the velocities before and after an impact
+
+
+class Moving(NamedTuple):
+    """Both links at one time: turns, and places [2, 3] and velocities [2, 3] about their mass centre, which moves with
+    `speed` [3]."""
+
+    turns: tuple[Rotation, Rotation]
+    place: np.ndarray  # m
+    velocity: np.ndarray  # m/s
+    spin: np.ndarray  # rad/s
+    speed: np.ndarray  # m/s
+
+    def corner(self, link: int, corner: int) -> np.ndarray:
+        """[3] m, about the mass centre."""
+        return self.place[link] + self.turns[link].apply(CORNERS[corner])
+
+    def velocity_of(self, link: int, point: np.ndarray) -> np.ndarray:
+        return self.speed + self.velocity[link] + np.cross(self.spin[link], point - self.place[link])
+
+    def turning(self) -> np.ndarray:
+        """[3] N m s, the angular momentum of solid links about the mass centre."""
+        inertia = (turn.as_matrix() @ np.diag(EVEN) @ turn.as_matrix().T for turn in self.turns)
+        own = sum(i @ w for i, w in zip(inertia, self.spin, strict=True))
+        return own + MASS * np.cross(self.place, self.velocity).sum(0)
+
+
+def moving(toss: Links, frames: np.ndarray, at: float, dt: float, gravity: np.ndarray) -> Moving:
+    """By parabolas through these frames, at the time `at` in frames."""
+    time = dt * (frames - at)[:, None]
+    powers = time ** np.arange(3)
+    one, two = (Rotation.from_quat(toss.quat_xyzw[frames, k]) for k in (0, 1))
+    turn, rate = np.linalg.lstsq(powers, (one * one[0].inv()).as_rotvec(), rcond=None)[0][:2]
+    first, tiny = Rotation.from_rotvec(turn) * one[0], 1e-5
+    spin = (Rotation.from_rotvec(turn + tiny * rate) * Rotation.from_rotvec(turn).inv()).as_rotvec() / tiny
+    bent = np.linalg.lstsq(powers, np.unwrap((one.inv() * two).as_rotvec()[:, 1]), rcond=None)[0]
+    second = first * Rotation.from_rotvec([0.0, bent[0], 0.0])
+    spins = np.stack([spin, spin + bent[1] * first.apply([0.0, 1.0, 0.0])])
+    arms = first.apply(PIVOT), second.apply(ARM)
+    apart, fast = sum(arms), sum(np.cross(w, arm) for w, arm in zip(spins, arms, strict=True))
+    middle = toss.position[frames].mean(1) - 0.5 * time**2 * gravity
+    speed = np.linalg.lstsq(powers[:, :2], middle, rcond=None)[0][1]
+    half = 0.5 * np.array([[-1.0], [1.0]])
+    return Moving((first, second), half * apart, half * fast, spins, speed)
+
+
+def impacts(tosses: Sequence[Links], dt: float, gravity: np.ndarray) -> dict[str, list[float]]:
+    """Of first impacts of one corner after which nothing touches for a while, each as quartiles and their number:
+    restitution of that corner, impulse along the table over that across it, and how much of the change of angular
+    momentum an impulse at that corner does not make."""
+    found: dict[str, list[float]] = {}
+    for toss in tosses:
+        first = flight(toss)
+        turns = Rotation.from_quat(toss.quat_xyzw.reshape(-1, 4)).as_matrix().reshape(-1, 2, 3, 3)
+        height = (toss.position[:, :, None] + np.einsum("tkij,cj->tkci", turns, CORNERS))[..., 2].reshape(-1, 16)
+        low = height.min(1)
+        if first < BEFORE + 1 or first + 2 >= len(low):
+            continue
+        at = first - 1 + int(np.argmin(low[first - 1 : first + 2]))
+        after = np.arange(at + 1, at + 1 + AFTER)
+        if after[-1] >= len(low) or low[after[1:]].min() < AWAY or np.diff(np.sort(height[at])[:2])[0] < ALONE:
+            continue
+        # Between frames: a fifth of one before the lowest.
+        a, b = (moving(toss, k, at - 0.2, dt, gravity) for k in (np.arange(first - BEFORE - 1, first - 1), after))
+        link, corner = divmod(int(height[at].argmin()), 8)
+        push, arm = 2.0 * MASS * (b.speed - a.speed), a.corner(link, corner)
+        if push[2] < 0.3:  # N s; the table throws back at least so much
+            continue
+        turned = b.turning() - a.turning()
+        came, went = (one.velocity_of(link, one.corner(link, corner))[2] for one in (a, b))
+        told = -went / came, np.hypot(*push[:2]) / push[2]
+        left = np.linalg.norm(turned - np.cross(arm, push)) / np.linalg.norm(turned)
+        names = "restitution", "impulse along over across", "angular momentum that is left"
+        for name, value in zip(names, (*told, left), strict=True):
+            found.setdefault(name, []).append(float(value))
+    return {name: [*np.percentile(values, [25, 50, 75]).tolist(), len(values)] for name, values in found.items()}
+
+
+def growth(found: Motion, truth: Motion, flights: Sequence[int]) -> dict[int, tuple[float, float]]:
+    """By frames after the last before the first impact: medians of the distance of the links in mm and of their turn in
+    degrees."""
+    way = 1e3 * np.sqrt(np.square(found.position - truth.position).sum(-1).mean(-1))
+    one, other = (Rotation.from_quat(m.quat_xyzw.reshape(-1, 4)) for m in (found, truth))
+    angle = np.degrees((one * other.inv()).magnitude().reshape(found.position.shape[:3]).mean(-1))
+    told = {}
+    for frame in (0, 1, 2, 4, 8, 16, 32):
+        rows = [(k, n - 2 + frame) for k, n in enumerate(flights) if 0 <= n - 2 + frame < FRAMES]  # poses from 1 on
+        told[frame] = tuple(float(np.median([of[row] for row in rows])) for of in (way, angle))
+    return told
 
 
 # --- engines ---
@@ -207,7 +276,7 @@ def mujoco(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict
     hinge = two.add_joint(type=engine.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0], frictionloss=values["drag"])
     hinge.damping = np.array([values["damping_of_hinge"], 0.0, 0.0])
     for body, place in ((one, np.zeros(3)), (two, ARM)):
-        geom = body.add_geom(type=engine.mjtGeom.mjGEOM_BOX, size=0.5 * values["side"] * SIZE, pos=place)
+        geom = body.add_geom(type=engine.mjtGeom.mjGEOM_BOX, size=0.5 * values["side"] * LINK, pos=place)
         geom.priority, geom.condim, geom.friction[0] = 1, 3, values["friction"]
         geom.solref = [max(values["softness"], 2.0 * step), values["damping"]]
         geom.contype, geom.conaffinity = 2, 1
@@ -246,7 +315,7 @@ def bullet(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict
         table = engine.createMultiBody(0.0, plane, basePosition=[0.0, 0.0, values["height"]], **here)
         engine.changeDynamics(table, -1, lateralFriction=1.0, restitution=1.0, **here)
         engine.setCollisionFilterGroupMask(table, -1, 1, 2, **here)
-        half = (0.5 * values["side"] * SIZE).tolist()
+        half = (0.5 * values["side"] * LINK).tolist()
         box = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half, **here)
         other = engine.createCollisionShape(
             engine.GEOM_BOX, halfExtents=half, collisionFramePosition=ARM.tolist(), **here
@@ -303,24 +372,27 @@ ENGINES: dict[str, tuple[Engine, dict[str, tuple[float, float]]]] = {
 @one_thread()
 def main(tosses: Path, out: Path, rounds: int, only: Sequence[str]) -> None:
     dt, known = load_tosses(tosses)
-    groups = split(known, dt)
     out.mkdir(parents=True, exist_ok=True)
-    gravity = gravity_of([*groups[0], *groups[1]], dt)
-    write_text(out / "scene.yaml", SCENE.format(gravity=np.round(gravity, 4).tolist()))
+    gravity = gravity_of(known, dt)
+    write_text(out / "scene.yaml", ELBOW.format(gravity=np.round(gravity, 4).tolist()))
     scene = load_scene(out / "scene.yaml")
+    groups = split(begun(known, dt, scene))
     (fit, fit_truth), (test, test_truth) = (
-        ([fitted_start(toss, dt, scene) for toss in group], recorded(group)) for group in groups
+        ([start_of(r) for _, r in group], recorded([toss for toss, _ in group])) for group in groups
     )
+    flights = [flight(toss) for toss, _ in groups[1]]
     result: dict[str, Any] = {}
+    for name, (low, middle, high, count) in impacts(known, dt, gravity).items():
+        print(f"first impacts of one corner, {name}: {middle:.3f} ({low:.3f} to {high:.3f}), {count:.0f} of them")
     if "sdfsim" in only:
         progress(0.0, "sdfsim: identify")
-        poses = [np.concatenate([toss.position[0], toss.quat_xyzw[0]], -1) for toss in groups[0]]
-        recordings = with_velocities([cleaned(str(k), dt, one, scene) for k, one in enumerate(poses)], scene)
-        own = identify(recordings, scene, on_progress=progress)
+        own = identify([r for _, r in groups[0]], scene, on_progress=progress)
         write_scene(own, out / "scene.yaml", out / "identified.yaml")
         found = load_scene(out / "identified.yaml")
         values = {"bodies": own.scene_values, "joints": own.joint_values}
-        result["sdfsim"] = values, *(errors(ours(s, dt, found), t) for s, t in ((fit, fit_truth), (test, test_truth)))
+        moved = [ours(starts, dt, found) for starts in (fit, test)]
+        result["sdfsim"] = values, *(errors(m, t) for m, t in zip(moved, (fit_truth, test_truth), strict=True))
+        print("sdfsim, mm and degrees by frames from the first impact:", growth(moved[1], test_truth, flights))
         write_json(out / "identified.json", own.report())
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
         if name not in only:

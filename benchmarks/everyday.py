@@ -9,8 +9,6 @@ of CoACD's (tetrahedra in Drake). Engines do not sleep. What an engine cannot ex
 for, is not run, and no check of it counts. DIR keeps results. All takes five minutes of a core.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import sys

@@ -7,8 +7,6 @@ the table and the pictures of docs/stability.md, and benchmarks/hard_cases_ratch
 what the slow test runs. With --quick the table is that of the short form too.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,16 +19,7 @@ from benchmarks.results import ROOT, progress, script, write_section
 from sdfsim.base.files import read_json, write_json
 from sdfsim.evaluation.engines import mujoco
 from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import (
-    USUAL,
-    Study,
-    draw_group,
-    figures,
-    loss_lines,
-    stress,
-    table,
-    write_report,
-)
+from sdfsim.evaluation.stress import USUAL, Study, draw_group, figures, loss_lines, stress, table, write_report
 
 ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
 DOCUMENT = ROOT / "docs" / "stability.md"

@@ -11,8 +11,6 @@ same at the steps next to the instants of which HOPNet reports errors. Its recor
 error of one step is handed to the next.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -7,8 +7,6 @@ them out beside the solver with as many inner steps, on validation and test traj
 results that DIR holds are kept. Writes DIR/table.md.
 """
 
-from __future__ import annotations
-
 import statistics
 import sys
 from dataclasses import dataclass, replace

@@ -15,8 +15,6 @@ so that an hour of a core is enough to learn something. Trainings go on where th
 are kept. Each command writes a table in Markdown into DIR.
 """
 
-from __future__ import annotations
-
 import resource
 import statistics
 import sys

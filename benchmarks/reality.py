@@ -12,12 +12,13 @@ is installed. Five minutes, about fifteen more for the networks, and ten more wi
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -32,21 +33,26 @@ from sdfsim.apps.identify import identify, repeated, write_scene
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_json, write_text
+from sdfsim.data.batching import roll_out
+from sdfsim.data.dataset import Trajectory
 from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.evaluation.engines import NotInstalled, engine_module
-from sdfsim.evaluation.harness import Line, Panel, draw, markdown, number, one_thread
+from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, one_thread
 from sdfsim.evaluation.metrics import interval
 from sdfsim.learned.impulse import ImpulseNetwork
+from sdfsim.learned.model import SURFACE, Model, load_model
 from sdfsim.scene.load import load_scene
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.training.motion_task import MotionTask, Starts
-from sdfsim.training.presets import PRESETS
+from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run
+from sdfsim.training.surface_task import SurfaceTask
 
 SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as measured by those who tossed it
 GRAVITY = 9.81  # m/s^2
 FRAMES = 75  # that are compared: half a second
 FIT, TEST, SEED = 60, 100, 0
+FEW = 16  # of the first, that ours is found on too
 CLEAR = 0.005  # m: a cube whose lowest corner is higher than this over z = 0 flies; the table is 1 to 6 mm lower
 FLIGHT = 6  # frames at least, to fit a start to
 INNER = 5  # inner steps of every engine in a frame
@@ -347,47 +353,182 @@ def rolled(network: ImpulseNetwork, task: MotionTask, starts: Sequence[Start]) -
     return Motion(place * worlds.units.length, turn)
 
 
-def trained(
-    task: MotionTask, seed: int, starts: Sequence[Start], truth: Motion, preset: str = "impacts"
-) -> tuple[ImpulseNetwork, float]:
-    """The state of a training that leaves the least error, of positions and turns added up, on whole motions."""
-    run = Run(PRESETS[preset], task, STEPS, seed, torch.device("cpu"))
-    best: tuple[float, ImpulseNetwork | None] = math.inf, None
-    while run.step < STEPS:
-        run.advance()
-        if run.step % (STEPS // LOOKS) == 0:
-            network = cast("ImpulseNetwork", run.averaged())
-            off = float(sum(error.mean() for error in errors(rolled(network, task, starts), truth)))
-            best = min(best, (off, network), key=lambda one: one[0])
-    run.close()
-    return cast("ImpulseNetwork", best[1]), best[0]
+def trained(how: Trained, seed: int, rows: Sequence[int], lesson: Lesson) -> tuple[Judged, float, float]:
+    """The state of a training on the recordings `rows` that leaves the least error on the tosses that choose: what
+    moves tosses with it, this error, and the seconds of processor time that all of it took."""
+    began = process_time()
+    with TemporaryDirectory() as folder:
+        plan, known = how.plan(), [lesson.known[k] for k in rows]
+        if plan.kind in SURFACE:
+            task: Any = SurfaceTask(dataset_of(known, lesson, Path(folder)), "train", plan, noisy=True)
+        else:
+            task = MotionTask(known or lesson.known[:1], lesson.scene, noisy=True)
+
+        def judged(run: Run) -> Judged:
+            if plan.kind in SURFACE:
+                return partial(on_surfaces, run.export(plan.kind, []), lesson)
+            return partial(rolled, cast("ImpulseNetwork", run.averaged()), task)
+
+        start = load_model(TEACHERS[seed]) if how.teacher else None
+        run = Run(plan, task, how.steps, seed, torch.device("cpu"), first=start)
+        states = [] if how.steps else [judged(run)]
+        while run.step < how.steps:
+            run.advance()
+            if run.step % (how.steps // LOOKS) == 0:
+                states.append(judged(run))
+        run.close()
+    starts, truth = lesson.chooses
+    off = [summed(state(starts), truth) for state in states]
+    best = int(np.argmin(off))
+    return states[best], off[best], process_time() - began
 
 
-def networks(groups: tuple[list[Toss], list[Toss], list[Toss]], scene: Scene, gravity: float) -> dict[str, Any]:
-    """Of each number of tosses, errors [TEST] on the tosses that judge as means over seeds, those of each seed, and how
-    far the chosen states are off on the tosses that choose."""
+def summed(found: Motion, truth: Motion) -> float:
+    """By which states of a training are chosen: mean errors, % and degrees added up."""
+    return float(sum(error.mean() for error in errors(found, truth)))
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a network is trained on, and what chooses and judges it."""
+
+    known: list[Recording]  # that may be trained on
+    scene: Scene  # as identified
+    # starts and what was recorded from there: of the tosses that choose, and of those that judge
+    chooses: tuple[list[Start], Motion]
+    judges: tuple[list[Start], Motion]
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One row of the table of networks."""
+
+    preset: str
+    tosses: int
+    steps: int = STEPS
+    teacher: bool = False  # whether it begins with what the engine has taught the networks of `TEACHERS`
+
+    def plan(self) -> Preset:
+        """How it is trained: networks on surface nodes at the size of `sdf-sim-small`, with the lengths of their
+        presets times what this cube has of the size of MOVi-B's bodies."""
+        plan = PRESETS[self.preset]
+        if plan.kind not in SURFACE:
+            return plan
+        small, share = PRESETS["sdf-sim-small"], SIDE / BODIES
+        return replace(
+            plan, config=small.config, batch=small.batch, nodes=NODES, reach=share * plan.reach,
+            noise=share * (plan.noise or 0.0),
+        )  # fmt: skip
+
+
+Judged = Callable[[Sequence[Start]], Motion]
+BODIES = 1.87  # m, the middle of the sizes of MOVi-B's bodies
+NODES = 32  # of a cube, at most
+SURFACE_STEPS = 800  # of networks on surface nodes, which have one seed
+HERE = Path(__file__).with_name("models")
+TEACHERS = [
+    HERE / "alone-0.safetensors",
+    "gnn",
+    HERE / "alone-2.safetensors",
+]  # each of 2,000 trajectories (docs/gpu.md)
+NETWORKS = {f"on the solve, {count} tosses": Trained("impacts", count) for count in TRAINED}
+NETWORKS |= {
+    "alone, 256 tosses": Trained("alone", 256),
+    "alone, after the engine, no tosses": Trained("alone", 0, 0, teacher=True),
+    "alone, after the engine, 256 tosses": Trained("alone", 256, teacher=True),
+    **{f"{kind}, 256 tosses": Trained(kind, 256, SURFACE_STEPS) for kind in SURFACE},
+}
+
+
+def learnt(how: Trained, seed: int, lesson: Lesson) -> dict[str, Any]:
+    """One network: errors [2, TEST] on the tosses that judge, and how far it is off on those that choose."""
+    rows = np.random.default_rng([seed, how.tosses]).choice(len(lesson.known), how.tosses, replace=False)
+    state, off, taken = trained(how, seed, rows.tolist(), lesson)
+    starts, truth = lesson.judges
+    return {"test": np.array(errors(state(starts), truth)).tolist(), "chosen": off, "seconds": taken}
+
+
+def _table(scene: Scene) -> tuple[Rotation, np.ndarray, Body]:
+    """How the table of a scene is turned, where it lies, and the cube."""
+    table, cube = scene.bodies
+    return Rotation.from_quat(table.quat_xyzw), np.asarray(table.position), cube
+
+
+def dataset_of(recordings: Sequence[Recording], lesson: Lesson, folder: Path) -> Path:
+    """Recordings as a dataset, whose floor is z = 0: there the table lies."""
+    (folder / "train").mkdir()
+    shape = lesson.scene.shapes[_table(lesson.scene)[2].shape]
+    shape.save(folder / "shapes" / CUBE)
+    for k, r in enumerate(recordings):
+        place, turn, speed, spin = r.position[:, 0], r.orientation[:, 0], r.velocity[:, 0], r.angular_velocity[:, 0]
+        trajectory_of(place, turn, speed, spin, r.dt, lesson.scene).save(folder / "train" / f"{k:03}.npz")
+    return folder
+
+
+def trajectory_of(
+    position: np.ndarray, turn: np.ndarray, velocity: np.ndarray, spin: np.ndarray, dt: float, scene: Scene
+) -> Trajectory:
+    """Poses and velocities [T, *] of the cube of a scene as seen from its table."""
+    lies, at, cube = _table(scene)
+    still, inertia = lies.inv(), cube.inertia if cube.inertia is not None else np.eye(3) * EVEN
+    return Trajectory(
+        position=still.apply(position - at)[:, None], orientation=(still * Rotation.from_quat(turn)).as_quat()[:, None],
+        velocity=still.apply(velocity)[:, None], angular_velocity=still.apply(spin)[:, None], shape=np.array([CUBE]),
+        scale=np.array([cube.scale]), mass=np.array([cube.mass]), inertia=np.diag(inertia)[None],
+        friction=np.array([cube.friction]), restitution=np.array([cube.restitution]), static=np.zeros(1, bool), dt=dt,
+        gravity=still.apply(scene.gravity),
+    )  # fmt: skip
+
+
+def on_surfaces(model: Model, lesson: Lesson, starts: Sequence[Start]) -> Motion:
+    """What a network on surface nodes makes of these starts; what touches nothing flies exactly."""
+    lies, at, cube = _table(lesson.scene)
+    table, dt = lesson.scene.bodies[0], lesson.known[0].dt
+
+    def begun(start: Start) -> Trajectory:
+        place, turn, speed, spin = (
+            getattr(start, name)[None] for name in ("position", "quat_xyzw", "velocity", "angular_velocity")
+        )
+        return trajectory_of(place, turn, speed, spin, dt, lesson.scene)
+
+    shapes, floor = {CUBE: lesson.scene.shapes[cube.shape]}, (table.friction, table.restitution)
+    moved = roll_out(model, list(map(begun, starts)), shapes, FRAMES, floor=floor)
+    place = np.stack([lies.apply(t.position[1:, 0]) + at for t in moved])
+    turn = np.stack([(lies * Rotation.from_quat(t.orientation[1:, 0])).as_quat() for t in moved])
+    return Motion(place, turn)
+
+
+CUBE = "cube"
+
+
+def networks(groups: tuple[list[Toss], list[Toss], list[Toss]], scene: Path, gravity: float, out: Path) -> Results:
+    """Every network of `NETWORKS` with every seed by (seed, name), each kept in a file under `out`; and the solve
+    without any. The tosses that parameters were found on are trained on too."""
     fit, test, rest = groups
     pool = [*fit, *rest]
     free, held = pool[: max(TRAINED)], pool[max(TRAINED) :]
-    known = recordings_of(free, scene)
-    (chooses, seen), (judges, truth) = (
-        ([fitted_start(toss, gravity) for toss in some], recorded(some)) for some in (held, test)
-    )
-    found: dict[str, Any] = {}
-    for count in TRAINED:
-        both, chosen = [], []
-        for seed in range(SEEDS):
-            rows = np.random.default_rng([seed, count]).choice(len(free), count, replace=False)
-            task = MotionTask([known[k] for k in rows], scene, noisy=True)
-            network, off = trained(task, seed, chooses, seen)
-            both.append(np.array(errors(rolled(network, task, judges), truth)))
-            chosen.append(off)
-            told = " / ".join(number(error) for error in both[-1].mean(1))
-            progress(len(found) / len(TRAINED), f"network, {count} tosses, seed {seed}: {told}")
-        found[f"network on sdfsim, {count} tosses"] = {
-            "test": np.mean(both, 0), "seeds": np.mean(both, 2).tolist(), "chosen": chosen,
-        }  # fmt: skip
-    return found
+    known = load_scene(scene)
+    chooses, judges = (([fitted_start(toss, gravity) for toss in some], recorded(some)) for some in (held, test))
+    lesson = Lesson(recordings_of(free, known), known, chooses, judges)
+    told = [scene.read_text(encoding="utf-8"), gravity, free, held, test]
+    jobs = [
+        Job(f"seed {seed}", name, [how, how.plan(), LOOKS, seed, *told], learnt, (how, seed, lesson))
+        for seed in range(SEEDS)
+        for name, how in NETWORKS.items()
+        if seed == 0 or how.preset not in SURFACE
+    ]
+    return measure([Job("-", SOLVE, told, solved, (lesson, known)), *jobs], out, on_progress=progress)
+
+
+SOLVE = "the solve alone"
+
+
+def solved(lesson: Lesson, scene: Scene) -> dict[str, Any]:
+    """The same of the solve without a network."""
+    found = [ours(starts, lesson.known[0].dt, scene) for starts, _ in (lesson.chooses, lesson.judges)]
+    return {
+        "test": np.array(errors(found[1], lesson.judges[1])).tolist(), "chosen": summed(found[0], lesson.chooses[1])
+    }  # fmt: skip
 
 
 # Where engines look for their parameters: lower and upper bound. Sizes are in sides, heights in m, times in s, inertias
@@ -423,11 +564,14 @@ def identified(loss: Callable[[dict[str, float]], float], bounds: dict[str, tupl
 
 
 @one_thread()
-def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
+def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bool = False) -> None:
     """Identify and judge every engine; the section of the page, `reality.json` with every toss's errors, the scene that
-    was identified, and pictures."""
+    was identified, and pictures. Then the networks; `networks_only` where DIR holds that scene already."""
     known = load_tosses(tosses)
     groups = split(known)
+    if networks_only:
+        write_networks(groups, out, gravity)
+        return
     (fit, fit_truth), (test, test_truth) = (
         ([fitted_start(toss, gravity) for toss in group], recorded(group)) for group in groups[:2]
     )
@@ -435,16 +579,19 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "scene.yaml", SCENE.format(gravity=-gravity, side=SIDE, mass=MASS, factor=INERTIA / EVEN))
     scene = load_scene(out / "scene.yaml")
-    progress(0.0, "sdfsim: identify")
-    own = identify(recordings_of(groups[0], scene), scene)
-    write_scene(own, out / "scene.yaml", out / "identified.yaml")
+    moved = {}
+    for name, count, file in ((FEWER, FEW, "identified-few.yaml"), (OURS, FIT, "identified.yaml")):
+        progress(0.0, f"{name}: identify")
+        own = identify(recordings_of(groups[0][:count], scene), scene)
+        write_scene(own, out / "scene.yaml", out / file)
+        known_by_it = load_scene(out / file)
+        table, cube = own.scene_values["table"], own.scene_values["cube"]
+        found = {
+            "friction": cube["friction"], "restitution": cube["restitution"], "height": table["position"][2],
+            "side": cube["scale"], "inertia": cube["inertia_factor"] * EVEN / INERTIA,
+        }  # fmt: skip
+        moved[name] = found, ours(fit, dt, known_by_it), ours(test, dt, known_by_it)
     scene = load_scene(out / "identified.yaml")
-    table, cube = own.scene_values["table"], own.scene_values["cube"]
-    found = {
-        "friction": cube["friction"], "restitution": cube["restitution"], "height": table["position"][2],
-        "side": cube["scale"], "inertia": cube["inertia_factor"] * EVEN / INERTIA,
-    }  # fmt: skip
-    moved = {OURS: (found, ours(fit, dt, scene), ours(test, dt, scene))}
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
         progress(k / (len(ENGINES) + 1), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
         try:
@@ -457,29 +604,26 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
         name: {"values": values, "fit": errors(fitted, fit_truth), "test": errors(judged, test_truth)}
         for name, (values, fitted, judged) in moved.items()
     }
-    learnt = networks(groups, scene, gravity)
     falls, sure = fall(known)
     every = [*fit, *test]
     off = 1e3 * np.median([start.off for start in every])
     turned_off = np.degrees(np.median([start.turned_off for start in every]))
     seen = shown(recordings_of(known, scene))
     kept = {"gravity": gravity, "fall": [falls, sure], "shown": seen, "engines": _plain(result)}
-    kept["networks"] = {name: one | {"test": one["test"].tolist()} for name, one in learnt.items()}
     write_json(out / "reality.json", kept)
     pictures(moved, test_truth, dt, out)
-    chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
     text = (
         f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
         f"95 % intervals; sdfsim less the other is toss by toss. Starts fit the free flight to {off:.2f} mm "
         f"and {turned_off:.2f} degrees (medians of root mean squares); recorded cubes fall with {falls:.3f} +- "
-        f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}\n\nNetworks on sdfsim with these numbers, {SEEDS} each, "
-        f"{STEPS} steps of a training; the best of {LOOKS} states of each on {chosen} tosses more.\n\n"
-        f"{markdown(network_table(learnt, result[OURS]['test']))}"
+        f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
     )
-    write_section("reality", "python benchmarks/reality.py TOSSES -o DIR", text)
+    write_section("reality", COMMAND, text)
+    write_networks(groups, out, gravity)
 
 
-OURS = "sdfsim"
+OURS, FEWER = "sdfsim", f"sdfsim, found on {FEW} tosses"
+COMMAND = "python benchmarks/reality.py TOSSES -o DIR"
 
 
 def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
@@ -534,14 +678,41 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def network_table(learnt: dict[str, Any], solve: Sequence[np.ndarray]) -> list[tuple[str, ...]]:
-    """Means over seeds, and what networks change of the solve alone, toss by toss."""
-    rows: list[tuple[str, ...]] = [("network", "position, %", "rotation, degrees", "less the solve alone", "seeds")]
-    for name, one in learnt.items():
-        apart = " / ".join(_told(its - own) for its, own in zip(one["test"], solve, strict=True))
-        seeds = "; ".join(" / ".join(map(number, of)) for of in one["seeds"])
-        rows.append((name, *map(_told, one["test"]), apart, seeds))
-    return rows
+def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path, gravity: float) -> None:
+    """Train and judge all networks on the scene that was identified; their section of the page."""
+    found = networks(groups, out / "identified.yaml", gravity, out / "networks")
+    chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
+    text = (
+        f"Networks in the scene that was identified: {STEPS} steps of a training ({SURFACE_STEPS} of networks on "
+        f"surface nodes), of which the best of {LOOKS} states on {chosen} tosses is taken, and judged once on {TEST} "
+        "others. Means over the seeds that are listed, with 95 % intervals over tosses. Less the solve: toss by toss. "
+        "Seconds of one core, for one training.\n\n"
+        f"{markdown(network_table(found))}"
+    )
+    write_section("reality networks", f"{COMMAND} --networks-only", text)
+
+
+def network_table(found: Results) -> list[tuple[str, ...]]:
+    """Means over seeds, and what networks change of the solve alone, toss by toss; whoever loses most comes first."""
+    solve = found["-", SOLVE]
+    own = np.array(solve["test"])
+    head = ("network", "position, %", "rotation, degrees", "less the solve", "position, % / degrees of each seed")
+    rows = []
+    for name in dict.fromkeys(method for _, method in found if method != SOLVE):
+        seeds = [one for (_, method), one in found.items() if method == name]
+        if why := next((one["failed"] for one in seeds if "failed" in one), ""):
+            rows.append((np.inf, (name, why, *[""] * (len(head) - 1))))
+            continue
+        test = np.array([one["test"] for one in seeds])
+        mean = test.mean(0)
+        apart = " / ".join(_told(change) for change in mean - own)
+        each = "; ".join(" / ".join(map(number, of)) for of in test.mean(2).tolist())
+        on = " / ".join(number(one["chosen"]) for one in seeds)
+        taken = number(float(np.mean([one["seconds"] for one in seeds])))
+        rows.append((float((mean - own).sum(0).mean()), (name, *map(_told, mean), apart, each, on, taken)))
+    rows.sort(key=lambda row: -row[0])
+    on = f"both errors on the tosses that choose (solve: {number(solve['chosen'])})"
+    return [(*head, on, "s"), *(row for _, row in rows), (SOLVE, *map(_told, own), "", "", "", "")]
 
 
 def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> None:

@@ -2,11 +2,12 @@
 
     python benchmarks/reconstruct.py -o DIR [--preset quick] [--budget MINUTES]
     python benchmarks/reconstruct.py -o DIR --capture record3d      # the same photos as a phone with depth exports them
+    python benchmarks/reconstruct.py room -o DIR [--capture record3d]    # or patches
 
-Runs the whole chain on samples/photos/table_vase (or takes what is already in the folder), moves the result onto the
-true cameras by a similarity, and prints pose errors, surface errors, how these go with the uncertainty that the run
-gave, and times. A folder of photos without
-`transforms.json` and `truth.ply` gets the report only.
+Runs the whole chain on samples/photos/table_vase, or on one of the sets that samples/photos/make.py draws, rendered
+into DIR-room (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
+prints pose errors, surface errors, how these go with the uncertainty that the run gave, and times. A folder of photos
+without `transforms.json` and `truth.ply` gets the report only.
 
     python benchmarks/reconstruct.py touching -o DIR
     python benchmarks/reconstruct.py shelf -o DIR [--kind clicks]
@@ -14,9 +15,13 @@ gave, and times. A folder of photos without
 render a set with truth of tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies, without
 (`plain`) and with one clicked place for each (`clicks`: the middle of where a photo shows most of it), or in one of
 these ways, and print the errors of every body.
-"""
 
-from __future__ import annotations
+    python benchmarks/reconstruct.py hinged -o DIR
+    python benchmarks/reconstruct.py sliding -o DIR
+
+render a cupboard with its door shut and open by 50 degrees, or a chest with its drawer in and out by 20 cm, reconstruct
+both states with `--joint`, and print how far the joint is from the true one.
+"""
 
 import json
 import shutil
@@ -28,6 +33,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "samples" / "photos"))
 
 from benchmarks.results import ROOT, script
 from pipeline.cameras import Similarity, View, load_views
@@ -44,6 +50,7 @@ PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
 RENDERED = ("touching", "shelf")
 KINDS = ("masks", "plain", "clicks")
+JOINTS = {"hinged": 50.0, "sliding": 0.2}  # degrees, and m, from the first state to the second
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
 
 
@@ -215,9 +222,8 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def captured(layout: str, out: Path) -> Path:
-    """The bundled photos as a phone's capture beside `out`, made where it is not there."""
-    sys.path.insert(0, str(PHOTOS.parent))
+def captured(layout: str, out: Path, photos: Path) -> Path:
+    """A rendered set as a phone's capture beside `out`, made where it is not there."""
     import phone
 
     if layout not in phone.LAYOUTS:
@@ -225,8 +231,22 @@ def captured(layout: str, out: Path) -> Path:
     place = out.with_name(f"{out.name}-{layout}" + (".r3d" if layout == "record3d" else ""))
     if not place.exists():
         place.parent.mkdir(parents=True, exist_ok=True)
-        phone.write(layout, place)
+        phone.write(layout, place, photos)
     return place / "transforms.json" if layout == "nerfstudio" else place
+
+
+def drawn(photos: Path, out: Path) -> Path:
+    """The folder of a set that make.py names: the bundled one, or one beside `out`, made where it is not there. Any
+    other folder as it is."""
+    import make
+
+    name = str(photos)
+    if name not in make.SETS:
+        return photos
+    folder = PHOTOS if name == make.BUNDLED else out.with_name(f"{out.name}-{name}")
+    if not (folder / "transforms.json").exists():
+        make.make_set(name, folder)
+    return folder
 
 
 def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
@@ -287,6 +307,45 @@ def rendered(name: str, out: Path, kind: str | None, **options: Any) -> dict[str
     return result
 
 
+def joint_of(name: str, out: Path, **options: Any) -> dict[str, Any]:
+    """Renders both states of a thing, reconstructs them together, and tells the errors of the joint: of the axis in
+    degrees, of its place in % of the size of the cupboard or chest, and of how far the part has moved."""
+    from pipeline.mesh.joint import load_held
+    from pipeline.states import reconstruct_states
+    from tests.pipeline import photo_sets
+
+    travel, states = JOINTS[name], [out / "shut", out / "open"]
+    for number, (state, moved) in enumerate(zip(states, (0.0, travel), strict=True)):
+        if not state.exists():
+            photo_sets.shoot_state(state, getattr(photo_sets, name), moved, seed=number + 1)
+    run = out / "run"
+    report, _ = reconstruct_states(states[0] / "images", states[1] / "images", run, **options)
+    held = load_held(run / "mesh" / "joint.json")
+    assert held is not None
+    about = json.loads((states[report["stages"]["photos"]["state"]] / "images" / "transforms.json").read_text())
+    move = moved_onto(load_views(run / "poses"), about)[0]
+    place, to_unit = load_placement(run / "mesh").to_metres, load_field(run / "distill").to_unit
+    found = held.moved(move.after(place.after(to_unit).inverse()))
+    axis = np.array([0, 0, -1.0] if name == "hinged" else [0, -1.0, 0])
+    still = load_mesh(states[0] / "truth" / "still.ply")
+    thing = still.vertices[still.vertices[:, 0] < 0.3]  # without the crate beside it
+    size = float(np.linalg.norm(np.ptp(thing, axis=0)))
+    result: dict[str, Any] = {
+        "found": held.line(), "kind": found.kind,
+        "axis_degrees": float(np.degrees(np.arccos(min(1.0, float(found.axis @ axis))))),
+    }  # fmt: skip
+    if found.kind == "hinge":
+        apart = found.anchor - photo_sets.HINGE
+        apart = float(np.linalg.norm(apart - axis * (apart @ axis)))
+        result |= {"place_mm": 1000 * apart, "place_percent_of_size": 100 * apart / size,
+                   "travel_degrees": float(np.degrees(found.travel)), "travel_error_degrees":
+                   float(np.degrees(found.travel)) - travel}  # fmt: skip
+    else:
+        result |= {"travel_mm": 1000 * found.travel, "travel_error_mm": 1000 * (found.travel - travel),
+                   "travel_error_percent_of_size": 100 * (found.travel - travel) / size}  # fmt: skip
+    return result | {"size_m": size, "notes": report["notes"], "seconds": report["seconds"]}
+
+
 def main(
     photos: Path = PHOTOS,
     *,
@@ -307,8 +366,12 @@ def main(
                 raise SdfsimError(f"--kind: {kind}: is none of {', '.join(KINDS)}")
             session.report(rendered(str(photos), out, kind, **options, progress=session.stage_progress))
             return
+        if str(photos) in JOINTS:
+            session.report(joint_of(str(photos), out, **options, progress=session.stage_progress))
+            return
         options |= {"size": size, "distance": distance and [*distance[:2], float(distance[2])]}
-        given = captured(capture, out) if capture else photos
+        photos = drawn(photos, out)
+        given = captured(capture, out, photos) if capture else photos
         report = reconstruct(given, out, **options, progress=session.stage_progress)
         if (photos / "truth.ply").exists():
             report["truth"] = evaluate(out, photos)

@@ -1,7 +1,5 @@
 """What benchmarks share: their command lines, lines of progress, and RESULTS.md, one section a benchmark."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import re

@@ -13,8 +13,6 @@ are CoACD's, with one setting for all, where a shape has none of its own. Making
 timed. Restitution is 0, friction the same for all. DIR keeps results.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

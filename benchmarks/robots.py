@@ -1,16 +1,14 @@
 """How many robots of PyBullet's data import, and whether MuJoCo puts their links where the scenes do.
 
-    python benchmarks/robots.py            # all of pybullet_data but its random solids
+    python benchmarks/robots.py [--files FILE ...]     # else all of pybullet_data but its random solids
 
 Of each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
 scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 import re
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +17,13 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.results import progress, script
 from sdfsim import load_scene
 from sdfsim.apps.import_robot import import_robot
-from sdfsim.base.errors import SdfsimError, run_main
+from sdfsim.base.errors import SdfsimError
+from sdfsim.evaluation.harness import markdown, number
 from sdfsim.scene.scene import Joint, Scene
 
 TRIES = 20
@@ -162,37 +164,33 @@ def _bare(source: Path) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("files", nargs="*", type=Path, help="URDF and MJCF files (default: those of pybullet_data)")
-    args = parser.parse_args()
-    files = args.files or _all()
+def main(*, files: list[Path] | None = None) -> None:
+    """Print a row a URDF or MJCF file; without any, of those of pybullet_data."""
     counts = {"imported": 0, "judged": 0, "refused": 0}
-    print("| file | bodies | joints | links judged | apart, mm | turned, degrees | mass | |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
-    for file in files:
+    rows = [("file", "bodies", "joints", "links judged", "apart, mm", "turned, degrees", "mass", "")]
+    files = files or _all()
+    for k, file in enumerate(files):
+        progress(k / len(files), file.name)
         with tempfile.TemporaryDirectory() as folder:
             try:
                 import_robot(file, Path(folder) / "scene.yaml")
                 scene = load_scene(Path(folder) / "scene.yaml")
             except SdfsimError as error:
                 counts["refused"] += 1
-                print(
-                    f"| {file.name} | | | | | | | {error.message.replace(str(file.parent) + '/', '')[:150]} |",
-                    flush=True,
-                )
+                rows.append((file.name, *[""] * 6, error.message.replace(f"{file.parent}/", "")[:150]))
                 continue
         counts["imported"] += 1
-        row = f"| {file.name} | {len(scene.bodies)} | {len(scene.joints)} |"
+        found, why = None, ""
         try:
             found = judge(file, scene)
         except ValueError as error:
-            print(f"{row} | | | | MuJoCo: {str(error).splitlines()[0][:100]} |", flush=True)
-            continue
-        counts["judged"] += 1
-        numbers = f"{1e3 * found.apart:.2g} | {math.degrees(found.turned):.2g} | {found.mass:.1g}"
-        print(f"{row} {found.links} | {numbers} | |", flush=True)
-    print(f"\n{len(files)} files: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
+            why = f"MuJoCo: {str(error).splitlines()[0][:100]}"
+        counts["judged"] += found is not None
+        figures = [""] * 4
+        if found is not None:
+            figures = [str(found.links), *map(number, (1e3 * found.apart, math.degrees(found.turned), found.mass))]
+        rows.append((file.name, str(len(scene.bodies)), str(len(scene.joints)), *figures, why))
+    print(f"{markdown(rows)}\n{len(files)} files: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
 
 
 def _all() -> list[Path]:
@@ -204,4 +202,4 @@ def _all() -> list[Path]:
 
 
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, main)

@@ -13,8 +13,6 @@ Every case of the first runs in a process of its own on one thread; its times ar
 holds is not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

@@ -7,8 +7,6 @@ and the paper's at equal time, with other widths of the network, and with smalle
 timed. Fits that DIR holds are not made again. Writes DIR/table.md and DIR/sdf.png.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

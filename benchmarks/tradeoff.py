@@ -5,8 +5,6 @@
 DATA is a MOVi-B dataset; DIR keeps the results of the command, which this script continues.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Posed cameras and sparse points: their files, similarity transforms, and how cameras stand about a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -80,12 +78,12 @@ class Similarity:
         """Points [P, 3], moved."""
         return self.scale * points @ self.rotation.T + self.translation
 
-    def after(self, first: Similarity) -> Similarity:
+    def after(self, first: "Similarity") -> "Similarity":
         """What `first` and then this one do together."""
         rotation = self.rotation @ first.rotation
         return Similarity(self.scale * first.scale, rotation, self.points(first.translation[None])[0])
 
-    def inverse(self) -> Similarity:
+    def inverse(self) -> "Similarity":
         """The way back."""
         return Similarity(1 / self.scale, self.rotation.T, -(np.asarray(self.translation) @ self.rotation) / self.scale)
 
@@ -100,7 +98,7 @@ class Similarity:
         return {"scale": self.scale, "rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
 
     @staticmethod
-    def from_dict(data: dict) -> Similarity:
+    def from_dict(data: dict) -> "Similarity":
         """The inverse of `to_dict`."""
         return Similarity(float(data["scale"]), np.array(data["rotation"]), np.array(data["translation"]))
 
@@ -128,7 +126,7 @@ class PosedPhotos:
     sparse: Sparse
     moved_by: Similarity = STILL  # from the world of structure-from-motion to this one
 
-    def moved(self, move: Similarity) -> PosedPhotos:
+    def moved(self, move: Similarity) -> "PosedPhotos":
         """The same in another world."""
         views = tuple(move.view(view) for view in self.views)
         return PosedPhotos(views, replace(self.sparse, xyz=move.points(self.sparse.xyz)), move.after(self.moved_by))

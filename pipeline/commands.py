@@ -54,19 +54,38 @@ def reconstruct(
     session: Session,
     photos: Photos,
     out: Out,
+    other: Annotated[
+        Path | None, typer.Argument(help="With --joint: photos of the thing in its other state.", show_default=False)
+    ] = None,
+    joint: Annotated[
+        bool, typer.Option("--joint", help="Find the hinge or slider by which what moves between both states is held.")
+    ] = False,
     first: Annotated[Stage | None, typer.Option("--from", help="Do this stage and those after it again.")] = None,
     last: Annotated[Stage | None, typer.Option("--until", help="Stop after this stage.")] = None,
     budget: Budget = None,
     device: str = "auto",
     **options: Any,
 ) -> None:
-    """Photos -> a scene that can be simulated, by all stages."""
-    from pipeline import stages
+    """Photos -> a scene that can be simulated, by all stages.
 
-    report = stages.reconstruct(
-        photos, out, **_given(options), budget=budget, device=device, from_stage=first, until_stage=last,
-        progress=session.stage_progress,
-    )  # fmt: skip
+    With --joint, photos of one thing in two states (door shut and open) -> a scene in which the door turns.
+    """
+    if joint != (other is not None):
+        message = (
+            "--joint takes two folders of photos, one for each state" if joint else f"{other}: one folder too many"
+        )
+        hint = "sdfsim reconstruct SHUT OPEN --joint -o DIR"
+        raise SdfsimError(message, hint, exit_code=EXIT_USAGE)
+    common = {**_given(options), "budget": budget, "device": device, "from_stage": first, "until_stage": last,
+              "progress": session.stage_progress}  # fmt: skip
+    if other is not None:
+        from pipeline import states
+
+        report, out = states.reconstruct_states(photos, other, out, **common)
+    else:
+        from pipeline import stages
+
+        report = stages.reconstruct(photos, out, **common)
     _report_stages(session, report, out)
 
 

@@ -1,7 +1,5 @@
 """Named materials: how heavy, how rough and how bouncy a body is, and where each number comes from."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A page on which clicks into photos become the options that name places: a known distance, and bodies."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """What a body may be called."""
 
-from __future__ import annotations
-
 import re
 
 import yaml

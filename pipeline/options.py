@@ -1,7 +1,5 @@
 """The options of a reconstruction: one model from which commands, stages and config.yaml take them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +16,7 @@ COMMAND = "reconstruct"
 METRES = (1e-4, 1e5)  # smallest and largest length that can be given
 
 
-Preset = Literal["quick", "standard", "fine", "volsdf"]
+Preset = Literal["quick", "standard", "fine", "volsdf"]  # what each is: PRESETS in pipeline/field/training.py
 
 
 def option(default: Any, stages: Sequence[str], about: str = "", kind: Any = None, metavar: str | None = None,
@@ -133,7 +131,7 @@ class Options(BaseModel):
         return given
 
     @model_validator(mode="after")
-    def _check(self) -> Options:
+    def _check(self) -> "Options":
         if self.size is not None and self.distance is not None:
             raise SdfsimError("size and distance: both set the scale", "give one of them")
         if self.distance is not None and self.distance[0] == self.distance[1]:
@@ -149,7 +147,7 @@ class Options(BaseModel):
         materials_of(self.material)
         return self
 
-    def changed(self, changes: dict[str, Any]) -> Options:
+    def changed(self, changes: dict[str, Any]) -> "Options":
         """The options with other values; a new size replaces a known distance, and the other way round. Raises as
         `options_of` does."""
         other = {"size": "distance", "distance": "size"}

@@ -1,7 +1,5 @@
 """How long work reports what it has done."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 Progress = Callable[[float, str], None]  # called with the fraction that is done, 0 to 1, and a message

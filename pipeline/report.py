@@ -1,7 +1,5 @@
 """What a run reports: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
@@ -111,6 +109,8 @@ def notes(stages: dict[str, dict]) -> list[str]:
     lines += mesh_notes(stages.get("mesh", {}))
     lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
     lines += [f"{name}: {material_line(body)}" for name, body in scene.get("bodies", {}).items()]
+    if scene.get("joint"):
+        lines.insert(0, f"joint: {scene['joint']}")
     return lines + scene.get("notes", [])
 
 

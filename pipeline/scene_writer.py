@@ -11,14 +11,17 @@ from typing import Literal
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from pipeline.materials import SCENERY, Choice
+from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held, scene_keys
 from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
 from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.files import write_text
+from sdfsim.geometry.bvh import ClosestPoint
 from sdfsim.geometry.mesh import Mesh, face_normals, joined
 from sdfsim.geometry.mesh_io import load_mesh, read_glb
 from sdfsim.scene.load import load_scene
@@ -34,6 +37,7 @@ BUMP = 0.06  # how far a level place may stick out of its plane, as a share of t
 BELOW = 0.001  # of the scenery's widest side: so far the added floor lies below the lowest of the scenery's own
 OWN_FLOOR, DENTS = 0.01, 0.02  # of that side: how far a floor is from 0 at most; share of it that may lie lower
 UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
+TOUCHES = 0.05  # of a part's surface, that is near to what holds it
 GAP = 0.3  # of the fall, as a share of the side
 
 
@@ -139,8 +143,16 @@ def write_scene(
     origins = {name: origin_of(mesh) for name, mesh in solids.items()}
     materials = materials or {}
     floor = floor_height(load_mesh(mesh_folder / "shown.ply")) if parts["scenery"] else 0.0
+    held = load_held(mesh_folder / JOINT)
+    holder = None
+    if held is not None:
+        if PART not in solids:
+            message = "joint: the part that moves could not be cut off the rest as a body of its own"
+            raise SdfsimError(f"{message}; {held.line()}", "photograph it from more sides", exit_code=EXIT_QUALITY)
+        others = {SCENERY: load_mesh(mesh_folder / "solid.ply")} if parts["scenery"] else {}
+        holder = holder_of(solids[PART], others | {name: mesh for name, mesh in solids.items() if name != PART})
     text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials, seed=seed,
-                      floor=floor)  # fmt: skip
+                      floor=floor, held=held, holder=holder)  # fmt: skip
     scene = load_scene(scene_file, text=text, allow_outside=True)
     names = [body.name for body in scene.bodies]
     for name in materials:
@@ -157,8 +169,18 @@ def write_scene(
     return {
         "objects": list(solids), "bodies": bodies_of(scene, materials), "size": placement.size_from,
         "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
-        "scene_sha256": made,
+        "scene_sha256": made, "joint": None if held is None else held.line(),
     }  # fmt: skip
+
+
+def holder_of(part: Mesh, others: dict[str, Mesh]) -> str | None:
+    """Name of what a part that moves is beside, of which it was cut off; None where there is nothing else."""
+
+    def beside(mesh: Mesh) -> float:
+        away = np.linalg.norm(ClosestPoint(mesh)(part.vertices)[0] - part.vertices, axis=1)
+        return float(np.quantile(away, TOUCHES))
+
+    return min(others, key=lambda name: beside(others[name]), default=None)
 
 
 def floor_height(shown: Mesh) -> float:
@@ -190,10 +212,11 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
 
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
-               drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0
-               ) -> str:  # fmt: skip
+               drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0,
+               held: HeldPart | None = None, holder: str | None = None) -> str:  # fmt: skip
     """The text of scene.yaml: a floor at a height, m, the scenery, the bodies that were found at their origins [3] m,
-    and one dropped from above where there is a slab."""
+    and one dropped from above where there is a slab. What is `held` by a joint starts in its first state, and the body
+    that is its `holder` stands still."""
     assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
     shapes: list[str] = []
@@ -222,7 +245,15 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
     if scenery:
         add(SCENERY, "motion: static", {"asset": f"assets/{folder_of(SCENERY)}"})
     for name, origin in origins.items():
-        add(name, f"position: {_flow(rounded(origin).tolist())}", {"asset": f"assets/{folder_of(name)}"})
+        keys = f"position: {_flow(rounded(origin).tolist())}"
+        if held is not None and name == PART:
+            turned = Rotation.from_matrix(held.turn).as_quat()
+            keys = f"position: {_flow(rounded(held.turn @ origin + held.shift).tolist())}"
+            keys += f", quat_xyzw: {_flow(turned.round(9).tolist())}"
+        elif name == holder:
+            bodies.append("  # stands still: the photos show no motion of it")
+            keys = f"motion: static, {keys}"
+        add(name, keys, {"asset": f"assets/{folder_of(name)}"})
     if slab is not None:
         box = {"box": {"size": rounded((slab.side, slab.side, slab.thickness)).tolist()}}
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
@@ -239,8 +270,16 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
         *shapes,
         "bodies:",
         *bodies,
+        *([] if held is None else joint_lines(held, holder)),
         "",
     ])  # fmt: skip
+
+
+def joint_lines(held: HeldPart, holder: str | None) -> list[str]:
+    """The lines of scene.yaml for the joint of a part that moves."""
+    keys = {name: np.round(value, 6).tolist() for name, value in scene_keys(held).items()}
+    return ["joints:", f"  # {held.line()}",
+            f"  - {_flow({'name': PART, 'type': held.kind, 'bodies': [PART, holder or 'world'], **keys})}"]  # fmt: skip
 
 
 def _flow(content: dict | list) -> str:

@@ -26,6 +26,14 @@ RECORD = "stage.json"
 FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 
 
+@dataclass(frozen=True)
+class Instead:
+    """What is done in place of a stage's own work, and on what its result depends besides options and inputs."""
+
+    run: Callable[[Project, Path], dict]
+    depends: Any
+
+
 @dataclass
 class Project:
     """A reconstruction: its folder, its options, and where it reports its progress."""
@@ -36,6 +44,7 @@ class Project:
     # s for the one stage that is run; None: it has its share of the budget for everything
     own_budget: float | None = None
     started: float = field(default_factory=time.monotonic)
+    instead: dict[str, Instead] = field(default_factory=dict)  # of stages
 
     def progress_of(self, stage: str) -> Progress:
         """Where one stage reports its progress."""
@@ -162,8 +171,8 @@ def reconstruct(
     """
     resolved = options_of(photos=str(Path(photos).absolute()), **options)
     names = list(STAGES)
-    first = _number(from_stage) if from_stage else len(names)
-    last = _number(until_stage) if until_stage else len(names) - 1
+    first = number_of(from_stage) if from_stage else len(names)
+    last = number_of(until_stage) if until_stage else len(names) - 1
     if from_stage and first > last:
         raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
     project = Project(Path(out), resolved, progress)
@@ -185,7 +194,7 @@ def run_stage(
 ) -> dict:  # fmt: skip
     """Runs one stage in a folder that the stages before it have written; returns and raises as `reconstruct` does.
     Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone."""
-    number, kept = _number(name), read_config(Path(folder))
+    number, kept = number_of(name), read_config(Path(folder))
     known = {key: value for key, value in changes.items() if value is not None}
     options = kept.changed(known)  # also checks the budget, which is not kept
     project = Project(
@@ -200,7 +209,8 @@ def run_stage(
     return run_all(project, {name: False})
 
 
-def _number(stage: str) -> int:
+def number_of(stage: str) -> int:
+    """Its place in the order of the stages. Raises SdfsimError: there is no such stage."""
     if stage not in STAGES:
         raise SdfsimError(f"no such stage: {stage!r}", "stages: " + ", ".join(STAGES))
     return list(STAGES).index(stage)
@@ -252,13 +262,19 @@ def run_reported(project: Project, stage: str, *, again: bool) -> None:
 def run_one(project: Project, stage: str, *, again: bool) -> None:
     """Runs one stage, or skips it where its fingerprint is that of its last run."""
     place, work = project.place(stage), project.folder / f".{stage}.part"
-    before = read_record(project.place(list(STAGES)[_number(stage) - 1])) if stage != "photos" else None
-    inputs = before["made"] if before else hash_of_photos(Path(project.options.photos))
+    before = read_record(project.place(list(STAGES)[number_of(stage) - 1])) if stage != "photos" else None
+    instead = project.instead.get(stage)
+    if before:
+        inputs = before["made"]
+    else:
+        inputs = hash_of_photos(Path(project.options.photos)) if instead is None else ""
     depends = project.options.of_stage(stage) | {"own_budget": project.own_budget}
     if stage == "fit":
         from sdfsim.sdf.fit import FIT_VERSION
 
         depends["fit_version"] = FIT_VERSION
+    if instead is not None:
+        depends["instead"] = instead.depends
     text = json.dumps([stage, STAGES[stage].version, inputs, depends], sort_keys=True)
     wanted = hashlib.sha256(text.encode()).hexdigest()
     known = read_record(place)
@@ -270,7 +286,7 @@ def run_one(project: Project, stage: str, *, again: bool) -> None:
         return
     begin(work, wanted, fresh=again)
     started = time.monotonic()
-    report = STAGES[stage].run(project, work)
+    report = (STAGES[stage] if instead is None else instead).run(project, work)
     # Training that a killed run had already done counts as well.
     seconds = time.monotonic() - started + report.get("seconds_before", 0.0)
     finish(work, place, wanted, inputs, report, seconds)

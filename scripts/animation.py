@@ -3,8 +3,6 @@
 python scripts/animation.py runs/demo/scene runs/demo/rollout -o docs/images/photos-to-motion.webp
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

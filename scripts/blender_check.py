@@ -6,8 +6,6 @@ they differ. Needs a Python of its own, with Blender as a module and nothing of 
     blender/bin/python scripts/blender_check.py run.glb run.csv 24
 """
 
-from __future__ import annotations
-
 import csv
 import sys
 

@@ -1,7 +1,5 @@
 """Simulates every sample and takes its picture for docs/samples.md: python scripts/gallery.py [NAME ...]"""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Makes the shapes that the sample scenes use: python scripts/sample_shapes.py (some minutes)."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

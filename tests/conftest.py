@@ -1,7 +1,5 @@
 """What the tests share: where the data that is not part of the project lies."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

@@ -135,6 +135,19 @@ def test_errors_beside_hopnet_are_the_results():
     assert cells(table, "bodies that have met nothing yet")[-1] in text
 
 
+def test_what_networks_change_on_real_tosses_is_the_same_everywhere():
+    table = section("reality networks", page("benchmarks/RESULTS.md"))
+    text = page("docs/reality.md").partition("## A network on the solve")[2].partition("\n## ")[0]
+    rows = [line for line in table.splitlines() if line.startswith(("| on the solve", "| alone", "| sdf-sim"))]
+    assert len(rows) >= 4
+    for row in rows:
+        (
+            name,
+            *_,
+        ) = (cell.strip() for cell in row.strip("|").split("|"))
+        assert cells(text, name)[0] == cells(table, name)[2]
+
+
 def test_what_far_scenery_costs_is_the_same_everywhere():
     """Nothing beside the solver, and with a network what the page says."""
     table = section("contact step", page("benchmarks/RESULTS.md"))

@@ -1,7 +1,5 @@
 """The functions of the package: the commands without a shell."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import os

@@ -3,8 +3,6 @@
 `python -m tests.test_imports` prints the rooms floor by floor, the imports that go upwards, and the circles.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import subprocess

@@ -1,7 +1,5 @@
 """Drake, with hydroelastic contact of tetrahedra that fTetWild makes."""
 
-from __future__ import annotations
-
 import tempfile
 from contextlib import chdir
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Newton on the CPU, by XPBD on triangle meshes; spheres and boxes are exact."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How bright and in which tint each photo was taken, learned beside the field."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """The field of the VolSDF paper: an 8 x 256 MLP with positional encoding, initialised to a sphere (appendix B)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

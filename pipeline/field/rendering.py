@@ -3,8 +3,6 @@
 The grids choose samples from a cached SDF; the MLP bounds the error of the opacity as VolSDF does (sections 3.3, 3.4).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What structure-from-motion and depth give to the training: where the object is, its surface, and free space."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Trains a field on posed photos: presets, rays, the losses of a step, checkpoints, and the trained field."""
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -127,7 +125,7 @@ class Rays:
     def __len__(self) -> int:
         return len(self.rgb)
 
-    def to(self, device: str) -> Rays:
+    def to(self, device: str) -> "Rays":
         """The same rays on another device."""
         moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in vars(self).items()}
         return Rays(**moved)

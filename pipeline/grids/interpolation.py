@@ -4,8 +4,6 @@ On a CPU it is compiled. torch's `grid_sample` does the same for volumes, with o
 channel; elsewhere the eight corners of a point are rows of a table, summed by `embedding_bag`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

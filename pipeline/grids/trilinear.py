@@ -1,7 +1,5 @@
 """Trilinear interpolation and its gradient, compiled for the CPU: `interpolation.py` has the same in torch."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numba import njit, prange

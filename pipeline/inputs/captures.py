@@ -1,7 +1,5 @@
 """Captures of phones that know their depth, gravity and metres: Record3D, Polycam, and transforms.json with depth."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Image files with more than 8 bits a channel, or with floats: read as they are, and brought to 8 bits."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One image file -> upright pixels, its mask, what EXIF says about the lens, and whether it is sharp and well lit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cameras that others have found: transforms.json (NeRF, instant-ngp, nerfstudio) and COLMAP models, text or binary."""
 
-from __future__ import annotations
-
 import codecs
 import json
 import struct

@@ -1,7 +1,5 @@
 """Which object each pixel shows: masks by object, or label images, that came with the photos."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the user gave: a folder of photos, a video, or photos whose cameras are known already."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A video -> its sharpest frames, spread evenly over the motion of the camera."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

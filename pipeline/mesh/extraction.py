@@ -1,7 +1,5 @@
 """Field -> surface: signed distances on a grid, marching cubes, and which part of the closed mesh the photos show."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,7 +60,7 @@ class Volume:
         """Trilinear values [P] at points [P, 3]; outside the grid those of its border."""
         return map_coordinates(self.values, ((points - self.low) / self.cell).T, order=1, mode="nearest")
 
-    def limited(self, limit: Distance) -> Volume:
+    def limited(self, limit: Distance) -> "Volume":
         """What of the solid lies within another one, whose distance [P] at points [P, 3] is given."""
         values = self.values.copy()
         for number, x in enumerate(self.axes()[0]):  # A fine grid has too many points to hold at once.

@@ -1,7 +1,5 @@
 """What is hollow about a body: how deep it is, whether photos see so deep, and how thick its wall is."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The mesh stage: a trained field becomes meshes in metres, a picture with their names, and a list of them."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +17,7 @@ from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.hollows import hollow
+from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held
 from pipeline.mesh.placement import GRAVITY, Placement, Up, located_bodies, measured_scale, place
 from pipeline.mesh.supports import complete, on_any
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
@@ -36,6 +35,7 @@ TEXTURED, NEXT = "textured.glb", "next_photos.json"
 RESOLUTION = {"quick": 256, "standard": 320, "fine": 512, "volsdf": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
+AXIS = (255, 0, 0)  # colour of a joint's axis there
 
 
 def make_meshes(
@@ -64,7 +64,14 @@ def make_meshes(
         up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
     if capture is not None and scale is None and options.size is None:
         scale = 1 / to_unit.scale, f"metres of {capture.app}"
+    held = load_held(photos / JOINT)
+    if held is not None and scale is None and options.size is None:
+        scale = held.metres / to_unit.scale, held.size_from
     placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
+    if held is not None:
+        if placement.size_from == held.size_from:
+            placement = replace(placement, size_assumed=held.size_assumed)
+        held.moved(placement.to_metres.after(to_unit)).save(out / JOINT)
     level, known, completed = placement.to_metres.rotation[2], None, []
     if not alone:
         on_progress(0.45, "looking for level surfaces without texture")
@@ -90,7 +97,8 @@ def make_meshes(
     on_progress(0.7, "looking for bodies")
     parts = split(surface, inside, field.finest, posed, photos, level, alone=alone, clicked=clicked)
     on_progress(0.8, "drawing objects.png")
-    draw_names(parts, posed.views, photos).save(out / "objects.png")
+    axis = axis_ends(parts, None if held is None else held.moved(to_unit))
+    draw_names(parts, posed.views, photos, axis).save(out / "objects.png")
     metres = placement.to_metres.scale
     closed, displayed = (
         {name: placement.mesh(mesh) for name, mesh in ({SCENERY: first} | parts.bodies).items() if mesh is not None}
@@ -195,8 +203,23 @@ def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
     return {name: replace(mesh, colors=to_bytes(colors_of(values[name], limits))) for name, mesh in meshes.items()}
 
 
-def draw_names(parts: Parts, views: Sequence[View], photos_folder: Path) -> Image.Image:
-    """A picture of the photos that show bodies best, each body tinted and with its name."""
+def axis_ends(parts: Parts, held: HeldPart | None) -> np.ndarray | None:
+    """[2, 3] ends of a line that shows a joint, all in normalised space: a hinge's axis along its part, or the way of a
+    slider; None where there is none."""
+    if held is None or PART not in parts.bodies:
+        return None
+    points = parts.bodies[PART].vertices @ held.turn.T + held.shift  # in the first state
+    along = (points - held.anchor) @ held.axis
+    if held.kind == "slider":
+        along = along.max() + np.array([0.0, held.travel])
+    return held.anchor + np.outer([along.min(), along.max()], held.axis)
+
+
+def draw_names(
+    parts: Parts, views: Sequence[View], photos_folder: Path, axis: np.ndarray | None = None
+) -> Image.Image:  # fmt: skip
+    """A picture of the photos that show bodies best, each body tinted and with its name; and the line [2, 3] of a
+    joint."""
     meshes = list(parts.bodies.values())
     caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))
     borders = np.cumsum([len(mesh.faces) for mesh in meshes])
@@ -213,14 +236,16 @@ def draw_names(parts: Parts, views: Sequence[View], photos_folder: Path) -> Imag
     pixels = np.array([np.bincount(seen(v, THUMB).ravel(), minlength=len(meshes) + 1)[:-1] for v in views])
     # Of each body, the largest first, the photo that shows most of it.
     chosen = list(dict.fromkeys(pixels.argmax(0).tolist()))[:PICTURES] or [0]
-    tiles = [_tile(views[k], seen(views[k], WIDE), list(parts.bodies), photos_folder) for k in chosen]
+    tiles = [_tile(views[k], seen(views[k], WIDE), list(parts.bodies), photos_folder, axis) for k in chosen]
     sheet = Image.new("RGB", (sum(t.width for t in tiles), max(t.height for t in tiles)), (255, 255, 255))
     for tile, right in zip(tiles, np.cumsum([t.width for t in tiles]).tolist(), strict=True):
         sheet.paste(tile, (right - tile.width, 0))
     return sheet
 
 
-def _tile(view: View, seen: np.ndarray, names: list[str], photos_folder: Path) -> Image.Image:
+def _tile(
+    view: View, seen: np.ndarray, names: list[str], photos_folder: Path, axis: np.ndarray | None
+) -> Image.Image:  # fmt: skip
     with Image.open(photos_folder / "images" / view.name) as photo:
         pixels = np.asarray(photo.convert("RGB").resize(seen.shape[::-1]), float)
     for number in range(len(names)):  # Hues a golden section apart, so that neighbours differ.
@@ -233,5 +258,9 @@ def _tile(view: View, seen: np.ndarray, names: list[str], photos_folder: Path) -
         rows, columns = np.nonzero(seen == number)
         if len(rows) >= 12:
             draw.text((float(np.median(columns)), float(np.median(rows))), name, anchor="mm", **style)
+    if axis is not None:
+        ends, depth = view.project(axis)
+        if (depth > 0).all():
+            draw.line([tuple(end) for end in (ends * seen.shape[1] / view.width).tolist()], fill=AXIS, width=4)
     draw.text((6, 4), view.source, **style)
     return tile

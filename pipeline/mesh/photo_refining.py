@@ -5,8 +5,6 @@ that show it; so the patch is moved along the normal until it does (normalised c
 nothing: there the surface is the smallest one between what is known on both sides, which takes bulges away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

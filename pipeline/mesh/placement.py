@@ -1,7 +1,5 @@
 """Normalised space -> metres with z up: which way gravity points, how large the scene is, where its floor lies."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ is taken to be flat: the plane through the line on the surface where the parts m
 inside belongs to the part whose surface is nearest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

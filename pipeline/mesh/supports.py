@@ -4,8 +4,6 @@ sinks or bulges there. Where photos allow it, its plane goes on from what is see
 Everything here is in normalised space.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

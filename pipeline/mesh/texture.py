@@ -4,8 +4,6 @@ Everything here is in metres. A texture is baked in blocks of texels: which phot
 once a block; the colours are then taken texel by texel, with the blocks' weights interpolated between them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ A photo fixes a point across its line of sight, to about a pixel, and not at all
 directions together fix it. What fewer than two photos see is a guess of the field.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -32,10 +30,7 @@ CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anyt
 SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others
 APART = 15.0  # degrees between the photos proposed
 LEAST = 0.01  # share of the surface that a photo has to help, else it is not worth the way
-NEARBY, SLIGHT = (
-    35.0,
-    0.04,
-)  # degrees up to which a way is described in metres; share of the distance not mentioned
+NEARBY, SLIGHT = (35.0, 0.04)  # degrees up to which a way is described in metres; share of the distance not mentioned
 
 
 @dataclass(frozen=True)
@@ -52,11 +47,11 @@ class Evidence:
         """[V] m, see `sigma_along`; infinite: guessed, as fewer than two photos see the point."""
         return np.where(self.views > 1, sigma_along(self.information, self.normals), np.inf)
 
-    def at(self, index: np.ndarray) -> Evidence:
+    def at(self, index: np.ndarray) -> "Evidence":
         """The same of some of the points."""
         return Evidence(self.vertices[index], self.normals[index], self.views[index], self.information[index])
 
-    def nearest(self, points: np.ndarray) -> Evidence:
+    def nearest(self, points: np.ndarray) -> "Evidence":
         """That of the nearest vertex to each of other points [P, 3] m."""
         return self.at(np.asarray(KDTree(self.vertices).query(points)[1]))
 

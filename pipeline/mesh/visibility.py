@@ -1,7 +1,5 @@
 """Which points of a surface photos, or a look from straight above, show; and in which colours."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -55,7 +53,7 @@ class Visibility:
         self._from = mesh.vertices + offset * self.normals
         self._blocking = blocking or Caster(mesh)
 
-    def at(self, index: np.ndarray) -> Visibility:
+    def at(self, index: np.ndarray) -> "Visibility":
         """The same for some of the vertices [S]."""
         part = copy(self)
         part.vertices, part.normals, part._from = self.vertices[index], self.normals[index], self._from[index]

@@ -1,7 +1,5 @@
 """How far poses agree with the matches between photos, of which each pair was verified on its own."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.cameras import View, view_of

@@ -1,7 +1,5 @@
 """Can a set of poses be trusted, and if not, what is wrong with the photos?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

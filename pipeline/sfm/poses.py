@@ -1,7 +1,5 @@
 """Photos -> camera poses and sparse points, in at most three attempts, each checked for whether it can be trusted."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -97,11 +95,12 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 4,  # of what the child writes, which a run that goes on takes up
+        "version": 5,  # of what the child writes, which a run that goes on takes up
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
         "pairs": seen_together(load_views(known)) if known.exists() else None,
+        "states": {photo.name: photo.state for photo in photos},
         "partners": int(np.clip(SHARE * len(photos), *PARTNERS)), "all_up_to": ALL_UP_TO,
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []

@@ -1,29 +1,43 @@
-"""Renders the bundled photo set: a table with a hollow vase on it, in a room, with exact poses and geometry.
+"""Renders photos of a table with a hollow vase in a room, with exact poses and geometry.
 
-    python samples/photos/make.py            # writes samples/photos/table_vase/
+    python samples/photos/make.py                       # writes samples/photos/table_vase/, the bundled set
+    python samples/photos/make.py room --out DIR        # or patches: one of the two sets into another folder
 
-Ray casting with open3d; every texture is made here from seeded noise and random cells and never repeats, because
-repeating textures make structure-from-motion converge to wrong cameras. World frame: metres, z up, floor at z = 0.
+Ray casting with open3d. Every texture is made here from seeded noise and random cells and never repeats, because
+repeating textures make structure-from-motion converge to wrong cameras. Table, vase and cameras are the same in both
+sets. `room` is what one photographs: wood, glaze, tiles, a cloth and a plant in soft light, exposed a little
+differently from photo to photo. `patches` has texture everywhere and no gloss: a benchmark for the geometry alone.
+World frame: metres, z up, floor at z = 0.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+SETS, BUNDLED = ("room", "patches"), "patches"
 WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
 SUPERSAMPLE = 3
+QUALITY = 88  # of JPEG
+EXPOSURE, BALANCE = 0.05, 0.012  # of the room's photos, standard deviations of the logarithm
 TABLE_SIZE = (1.2, 0.8)
 TABLE_HEIGHT = 0.55
 TABLE_THICKNESS = 0.05
 LEG = 0.09
 VASE_AT = (0.12, -0.05)
+BOWL_AT = (0.40, 0.16)
+PLANT_AT = (-0.36, -0.17)
 ROOM = 3.6
+# A lathe's texture: m to the radian, m from the outer side's rows to those of the inner one, m of a pixel.
+AROUND, INSIDE, LATHE_TEXEL = 0.12, 0.36, 0.0008
 LIGHT = np.array([0.45, 0.35, 0.82]) / np.linalg.norm([0.45, 0.35, 0.82])
+SPREAD = 0.3  # of the light's directions in the room, standard deviation over their length
+DIRECTIONS = 160  # from which the room's light comes, and as many more from all around
 # Outer profile upwards, then inner profile downwards: radius, height above the table top (m).
 VASE_OUTER = [
     (0.0, 0.0), (0.075, 0.0), (0.105, 0.05), (0.125, 0.12), (0.115, 0.19), (0.08, 0.25), (0.06, 0.29), (0.09, 0.34)
@@ -31,6 +45,15 @@ VASE_OUTER = [
 VASE_INNER = [
     (0.075, 0.34), (0.046, 0.29), (0.064, 0.25), (0.098, 0.19), (0.108, 0.12), (0.088, 0.05), (0.05, 0.02), (0.0, 0.018)
 ]  # fmt: skip
+# Of the bowl and of the pot, likewise.
+BOWL_OUTER = [(0.0, 0.0), (0.045, 0.0), (0.05, 0.008), (0.085, 0.03), (0.105, 0.06), (0.112, 0.08)]
+BOWL_INNER = [(0.104, 0.081), (0.096, 0.06), (0.076, 0.035), (0.045, 0.018), (0.0, 0.014)]
+POT_OUTER = [(0.0, 0.0), (0.052, 0.0), (0.066, 0.075), (0.073, 0.077), (0.077, 0.108)]
+POT_INNER = [(0.069, 0.109), (0.066, 0.094), (0.04, 0.097), (0.0, 0.099)]  # the soil closes it
+TURNED = {
+    "vase": ((VASE_OUTER, VASE_INNER), VASE_AT, 96), "bowl": ((BOWL_OUTER, BOWL_INNER), BOWL_AT, 64),
+    "pot": ((POT_OUTER, POT_INNER), PLANT_AT, 64),
+}  # fmt: skip
 
 
 @dataclass
@@ -41,8 +64,12 @@ class Part:
         vertices: [V, 3] m.
         faces: [F, 3].
         texture: [H, W, 3] float32 RGB in 0..1.
-        mapping: "box" (each side its own part of the texture), "sheet" (x and y) or "lathe" (angle and height).
+        mapping: "box" (each side its own part of the texture), "sheet" (x and y), "lathe" (angle and height) or "uv".
         texel: metres a texture pixel covers.
+        axis: of a lathe, where it meets what it stands on, m.
+        uv: [V, 2] m, places on the texture; of "uv" only.
+        gloss: share of the light that a mirror would throw back; seen in the room only.
+        moved: turn [3, 3] and shift [3] m by which the part has moved since its texture was laid on it, if it has.
     """
 
     vertices: np.ndarray
@@ -50,6 +77,14 @@ class Part:
     texture: np.ndarray
     mapping: str
     texel: float
+    axis: tuple[float, float, float] = (*VASE_AT, TABLE_HEIGHT)
+    uv: np.ndarray | None = None
+    gloss: float = 0.0
+    moved: tuple[np.ndarray, np.ndarray] | None = None
+
+    def before(self, points: np.ndarray) -> np.ndarray:
+        """Points [P, 3] where they were before the part moved."""
+        return points if self.moved is None else (points - self.moved[1]) @ self.moved[0]
 
 
 def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -89,15 +124,26 @@ def smooth_profile(points: list[tuple[float, float]], samples: int) -> np.ndarra
     return PchipInterpolator(t, p)(np.linspace(0, t[-1], samples))
 
 
-def noise(rng: np.random.Generator, height: int, width: int, coarsest: int, octaves: int) -> np.ndarray:
-    """Sum of smoothed random grids, each octave twice as fine and 0.65 as strong; about zero mean, unit spread."""
+def turned_solid(outer: list, inner: list, segments: int) -> tuple[np.ndarray, np.ndarray]:
+    """A hollow thing of the room, standing at the origin, from the points of its two profiles."""
+    return lathe(np.vstack([smooth_profile(outer, 36), smooth_profile(inner, 30)]), segments)
+
+
+def noise(
+    rng: np.random.Generator, height: int, width: int, coarsest: int | tuple[int, int], octaves: int
+) -> np.ndarray:
+    """Sum of smoothed random grids, each octave twice as fine and 0.65 as strong; about zero mean, unit spread.
+
+    `coarsest` is the cell of the first grid in pixels, or its height and width.
+    """
     import cv2
 
     total = np.zeros((height, width), np.float32)
+    first = coarsest if isinstance(coarsest, tuple) else (coarsest, coarsest)
     for octave in range(octaves):
-        cell = max(1, coarsest >> octave)
-        grid = rng.standard_normal((height // cell + 2, width // cell + 2)).astype(np.float32)
-        big = cv2.resize(grid, None, fx=cell, fy=cell, interpolation=cv2.INTER_CUBIC)
+        high, wide = (max(1, cell >> octave) for cell in first)
+        grid = rng.standard_normal((height // high + 2, width // wide + 2)).astype(np.float32)
+        big = cv2.resize(grid, None, fx=wide, fy=high, interpolation=cv2.INTER_CUBIC)
         total += 0.65**octave * big[:height, :width]
     return (total - total.mean()) / total.std()
 
@@ -129,8 +175,8 @@ def texture(
     return np.clip(image * shade + tint, 0.02, 0.98).astype(np.float32)
 
 
-def build() -> list[Part]:
-    """The scene: room, table (one part a box) and vase."""
+def build_patches() -> list[Part]:
+    """Room, table (one part a box) and vase, all of random patches."""
     half_x, half_y = TABLE_SIZE[0] / 2, TABLE_SIZE[1] / 2
     wood = [(0.55, 0.33, 0.17), (0.72, 0.50, 0.28), (0.38, 0.22, 0.12), (0.80, 0.66, 0.42), (0.30, 0.34, 0.24)]
     stone = [(0.42, 0.46, 0.52), (0.60, 0.60, 0.58), (0.28, 0.31, 0.38), (0.68, 0.58, 0.48), (0.35, 0.42, 0.36)]
@@ -162,21 +208,330 @@ def build() -> list[Part]:
     return parts
 
 
-def sample_texture(part: Part, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Colours [P, 3] of a part at surface points [P, 3] with normals [P, 3]."""
+def cells(rng: np.random.Generator, height: int, width: int, spacing: float, bend: float) -> tuple[np.ndarray, ...]:
+    """Random cells about `spacing` pixels wide with bent borders: the cell of each pixel, its distance from the cell's
+    middle and how much farther the next middle is, px."""
+    from scipy.spatial import cKDTree
+
+    sites = rng.random((max(2, round(height * width / spacing**2)), 2)) * (height, width)
+    row, column = np.mgrid[0:height, 0:width].astype(np.float32)
+    octaves = max(1, min(4, int(np.log2(spacing))))
+    row += bend * spacing * noise(rng, height, width, max(2, int(spacing)), octaves)
+    column += bend * spacing * noise(rng, height, width, max(2, int(spacing)), octaves)
+    away, nearest = cKDTree(sites).query(np.stack([row, column], -1).reshape(-1, 2), k=2, workers=-1)
+    shape = (height, width)
+    return nearest[:, 0].reshape(shape), away[:, 0].reshape(shape), (away[:, 1] - away[:, 0]).reshape(shape)
+
+
+def soft(low: float, high: float, values: np.ndarray) -> np.ndarray:
+    """0 below `low`, 1 above `high`, smooth between."""
+    t = np.clip((values - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def over(image: np.ndarray, color: tuple[float, ...] | np.ndarray, share: np.ndarray) -> np.ndarray:
+    """An image [H, W, 3] with a colour laid over it by a share [H, W]."""
+    return image + share[..., None] * (np.asarray(color, np.float32) - image)
+
+
+def ramp(colors: list[tuple[float, float, float]], values: np.ndarray) -> np.ndarray:
+    """Colours [H, W, 3] of values [H, W] in 0..1, between those of a list."""
+    places = np.linspace(0, 1, len(colors))
+    return np.stack([np.interp(values, places, [c[k] for c in colors]) for k in range(3)], -1).astype(np.float32)
+
+
+def spotted(rng: np.random.Generator, image: np.ndarray, color: tuple, spacing: float, radius: float,
+            share: float = 1.0) -> np.ndarray:  # fmt: skip
+    """An image with ragged spots of random size in one colour; `share` of the cells have one."""
+    cell, away, _ = cells(rng, *image.shape[:2], spacing, 0.12)
+    size = radius * rng.uniform(0.4, 1.5, cell.max() + 1) * (rng.random(cell.max() + 1) < share)
+    return over(image, color, 0.9 * soft(-1, 1, size[cell] - away))
+
+
+def closed(image: np.ndarray, margin: int) -> np.ndarray:
+    """An image without its last columns, which fade into the first: it goes round a lathe without a seam."""
+    t = np.linspace(0, 1, margin, dtype=np.float32)[None, :, None]
+    image[:, :margin] = t * image[:, :margin] + (1 - t) * image[:, -margin:]
+    return image[:, :-margin]
+
+
+def wood(seed: int, height: int, width: int, texel: float, stave: tuple[float, float]) -> np.ndarray:
+    """Oak glued from staves that lie along the rows, `stave` m wide and on average long."""
+    rng = np.random.default_rng(seed)
+    y, x = np.arange(height) * texel, np.arange(width) * texel
+    strip = (y / stave[0]).astype(int)
+    tone = np.empty((height, width), np.float32)
+    shift, joint = np.empty_like(tone), np.zeros_like(tone)
+    for number in range(strip[-1] + 1):
+        cuts = np.cumsum(stave[1] * rng.uniform(0.6, 1.4, int(width * texel / stave[1] * 2) + 3)) - stave[1]
+        piece = np.searchsorted(cuts, x)
+        tone[strip == number] = rng.normal(0, 0.13, len(cuts) + 1)[piece]
+        shift[strip == number] = rng.uniform(0, 40, len(cuts) + 1)[piece]
+        joint[strip == number] = np.abs(x[:, None] - cuts).min(1) < 0.8 * texel
+    joint[np.flatnonzero(np.diff(strip)) + 1] = 1
+    # Rings are contours of a height that rises across the grain; a bump makes them go round a knot.
+    across = y[:, None] / 0.016 + shift + 1.3 * noise(rng, height, width, (40, 400), 4)
+    for _ in range(int(40 * height * width * texel**2)):
+        row, column, size = rng.uniform(0, y[-1]), rng.uniform(0, x[-1]), rng.uniform(0.5, 1.3)
+        bump = ((y[:, None] - row) / (0.010 * size)) ** 2 + ((x - column) / (0.028 * size)) ** 2
+        across += 2.4 * np.exp(-bump)
+        tone -= 0.55 * np.exp(-4 * bump)
+    rings = np.abs((across % 1) * 2 - 1) ** 1.5
+    fibre = noise(rng, height, width, (6, 96), 3)
+    pores = soft(1.1, 1.9, noise(rng, height, width, (3, 36), 2))
+    cloud = noise(rng, height, width, (60, 90), 4)
+    value = 0.56 + tone + 0.16 * (rings - 0.5) + 0.05 * fibre + 0.09 * cloud - 0.16 * pores
+    image = ramp([(0.20, 0.11, 0.06), (0.44, 0.26, 0.14), (0.67, 0.46, 0.27), (0.84, 0.67, 0.46)], np.clip(value, 0, 1))
+    return over(image, (0.20, 0.12, 0.07), 0.6 * joint)
+
+
+def terrazzo(seed: int, side: int, texel: float, tile: float) -> np.ndarray:
+    """Tiles of stone chips in cement, `tile` m wide, no two alike."""
+    rng = np.random.default_rng(seed)
+    place = (np.arange(side) * texel / tile).astype(int)
+    number = place[:, None] * (place[-1] + 1) + place
+    tint = rng.normal(0, 0.035, number.max() + 1)[:, None] + rng.normal(0, 0.012, (number.max() + 1, 3))
+    image = np.float32([0.66, 0.63, 0.57]) + 0.03 * noise(rng, side, side, 16, 4)[..., None]
+    chips = [(0.36, 0.33, 0.31), (0.52, 0.36, 0.27), (0.80, 0.77, 0.70), (0.47, 0.50, 0.47), (0.58, 0.50, 0.38)]
+    for spacing, share in ((0.014, 0.45), (0.042, 0.55)):
+        cell, _, gap = cells(rng, side, side, spacing / texel, 0.08)
+        shown = (rng.random(cell.max() + 1) < share)[cell] * soft(0.06, 0.16, gap * texel / spacing)
+        own = (
+            np.array(chips)[rng.integers(0, len(chips), cell.max() + 1)]
+            * rng.uniform(0.8, 1.15, cell.max() + 1)[:, None]
+        )
+        image = over(image, own[cell].astype(np.float32), 0.85 * shown)
+    image += (tint[number] + 0.025 * noise(rng, side, side, 300, 6)[..., None]).astype(np.float32)
+    seam = np.abs(((np.arange(side) * texel + tile / 2) % tile) - tile / 2) < 0.005
+    return np.clip(over(image, (0.34, 0.33, 0.31), 0.9 * (seam[:, None] | seam)), 0.02, 0.98)
+
+
+def glaze(seed: int, dipped: float, colors: list, under: list, dots: tuple) -> np.ndarray:
+    """A glaze for a lathe: `under` with iron dots and brush marks, and `colors` dipped over it, which runs down.
+
+    Args:
+        seed: of all that is random.
+        dipped: how far up, m, the upper glaze reaches on average.
+        colors: of the upper glaze, from thin to thick.
+        under: the same of the lower one.
+        dots: colour of the dots.
+    """
+    rng = np.random.default_rng(seed)
+    margin, texel = 60, LATHE_TEXEL
+    height, width = int(2 * INSIDE / texel), round(2 * np.pi * AROUND / texel) + margin
+    up = np.arange(height)[:, None] * texel % INSIDE
+    body = ramp(under, np.clip(0.5 + 0.22 * noise(rng, height, width, 40, 4), 0, 1))
+    brush = noise(rng, height, width, (36, 20), 3) + 0.5 * noise(rng, height, width, 80, 2)
+    body = over(body, dots, 0.65 * soft(1.15, 1.35, brush))
+    body = spotted(rng, body, dots, 15, 3.2, 0.8)
+    thick = up - dipped + 0.03 * noise(rng, 1, width, 64, 4) + 0.008 * noise(rng, height, width, (80, 40), 3)
+    runs = np.clip(0.45 + 1.2 * thick / 0.3 + 0.22 * noise(rng, height, width, (60, 24), 5), 0, 1)
+    top = spotted(rng, ramp(colors, runs), under[-1], 22, 3.6, 0.6)
+    share = soft(-0.002, 0.003, thick)
+    image = over(over(body, colors[0], 0.8 * soft(-0.006, 0.0, thick) * (1 - share)), top, share)
+    return closed(np.clip(image, 0.02, 0.98).astype(np.float32), margin)
+
+
+def plaster(seed: int) -> np.ndarray:
+    """The room's walls, one side of the box below the other: plaster, skirting and pictures."""
+    rng = np.random.default_rng(seed)
+    texel, high = 0.006, 3.2
+    height, width = int((4 * ROOM + 4 * high) / texel) + 2, int(2 * ROOM / texel) + 2
+    image = np.float32([0.80, 0.76, 0.68]) + 0.018 * noise(rng, height, width, 200, 7)[..., None]
+    image += 0.012 * noise(rng, height, width, 6, 2)[..., None]
+    for side in range(4):
+        first = int((4 * ROOM + side * high) / texel)
+        wall = image[first : first + int(high / texel)]
+        wall[:] = wall * (1.0, 0.985, 0.96) if side % 2 else wall
+        wall[: int(0.11 / texel)] = wood(seed + 10 + side, int(0.11 / texel), width, texel, (0.3, 2.0)) * 0.75
+        wall[int(0.11 / texel) : int(0.12 / texel)] *= 0.6
+        at = rng.uniform(0.25, 0.6)
+        while at < 2 * ROOM - 1.0:
+            wide, tall, low = rng.uniform(0.45, 1.0), rng.uniform(0.5, 1.0), rng.uniform(0.65, 1.0)
+            rows, columns = (slice(int(a / texel), int(b / texel)) for a, b in ((low, low + tall), (at, at + wide)))
+            frame = wall[rows, columns]
+            frame[:] = rng.choice([(0.22, 0.15, 0.10), (0.75, 0.70, 0.62), (0.12, 0.12, 0.13), (0.62, 0.46, 0.22)])
+            picture = frame[8:-8, 8:-8]
+            picture[:] = (0.90, 0.88, 0.83)
+            picture = picture[12:-12, 12:-12]
+            picture[:] = painting(rng, *picture.shape[:2])
+            at += wide + rng.uniform(0.3, 0.8)
+    return np.clip(image, 0.02, 0.98)
+
+
+def painting(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """Hills below a sky, in one of a few moods."""
+    moods = [
+        [(0.20, 0.30, 0.24), (0.38, 0.50, 0.36), (0.62, 0.66, 0.50), (0.78, 0.80, 0.80), (0.60, 0.72, 0.84)],
+        [(0.25, 0.18, 0.20), (0.50, 0.28, 0.22), (0.74, 0.48, 0.28), (0.88, 0.74, 0.52), (0.70, 0.68, 0.72)],
+        [(0.10, 0.18, 0.30), (0.16, 0.34, 0.48), (0.40, 0.56, 0.62), (0.80, 0.80, 0.74), (0.88, 0.84, 0.76)],
+    ]
+    up = np.linspace(0, 1, height)[:, None] + 0.16 * noise(rng, height, width, (24, 60), 4)
+    layers = np.round(5 * up) / 5 + 0.05 * noise(rng, height, width, 10, 3)
+    return ramp(moods[rng.integers(len(moods))], np.clip(layers, 0, 1))
+
+
+def linen(seed: int, height: int, width: int) -> np.ndarray:
+    """A woven cloth with stripes of random width both ways."""
+    rng = np.random.default_rng(seed)
+
+    def stripes(count: int) -> np.ndarray:
+        edges = np.cumsum(rng.uniform(6, 34, count // 6))
+        kind = rng.choice([0, 0, 0, 1, 2], len(edges) + 1)
+        return kind[np.searchsorted(edges, np.arange(count))]
+
+    image = np.full((height, width, 3), (0.86, 0.82, 0.73), np.float32)
+    for lines in (stripes(height)[:, None], stripes(width)[None, :]):
+        for kind, color in ((1, (0.20, 0.32, 0.46)), (2, (0.68, 0.27, 0.20))):
+            image = over(image, color, 0.55 * np.broadcast_to(lines == kind, (height, width)))
+    row, column = np.mgrid[0:height, 0:width]
+    threads = 0.05 * np.where((row // 2 + column // 2) % 2, 1, -1) * (1 + 0.5 * noise(rng, height, width, 4, 2))
+    return np.clip(image * (1 + threads + 0.07 * noise(rng, height, width, 24, 5))[..., None], 0.02, 0.98)
+
+
+def leaf_green(seed: int, height: int, width: int) -> np.ndarray:
+    """Bands across a leaf, as on a snake plant, with a light rim; a leaf lies along the columns."""
+    rng = np.random.default_rng(seed)
+    bands = noise(rng, height, width, (12, 48), 4) + 0.4 * noise(rng, height, width, 6, 2)
+    image = ramp([(0.14, 0.26, 0.15), (0.26, 0.42, 0.22), (0.52, 0.62, 0.36)], np.clip(0.45 + 0.3 * bands, 0, 1))
+    return np.clip(image, 0.02, 0.98)
+
+
+def cloth() -> Part:
+    """A cloth of 5 mm that lies on the table askew and hangs down over its edge, with folds."""
+    count, (long, wide), thick, turn = 48, (0.42, 0.30), 0.005, 0.12
+    along, across = np.meshgrid(np.linspace(0, long, count), np.linspace(0, wide, count), indexing="ij")
+    x = -0.44 + across * np.cos(turn) + along * np.sin(turn)
+    ahead = 0.10 + along * np.cos(turn) - across * np.sin(turn)  # along y, and then down
+    bend, edge = 0.012, TABLE_SIZE[1] / 2
+    angle = np.clip((ahead - edge) / bend, 0, np.pi / 2)
+    down = np.maximum(ahead - edge - bend * np.pi / 2, 0)
+    rng = np.random.default_rng(21)
+    wave = noise(rng, count, count, 16, 2)
+    lift = 0.0015 + 0.004 * soft(0.6, 2.2, wave) * np.cos(angle)  # it lies flat but for a few creases
+    out = down * (0.09 * np.sin(2 * np.pi * across / 0.105 + 0.8) + 0.09) + lift
+    y = np.minimum(ahead, edge) + bend * np.sin(angle) + out * np.sin(angle)
+    z = TABLE_HEIGHT - bend * (1 - np.cos(angle)) - down + lift * np.cos(angle)
+    sheet = np.stack([x, y, z], -1)
+    normal = np.cross(np.gradient(sheet, axis=1), np.gradient(sheet, axis=0))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    vertices = np.concatenate([(sheet + thick * normal).reshape(-1, 3), sheet.reshape(-1, 3)])
+    k = np.arange(count * count).reshape(count, count)
+    a, b, c, d = k[:-1, :-1].ravel(), k[1:, :-1].ravel(), k[1:, 1:].ravel(), k[:-1, 1:].ravel()
+    upper = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+    rim = np.concatenate([k[0, :-1], k[:-1, -1], k[-1, :0:-1], k[:0:-1, 0]])
+    after, under = np.roll(rim, -1), count * count
+    side = np.concatenate([np.stack([rim, rim + under, after], 1), np.stack([after, rim + under, after + under], 1)])
+    faces = np.concatenate([upper, upper[:, ::-1] + under, side])
+    uv = np.tile(np.stack([along, across], -1).reshape(-1, 2), (2, 1))
+    return Part(vertices, faces, linen(22, int(wide / 0.0008) + 2, int(long / 0.0008) + 2), "uv", 0.0008, uv=uv)
+
+
+def leaves() -> Part:
+    """The thick leaves of a plant, each a bent tapering spindle, one mesh."""
+    rng = np.random.default_rng(31)
+    rings, segments, parts, places = 18, 14, [], []
+    for number in range(11):
+        azimuth = number * 2.4 + rng.normal(0, 0.15)  # rad; the golden angle, as leaves grow
+        lean, length = rng.uniform(0.10, 0.25) + 0.055 * number, rng.uniform(0.15, 0.18) - 0.003 * number
+        t = np.linspace(0, 1, rings)
+        tilt = lean * (0.5 + 1.1 * t)
+        step = length / (rings - 1)
+        reach = 0.012 + 0.0012 * number + np.concatenate([[0], np.cumsum(step * np.sin(tilt[:-1]))])
+        high = np.concatenate([[0], np.cumsum(step * np.cos(tilt[:-1]))]) + TABLE_HEIGHT + 0.085
+        outward = np.array([np.cos(azimuth), np.sin(azimuth), 0])
+        beside = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+        middle = np.array([*PLANT_AT, 0]) + reach[:, None] * outward + high[:, None] * [0, 0, 1]
+        flat = np.cos(tilt)[:, None] * outward - np.sin(tilt)[:, None] * [0, 0, 1]
+        broad = 0.024 * (1 - t**2.2) ** 0.8 * (0.72 + 0.9 * t * (1 - t)) + 0.001
+        thick = 0.008 * (1 - 0.6 * t) * (1 - t**6) + 0.0008
+        angle = np.arange(segments) * 2 * np.pi / segments
+        circle = broad[:, None, None] * np.cos(angle)[:, None] * beside + (
+            (thick[:, None] * np.sin(angle))[..., None] * flat[:, None]
+        )
+        parts.append((middle[:, None] + circle).reshape(-1, 3))
+        v = 0.05 * number + 0.025 + broad[:, None] * np.cos(angle)
+        places.append(np.stack([np.broadcast_to(0.2 * t[:, None], v.shape), v], -1).reshape(-1, 2))
+    k = np.arange(rings * segments).reshape(rings, segments)
+    nxt = np.roll(k, -1, 1)
+    a, b, c, d = k[:-1].ravel(), nxt[:-1].ravel(), nxt[1:].ravel(), k[1:].ravel()
+    one = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+    caps = [np.stack([np.full(segments - 2, 0), k[0, 1:-1], k[0, 2:]], 1),
+            np.stack([np.full(segments - 2, k[-1, 0]), k[-1, 2:], k[-1, 1:-1]], 1)]  # fmt: skip
+    one = np.concatenate([one, *caps])
+    faces = np.concatenate([one + number * rings * segments for number in range(len(parts))])
+    return Part(
+        np.concatenate(parts), faces, leaf_green(32, 560, 210), "uv", 0.001, uv=np.concatenate(places), gloss=0.03
+    )
+
+
+def build_room() -> list[Part]:
+    """Table, vase, bowl, plant and cloth on a tiled floor, and the walls."""
+    half_x, half_y = TABLE_SIZE[0] / 2, TABLE_SIZE[1] / 2
+    under, fine = TABLE_HEIGHT - TABLE_THICKNESS, 0.0008
+    slab = box((-half_x, -half_y, under), (half_x, half_y, TABLE_HEIGHT))
+    rows = int((2 * TABLE_SIZE[1] + 4 * TABLE_THICKNESS) / fine) + 2
+    parts = [Part(*slab, wood(1, rows, int(TABLE_SIZE[0] / fine) + 2, fine, (0.066, 0.34)), "box", fine, gloss=0.02)]
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            x, y = sx * (half_x - 0.04 - LEG / 2), sy * (half_y - 0.04 - LEG / 2)
+            shape = box((x - LEG / 2, y - LEG / 2, 0.0), (x + LEG / 2, y + LEG / 2, under))
+            # The grain of a leg runs upwards, along its texture's columns.
+            upright = wood(
+                10 + len(parts), int(LEG / fine) + 2, int((4 * under + 2 * LEG) / fine) + 2, fine, (0.045, 0.4)
+            )
+            parts.append(Part(*shape, np.ascontiguousarray(upright.transpose(1, 0, 2)), "box", fine))
+
+    def turned(name: str, picture: np.ndarray, gloss: float) -> None:
+        profiles, at, segments = TURNED[name]
+        vertices, faces = turned_solid(*profiles, segments)
+        axis = (*at, TABLE_HEIGHT)
+        parts.append(Part(vertices + axis, faces, picture, "lathe", LATHE_TEXEL, axis, gloss=gloss))
+
+    cream = [(0.62, 0.54, 0.42), (0.80, 0.74, 0.62), (0.90, 0.87, 0.78)]
+    teal = [(0.42, 0.30, 0.20), (0.14, 0.36, 0.40), (0.10, 0.30, 0.42), (0.24, 0.52, 0.56), (0.08, 0.20, 0.34)]
+    honey = [(0.36, 0.22, 0.12), (0.66, 0.42, 0.18), (0.80, 0.60, 0.30), (0.54, 0.30, 0.14), (0.86, 0.72, 0.44)]
+    clay = [(0.50, 0.25, 0.16), (0.66, 0.36, 0.24), (0.78, 0.48, 0.34)]
+    turned("vase", glaze(2, 0.19, teal, cream, (0.30, 0.17, 0.10)), 0.05)
+    turned("bowl", glaze(5, 0.035, honey, cream, (0.26, 0.15, 0.09)), 0.05)
+    pot = glaze(6, 0.3, clay, clay, (0.36, 0.17, 0.11))
+    rng = np.random.default_rng(7)
+    soil = ramp(
+        [(0.10, 0.07, 0.05), (0.24, 0.17, 0.11), (0.42, 0.32, 0.22)],
+        np.clip(0.4 + 0.25 * noise(rng, *pot.shape[:2], 12, 3), 0, 1),
+    )
+    pot[len(pot) // 2 :] = soil[len(pot) // 2 :]
+    turned("pot", pot, 0.0)
+    parts += [leaves(), cloth()]
+    corners = np.array([[-ROOM, -ROOM, 0.0], [ROOM, -ROOM, 0], [ROOM, ROOM, 0], [-ROOM, ROOM, 0]])
+    floor = (corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    parts.append(Part(*floor, terrazzo(3, 2402, 0.003, 0.40), "sheet", 0.003, gloss=0.02))
+    # Its lower side lies below the floor, so that rays meet only that.
+    walls = box((-ROOM, -ROOM, -0.01), (ROOM, ROOM, 3.2))
+    parts.append(Part(walls[0], walls[1][:, ::-1], plaster(4), "box", 0.006))
+    return parts
+
+
+def sample_texture(part: Part, points: np.ndarray, normals: np.ndarray, uv: np.ndarray | None = None) -> np.ndarray:
+    """Colours [P, 3] of a part at surface points [P, 3] with normals [P, 3], and `uv` [P, 2] m if it is mapped so."""
     import cv2
 
-    if part.mapping == "lathe":
-        local = points - [*VASE_AT, TABLE_HEIGHT]
+    vertices = part.before(part.vertices)
+    if part.moved is not None:
+        points, normals = part.before(points), normals @ part.moved[0]
+    if uv is not None:
+        u, v = uv.T
+    elif part.mapping == "lathe":
+        local = points - part.axis
         angle = np.arctan2(local[:, 1], local[:, 0])
-        inside = ((normals[:, :2] * local[:, :2]).sum(1) < 0) * 0.36
-        u, v = (angle + np.pi) * 0.12, local[:, 2] + inside
+        inside = ((normals[:, :2] * local[:, :2]).sum(1) < 0) * INSIDE
+        u, v = (angle + np.pi) * AROUND, local[:, 2] + inside
     elif part.mapping == "sheet":
-        u, v = (points[:, :2] - part.vertices[:, :2].min(0)).T
+        u, v = (points[:, :2] - vertices[:, :2].min(0)).T
     else:
         axis = np.abs(normals).argmax(1)
         sign = np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0
-        low, high = part.vertices.min(0), part.vertices.max(0)
+        low, high = vertices.min(0), vertices.max(0)
         size = high - low
         local = points - low
         # The six sides lie below one another in the texture: bottom and top, then the upright ones.
@@ -219,17 +574,23 @@ def cameras() -> list[np.ndarray]:
     return poses
 
 
-def render(parts: list[Part], caster, pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """One photo [H, W, 3] uint8: Lambert from one soft light with shadows, plus ambient light."""
-    import open3d as o3d
-
+def view_rays(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions [N, 3] float32 of the rays of a photo, row by row, SUPERSAMPLE squared to a pixel."""
     n = SUPERSAMPLE
     x = (np.arange(WIDTH * n) + 0.5) / n - WIDTH / 2
     y = (np.arange(HEIGHT * n) + 0.5) / n - HEIGHT / 2
     direction = np.empty((HEIGHT * n, WIDTH * n, 3), np.float32)
     direction[..., 0], direction[..., 1], direction[..., 2] = x[None, :] / FOCAL, -y[:, None] / FOCAL, -1
     direction = (direction @ pose[:3, :3].T).reshape(-1, 3).astype(np.float32)
-    origin = np.broadcast_to(pose[:3, 3].astype(np.float32), direction.shape)
+    return np.broadcast_to(pose[:3, 3].astype(np.float32), direction.shape), direction
+
+
+def render(parts: list[Part], caster, pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One photo [H, W, 3] uint8 of patches: Lambert from one soft light with shadows, plus ambient light."""
+    import open3d as o3d
+
+    n = SUPERSAMPLE
+    origin, direction = view_rays(pose)
     hit = caster.cast_rays(o3d.core.Tensor(np.concatenate([origin, direction], 1)))
     distance, part_id = hit["t_hit"].numpy(), hit["geometry_ids"].numpy()
     normal = hit["primitive_normals"].numpy()
@@ -251,6 +612,107 @@ def render(parts: list[Part], caster, pose: np.ndarray, rng: np.random.Generator
     return (255 * color ** (1 / 1.6) + 0.5).astype(np.uint8)
 
 
+class Room:
+    """The parts as a photographer sees them: soft light from above, light from all around, and what objects throw back.
+
+    Light is computed once, at the vertices of meshes that are fine enough for its shadows, and the same in all photos.
+    """
+
+    def __init__(self, parts: list[Part]) -> None:
+        import open3d as o3d
+
+        self.parts = parts
+        self.meshes = [_lit_mesh(part, 0.2 if part is parts[-1] else 0.045) for part in parts]
+        self.caster = o3d.t.geometry.RaycastingScene()
+        for vertices, faces, _, _ in self.meshes:
+            self.caster.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+        self.light = self._light()
+
+    def _light(self) -> list[np.ndarray]:
+        """Light [V, 3] that falls onto the vertices of each mesh."""
+        import open3d as o3d
+
+        rng = np.random.default_rng(8)
+        sun = LIGHT + SPREAD * rng.standard_normal((DIRECTIONS, 3))
+        sun /= np.linalg.norm(sun, axis=1, keepdims=True)
+        k = np.arange(DIRECTIONS) + 0.5
+        turn, height = np.pi * (1 + 5**0.5) * k, 1 - 2 * k / DIRECTIONS
+        around = np.stack([np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height], 1)
+        point = np.concatenate([mesh[0] + 1e-3 * mesh[2] for mesh in self.meshes]).astype(np.float32)
+        normal = np.concatenate([mesh[2] for mesh in self.meshes])
+        # What the room throws back is its own colour, in part; floor and walls stand in nobody's light.
+        back = np.array([0.7 * (part.texture.mean((0, 1)) ** 2.2) for part in self.parts], np.float32)
+        standing = len(self.parts) - 2
+        total = np.zeros((len(point), 3), np.float32)
+        for directions, strength in ((sun, 1.15), (around, None)):
+            for direction in directions:
+                facing = np.clip(normal @ direction, 0, None).astype(np.float32)
+                seen = np.flatnonzero(facing)
+                rays = np.concatenate([point[seen], np.broadcast_to(direction, (len(seen), 3))], 1).astype(np.float32)
+                met = self.caster.cast_rays(o3d.core.Tensor(rays))["geometry_ids"].numpy()
+                blocked = met < standing
+                if strength is None:  # skylight from above, what floor and walls throw back from below
+                    sky = np.float32([0.80, 0.88, 1.0]) if direction[2] > 0 else np.float32([0.52, 0.47, 0.40])
+                    arriving = np.where(blocked[:, None], back[np.minimum(met, standing)], sky)
+                    total[seen] += (4 / DIRECTIONS * 0.62) * facing[seen, None] * arriving
+                else:
+                    color = np.float32([1.0, 0.95, 0.86])
+                    total[seen] += (strength / DIRECTIONS) * (facing[seen] * ~blocked)[:, None] * color
+        return np.split(total, np.cumsum([len(mesh[0]) for mesh in self.meshes])[:-1])
+
+    def photo(self, pose: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """One photo [H, W, 3] uint8, exposed by a `gain` [3]."""
+        import open3d as o3d
+
+        origin, direction = view_rays(pose)
+        hit = self.caster.cast_rays(o3d.core.Tensor(np.concatenate([origin, direction], 1)))
+        part_id, face, uv = (hit[name].numpy() for name in ("geometry_ids", "primitive_ids", "primitive_uvs"))
+        point = origin + hit["t_hit"].numpy()[:, None] * direction
+        ahead = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        weights = np.concatenate([1 - uv.sum(1, keepdims=True), uv], 1)[..., None]
+        color = np.zeros_like(point)
+        for index, part in enumerate(self.parts):
+            chosen = part_id == index
+            if not chosen.any():
+                continue
+            _, faces, normals, places = self.meshes[index]
+            corner, weight = faces[face[chosen]], weights[chosen]
+            normal = (weight * normals[corner]).sum(1)
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            place = (weight * places[corner]).sum(1) if places is not None else None
+            light = (weight * self.light[index][corner]).sum(1)
+            shown = sample_texture(part, point[chosen], normal, place) ** 2.2 * light
+            if part.gloss:
+                seen = ahead[chosen]
+                cosine = np.clip(-(normal * seen).sum(1), 0, 1)
+                mirrored = seen + 2 * cosine[:, None] * normal
+                lamp = 9 * np.exp(28 * (np.clip(mirrored @ LIGHT, -1, 1) - 1)) + 0.6 * soft(-0.2, 1.0, mirrored[:, 2])
+                shown += (part.gloss * (1 + 6 * (1 - cosine) ** 5) * lamp * light.mean(1))[:, None]
+            color[chosen] = shown
+        color = (color * gain).reshape(HEIGHT, SUPERSAMPLE, WIDTH, SUPERSAMPLE, 3).mean((1, 3))
+        # Bright places are compressed, as a camera does.
+        color = np.where(color > 0.6, 0.6 + 0.4 * np.tanh((color - 0.6) / 0.4), color)
+        return (255 * np.clip(color, 0, 1) ** (1 / 2.2) + 0.5).astype(np.uint8)
+
+
+def _lit_mesh(part: Part, longest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """A part's mesh with normals: vertices [V, 3], faces [F, 3], normals [V, 3] and places on the texture.
+
+    Flat sides are cut until no edge is longer than `longest`, and share no vertices at edges.
+    """
+    import trimesh
+
+    if part.mapping in ("lathe", "uv"):
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        return mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), mesh.vertex_normals.copy(), part.uv
+    flat = part.vertices[part.faces].reshape(-1, 3)
+    vertices, faces = trimesh.remesh.subdivide_to_size(flat, np.arange(len(flat)).reshape(-1, 3), longest, max_iter=20)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    key = np.concatenate([vertices[faces].reshape(-1, 3), np.repeat(mesh.face_normals, 3, 0)], 1).round(6)
+    unique, inverse = np.unique(key, axis=0, return_inverse=True)
+    return unique[:, :3].astype(np.float32), inverse.reshape(-1, 3).astype(np.uint32), unique[:, 3:], None
+
+
 def write_truth(parts: list[Part], path: Path) -> None:
     """The true surface of table, vase and floor (not the walls) with plain colours, metres."""
     import open3d as o3d
@@ -266,30 +728,51 @@ def write_truth(parts: list[Part], path: Path) -> None:
 
 
 def main() -> None:
-    """Renders everything into the folder given (default: table_vase beside this file)."""
+    """Renders a set into the folder given (default: table_vase beside this file)."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("set", nargs="?", choices=SETS, default=BUNDLED, help=f"default: {BUNDLED}, the bundled one")
+    parser.add_argument("--out", type=Path, help=f"default for {BUNDLED}: table_vase beside this file")
+    parser.add_argument("--views", type=int, default=None, help="render only the first N views")
+    arguments = parser.parse_args()
+    if arguments.out is None and arguments.set != BUNDLED:
+        parser.error(f"{arguments.set}: give a folder with --out")
+    make_set(arguments.set, arguments.out or Path(__file__).parent / "table_vase", arguments.views)
+
+
+def make_set(name: str, folder: Path, views: int | None = None) -> None:
+    """Writes the photos of "room" or "patches" with transforms.json and truth.ply into a folder.
+
+    Args:
+        name: of the set.
+        folder: made where it is not there.
+        views: only the first so many photos.
+    """
     import cv2
     import open3d as o3d
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "table_vase")
-    parser.add_argument("--views", type=int, default=None, help="render only the first N views")
-    arguments = parser.parse_args()
-    folder = arguments.out
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    parts = build()
-    caster = o3d.t.geometry.RaycastingScene()
-    for part in parts:
-        caster.add_triangles(
-            o3d.core.Tensor(part.vertices.astype(np.float32)), o3d.core.Tensor(part.faces.astype(np.uint32))
-        )
-    frames = []
+    parts = build_room() if name == "room" else build_patches()
     rng = np.random.default_rng(6)
-    for index, pose in enumerate(cameras()[: arguments.views]):
-        image = render(parts, caster, pose, rng)
-        name = f"images/{index:03d}.jpg"
-        cv2.imwrite(str(folder / name), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-        print(f"\r{index + 1} views", end="", flush=True)
+    if name == "room":
+        room = Room(parts)
+
+        def photo(pose: np.ndarray) -> np.ndarray:
+            return room.photo(pose, np.exp(rng.normal(0, EXPOSURE) + rng.normal(0, BALANCE, 3)))
+    else:
+        caster = o3d.t.geometry.RaycastingScene()
+        for part in parts:
+            triangles = (part.vertices.astype(np.float32), part.faces.astype(np.uint32))
+            caster.add_triangles(*map(o3d.core.Tensor, triangles))
+
+        def photo(pose: np.ndarray) -> np.ndarray:
+            return render(parts, caster, pose, rng)
+
+    frames = []
+    for index, pose in enumerate(cameras()[:views]):
+        file = f"images/{index:03d}.jpg"
+        cv2.imwrite(str(folder / file), photo(pose)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        frames.append({"file_path": file, "transform_matrix": pose.tolist()})
+        print(f"\r{index + 1} views", end="", flush=True, file=sys.stderr)
     write_truth(parts, folder / "truth.ply")
     about = {
         "comment": "camera-to-world, OpenGL axes; metres, z up; pixel centres at +0.5; made by samples/photos/make.py",
@@ -297,7 +780,7 @@ def main() -> None:
         "table_width": TABLE_SIZE[0], "table_height": TABLE_HEIGHT, "frames": frames,
     }  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
-    print()
+    print(file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -31,15 +31,16 @@ TO_ARKIT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 DRIFT, TURN = 0.01, 0.3  # m and degrees, the spread at the end of the walk
 
 
-def depths(poses: list[np.ndarray], focal: float, width: int, rng: np.random.Generator) -> list[tuple]:
-    """A sensor's depth [ROWS, COLUMNS] m, 0 in holes, and its confidence 0, 1 or 2, of cameras [4, 4], OpenGL axes."""
+def depths(truth: Path, poses: list[np.ndarray], focal: float, width: int, rng: np.random.Generator) -> list[tuple]:
+    """A sensor's depth [ROWS, COLUMNS] m, 0 in holes, and its confidence 0, 1 or 2, of cameras [4, 4], OpenGL axes,
+    that look at the mesh of a file."""
     import cv2
     import open3d as o3d
 
     caster = o3d.t.geometry.RaycastingScene()
-    truth = o3d.io.read_triangle_mesh(PHOTOS / "truth.ply")
+    true = o3d.io.read_triangle_mesh(truth)
     walls = make.box((-make.ROOM, -make.ROOM, 0.0), (make.ROOM, make.ROOM, 3.2))
-    for vertices, faces in ((np.asarray(truth.vertices), np.asarray(truth.triangles)), walls):
+    for vertices, faces in ((np.asarray(true.vertices), np.asarray(true.triangles)), walls):
         caster.add_triangles(*map(o3d.core.Tensor, (vertices.astype(np.float32), faces.astype(np.uint32))))
     scale = focal * COLUMNS / width
     x = (np.arange(COLUMNS) + 0.5 - COLUMNS / 2) / scale
@@ -75,30 +76,31 @@ def drifted(poses: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarra
     return moved
 
 
-def write(layout: str, out: Path, *, exact: bool = False, every: int = 1, seed: int = 0) -> None:
+def write(layout: str, out: Path, folder: Path = PHOTOS, *, exact: bool = False, every: int = 1, seed: int = 0) -> None:
     """Writes the capture.
 
     Args:
         layout: one of `LAYOUTS`.
         out: the `.r3d` file of record3d, else a folder to make.
+        folder: of a set that make.py has rendered.
         exact: no drift of the poses.
         every: only each so many-th photo.
         seed: of all noise.
     """
     rng = np.random.default_rng(seed)
-    about = json.loads((PHOTOS / "transforms.json").read_text(encoding="utf-8"))
+    about = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
     frames = about["frames"][::every]
-    photos = [PHOTOS / frame["file_path"] for frame in frames]
+    photos = [folder / frame["file_path"] for frame in frames]
     true = [np.array(frame["transform_matrix"]) for frame in frames]
-    measured = depths(true, about["fl_x"], about["w"], rng)
+    measured = depths(folder / "truth.ply", true, about["fl_x"], about["w"], rng)
     poses = [TO_ARKIT @ pose for pose in true] if exact else drifted(true, rng)
     lens = {"fx": about["fl_x"], "fy": about["fl_y"], "cx": about["cx"], "cy": about["cy"]}
     if layout == "record3d":
-        with tempfile.TemporaryDirectory() as folder:
-            _record3d(Path(folder), photos, poses, measured, lens, about, exr=False)
+        with tempfile.TemporaryDirectory() as packed:
+            _record3d(Path(packed), photos, poses, measured, lens, about, exr=False)
             with zipfile.ZipFile(out, "w") as archive:
-                for path in sorted(Path(folder).rglob("*")):
-                    archive.write(path, path.relative_to(folder))
+                for path in sorted(Path(packed).rglob("*")):
+                    archive.write(path, path.relative_to(packed))
     elif layout == "exr":
         _record3d(out, photos, poses, measured, lens, about, exr=True)
     elif layout == "polycam":

@@ -1,7 +1,5 @@
 """What the command info tells: versions, devices, models; what is missing here, what for, and how to get it."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import platform

@@ -4,8 +4,6 @@ Pose frames are the shapes' own origins in every format. The report's `left_out`
 docs/export.md says it of each format.
 """
 
-from __future__ import annotations
-
 import csv
 import importlib
 import io
@@ -23,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps import export_joints as jointed
+from sdfsim.apps.export_joints import add
 from sdfsim.apps.observed import COLUMNS
 from sdfsim.apps.recording import body_colors, framed, shown, sunk, with_normals
 from sdfsim.apps.run import read_run
@@ -91,7 +90,7 @@ class Take:
         """m to each side, of the sheet that is shown for a plane."""
         return 6.0 * framed(self.scene)[1]
 
-    def at_rate(self, fps: float) -> Take:
+    def at_rate(self, fps: float) -> "Take":
         """The same motion at so many evenly spaced times in a second, between frames as if moved evenly."""
         count = int(np.floor((self.time[-1] - self.time[0]) * fps + 1e-6)) + 1
         time = self.time[0] + np.arange(count) / fps
@@ -267,10 +266,6 @@ def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
 def _rgba(shape: Shape, color: np.ndarray) -> str:
     """For formats with one colour a mesh: the mean of its own ones, or `color`."""
     return _numbers((color if shape.mesh.colors is None else shape.mesh.colors.mean(0)) / 255.0, 1.0)
-
-
-def _add(parent: XML, tag: str, **attributes: str) -> XML:
-    return ElementTree.SubElement(parent, tag, {key.rstrip("_"): value for key, value in attributes.items()})
 
 
 def _write_xml(path: Path, root: XML) -> None:
@@ -487,13 +482,13 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     seen, cut = _write_assets(take, out, lambda body: not sampled, on_progress)
     root = XML("mujoco", model=plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
-    _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
-    _add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
+    add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
+    add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
     if sampled:  # from so many places, and for so long, MuJoCo looks for where two bodies are nearest
         root[-1].attrib |= {"sdf_initpoints": "40", "sdf_iterations": "10"}
-    _add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than is the default
-    asset, world = _add(root, "asset"), _add(root, "worldbody")
-    _add(world, "light", directional="true", castshadow="false", pos="0 0 10", dir="-0.4 0.3 -0.9")
+    add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than is the default
+    asset, world = add(root, "asset"), add(root, "worldbody")
+    add(world, "light", directional="true", castshadow="false", pos="0 0 10", dir="-0.4 0.3 -0.9")
     group, allowed = contact_groups(scene.bodies)
     if len(allowed) > MOST_GROUPS:
         left_out.append(f"collides_with: {len(allowed)} groups of bodies (MuJoCo knows {MOST_GROUPS})")
@@ -510,14 +505,14 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             meshes.add(name)
             # "convex" and "shell" need no enclosed volume, which meshes that are only shown may lack.
             inertia = "convex" if "-" in file.stem else "shell"
-            _add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
+            add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
         return name
 
     every = list(take.each())
     for k in tree.order:
         (name, body, shape, color), quat, above = every[k], every[k][1].quat_xyzw, tree.above.get(k)
         place, turned = jointed.mjcf_pose(scene, tree, k)
-        node = _add(nodes[above.parent if above else -1], "body", name=name, pos=_numbers(place))
+        node = add(nodes[above.parent if above else -1], "body", name=name, pos=_numbers(place))
         node.set("quat", _numbers(_wxyz(turned)))
         nodes[k] = node
         if body.motion == "kinematic":
@@ -528,10 +523,10 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
                 places += [_numbers(start)] * (len(start) > 0)
                 speeds += [_numbers(moving)] * (len(moving) > 0)
             else:
-                _add(node, "freejoint", name=f"{name}_free")
+                add(node, "freejoint", name=f"{name}_free")
             com, tensor = body.scale * shape.com, _inertia(body, shape)
             full = _numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
-            _add(node, "inertial", pos=_numbers(com), mass=_numbers(body.mass), fullinertia=full)
+            add(node, "inertial", pos=_numbers(com), mass=_numbers(body.mass), fullinertia=full)
         if body.motion == "dynamic" and not above:
             com, turn = body.scale * shape.com, Rotation.from_quat(quat)
             # Of the body's own origin, in world axes; and of its turning, in its own axes.
@@ -541,7 +536,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         rgba = _rgba(shape, color)
         if body.shape in seen:
             mesh = mesh_of(seen[body.shape], body.scale)
-            _add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
+            add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
             solids = [{"type": "mesh", "mesh": mesh_of(file, body.scale), "group": "3"} for file in cut[body.shape]]
             if sampled:
                 solids = [{"type": "sdf", "mesh": mesh, "group": "3"}]
@@ -554,7 +549,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         surface |= _mjcf_surface(body.friction**2, body.restitution**2)
         geoms[k] = [f"{name}-{i}" for i in range(len(solids))]
         for solid, label in zip(solids, geoms[k], strict=True):
-            _add(node, "geom", name=label, **solid, **surface)
+            add(node, "geom", name=label, **solid, **surface)
 
     # Between bodies of one material the square is the product. Other pairs are written one by one, while they are few:
     # those of few geoms first, since the floor is one.
@@ -572,9 +567,9 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             break
         surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
         pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[i] for b in geoms[j]]
-    contact = _add(root, "contact") if pairs else root
+    contact = add(root, "contact") if pairs else root
     for pair in pairs:
-        _add(contact, "pair", **pair)
+        add(contact, "pair", **pair)
     if scene.joints:
         ends = [nodes[k] for k in range(len(take.names))] + [world]
         controls, told = jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names)
@@ -583,7 +578,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         start = {"qpos": " ".join(places), "qvel": " ".join(speeds)} | (
             {"ctrl": _numbers(controls)} if controls else {}
         )
-        _add(_add(root, "keyframe"), "key", name="start", **start)
+        add(add(root, "keyframe"), "key", name="start", **start)
     _write_xml(out, root)
     return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
 
@@ -617,44 +612,44 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         if above is None or above.parent < 0:
             robots[k] = XML("robot", name=name), out if single else out.with_name(f"{out.stem}.{name}.urdf")
             if above is not None:
-                _add(robots[k][0], "link", name="world")
+                add(robots[k][0], "link", name="world")
             files.append(robots[k][1])
         else:
             robots[k] = robots[above.parent]
         root = robots[k][0]
-        link = _add(root, "link", name=name)
+        link = add(root, "link", name=name)
         # A link that is held has its origin where the joint is.
         origin = np.zeros(3) if above is None else above.anchor
-        surface = _add(link, "contact")
-        _add(surface, "lateral_friction", value=_numbers(body.friction))
-        _add(surface, "restitution", value=_numbers(body.restitution))
+        surface = add(link, "contact")
+        add(surface, "lateral_friction", value=_numbers(body.friction))
+        add(surface, "restitution", value=_numbers(body.restitution))
         moves = body.motion == "dynamic"
-        inertial = _add(link, "inertial")
-        _add(inertial, "origin", xyz=_numbers(body.scale * shape.com - origin), rpy="0 0 0")
-        _add(inertial, "mass", value=_numbers(body.mass if moves else 0.0))
+        inertial = add(link, "inertial")
+        add(inertial, "origin", xyz=_numbers(body.scale * shape.com - origin), rpy="0 0 0")
+        add(inertial, "mass", value=_numbers(body.mass if moves else 0.0))
         tensor = _inertia(body, shape) if moves else np.zeros((3, 3))
         sides = {f"i{'xyz'[a]}{'xyz'[b]}": _numbers(tensor[a, b]) for a in range(3) for b in range(a, 3)}
-        _add(inertial, "inertia", **sides)
+        add(inertial, "inertia", **sides)
 
         def part(tag: str, link: XML = link, origin: np.ndarray = origin, **keys: str) -> XML:
-            made = _add(link, tag, **keys)
+            made = add(link, tag, **keys)
             if np.any(origin):
-                _add(made, "origin", xyz=_numbers(-origin), rpy="0 0 0")
+                add(made, "origin", xyz=_numbers(-origin), rpy="0 0 0")
             return made
 
         def mesh(element: XML, file: Path, scale: float = body.scale) -> None:
             path = f"{file.parent.name}/{file.name}"
-            _add(_add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
+            add(add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
 
         if body.shape not in seen:
             if isinstance(shape.sdf, PlaneSdf):  # PyBullet draws none
-                visual = _add(link, "visual")
-                _add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
-                _add(_add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
+                visual = add(link, "visual")
+                add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
+                add(add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
             else:
                 visual = part("visual")
-                _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
-            _urdf_form(_add(part("collision"), "geometry"), shape.sdf, body.scale)
+                _urdf_form(add(visual, "geometry"), shape.sdf, body.scale)
+            _urdf_form(add(part("collision"), "geometry"), shape.sdf, body.scale)
         else:
             visual = part("visual")
             mesh(visual, seen[body.shape])
@@ -663,7 +658,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             for file in cut[body.shape] if body.motion != "static" else []:
                 mesh(part("collision"), file)
         rgba = _rgba(shape, color)
-        _add(_add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
+        add(add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
         if above is not None:
             held_at = tree.above[above.parent].anchor if above.parent in tree.above else np.zeros(3)
             jointed.urdf_joint(root, above, k, joint_names, links, held_at)
@@ -683,13 +678,13 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
 def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
     form = form.scaled(scale)
     if isinstance(form, PlaneSdf):
-        _add(geometry, "plane", normal="0 0 1")
+        add(geometry, "plane", normal="0 0 1")
     elif isinstance(form, SphereSdf):
-        _add(geometry, "sphere", radius=_numbers(form.radius))
+        add(geometry, "sphere", radius=_numbers(form.radius))
     elif isinstance(form, BoxSdf):
-        _add(geometry, "box", size=_numbers(2.0 * np.array(form.half)))
+        add(geometry, "box", size=_numbers(2.0 * np.array(form.half)))
     else:
-        _add(geometry, form.KIND, radius=_numbers(form.radius), length=_numbers(2.0 * form.half))
+        add(geometry, form.KIND, radius=_numbers(form.radius), length=_numbers(2.0 * form.half))
 
 
 # --- poses ---

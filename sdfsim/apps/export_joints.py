@@ -1,7 +1,5 @@
 """Joints of a scene in the formats of `export`: nested bodies of MJCF, links of URDF, joints of UsdPhysics."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -143,8 +141,6 @@ def speed_of(scene: Scene, one: Held, child: int) -> np.ndarray:
     (fast, spin), (carried, turned) = _speed(scene, child, point), _speed(scene, one.parent, point)
     axis = turn.apply(one.axis())
     kinds = {"hinge": [axis @ (spin - turned)], "slider": [axis @ (fast - carried)]}
-    if one.joint.kind == "slider":  # the point moves along with the frame that holds it
-        kinds["slider"] = [axis @ (fast - carried)]
     return turn.inv().apply(spin - turned) if one.joint.kind == "ball" else np.array(kinds.get(one.joint.kind, []))
 
 
@@ -165,8 +161,8 @@ def _text(*values: Any) -> str:
     return " ".join(f"{value + 0.0:.12g}" for value in np.concatenate([np.ravel(value) for value in values]))
 
 
-def _add(parent: Element, tag: str, **attributes: str) -> Element:
-    return SubElement(parent, tag, {key.rstrip("_"): value for key, value in attributes.items()})
+def add(parent: Element, tag: str, **attributes: str) -> Element:
+    return SubElement(parent, tag, attributes)
 
 
 def mjcf_pose(scene: Scene, tree: Trees, k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -191,7 +187,7 @@ def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) ->
         keys |= {"limited": "true", "range": _text(joint.limits)}
     if joint.spring is not None:
         keys |= {"stiffness": _text(joint.spring.stiffness), "springref": _text(joint.spring.rest)}
-    _add(node, "joint", name=name, **keys)
+    add(node, "joint", name=name, **keys)
     return (np.array([1.0, 0.0, 0.0, 0.0]) if joint.kind == "ball" else np.array([start])), speed
 
 
@@ -206,7 +202,7 @@ def mjcf_rest(
 
     def end(joint: Joint, side: int) -> str:
         name = f"{names[joint.name]}_end{side}"
-        _add(sites[joint.bodies[side]], "site", name=name, pos=_text(joint.anchor[side]), size="0.002")
+        add(sites[joint.bodies[side]], "site", name=name, pos=_text(joint.anchor[side]), size="0.002")
         return name
 
     for joint in tree.loops:
@@ -218,22 +214,22 @@ def mjcf_rest(
             if joint.spring is not None:
                 keys |= {"stiffness": _text(joint.spring.stiffness), "springlength": _text(joint.spring.rest)}
             keys |= {"damping": _text(joint.damping)} if joint.damping else {}
-            rope = _add(into["tendon"], "spatial", name=name, width="0.003", **keys)
+            rope = add(into["tendon"], "spatial", name=name, width="0.003", **keys)
             for side in (0, 1):
-                _add(rope, "site", site=end(joint, side))
+                add(rope, "site", site=end(joint, side))
             if joint.length is not None:
-                _add(into["equality"], "tendon", name=f"{name}_rod", tendon1=name)
+                add(into["equality"], "tendon", name=f"{name}_rod", tendon1=name)
             continue
         one = held(joint, joint.bodies[0])
         ends = {"body1": bodies[joint.bodies[0]]} | ({"body2": bodies[one.parent]} if one.parent >= 0 else {})
         if joint.kind == "fixed":
-            _add(into["equality"], "weld", name=name, **ends, anchor=_text(np.zeros(3)))
+            add(into["equality"], "weld", name=name, **ends, anchor=_text(np.zeros(3)))
         elif joint.kind == "slider":
             told.append(f"slider {joint.name}, which closes a loop")
         else:  # a hinge is held in two points of its axis
             points = [one.anchor] if joint.kind == "ball" else [one.anchor + s * 0.1 * one.axis() for s in (-1.0, 1.0)]
             for number, point in enumerate(points):
-                _add(
+                add(
                     into["equality"], "connect", name=name + (f"_{number}" if number else ""), **ends,
                     anchor=_text(point),
                 )  # fmt: skip
@@ -244,17 +240,17 @@ def mjcf_rest(
         if joint.collides and any(one.joint is joint for one in tree.above.values()):
             told.append(f"that bodies of {joint.name} touch each other")
         elif not joint.collides and second >= 0 and "dynamic" == scene.bodies[first].motion:
-            _add(into["contact"], "exclude", body1=bodies[first], body2=bodies[second])
+            add(into["contact"], "exclude", body1=bodies[first], body2=bodies[second])
         if joint.motor is None or joint in tree.loops:
             continue
         speed = KEEN * joint.motor.most
         keys = {"name": f"{names[joint.name]}_motor", "joint": names[joint.name]}
         keys |= {"forcerange": _text((-joint.motor.most, joint.motor.most))}
         if joint.motor.speed is not None:
-            _add(into["actuator"], "velocity", kv=_text(speed), **keys)
+            add(into["actuator"], "velocity", kv=_text(speed), **keys)
             controls.append(joint.motor.speed)
         else:
-            _add(into["actuator"], "position", kp=_text(speed / joint.motor.time), kv=_text(speed), **keys)
+            add(into["actuator"], "position", kp=_text(speed / joint.motor.time), kv=_text(speed), **keys)
             controls.append(float(joint.motor.position or 0.0))
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
         told.append("that a cone bounds the lean of a ball only: MuJoCo bounds its whole turn")
@@ -276,19 +272,19 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
     joint = one.joint
     bounded = joint.limits is not None and joint.kind != "ball"
     kinds = {"hinge": "revolute" if bounded else "continuous", "slider": "prismatic", "ball": "spherical"}
-    made = _add(root, "joint", name=names[joint.name], type=kinds.get(joint.kind, "fixed"))
-    _add(made, "parent", link=links[one.parent])
-    _add(made, "child", link=links[child])
+    made = add(root, "joint", name=names[joint.name], type=kinds.get(joint.kind, "fixed"))
+    add(made, "parent", link=links[one.parent])
+    add(made, "child", link=links[child])
     turn = one.parent_frame * one.frame.inv()
-    _add(made, "origin", xyz=_text(one.parent_anchor - origin), rpy=_text(turn.as_euler("xyz")))
+    add(made, "origin", xyz=_text(one.parent_anchor - origin), rpy=_text(turn.as_euler("xyz")))
     if joint.kind in ("hinge", "slider"):
-        _add(made, "axis", xyz=_text(one.axis()))
+        add(made, "axis", xyz=_text(one.axis()))
         low, high = joint.limits or (-EFFORT, EFFORT)
         effort = EFFORT if joint.motor is None else joint.motor.most
         ends = {} if joint.kind == "hinge" and not bounded else {"lower": _text(low), "upper": _text(high)}
-        _add(made, "limit", **ends, effort=_text(effort), velocity=_text(EFFORT))
+        add(made, "limit", **ends, effort=_text(effort), velocity=_text(EFFORT))
     if joint.damping or joint.friction:
-        _add(made, "dynamics", damping=_text(joint.damping), friction=_text(joint.friction))
+        add(made, "dynamics", damping=_text(joint.damping), friction=_text(joint.friction))
 
 
 def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:

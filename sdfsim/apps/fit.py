@@ -1,7 +1,5 @@
 """What the fit command does: mesh files become shape folders, one or many."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -57,6 +57,7 @@ HELD = 6  # every so many-th recording is kept out of the fit, where there are a
 ENOUGH = 4
 TRIES = 15, 15, 8  # of the fits to short windows, and to long ones
 DRAWS = 400  # of recordings, for intervals
+POINTS, BEYOND = 4, 2.0  # of a profile: on either side, and how far out, in half intervals
 CROWD, ROUNDS, AROUND = 24, 14, 0.15  # of the search between them: points, rounds, and how far about, in widths
 # How far parameters are looked for from the scene's: logarithms of factors, model lengths, rad.
 WIDTH = {
@@ -116,6 +117,19 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Profile:
+    """How the loss goes with one parameter, the others fitted again for each of its values."""
+
+    kind: str  # of `HEADS`
+    name: str
+    unit: str
+    value: float  # that was found, in this unit
+    interval: tuple[float, float] | None  # None where the recordings do not show it
+    x: list[float]
+    loss: list[float]  # over that of `value`
+
+
+@dataclass(frozen=True)
 class Identified:
     """What `identify` found. `scene_values`: body -> key of the scene file -> its value."""
 
@@ -126,6 +140,7 @@ class Identified:
     notes: list[str]
     scene_values: dict[str, dict[str, Any]] = field(default_factory=dict)
     joint_values: dict[str, dict[str, Any]] = field(default_factory=dict)  # joint -> key -> value
+    profiles: list[Profile] = field(default_factory=list)  # where they are asked for
 
     def report(self) -> dict[str, Any]:
         """By kind and name."""
@@ -544,8 +559,11 @@ class _Part:
 # --- the fit ---
 
 
-def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Progress = silent) -> Identified:
-    """Find the parameters with which the contact solve repeats recordings, and by how much they may be otherwise.
+def identify(
+    recordings: Sequence[Recording], scene: Scene, *, profiles: bool = False, on_progress: Progress = silent
+) -> Identified:
+    """Find the parameters with which the contact solve repeats recordings, and by how much they may be otherwise; with
+    `profiles` also how the loss goes with each.
 
     Those of the static body that is touched most count as the scene has them, as contacts show products only. Raises
     SdfsimError for recordings that are too short, or in which nothing touches.
@@ -620,11 +638,13 @@ def identify(recordings: Sequence[Recording], scene: Scene, *, on_progress: Prog
         "change": change.mean(0).tolist(), "change_95": sure.tolist() if np.isfinite(sure).all() else None,
     }  # fmt: skip
     error = float(np.sqrt(np.nanmean(np.concatenate([e[..., :3].ravel() for e in short.run(best)]) ** 2)))
-    found = _estimates(problem, best, last.group, slope(last, best, every), errors_of(last, best), scatter)
+    by, there = slope(last, best, every), errors_of(last, best)
+    found = _estimates(problem, best, last.group, by, there, scatter)
+    drawn = _profiles(problem, best, by, there, partial(errors_of, last), found) if profiles else []
     return Identified(
         found, len(short.begin),
         error * math.sqrt(3.0) * problem.units.length, confirmed, _notes(recordings), _scene_values(problem, best),
-        _joint_values(problem, best),
+        _joint_values(problem, best), drawn,
     )  # fmt: skip
 
 
@@ -693,37 +713,76 @@ def _estimates(
     def estimate(kind: str, name: str, value: float, gradient: dict[int, float]) -> Estimate:
         """Of a value with these derivatives by parameters."""
         at, by = list(gradient), np.array(list(gradient.values())) * width[list(gradient)]
-        unit = UNITS.get(kind, "")
         if not shown[at][by != 0.0].all():
-            return Estimate(kind, name, unit, None, None)
+            return Estimate(kind, name, "", None, None)
         half = SURE * float(np.sqrt(by @ covariance[np.ix_(at, at)] @ by))
         least = -math.inf if kind in ("height", "tilt") else 0.0
-        return Estimate(kind, name, unit, float(value), (max(least, float(value) - half), float(value) + half))
+        return Estimate(kind, name, "", float(value), (max(least, float(value) - half), float(value) + half))
 
-    found, own = [], {(p.kind, k): i for i, p in enumerate(parameters) for k in p.bodies}
+    found, number = [], {(p.kind, k): i for i, p in enumerate(parameters) for k in p.bodies}
     for kind in HIGH:
         for a, b in problem.pairs:
             gradient, product = {}, 1.0
             for one, other in ((a, b), (b, a)):
-                of = values[own[kind, other]] if (kind, other) in own else getattr(problem.bodies[other], kind)
+                of = values[number[kind, other]] if (kind, other) in number else getattr(problem.bodies[other], kind)
                 product *= of
-                if (i := own.get((kind, one))) is not None:
+                if (i := number.get((kind, one))) is not None:
                     gradient[i] = gradient.get(i, 0.0) + of
             found.append(estimate(kind, f"{problem.bodies[a].name} / {problem.bodies[b].name}", product, gradient))
     for i, (p, value) in enumerate(zip(parameters, values, strict=True)):
-        if p.kind in HIGH:
-            found.append(estimate(f"own_{p.kind}", p.name, value, {i: 1.0}))
-        elif p.kind in OF_JOINTS:
-            joint = problem.joints[p.axis]
-            heft = problem.heft(joint, p.kind)
-            unit = OF_TURNS[p.kind][0 if joint.kind in ("hinge", "ball") else 1]
-            found.append(replace(estimate(p.kind, p.name, heft * value, {i: heft}), unit=unit))
-        elif p.kind in FACTORS:
-            factor = math.exp(value) * (problem.bodies[p.bodies[0]].mass if p.kind == "mass" else 1.0)
-            found.append(estimate(p.kind, p.name, factor, {i: factor}))
-        else:
-            unit = problem.units.length if p.kind == "height" else math.degrees(1.0)
-            found.append(estimate(p.kind, p.name, unit * value, {i: unit}))
+        kind, unit, own = _own(problem, p, value)
+        by = own if p.kind in FACTORS else _own(problem, p, 1.0)[2]
+        found.append(replace(estimate(kind, p.name, own, {i: by}), unit=unit))
+    return found
+
+
+def _own(problem: Problem, p: Parameter, value: float) -> tuple[str, str, float]:
+    """Kind of the estimate, unit and value in it of a parameter by itself."""
+    if p.kind in HIGH:
+        return f"own_{p.kind}", "", value
+    if p.kind in OF_JOINTS:
+        joint = problem.joints[p.axis]
+        unit = OF_TURNS[p.kind][0 if joint.kind in ("hinge", "ball") else 1]
+        return p.kind, unit, value * problem.heft(joint, p.kind)
+    unit = UNITS.get(p.kind, "")
+    if p.kind in FACTORS:
+        return p.kind, unit, math.exp(value) * (problem.bodies[p.bodies[0]].mass if p.kind == "mass" else 1.0)
+    return p.kind, unit, value * (problem.units.length if p.kind == "height" else math.degrees(1.0))
+
+
+def _profiles(
+    problem: Problem, best: np.ndarray, slope: np.ndarray, errors: np.ndarray,
+    errors_of: Callable[[np.ndarray], np.ndarray], estimates: Sequence[Estimate],
+) -> list[Profile]:  # fmt: skip
+    """The loss along each parameter. The others go where the slopes at the best place say that they fit best, which is
+    a fit of one step."""
+    found, (low, high), width = [], problem.bounds, problem.width
+    weight = (1.0 + errors**2) ** -0.25  # of the soft L1 loss
+    weighted = slope * width * weight[:, None]
+
+    def loss(values: np.ndarray) -> float:
+        return float((np.sqrt(1.0 + errors_of(values) ** 2) - 1.0).sum())
+
+    least = max(loss(best), 1e-12)  # of a recording that is repeated exactly
+    for k, p in enumerate(problem.parameters):
+        kind, unit, value = _own(problem, p, float(best[k]))
+        interval = next(e.interval for e in estimates if (e.kind, e.name) == (kind, p.name))
+        by = (_own(problem, p, best[k] + 1e-6 * width[k])[2] - value) / 1e-6  # of the unit, in a width
+        half = 0.5 * (interval[1] - interval[0]) / by if interval else 0.5 / BEYOND
+        half = max(half, NUDGE[p.kind] / BEYOND)
+        others = np.delete(np.arange(len(best)), k)
+        along = np.zeros(len(best))
+        along[k] = 1.0
+        along[others] = np.linalg.lstsq(weighted[:, others], -weighted[:, k], rcond=1e-6)[0]
+        x, y = [], []
+        for step in np.linspace(-BEYOND, BEYOND, 2 * POINTS + 1):
+            values = best + step * half * along * width
+            if not low[k] <= values[k] <= high[k]:
+                continue
+            values = np.clip(values, low, high)
+            x.append(_own(problem, p, float(values[k]))[2])
+            y.append(loss(values) / least if step else 1.0)
+        found.append(Profile(kind, p.name, unit, value, interval, x, y))
     return found
 
 

@@ -1,7 +1,5 @@
 """`import`: a URDF or MJCF file becomes a scene.yaml."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -47,7 +45,7 @@ def import_robot(
         robot = read_urdf(source, packages=[Path(folder) for folder in packages], fixed=fixed)
     else:
         if fixed or packages:
-            raise SdfsimError(f"{source}: --fixed and --packages go with a URDF", "MJCF tells both itself")
+            raise SdfsimError(f"{source}: --fixed and --packages go with a URDF", "an MJCF file says both itself")
         robot = read_mjcf(source, key=key)
     check_writable(out.parent)
     files, notes = write_scene(robot, out, floor=floor, on_progress=partial(on_progress, "shapes"))

@@ -1,8 +1,6 @@
 """MJCF -> links and joints, as `robot` turns them into a scene. MuJoCo itself reads the file: its compiler knows all
 defaults, frames, inertias and includes, and what it refuses is no MJCF."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from dataclasses import replace
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.robot import Held, Link, Part, Robot, moved, named, pose_of
+from sdfsim.apps.robot import Link, LinkJoint, Part, Robot, moved, named, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
@@ -232,14 +230,14 @@ class _Reader:
 
     # --- joints ---
 
-    def _joints(self, b: int) -> list[Held]:
+    def _joints(self, b: int) -> list[LinkJoint]:
         model, data, types = self.model, self.data, self.mj.mjtJoint
         child, parent = self.link[b], self.link[model.body_parentid[b]]
         if model.body_weldid[b] == 0:
             return []
         first, count = model.body_jntadr[b], model.body_jntnum[b]
         if not count:
-            return [Held(f"{self._body_name(b)}_weld", "fixed", child, parent, data.xpos[b].copy())]
+            return [LinkJoint(f"{self._body_name(b)}_weld", "fixed", child, parent, data.xpos[b].copy())]
         found = []
         for j in range(first, first + count):
             kind, dof, at = types(int(model.jnt_type[j])), model.jnt_dofadr[j], model.jnt_qposadr[j]
@@ -259,12 +257,12 @@ class _Reader:
                     held["axis"] = data.xmat[b].reshape(3, 3)[:, 0].copy()
                 if stiff:
                     self.left.append(f"joint {name}: the stiffness of a ball")
-                found.append(Held(kind="ball", **held, limits=cone))
+                found.append(LinkJoint(kind="ball", **held, limits=cone))
                 continue
             limits = tuple(float(end) for end in model.jnt_range[j]) if limited else None
             spring = (stiff, float(model.qpos_spring[at])) if stiff else None
             held |= {"axis": data.xaxis[j].copy(), "start": float(data.qpos[at]), "limits": limits, "spring": spring}
-            found.append(Held(kind="hinge" if kind == types.mjJNT_HINGE else "slider", **held))
+            found.append(LinkJoint(kind="hinge" if kind == types.mjJNT_HINGE else "slider", **held))
         return found
 
     def _rotors(self) -> list[int]:
@@ -304,7 +302,7 @@ class _Reader:
             self.left.append(named(told, others))
         return found
 
-    def _loops(self) -> list[Held]:
+    def _loops(self) -> list[LinkJoint]:
         """Connect and weld of two bodies, which close loops."""
         model, mj = self.model, self.mj
         found, others = [], []
@@ -330,12 +328,12 @@ class _Reader:
             if np.linalg.norm(places[0] - places[1]) > NEAR:
                 self.notes.append(f"equality {name}: its ends are apart at the start; it holds them as they are")
             child, parent = both if both[0] >= 0 else both[::-1]
-            found.append(Held(name, "ball" if ball else "fixed", child, parent, places[0], loop=True))
+            found.append(LinkJoint(name, "ball" if ball else "fixed", child, parent, places[0], loop=True))
         if others:
             self.left.append(named("equalities that are not a connect or weld of two bodies", others))
         return found
 
-    def _ropes(self) -> list[Held]:
+    def _ropes(self) -> list[LinkJoint]:
         """Tendons between two sites."""
         model, mj = self.model, self.mj
         rods = {
@@ -364,7 +362,7 @@ class _Reader:
             if model.tendon_damping[k] and k not in rods:
                 made["damping"] = float(model.tendon_damping[k])
             found.append(
-                Held(
+                LinkJoint(
                     name, "distance", both[order[0]], both[order[1]], ends[0], loop=True, others=made,
                     limits=(0.0, float(model.tendon_range[k, 1])) if rope and k not in rods else None,
                     spring=(stiff, float(model.tendon_lengthspring[k, 1])) if stiff and k not in rods else None,

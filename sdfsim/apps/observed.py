@@ -4,6 +4,7 @@ that fits through smooth stretches tell."""
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -11,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfsim.apps.observed_joints import held_together, jointed
+from sdfsim.apps.beside import Beside
+from sdfsim.apps.observed_joints import Swing, flying_trees, held_together, jointed, swung, tree_of
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, visible
@@ -19,6 +21,7 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import from_scene, largest_extent
 from sdfsim.physics.free_flight import torque_free
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Scene
@@ -31,6 +34,7 @@ BEYOND = 5.0  # deviations of the noise that are no noise
 # Trackers that smooth are off more in a flight than from frame to frame: by so much of a size (and rad) at most, and
 # so many deviations of that.
 ROUGH, SMOOTHED = 3e-3, 30.0
+LEVER = 2.0  # of what trackers are off on one body: where the bodies of a tree are depends on each other's turns
 FINEST = 2e-6  # of a body's size (and rad): poses are not expected to be more exact
 WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
 ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
@@ -69,12 +73,14 @@ def load_recordings(
     paths: Sequence[Path],
     scene_file: Path | None = None,
     *,
+    only: int | None = None,
     allow_outside: bool = False,
     on_progress: Progress = silent,
 ) -> tuple[list[Recording], Scene]:
     """Recordings of one scene, and the scene: of run folders and `rollout.npz`, whose scene is known; of CSVs and
     `npz` files of poses, whose positions are those of the shapes' own origins, as in a scene file; and of folders of
-    these. Raises SdfsimError for no scene, unreadable files, or a recording that is not of this scene."""
+    these. `only` is which of those in a file of many is wanted. Raises SdfsimError for no scene, unreadable files, or a
+    recording that is not of this scene."""
     files = [file for path in paths for file in _files(path)]
     scene, found = None, []
     if scene_file is not None:
@@ -97,10 +103,33 @@ def load_recordings(
         else:
             names = [body.name for body in movers(scene)]
             read = _csv(file, names) if file.suffix == ".csv" else _npz(file, names)
+            if only is not None and only >= len(read):
+                raise SdfsimError(f"{file}[{only}]: there are {len(read)} recordings", f"0 to {len(read) - 1}")
+            read = read if only is None else read[only : only + 1]
             found += [cleaned(name, dt, poses, scene) for name, dt, poses in read]
     if scene is None:
         raise SdfsimError("no recordings", "give run folders, or CSV or npz files of poses")
     return with_velocities(found, scene), scene
+
+
+def load_beside(path: Path, scene_file: Path, *, allow_outside: bool = False, on_progress: Progress = silent) -> Beside:
+    """One recording, to simulate a scene beside it: a run, a file of poses, or `FILE[K]` for that one of many in it. It
+    begins with the first frame whose velocities are known. Raises SdfsimError as `load_recordings` does, where which of
+    many is meant is not said, and where no velocities are known."""
+    numbered = None if path.exists() else re.fullmatch(r"(.+)\[(\d+)\]", str(path))
+    file, only = (Path(numbered[1]), int(numbered[2])) if numbered else (path, None)
+    found, scene = load_recordings([file], scene_file, only=only, allow_outside=allow_outside, on_progress=on_progress)
+    if len(found) > 1:
+        raise SdfsimError(f"{path}: {len(found)} recordings", f"say which one, as {found[0].name}")
+    one = found[0]
+    if not one.known.any():
+        raise SdfsimError(f"{one.name}: no stretch is smooth enough to tell a velocity", "give a longer recording")
+    first = int(one.known.argmax())
+    frames = first + np.flatnonzero(one.seen[first:].all(1))
+    return Beside(
+        one.name, tuple(body.name for body in movers(scene)), one.dt * (frames - first), one.goal[0][frames],
+        one.goal[1][frames], {name: getattr(one, name)[first] for name in MOTION},
+    )  # fmt: skip
 
 
 def _files(path: Path) -> list[Path]:
@@ -266,8 +295,8 @@ def _excursions(x: np.ndarray) -> np.ndarray:
 
 def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording]:
     """The recordings with the velocities of their smooth stretches: of flights by a parabola and a torque-free rotation
-    through all of a flight, elsewhere (a slide, a roll, rest) by a polynomial through the frames nearby. Those of a run
-    are known."""
+    through all of a flight (of bodies that joints hold together, by the motion of all of them), elsewhere (a slide, a
+    roll, rest) by a polynomial through the frames nearby. Those of a run are known."""
     bodies = movers(scene)
     inertia = from_scene(replace(scene, bodies=tuple(bodies), joints=()), scene_units(scene))[0].inertia
     size = [largest_extent(scene.shapes[b.shape]) * b.scale for b in bodies]
@@ -302,7 +331,46 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
             )
         )  # fmt: skip
     _rotations(done, flights, inertia)
-    return [r if given.known.any() else _held(r, scene) for r, given in zip(done, recordings, strict=True)]
+    done = [r if given.known.any() else _held(r, scene) for r, given in zip(done, recordings, strict=True)]
+    for rows in flying_trees(scene):
+        _swings(done, [k for k, given in enumerate(recordings) if not given.known.any()], rows, scene)
+    return done
+
+
+def _swings(done: list[Recording], numbers: Sequence[int], rows: list[int], scene: Scene) -> None:
+    """Write the flights of bodies that joints hold together: their mass centre falls along a parabola, and they swing
+    about it as the solve moves them. What does not fly so stays as it is."""
+    tree = tree_of(scene, rows)
+    mass = np.array([b.mass for b in tree.bodies])
+    size = max(largest_extent(tree.shapes[b.shape]) * b.scale for b in tree.bodies)
+    rough = LEVER * ROUGH
+    gravity = np.asarray(scene.gravity)
+    flights: dict[float, list[tuple[int, int, int, Swing]]] = {}
+    for k in numbers:
+        r, seen = done[k], np.asarray(done[k].seen[:, rows].all(1))
+        place, turn = (array[:, rows] for array in r.goal)
+        middle = (mass[:, None] * place).sum(1) / mass.sum()
+        sigma = _noise(middle, seen, FINEST * size), r.noise[1]
+        flies = _nearby(middle, turn[:, 0], seen, r.dt, gravity, sigma)[2]
+        most = max(BEYOND * sigma[0], min(rough * size, SMOOTHED * sigma[0]))
+        for a, b in _flights(flies, seen, middle, r.dt, gravity, most):
+            some = np.arange(a, b)[seen[a:b]]
+            swing = Swing(r.dt * (some - a), place[some], turn[some], r.noise)
+            flights.setdefault(r.dt, []).append((k, a, b, swing))
+    for dt, some in flights.items():
+        for (k, a, b, swing), (path, off, turned_off) in zip(some, swung([s for *_, s in some], dt, tree), strict=True):
+            r, seen = done[k], a + np.round(swing.time / dt).astype(int)
+            if off > max(BEYOND * r.noise[0], rough * size) or turned_off > max(BEYOND * r.noise[1], 2.0 * rough):
+                continue  # something turned it
+            middle = (mass[:, None] * swing.position).sum(1) / mass.sum()
+            (at, fast), _ = _parabola(seen, middle, dt, gravity, np.arange(a, b))
+            for whole, values, more in zip(
+                (r.position, r.orientation, r.velocity, r.angular_velocity), path, (at, None, fast, None), strict=True
+            ):
+                whole[a:b, rows] = values if more is None else values + more[:, None]
+            r.flying[a:b, rows] = True
+            if len(rows) == r.seen.shape[1]:
+                r.known[a:b] = True
 
 
 def _held(r: Recording, scene: Scene) -> Recording:

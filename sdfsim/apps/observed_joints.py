@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
 import numpy as np
 
 from sdfsim.apps.export_joints import Held, trees
+from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
+from sdfsim.physics.joints import initial
+from sdfsim.physics.options import STEP, SUBSTEPS, Options
+from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
+from sdfsim.simulate.batch import placed, side_by_side
+from sdfsim.simulate.steppers import Frames as Moved
+from sdfsim.simulate.steppers import stepper_of
+
+ROUNDS = 5  # of Gauss and Newton, for the flight of a tree
+BEGIN = 8  # frames of a flight that tell where its fit begins
+SINGULAR = 1e-3  # of the strongest way to change a flight: ways that joints do not allow are weaker
+OUTLIER = 3.0  # deviations: poses that are farther off count less than squared
 
 Frames = tuple[
     np.ndarray, np.ndarray, np.ndarray, np.ndarray
@@ -88,3 +105,155 @@ def _allowed(one: Held, child: Frames, parent: Frames, com: np.ndarray, com_of_p
         sliding = axis * ((here - there) * axis).sum(-1, keepdims=True)
     velocity = carried + np.cross(turned, arm + along) + sliding + np.cross(rate, lever)
     return anchor + along + lever, orientation, velocity, rate
+
+
+# --- flights ---
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A flight of bodies that joints hold together, as it was seen in N frames; D bodies."""
+
+    time: np.ndarray  # [N] s, from its first frame on
+    position: np.ndarray  # [N, D, 3] m, of the centres of mass
+    orientation: np.ndarray  # [N, D, 4]
+    noise: tuple[float, float]  # m and rad
+
+
+def flying_trees(scene: Scene) -> list[list[int]]:
+    """Numbers, among the bodies that move, of those that joints hold together and nothing else holds. Loops and
+    distances are none of them."""
+    if scene.effects.joints == "off":
+        return []
+    tree = trees(scene)
+    number = {k: d for d, k in enumerate(k for k, b in enumerate(scene.bodies) if b.motion == "dynamic")}
+    looped = {tree.root(k) for joint in tree.loops for k in joint.bodies}
+    found: dict[int, list[int]] = {}
+    for k in number:
+        found.setdefault(tree.root(k), []).append(number[k])
+    return [rows for root, rows in found.items() if root in number and len(rows) > 1 and root not in looped]
+
+
+def tree_of(scene: Scene, rows: Sequence[int]) -> Scene:
+    """A scene of these bodies that move, and of their joints, alone and without gravity."""
+    moving = [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
+    new = {moving[row]: at for at, row in enumerate(rows)}
+    joints = [j for j in scene.joints if set(j.bodies) <= set(new)]
+    return replace(
+        scene, bodies=tuple(scene.bodies[k] for k in new), gravity=np.zeros(3),
+        joints=tuple(replace(j, bodies=(new[j.bodies[0]], new[j.bodies[1]])) for j in joints),
+    )  # fmt: skip
+
+
+def swung(swings: Sequence[Swing], dt: float, scene: Scene) -> list[tuple[Frames, float, float]]:
+    """The motions of the tree `scene` in free flight that are nearest to what was seen, frame by frame at `dt` s up to
+    the last one of each; and how far poses are off, root mean square, m and rad. Positions and velocities are those
+    about the mass centre of all, which flies on its own."""
+    mass = np.array([b.mass for b in scene.bodies])
+    share = mass / mass.sum()
+    count, many = len(swings), len(mass)
+    last = [round(float(s.time[-1]) / dt) for s in swings]
+    guess = [np.stack(arrays) for arrays in zip(*(_begun(s, share) for s in swings), strict=True)]
+    # Each is turned and spun, and moved along where a joint lets it slide; joints take away what they do not allow.
+    slides = [b for j in scene.joints if j.kind == "slider" for b in j.bodies]
+    ways = [(array, d, c) for array, rows in ((1, range(many)), (3, range(many)), (0, slides), (2, slides))
+            for d in rows for c in range(3)]  # fmt: skip
+    length = scene_units(scene).length
+    for turn in range(ROUNDS + 1):
+        tried = [np.repeat(array[:, None], 1 + len(ways), 1) for array in guess]
+        # Rates are changed by so much that it shows at the end.
+        step = np.empty((count, len(ways)))
+        for w, (array, d, c) in enumerate(ways):
+            step[:, w] = 1e-4 * (length if array in (0, 2) else 1.0)
+            step[:, w] /= np.array(last) * dt if array in (2, 3) else 1.0
+            _nudge(tried, slice(None), 1 + w, (array, d, c), step[:, w])
+        flat = [array.reshape(-1, *array.shape[2:]) for array in tried]
+        begun = tuple(array.reshape(count, 1 + len(ways), *array.shape[1:]) for array in _centred(flat, scene, share))
+        if turn == ROUNDS:
+            begun = tuple(array[:, :1] for array in begun)
+        paths = _flown(begun, dt, max(last), scene)
+        if turn == ROUNDS:
+            break
+        for f, swing in enumerate(swings):
+            off = _off(swing, [path[f] for path in paths], dt, share).reshape(1 + len(ways), -1)
+            slope = off[1:] - off[0]  # by a step each, which makes turns and rates comparable
+            usual = max(1.0, 1.48 * float(np.median(np.abs(off[0]))))  # trackers are less exact in motion than at rest
+            weight = (1.0 + np.square(off[0] / (OUTLIER * usual))) ** -0.25
+            change = np.linalg.lstsq((slope * weight).T, -off[0] * weight, rcond=SINGULAR)[0]
+            for w, way in enumerate(ways):
+                _nudge(guess, f, None, way, change[w] * step[f, w])
+    found = []
+    for f, swing in enumerate(swings):
+        own = cast("Frames", tuple(path[f, 0, : last[f] + 1] for path in paths))
+        off = _off(swing, [path[f] for path in paths], dt, share).reshape(-1, many, 6) * np.repeat(swing.noise, 3)
+        away = [float(np.sqrt(np.square(off[..., k]).sum(-1).mean())) for k in (slice(0, 3), slice(3, 6))]
+        found.append((own, away[0], away[1]))
+    return found
+
+
+def _nudge(arrays: list[np.ndarray], flight: int | slice, at: int | None, way: tuple[int, int, int], by) -> None:
+    """Change a number of a body in flights: a turn by a rotation about an axis of the world."""
+    array, d, c = way
+    rows = arrays[array][flight] if at is None else arrays[array][flight, at]
+    if array == 1:
+        turn = np.zeros((*np.shape(by), 3))
+        turn[..., c] = by
+        rows[..., d, :] = pose.multiply(pose.from_rotvec(turn), rows[..., d, :])
+    else:
+        rows[..., d, c] += by
+
+
+def _begun(swing: Swing, share: np.ndarray) -> Frames:
+    """[D, *] a first guess of a flight's start: parabolas through its first frames, of places about the mass centre
+    and of turns."""
+    time = swing.time[:BEGIN, None]
+    powers = time ** np.arange(3)
+    about = swing.position - (share[:, None] * swing.position).sum(1, keepdims=True)
+    place = np.linalg.lstsq(powers, about[:BEGIN].reshape(len(time), -1), rcond=None)[0].reshape(3, -1, 3)
+    first = swing.orientation[0]
+    turned = pose.to_rotvec(pose.multiply(swing.orientation[:BEGIN], pose.conjugate(first)[None]))
+    turn = np.linalg.lstsq(powers, turned.reshape(len(time), -1), rcond=None)[0].reshape(3, -1, 3)
+    return place[0], pose.multiply(pose.from_rotvec(turn[0]), first), place[1], turn[1]
+
+
+def _centred(arrays: Sequence[np.ndarray], scene: Scene, share: np.ndarray) -> Frames:
+    """As joints let them be, the mass centre of all at rest at zero."""
+    place, turn, speed, spin = held_together(cast("Frames", tuple(arrays)), scene)
+    about, drift = ((share[:, None] * array).sum(1, keepdims=True) for array in (place, speed))
+    return place - about, turn, speed - drift, spin
+
+
+def _flown(begun: tuple[np.ndarray, ...], dt: float, frames: int, scene: Scene) -> list[np.ndarray]:
+    """[F, P, T, D, *] poses and velocities of flights [F, P, D, *] from their starts on, these first."""
+    u, shape = scene_units(scene), begun[0].shape[:2]
+    count, many = shape[0] * shape[1], len(scene.bodies)
+    joints = tuple(
+        replace(j, name=f"{j.name} {w}", bodies=(w * many + j.bodies[0], w * many + j.bodies[1]))
+        for w in range(count)
+        for j in scene.joints
+    )
+    whole = replace(scene, bodies=tuple([*scene.bodies] * count), joints=joints)
+    bodies, state = side_by_side(whole, np.repeat(np.arange(count), many).tolist(), u)
+    place, turn, speed, spin = (array.reshape(count * many, -1) for array in begun)
+    state = placed(state, place / u.length, turn, speed / u.velocity, spin * u.time)
+    if bodies.joints is not None:
+        state = replace(state, joints=initial(bodies.joints, state.position, state.orientation))
+    step = dt / u.time
+    options = Options(np.zeros(3), step, max(1, math.ceil(step / (STEP / SUBSTEPS) - 0.01)))
+    solver = stepper_of(load_model())
+    _, carry = solver.advance(state, solver.init(bodies, state, options), frames, keep=True)
+    moved = cast("Moved", carry.frames)
+    kept = (moved.position * u.length, moved.orientation, moved.velocity * u.velocity, moved.angular_velocity / u.time)
+    paths = []
+    for first, later in zip(begun, kept, strict=True):
+        later = np.moveaxis(later.reshape(frames, *first.shape), 0, 2)
+        paths.append(np.concatenate([first[:, :, None], later], 2))
+    return paths
+
+
+def _off(swing: Swing, paths: Sequence[np.ndarray], dt: float, share: np.ndarray) -> np.ndarray:
+    """[P, N, D, 6] of paths [P, T, D, *]: how far poses are off those seen, about the mass centre, in deviations."""
+    rows = np.round(swing.time / dt).astype(int)
+    about = swing.position - (share[:, None] * swing.position).sum(1, keepdims=True)
+    away = pose.to_rotvec(pose.multiply(paths[1][:, rows], pose.conjugate(swing.orientation)[None]))
+    return np.concatenate([(paths[0][:, rows] - about) / swing.noise[0], away / swing.noise[1]], -1)

@@ -1,7 +1,5 @@
 """What the command plan tells: which effects are in play, why, and what a step costs."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from dataclasses import asdict
@@ -24,12 +22,7 @@ TRIAL_STEPS = 5
 
 
 def describe(
-    scene_file: Path,
-    *,
-    model: str | None,
-    device: str,
-    on_progress: StageProgress,
-    allow_outside: bool = False,
+    scene_file: Path, *, model: str | None, device: str, on_progress: StageProgress, allow_outside: bool = False
 ) -> dict[str, Any]:
     """The plan of a scene with its units, and what a step costs in the first few: pairs by what filters them; contacts,
     nodes, edges, time and memory. Raises SdfsimError for bad input."""

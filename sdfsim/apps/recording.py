@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sdfsim.apps.beside import COLOR, OPACITY, Beside
 from sdfsim.apps.recording_joints import AXIS_COLOR, ends, marks, shown_joints
 from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
@@ -33,6 +34,7 @@ CONTACTS = "world/contacts"
 JOINTS = "world/joints"
 FORCES = "world/forces"
 STILL = "world/still"
+BESIDE = "world/recorded"
 # What is plotted: the counters of a view by their legends.
 VIEWS = {
     "kinetic energy (J)": {"kinetic_energy": "kinetic energy (J)"},
@@ -63,9 +65,11 @@ FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 class Playback:
     """One recording of one scene, to be written to a file, or streamed to a viewer. Its first view shows all of the
     scene, and where the motion is known already all of that; then there are only the plots that have something to show.
-    `network` is whether there is one in the run."""
+    `network` is whether there is one in the run; a recorded motion `beside` it is shown too, bodies to look through."""
 
-    def __init__(self, scene: Scene, motion: Rollout | None = None, *, network: bool = True) -> None:
+    def __init__(
+        self, scene: Scene, motion: Rollout | None = None, *, network: bool = True, beside: Beside | None = None
+    ) -> None:
         import rerun as rr
 
         self._rr = rr
@@ -87,6 +91,9 @@ class Playback:
         crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
         paths = [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
         self._alone = [(k, path) for k, path in enumerate(paths) if k not in crowded]
+        rows = () if beside is None else beside.rows(scene)
+        self._ghosts = [(int(k), f"{BESIDE}/{rr.escape_entity_path_part(scene.bodies[k].name)}") for k in rows]
+        self._beside = beside
         self._ropes = [joint for joint in shown_joints(scene) if joint.kind == "distance"]
         self.stream = rr.RecordingStream("sdfsim")
 
@@ -140,6 +147,10 @@ class Playback:
                 centre = body.position + _turned(com, body.quat_xyzw)
                 pose = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
                 self.stream.log(path, pose, static=True)
+        for k, path in self._ghosts:
+            body, mesh = scene.bodies[k], scene.shapes[scene.bodies[k].shape].mesh
+            plain = Mesh(mesh.vertices * body.scale - self._com[k], mesh.faces)
+            self.stream.log(f"{path}/mesh", _shaded(rr, plain, (*COLOR, round(255 * OPACITY))), static=True)
         for joint in shown_joints(scene):
             for number, mark in enumerate(marks(scene, joint)):
                 home = JOINTS if mark.body < 0 else dict(self._alone)[mark.body]
@@ -180,6 +191,11 @@ class Playback:
             strips = ends(self._ropes, chunk.position, chunk.orientation, self._scene)
             lines = rr.LineStrips3D.columns(strips=strips.reshape(-1, 2, 3).astype(np.float32))
             self.stream.send_columns(f"{JOINTS}/ropes", times, lines.partition(np.full(frames, len(self._ropes))))
+        if self._beside is not None:
+            places, turns = self._beside.at(chunk.time)
+            for d, (_, path) in enumerate(self._ghosts):
+                motion = rr.Transform3D.columns(translation=places[:, d], quaternion=turns[:, d])
+                self.stream.send_columns(path, times, motion)
         points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)
         self.stream.send_columns(CONTACTS, times, points)
         self._log_forces(chunk, times)
@@ -241,9 +257,10 @@ def _crowds(scene: Scene) -> list[Crowd]:
     return found
 
 
-def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
-    """Write `rollout` as a rerun recording. Raises SdfsimError where the file cannot be written."""
-    playback = Playback(scene, rollout)
+def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Beside | None = None) -> None:
+    """Write `rollout` as a rerun recording, with a recorded motion `beside` it. Raises SdfsimError where the file
+    cannot be written."""
+    playback = Playback(scene, rollout, beside=beside)
     encoded = playback.stream.binary_stream()  # since rerun's own sink only logs a full disk
     playback.log_static()
     playback.log_steps(rollout)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.apps.beside import COLOR, OPACITY, Beside
 from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, sunk, with_normals
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
@@ -38,22 +39,24 @@ _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
 
 def render(
     scene: Scene | SceneBuilder, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
-    look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
+    look_at: Place | None = None, at: float | None = None, beside: Beside | None = None,
+    on_progress: Progress = silent,
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.
 
-    Camera and what it looks at, [3] m each, are as in `eye_of`. Raises SdfsimError for another ending, a time outside
+    Camera and what it looks at, [3] m each, are as in `eye_of`. A recorded motion `beside` the run is shown too, bodies
+    to look through. Raises SdfsimError for another ending, a time outside
     of the run, a camera where it looks at, or a file that cannot be written.
     """
     out, scene = Path(out), scene if isinstance(scene, Scene) else scene.load()
     check_format(out)
     if at is not None and not rollout.time[0] <= at <= rollout.time[-1] + rollout.meta["dt"]:
         raise SdfsimError(f"--at {at:g}: the run holds {rollout.time[0]:g} to {rollout.time[-1]:g} s")
-    studio = Studio(scene, eye_of(scene, rollout, camera, look_at), framed(scene, rollout)[1])
+    studio = Studio(scene, eye_of(scene, rollout, camera, look_at), framed(scene, rollout)[1], beside)
     if out.suffix == ".png":
         from PIL import Image
 
-        pixels = studio.picture(*poses_at(rollout, rollout.time[-1] if at is None else at))
+        pixels = studio.picture_at(rollout, rollout.time[-1] if at is None else at)
         with replacing(out) as partial:
             Image.fromarray(pixels).save(partial, format="PNG")
         return
@@ -61,7 +64,7 @@ def render(
 
     def pictures() -> Iterator[np.ndarray]:
         for k in range(count):
-            yield studio.picture(*poses_at(rollout, rollout.time[0] + k / FRAMES))
+            yield studio.picture_at(rollout, rollout.time[0] + k / FRAMES)
             on_progress((k + 1) / count, f"frame {k + 1} of {count}")
 
     write_movie(out, pictures())
@@ -148,11 +151,12 @@ class _Cast:
 
 
 class Studio:
-    """A scene with a camera and a sun, of which pictures are taken; `radius` m is that of all that is shown. `axes` [3,
-    3] are unit vectors right and down in the picture, and into it; `sun` [3] is one towards the sun."""
+    """A scene with a camera and a sun, of which pictures are taken; `radius` m is that of all that is shown, `beside` a
+    recorded motion that is shown too. `axes` [3, 3] are unit vectors right and down in the picture, and into it; `sun`
+    [3] is one towards the sun."""
 
-    def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
-        self._eye, self._radius = eye, radius
+    def __init__(self, scene: Scene, eye: Eye, radius: float, beside: Beside | None = None) -> None:
+        self._eye, self._radius, self._beside = eye, radius, beside
         shapes = [scene.shapes[b.shape] for b in scene.bodies]
         self._floors = np.array([is_infinite(shape) for shape in shapes])
         self._models: list[_Model] = []
@@ -161,6 +165,10 @@ class Studio:
             colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
             vertices = body.scale * (mesh.vertices - shape.com) - [0.0, 0.0, sunk(scene, k)]
             self._models.append((replace(mesh, vertices=vertices, colors=colors), normals))
+        self._ghosts: list[_Model] = []
+        for k in () if beside is None else beside.rows(scene):
+            mesh, normals = self._models[k]
+            self._ghosts.append((Mesh(mesh.vertices, mesh.faces, np.broadcast_to(COLOR, mesh.vertices.shape)), normals))
         forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
         right = np.cross(forward, eye.up)
         right /= np.linalg.norm(right)
@@ -168,11 +176,20 @@ class Studio:
         self.sun = _SUN @ np.stack([right, np.cross(eye.up, right), eye.up])
         self._through = self._rays(_GRID)
 
-    def picture(self, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-        """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4]."""
+    def picture_at(self, rollout: Rollout, time: float) -> np.ndarray:
+        """[H, W, 3] uint8 of a moment of a run, and of what was recorded then."""
+        place, turn = poses_at(rollout, time)
+        if self._beside is None:
+            return self.picture(place, turn)
+        place_beside, turn_beside = self._beside.at(np.array([time]))
+        matrix = Rotation.from_quat(turn_beside[0]).as_matrix()
+        return self.picture(place, turn, _Cast(self._ghosts, place_beside[0], matrix))
+
+    def picture(self, position: np.ndarray, orientation: np.ndarray, ghosts: _Cast | None = None) -> np.ndarray:
+        """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4], and of `ghosts`."""
         cast = _Cast(self._models, position, Rotation.from_quat(orientation).as_matrix())
         wide, tall = SIZE
-        pixels, label = self._look(cast, self._through)
+        pixels, label = self._look(cast, ghosts, self._through)
         pixels, label = pixels.reshape(tall, wide, 3), label.reshape(tall, wide)
         edge = np.zeros((tall, wide), bool)
         for axis in (0, 1):
@@ -180,7 +197,7 @@ class Studio:
             edge[: tall - (axis == 0), : wide - (axis == 1)] |= differs
             edge[axis == 0 :, axis == 1 :] |= differs
         if edge.any():
-            again, _ = self._look(cast, self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2)))
+            again, _ = self._look(cast, ghosts, self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2)))
             pixels[edge] = again.reshape(-1, len(_SUB), 3).mean(1)
         return np.clip(pixels + 0.5, 0, 255).astype(np.uint8)
 
@@ -191,10 +208,10 @@ class Studio:
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
 
-    def _look(self, cast: _Cast, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _look(self, cast: _Cast, ghosts: _Cast | None, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ."""
-        away, face, uv = cast.caster.cast(rays)
-        there = np.flatnonzero(np.isfinite(away))
+        far, face, uv = cast.caster.cast(rays)
+        away, there = far, np.flatnonzero(np.isfinite(far))
         away, face, direction = away[there, None], face[there], rays[there, 3:]
         body = cast.body[face]
         normal, color = cast.surface(face, uv[there])
@@ -214,4 +231,11 @@ class Studio:
         pixels, label = np.tile(_SKY, (len(rays), 1)), np.full(len(rays), -1)
         pixels[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
         label[there] = 2 * body + dark
+        if ghosts is not None:  # they take light and throw no shadow
+            away, face, uv = ghosts.caster.cast(rays)
+            front = np.flatnonzero(away < far - 1e-4 * self._radius)
+            normal, color = ghosts.surface(face[front], uv[front])
+            light = _SHADE + (1.0 - _SHADE) * np.clip(normal @ self.sun.astype(np.float32), 0.0, 1.0)
+            pixels[front] = (1.0 - OPACITY) * pixels[front] + OPACITY * light[:, None] * color
+            label[front] = label[front] + 2 * len(self._models) * (1 + ghosts.body[face[front]])
         return pixels, label

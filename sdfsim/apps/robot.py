@@ -1,8 +1,6 @@
 """Links and joints, as files of robots have them -> a scene: its scene.yaml, and a Shape folder for each link that is
 more than one primitive. `urdf` and `mjcf` read the files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -70,7 +68,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Held:
+class LinkJoint:
     """A joint: how the link `child` is held by the link `parent` (-1: by the world), in the world as all is at the
     start."""
 
@@ -94,7 +92,7 @@ class Robot:
 
     name: str
     links: tuple[Link, ...]
-    joints: tuple[Held, ...]
+    joints: tuple[LinkJoint, ...]
     gravity: np.ndarray | None = None  # [3] m/s^2
     # pairs of links, the lower number first, that never touch; None: those that overlap at the start
     apart: frozenset[tuple[int, int]] | None = None
@@ -290,7 +288,7 @@ def _shifted(inertia: np.ndarray, mass: float, away: np.ndarray) -> np.ndarray:
 def _apart(robot: Robot) -> tuple[Robot, list[str]]:
     """Links that are held by several joints get small balls between these, which hold a little of their mass."""
     links, joints, notes = list(robot.links), [], list(robot.notes)
-    chains: dict[tuple[int, int], list[Held]] = {}
+    chains: dict[tuple[int, int], list[LinkJoint]] = {}
     for joint in robot.joints:
         if joint.loop or joint.kind == "distance":
             joints.append(joint)
@@ -543,7 +541,7 @@ def _overlap(one: Shape | None, pose: np.ndarray, other: Shape | None, place: np
 # --- joints ---
 
 
-def _join(scene: SceneBuilder, joint: Held, names: list[str], lift: np.ndarray) -> None:
+def _join(scene: SceneBuilder, joint: LinkJoint, names: list[str], lift: np.ndarray) -> None:
     """Write a joint; angles are in degrees there."""
     turns = joint.kind in ("hinge", "ball")
 

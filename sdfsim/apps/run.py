@@ -1,7 +1,5 @@
 """`simulate`: a scene file becomes a run folder; and what is kept there so that a killed run goes on."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable
@@ -13,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
+from sdfsim.apps.beside import FILE, Beside
 from sdfsim.apps.recording import Playback, framed, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
 from sdfsim.base.console import columns, plain
@@ -49,7 +48,7 @@ STILL = 0.01  # see `resting`
 TOLD = 12  # bodies, up to which each has a line at the end
 FAR = 10.0  # times the size of the scene: who is farther away in the end has left it
 _REPORT = "report.json"
-_RESULTS = (_REPORT, "rollout.npz", "rollout.rrd")
+_RESULTS = (_REPORT, "rollout.npz", "rollout.rrd", FILE)
 _STATE = "state.npz"
 _ANEW = "leave --resume away to start anew"
 _OTHER = "is of another scene, model or seed"
@@ -69,6 +68,7 @@ def simulate(
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
+    beside: Beside | None = None,
 ) -> dict[str, Any]:
     """Simulate a scene file, or a sample by its name, and write config.yaml, report.json, rollout.npz and (unless
     `viewer` is none) rollout.rrd; an earlier run in `out` is replaced. Returns the report; of the shapes that were
@@ -76,7 +76,9 @@ def simulate(
 
     What is None is as the scene says: model, `seconds` of simulated time, seed. `until_settled` ends the run as soon as
     everything rests. `resume` goes on with the run in `out` that was interrupted, from the start where there is none; a
-    finished one is left as it is, and its report is returned. `say` is called with lines for the person.
+    finished one is left as it is, and its report is returned. `beside` is a recorded motion of the scene: the run
+    begins where it does, the recording shows both, and the report says how far apart they are. `say` is called with
+    lines for the person.
 
     Raises SdfsimError for bad input, an output that cannot be written, another run that writes to the same folder, or a
     finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
@@ -96,6 +98,9 @@ def simulate(
     scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
     for note in scene.notes:
         say(note)
+    known = fingerprints(scene)
+    if beside is not None:
+        scene = beside.begun(scene)
     simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
     asked = model or scene.model or ""
@@ -109,6 +114,7 @@ def simulate(
         "allow_outside": allow_outside,
         "until_settled": until_settled,
         "device": simulator.device,
+        **({"beside": beside.name} if beside else {}),
     }
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
@@ -129,7 +135,7 @@ def simulate(
             kept.add(parts[0])
         write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
         network = simulator.model.kind != SOLVER
-        live = Playback(scene, network=network) if viewer in ("native", "web") else None
+        live = Playback(scene, network=network, beside=beside) if viewer in ("native", "web") else None
         if live:
             if address := stream_to_viewer(live, viewer):
                 say(f"watch it at {address}")
@@ -162,7 +168,7 @@ def simulate(
                 kept.add(error.rollout)
             kept.save()
         rollout = join(parts)
-        rollout = replace(rollout, meta=rollout.meta | {"scene": fingerprints(scene)})
+        rollout = replace(rollout, meta=rollout.meta | {"scene": known})
         on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
         report = summary(scene, rollout, time.monotonic() - started) | {
@@ -175,11 +181,14 @@ def simulate(
         }
         if until_settled:
             report["settled"] = settled()
+        if beside is not None:
+            report["beside"] = beside.off(scene, rollout)
+            beside.save(out / FILE)
         if isinstance(broken, SdfsimError):
             report["error"] = broken.message
         rollout.save(out / "rollout.npz")
         if viewer != "none":
-            save_rollout(scene, rollout, out / "rollout.rrd")
+            save_rollout(scene, rollout, out / "rollout.rrd", beside)
             report["recording"] = out / "rollout.rrd"
         report = plain(report)
         write_json(out / _REPORT, report)
@@ -279,6 +288,14 @@ def ending_lines(report: dict[str, Any]) -> list[str]:
         if names:
             lines.append(f"{what}: {', '.join(names[:3])}" + (f" and {len(names) - 3} more" if len(names) > 3 else ""))
     return lines
+
+
+def beside_lines(report: dict[str, Any]) -> list[str]:
+    """How far a run is from the recorded motion that it was simulated beside; none where there was nothing."""
+    if not (off := report.get("beside")):
+        return []
+    far = f"{1e3 * off['position_m']:.3g} mm (root mean square), {off['rotation_degrees']:.3g} degrees (mean)"
+    return [f"off {off['recording']} by {far} over {off['seconds']:.3g} s"]
 
 
 class Checkpoint:

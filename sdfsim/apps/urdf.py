@@ -1,7 +1,5 @@
 """URDF -> links and joints, as `robot` turns them into a scene."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter
@@ -15,7 +13,7 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.robot import Held, Link, Part, Robot, moved, pose_of
+from sdfsim.apps.robot import Link, LinkJoint, Part, Robot, moved, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
@@ -188,7 +186,7 @@ class _Reader:
                 told = f"link {links[child].name!r} is held by two joints: URDF knows trees only"
                 raise self.wrong(element, told, "close loops in MJCF (equality connect), or in scene.yaml")
             by_child[child] = element, parent
-        joints: list[Held] = []
+        joints: list[LinkJoint] = []
         roots = [k for k in range(len(links)) if k not in by_child]
         order, children = list(roots), {k: [c for c, (_, p) in by_child.items() if p == k] for k in range(len(links))}
         for k in order:  # grows
@@ -335,7 +333,7 @@ class _Reader:
         except (OSError, ValueError):
             return None
 
-    def _joint(self, element: Element, links: list[Link], child: int, parent: int) -> tuple[Link, list[Held]]:
+    def _joint(self, element: Element, links: list[Link], child: int, parent: int) -> tuple[Link, list[LinkJoint]]:
         """The child where it is at the start, and what holds it."""
         name, kind = self.text(element, "name"), self.text(element, "type")
         if kind not in KINDS:
@@ -360,12 +358,12 @@ class _Reader:
             return replace(links[child], pose=pose), []
         if kind == "planar":
             sides = Rotation.align_vectors([along], [[0.0, 0.0, 1.0]])[0].as_matrix()
-            made = [Held(f"{name}_{k}", "slider", child, parent, anchor, sides[:, k]) for k in (0, 1)]
-            return replace(links[child], pose=pose), [*made, Held(name, "hinge", child, parent, anchor, along)]
+            made = [LinkJoint(f"{name}_{k}", "slider", child, parent, anchor, sides[:, k]) for k in (0, 1)]
+            return replace(links[child], pose=pose), [*made, LinkJoint(name, "hinge", child, parent, anchor, along)]
         if KINDS[kind] in ("fixed", "ball"):
             if KINDS[kind] == "ball" and self.child(element, "limit") is not None:
                 self.left["limits of spherical joints"] += 1
-            return replace(links[child], pose=pose), [Held(kind=KINDS[kind], **held, others=others)]  # type: ignore[arg-type]
+            return replace(links[child], pose=pose), [LinkJoint(kind=KINDS[kind], **held, others=others)]  # type: ignore[arg-type]
         limits, start = self._limits(element, name, kind), 0.0
         if limits is not None and not limits[0] <= 0.0 <= limits[1]:
             start = min(max(0.0, limits[0]), limits[1])
@@ -377,7 +375,7 @@ class _Reader:
             pose = pose @ np.eye(4)
             pose[:3, :3] = Rotation.from_rotvec(start * along).as_matrix() @ turn
         held |= {"anchor": pose[:3, 3], "axis": along, "start": start, "limits": limits, "others": others}
-        return replace(links[child], pose=pose), [Held(kind=KINDS[kind], **held)]  # type: ignore[arg-type]
+        return replace(links[child], pose=pose), [LinkJoint(kind=KINDS[kind], **held)]  # type: ignore[arg-type]
 
     def _limits(self, element: Element, name: str, kind: str) -> tuple[float, float] | None:
         limit = self.child(element, "limit")

@@ -1,7 +1,5 @@
 """Arguments that several commands share, and how a command runs."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Warns before a compilation that takes long."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """How a command reports: progress and errors on stderr, the result on stdout, and its exit code."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -43,7 +41,7 @@ class Session:
         self.stage_progress = self._bar.update
         self.progress = partial(self._bar.update, "")
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> "Session":
         # Consoles of Windows know few characters; others are escaped, as Python does on stderr by itself.
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")

@@ -1,7 +1,5 @@
 """The one error type of the project; `cli.py` and `run_main` turn it into one line, a hint and an exit code."""
 
-from __future__ import annotations
-
 import difflib
 import itertools
 import sys

@@ -1,7 +1,5 @@
 """Files that are whole or absent: written under a temporary name, then renamed. Arrays without pickle. Digests."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

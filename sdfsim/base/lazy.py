@@ -1,7 +1,5 @@
 """Torch, imported on first use: simulations with the solver alone never import it."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

@@ -1,8 +1,6 @@
 """The commands on scenes and motion: simulate, plan, view, render, export, import, identify, info; dataset, train,
 evaluate; tradeoff, stress."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,7 +14,8 @@ from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
-    list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
+    list[str] | None,
+    typer.Option(help="Bundled model or path; may be given again (default: those on the solve)."),
 ]
 
 
@@ -33,12 +32,25 @@ def simulate(
         bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")] = False,
+    beside: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RECORDING",
+            help="A recorded motion of the scene, as identify reads it, FILE[K] of many: begin as it does, show both.",
+        ),
+    ] = None,
     allow_outside: Outside = False,
     device: str = "auto",
 ) -> None:
     """Scene -> motion, in a run folder."""
     from sdfsim.apps import run
 
+    recorded = None
+    if beside is not None:
+        from sdfsim.apps.observed import load_beside
+
+        shapes = partial(session.stage_progress, "shapes")
+        recorded = load_beside(beside, scene, allow_outside=allow_outside, on_progress=shapes)
     report = run.simulate(
         scene,
         out,
@@ -49,6 +61,7 @@ def simulate(
         allow_outside=allow_outside,
         until_settled=until_settled,
         resume=resume,
+        beside=recorded,
         device=device,
         on_progress=session.stage_progress,
         say=session.say,
@@ -59,6 +72,7 @@ def simulate(
         + ("" if median is None else f" (median {median:.1f} ms a step)"),
         f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
         *run.ending_lines(report),
+        *run.beside_lines(report),
         *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
         f"wrote {out}",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
@@ -147,12 +161,14 @@ def render(
     if at is not None and out.suffix != ".png":
         raise SdfsimError("--at goes with a picture, -o FILE.png", exit_code=EXIT_USAGE)
     from sdfsim.apps import render as room
+    from sdfsim.apps.beside import beside_of
     from sdfsim.apps.run import read_run
 
     room.check_format(out)
     shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
     loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
-    room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, on_progress=frames)
+    beside = beside_of(source, loaded)
+    room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, beside=beside, on_progress=frames)
     session.report({"picture" if out.suffix == ".png" else "movie": out}, [f"wrote {out}"])
 
 
@@ -201,8 +217,7 @@ def import_(
         Path, typer.Option("-o", "--out", metavar="FILE", help="The scene.yaml to write.", show_default=False)
     ],
     packages: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of the packages that package:// names (URDF); may be given again."),
+        list[Path] | None, typer.Option(help="Folder of the packages that package:// names (URDF); may be given again.")
     ] = None,
     fixed: Annotated[bool, typer.Option("--fixed", help="The root never moves (URDF).")] = False,
     floor: Annotated[bool, typer.Option("--floor", help="Add a floor at z = 0, and stand all on it.")] = False,
@@ -231,30 +246,45 @@ def identify(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Run folders, rollout.npz, CSV or npz files of poses, folders of these (docs/identify.md).",
+            help="Run folders, rollout.npz, CSV or npz files of poses, folders of these (docs/identify.md); or "
+            "contactnets-cube or contactnets-elbow: public ones with their scene, downloaded once.",
             show_default=False,
         ),
     ],
     scene: OfRun = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="FILE", help="Write the scene with what was found.")
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="FILE", help="Write the scene with what was found, and a picture of it as FILE.png."
+        ),
     ] = None,
     allow_outside: Outside = False,
 ) -> None:
     """Recorded motions -> friction, restitution, sizes, masses, the lie of the ground."""
     from sdfsim.apps import identify as room
+    from sdfsim.apps.identify_picture import picture
     from sdfsim.apps.observed import load_recordings
     from sdfsim.base.files import check_writable
+    from sdfsim.data.public_tosses import public_tosses
 
     if out is not None:
         check_writable(out.parent)
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
-    motions, known = load_recordings(recordings, scene, allow_outside=allow_outside, on_progress=shapes)
-    found = room.identify(motions, known, on_progress=fit)
-    lines = room.report_lines(found)
+    paths = [public_tosses(path, partial(session.stage_progress, "fetch")) for path in recordings]
+    public = [path for path, given in zip(paths, recordings, strict=True) if path != given]
+    scene = scene or next((path / "scene.yaml" for path in public), None)
+    motions, known = load_recordings(paths, scene, allow_outside=allow_outside, on_progress=shapes)
+    found = room.identify(motions, known, profiles=out is not None, on_progress=fit)
+    lines, wrote = room.report_lines(found), {}
     if out is not None and known.path is not None:
         lines += [*room.write_scene(found, known.path, out), f"wrote {out}"]
-    session.report(found.report() | ({"wrote": out} if out else {}), lines)
+        wrote, drawn = {"wrote": out}, out.with_suffix(".png")
+        if missing := picture(found, drawn):
+            lines.append(f"no {drawn.name}: {missing}")
+        else:
+            wrote["picture"] = drawn
+            lines.append(f"wrote {drawn}: the loss against each parameter")
+    session.report(found.report() | wrote, lines)
 
 
 @command
@@ -330,6 +360,12 @@ def train(
         typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
+    first: Annotated[
+        str | None,
+        typer.Option(
+            "--from", metavar="MODEL", help="Begin with the weights of a model of this preset.", show_default=False
+        ),
+    ] = None,
     workers: Annotated[
         int, typer.Option(help="Processes that draw batches ahead, for networks on surface nodes on a GPU.", min=0)
     ] = 0,
@@ -338,7 +374,7 @@ def train(
     """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene}
+    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene, "first": first}
     session.report(run_training(data, out, **how, on_progress=session.progress))
 
 
@@ -352,8 +388,7 @@ def evaluate(
         Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: of published networks).")
     ] = "exact",
     chaos_floor: Annotated[
-        bool,
-        typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet)."),
+        bool, typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet).")
     ] = False,
     device: str = "auto",
 ) -> None:

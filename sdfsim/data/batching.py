@@ -1,7 +1,5 @@
 """Many trajectories at once: as one set of bodies, and simulated again by a model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import cast
 

@@ -1,7 +1,5 @@
 """Datasets made by the teacher: shapes, then trajectories on all cores."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

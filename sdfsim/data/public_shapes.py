@@ -8,8 +8,6 @@ public_shapes.sha256 holds the sums of the files that the published figures were
 checked: packing it anew changes no shape.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tarfile
 import tempfile
@@ -45,7 +43,7 @@ def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
     missing = [file for file in SUMS[name] if not (folder / file).is_file()]
     for url in dict.fromkeys(map(_url, missing)):
         on_progress(0.0, f"fetching {url}")
-        content = _fetched(url, hint)
+        content = fetched(url, hint)
         found = {file: content.get(Path(file).name) or content.get("", b"") for file in missing if _url(file) == url}
         for file in found:  # all of them before any is kept
             _check(found[file], SUMS[name][file], f"{url}: {Path(file).name}", hint)
@@ -69,18 +67,23 @@ def _check(content: bytes, expected: str, what: str, hint: str) -> None:
         raise SdfsimError(f"{what}: another file than expected: SHA-256 {got}, not {expected}", hint)
 
 
-def _fetched(url: str, hint: str) -> dict[str, bytes]:
-    """The files of an archive by their base names, so that no path in it matters; a single file under ""."""
+def fetched(url: str, hint: str, inside: str = "", kept: Path | None = None) -> dict[str, bytes]:
+    """The files of an archive by their base names, so that no path in it matters, of all folders or of those of one
+    name; a single file under "". `kept` is where people may have put it. Raises SdfsimError where it cannot be had."""
     import pooch
 
     pooch.get_logger().setLevel("WARNING")  # it would log the checksum of each download
     try:
         with tempfile.TemporaryDirectory() as scratch:
-            file = Path(pooch.retrieve(url, known_hash=None, fname="download", path=scratch))
-            if not url.endswith(ARCHIVE):
+            if kept is not None and kept.is_file():
+                file = kept
+            else:
+                file = Path(pooch.retrieve(url, known_hash=None, fname="download", path=scratch))
+            if ARCHIVE[1:] not in url:
                 return {"": file.read_bytes()}
             with tarfile.open(file, "r:gz") as archive:
                 members = [member for member in archive if member.isfile() and member.size <= FREELY]
+                members = [member for member in members if inside in ("", Path(member.name).parent.name)]
                 opened = ((Path(member.name).name, archive.extractfile(member)) for member in members)
                 return {name: content.read() for name, content in opened if content is not None}
     except (OSError, EOFError, tarfile.TarError, zlib.error) as error:

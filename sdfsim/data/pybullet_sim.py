@@ -4,8 +4,6 @@ docs/teacher.md compares the settings one by one. Before the first inner step th
 bodies far apart, because it would use the inertias of a mass of 1 kg in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -195,7 +193,7 @@ class Teacher:
             self.push(i, velocity, angular)
         self._settled = True
 
-    def __enter__(self) -> Teacher:
+    def __enter__(self) -> "Teacher":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,5 @@
 """What the teacher's scenes start from: MOVi-B and MOVi-C as Kubric spawns them (Greff et al., 2022), and our own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

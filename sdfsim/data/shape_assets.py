@@ -1,7 +1,5 @@
 """The shapes of a dataset: found, cut into convex pieces for the engine, split by name, and fitted."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Both take convex pieces, MuJoCo also a mesh as an SDF (its own octree). Spheres,
 exact.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 import time

@@ -1,7 +1,5 @@
 """Rollouts against a recorded dataset: the numbers that models are compared by, and their tables."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace

@@ -9,8 +9,6 @@ of the size, times and speeds as at 10 cm (they scale by Froude's law). Everythi
 instruments of `sdfsim.physics.instruments`, never by what the contact solve says of itself.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Scenes are of metre-sized boxes and balls on a floor, in the teacher's gravity. 
 are such that their products lie within what models are trained on, unless a case is about them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial

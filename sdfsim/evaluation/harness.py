@@ -4,8 +4,6 @@ A study makes a `Job` for each case and method. `measure` runs those whose resul
 into one JSON file, so that an interrupted study goes on where it was.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import platform
 from collections.abc import Callable, Iterable, Iterator, Sequence

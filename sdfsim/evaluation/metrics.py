@@ -1,7 +1,5 @@
 """What rollouts are judged by: errors as Rubanova et al. (2024) report them, energy, rest, survival."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """How deep bodies are inside each other and the floor, measured on their exact geometry."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """A scene run by a model of ours or by another engine: both give the same record."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property

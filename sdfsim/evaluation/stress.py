@@ -1,7 +1,5 @@
 """The hard cases run with models, the teacher and other engines; their table, plots and report."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +21,7 @@ from sdfsim.evaluation.engines import Engine, TooSlow, bullet, shape_urdf
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
 from sdfsim.evaluation.runs import Ran, by_engine, by_model, still
-from sdfsim.learned.model import Model, load_model, model_names
+from sdfsim.learned.model import Model, load_model, sound_models
 from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
@@ -84,7 +82,7 @@ def stress(
     recordings/ a motion of each case that is not as wanted.
 
     Args:
-        models: names or paths; none for the solver and all bundled networks.
+        models: names or paths; none for the solver and the bundled networks on it.
         quick: fewer and shorter cases.
         shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
         engines: by name; the teacher is `TEACHER`.
@@ -94,7 +92,7 @@ def stress(
             in the folder, or a folder that cannot be written.
     """
     device = str(pick_device(device))
-    tested = [load_model(name) for name in models or model_names()]
+    tested = [load_model(name) for name in models or sound_models()]
     names, others = [model.name for model in tested], list(engines)
     if twice := {name for name in names if names.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")

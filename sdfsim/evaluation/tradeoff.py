@@ -1,7 +1,5 @@
 """Error against time: our models with their settings, and other engines."""
 
-from __future__ import annotations
-
 import csv
 import io
 import time
@@ -29,7 +27,7 @@ from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import energy_gain, errors
 from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
-from sdfsim.learned.model import SOLVER, Model, load_model, model_names
+from sdfsim.learned.model import SOLVER, Model, load_model, sound_models
 from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -51,14 +49,14 @@ TIMED = 80  # steps, at most
 EXPLODED = 1.0  # energy gain over the energy at the start, beyond which a motion blew up
 OFF = 1e-3  # m/s, by which the starts of the chaos floor differ from the recorded ones
 HORIZON = 50  # steps of the errors that are drawn
-RUNS: dict[str, Engine] = {
+ENGINES: dict[str, Engine] = {
     "PyBullet": engines.bullet,
     "MuJoCo": engines.mujoco,
     "MuJoCo mesh SDF": partial(engines.mujoco, pieces=False),
 }
 # Steps of the engine in a recorded one.
-ENGINES = {"PyBullet": (5, 4, 3, 2, 1), "MuJoCo": (10, 5, 2), "MuJoCo mesh SDF": (5, 2)}
-ENGINES_QUICK = {"PyBullet": (5, 1), "MuJoCo": (5,)}
+INNER = {"PyBullet": (5, 4, 3, 2, 1), "MuJoCo": (10, 5, 2), "MuJoCo mesh SDF": (5, 2)}
+INNER_QUICK = {"PyBullet": (5, 1), "MuJoCo": (5,)}
 TRUTH = f"PyBullet {1e3 * SUBSTEP:.3g} ms"  # made the recordings: no error of its own
 FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
 GRIDS = (32, 64, 128, 256)
@@ -266,7 +264,7 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
     """Errors and times of an engine with `substeps` steps in a recorded one; starts differ by `off` m/s."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
-    run = RUNS[name]
+    run = ENGINES[name]
     if lacking := sorted({str(n) for t in cases.recorded for n in t.shape} - set(cases.urdfs)):
         raise SdfsimError(f"no engine file of {', '.join(lacking)}")
     meshes = {name: centred_mesh(shape) for name, shape in cases.shapes.items()}
@@ -324,12 +322,7 @@ def _times(run: Callable[[], Timing], cases: Cases) -> dict[str, Any]:
 
 
 def tradeoff(
-    source: Path | None,
-    out: Path,
-    *,
-    models: Sequence[str] = (),
-    quick: bool = False,
-    on_progress: StageProgress,
+    source: Path | None, out: Path, *, models: Sequence[str] = (), quick: bool = False, on_progress: StageProgress
 ) -> dict[str, Any]:
     """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
 
@@ -337,7 +330,7 @@ def tradeoff(
         source: dataset folder, or a scene file, which the teacher then simulates; None takes a random scene of
             boxes and balls.
         out: folder to write; results that it holds already are kept.
-        models: names or paths (none: the solver and all bundled networks).
+        models: names or paths (none: the solver and the bundled networks on it).
         quick: fewer variants on fewer, shorter scenes.
 
     Returns:
@@ -349,7 +342,7 @@ def tradeoff(
     """
     if source and not source.exists():
         raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
-    names = list(models) or model_names()
+    names = list(models) or sound_models()
     with locked(out), one_thread():
         on_progress("scenes", 0.0, "reading scenes and shapes")
         if source and source.is_dir():
@@ -364,7 +357,7 @@ def tradeoff(
             families[variant.label] = variant.family
             weights = load_model(variant.model) if variant.contact else None
             jobs.append(Job("cases", variant.label, [content, variant, weights], measure_ours, (variant, cases)))
-        for name, counts in (ENGINES_QUICK if quick else ENGINES).items():
+        for name, counts in (INNER_QUICK if quick else INNER).items():
             for substeps in counts:
                 label = f"{name} {1e3 * DT / substeps:.3g} ms"
                 kinds[label], families[label] = "engine", f"{name}: step"

@@ -1,7 +1,5 @@
 """Bounding-volume hierarchies over triangles: nearest point, ray parity, winding number, rays."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

@@ -5,8 +5,6 @@ glTF has y up and we have z up. A file that we write has one node above all othe
 and motions hold our own numbers; what we read is turned back (a file of ours comes out as it was).
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Volume, centre of mass and inertia, of closed meshes exactly and of any bounded SDF on a grid."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

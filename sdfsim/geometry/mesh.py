@@ -1,7 +1,5 @@
 """Triangle meshes: cleaning, convex hulls, normals, and points on surfaces."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ line; Open3D, which reads both, gives up a whole file for one polygon with three
 read here. All readers raise ValueError for a file that is damaged or cut short.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import struct

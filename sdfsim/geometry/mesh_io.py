@@ -1,7 +1,5 @@
 """Meshes from files of all kinds, and the files that we write: PLY, glTF with textures, convex pieces as OBJ."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

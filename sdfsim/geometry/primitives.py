@@ -1,7 +1,5 @@
 """Procedural watertight meshes, metres, about 1 m wide by default, and the convex pieces of those that have them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

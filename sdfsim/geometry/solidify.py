@@ -4,8 +4,6 @@ Vertices [V, 3 + K] and corners of triangles [F, 3, 3 + K] hold coordinates, and
 get by the same averages.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -20,6 +20,7 @@ BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # of any size of a network
 MODEL_VERSION = 3  # 2: networks without the contact solve; 1: of an earlier teacher
 SOLVER = "solver"
+LEARNED = ("gnn", "sdf-sim")  # bundled networks that go by learning alone, without the solve
 SURFACE = ("sdf-sim", "fignet", "fignet-star", "mgn", "dpi")  # networks whose messages run between surface nodes
 
 
@@ -89,6 +90,11 @@ def bundled_models() -> list[str]:
 def model_names() -> list[str]:
     """What a model may be called: the solver, and the bundled networks."""
     return [SOLVER, *bundled_models()]
+
+
+def sound_models() -> list[str]:
+    """The solver, and the bundled networks on top of it: what hard cases and studies run where no model is named."""
+    return [name for name in model_names() if name not in LEARNED]
 
 
 def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:

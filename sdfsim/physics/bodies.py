@@ -1,7 +1,5 @@
 """A scene as arrays in the model's units: what stays constant while it is simulated, and the state that changes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

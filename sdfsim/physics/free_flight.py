@@ -1,7 +1,5 @@
 """Free flight in closed form: ballistic motion, and torque-free rotation that keeps its angular momentum; of states."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -4,8 +4,6 @@ Nothing here uses the contact search, baked grids or the solver's own penetratio
 closed forms and meshes.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

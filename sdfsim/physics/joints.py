@@ -1,7 +1,5 @@
 """Joints of a scene as arrays in model units: what they are, what is known of them, and where they stand."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Where bodies are and how they move: one record for states, rollouts and recordings."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Self
 

@@ -1,7 +1,5 @@
 """What is in play during a run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

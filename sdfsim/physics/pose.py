@@ -1,7 +1,5 @@
 """Rotations as unit quaternions (xyzw), batched over leading dimensions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

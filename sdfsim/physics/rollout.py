@@ -1,7 +1,5 @@
 """A finished (or partial) simulation as arrays, and its file."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -59,7 +57,7 @@ class Rollout:
         """Number of steps, T."""
         return len(self.time) - 1
 
-    def frames(self, start: int, stop: int) -> Rollout:
+    def frames(self, start: int, stop: int) -> "Rollout":
         """Entries `start` to `stop` (exclusive) of every array, contacts included."""
         ends = np.concatenate([[0], np.cumsum(self.contact_count)])
         rows = slice(int(ends[start]), int(ends[stop]))
@@ -84,7 +82,7 @@ class Rollout:
         write_arrays(Path(path), arrays)
 
     @classmethod
-    def load(cls, path: Path | str) -> Rollout:
+    def load(cls, path: Path | str) -> "Rollout":
         """Read a `rollout.npz`. Raises SdfsimError when it is missing or not one of ours."""
         arrays = read_arrays(Path(path), "a rollout")
         try:

@@ -6,8 +6,6 @@ on it, and those that may hold the nearest (or deepest) point are cut further: o
 no vertex in each other, are measured like everything else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -239,7 +237,7 @@ class Placed:
     origin: np.ndarray  # [K, 3] m, of the solids' frames
     turn: np.ndarray  # [K, 3, 3], solid -> world
 
-    def __getitem__(self, rows: np.ndarray) -> Placed:
+    def __getitem__(self, rows: np.ndarray) -> "Placed":
         return Placed(self.solid[rows], self.scale[rows], self.origin[rows], self.turn[rows])
 
 

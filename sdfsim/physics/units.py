@@ -1,7 +1,5 @@
 """Froude scaling: the units in which a scene has bodies of the model's size at the model's gravity."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a state and a scene must be for their motion to mean anything."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Scenes written in Python: the keys of scene.yaml as keyword arguments, and the same checks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +31,7 @@ class SceneBuilder:
         self._bodies: list[dict[str, Any]] = []
         self._joints: list[dict[str, Any]] = []
 
-    def add(self, name: str, **keys: Any) -> SceneBuilder:
+    def add(self, name: str, **keys: Any) -> "SceneBuilder":
         """Add a body, or many copies of one, and return the scene.
 
         Keys are of the body and of its shape, which has the same name, as docs/scene.md has them, such as
@@ -50,7 +48,7 @@ class SceneBuilder:
         self._bodies.append(_plain({"name": name, **body}))
         return self
 
-    def join(self, name: str, type: str, *bodies: str, **keys: Any) -> SceneBuilder:
+    def join(self, name: str, type: str, *bodies: str, **keys: Any) -> "SceneBuilder":
         """Add a joint between two bodies, the second of which may be "world" and is so where only one is given, and
         return the scene.
 

@@ -1,7 +1,5 @@
 """The sample scenes that come with the package, by name: `pile` is as good as the path of `pile.yaml`."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which bodies may touch: by groups, and counted by kinds, so that thousands of bodies make no millions of tests."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

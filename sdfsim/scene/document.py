@@ -1,7 +1,5 @@
 """The YAML of a scene file with its line numbers, and the faults that are found in it."""
 
-from __future__ import annotations
-
 import errno
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Joints of a scene: from points and axes in the world, or in a body, to a frame at each of both bodies."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

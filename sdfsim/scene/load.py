@@ -1,7 +1,5 @@
 """`load_scene`: a scene file is read and checked, and becomes a `Scene` with its shapes made."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The plan: which effects are in play in a scene, and why. The simulator leaves out what is off."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

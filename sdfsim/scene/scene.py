@@ -1,7 +1,5 @@
 """A scene as immutable data in SI units: what a scene file becomes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

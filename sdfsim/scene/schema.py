@@ -1,7 +1,5 @@
 """The keys of scene.yaml as pydantic models. `python -m sdfsim.scene.schema` writes docs/scene.md, their reference."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -27,14 +25,7 @@ from sdfsim.base.errors import nearest
 from sdfsim.geometry.primitives import PRIMITIVES
 from sdfsim.scene.document import NOTHING, Loc, Numeral
 from sdfsim.scene.scene import WORLD, JointKind, Motion, Switch
-from sdfsim.shape.shape import (
-    DEFAULT_RESOLUTION,
-    MESH_FILE,
-    RECORD_FILE,
-    SKIN_FILE,
-    WEIGHTS_FILE,
-    SdfKind,
-)
+from sdfsim.shape.shape import DEFAULT_RESOLUTION, MESH_FILE, RECORD_FILE, SKIN_FILE, WEIGHTS_FILE, SdfKind
 
 VERSION = 1
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -59,7 +50,7 @@ def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("value", "{text}", {"text": text})
 
 
-def _told(error: Any, table: type[Table]) -> str:
+def _told(error: Any, table: "type[Table]") -> str:
     """What pydantic found in a table, in our words."""
     kind, known = error["type"], table.model_fields
     if kind == "value":
@@ -528,7 +519,7 @@ class JointTable(Table):
     to: Vector | None = key("of a distance: its end at the second body", None, "m")
     axis: Direction | None = key("of a hinge, a slider and the cone of a ball; of any length", None)
     frame: Text = key(
-        f"where anchor, to and axis are told: `{WORLD}`, as bodies lie at the start, or the name of one of both "
+        f"where anchor, to and axis are given: `{WORLD}`, as bodies lie at the start, or the name of one of both "
         "bodies: from its shape's origin along its axes",
         WORLD,
     )
@@ -567,7 +558,7 @@ class JointTable(Table):
             if not {"rod", "rope", "spring"} & data.keys():
                 yield (), "one of rod, rope, spring is required: this is a distance"
         if "cone_deg" in data and "axis" not in data:
-            yield ("axis",), "is required: cone_deg is told from it"
+            yield ("axis",), "is required: cone_deg is measured from it"
         if "restitution" in data and not {"limits", "limits_deg", "cone_deg", "rope"} & data.keys():
             yield ("restitution",), "goes with limits or a rope only"
         if kind == "distance" and "damping" in data and "rod" in data:

@@ -1,7 +1,5 @@
 """Reference signed distances from a bounding-volume hierarchy, and where their sign can be trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 

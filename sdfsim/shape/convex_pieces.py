@@ -1,7 +1,5 @@
 """Convex pieces of a shape as contacts use them: closed forms, and hulls with their flat faces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 

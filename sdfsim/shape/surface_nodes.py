@@ -1,7 +1,5 @@
 """Surface nodes: the points of a body that carry contact, sampled from its SDF alone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError

@@ -1,7 +1,5 @@
 """Many scenes in one call: each a world of one set of bodies, which never meets the others."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

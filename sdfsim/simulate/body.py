@@ -1,7 +1,5 @@
 """Bodies of a running simulation by name, and where they touch: metres, kilograms and seconds, NumPy arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

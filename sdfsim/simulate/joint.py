@@ -1,7 +1,5 @@
 """Joints of a running simulation by name: metres, radians, newtons and seconds, NumPy arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError

@@ -52,11 +52,7 @@ COUNTS = {
     "active": "dynamic bodies awake that contacts moved",
     "asleep": "dynamic bodies asleep",
 }
-PHASES = {
-    "flight_ms": "free flight",
-    "contact_ms": "contact solve",
-    "network_ms": "network",
-}
+PHASES = {"flight_ms": "free flight", "contact_ms": "contact solve", "network_ms": "network"}
 
 
 @dataclass(frozen=True)

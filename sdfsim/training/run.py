@@ -9,7 +9,7 @@ from copy import deepcopy
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,10 +17,13 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import read_arrays, write_arrays
+from sdfsim.base.files import digest, read_arrays, write_arrays
 from sdfsim.training.batches import Drawn, Draws, batches, moved
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
+
+if TYPE_CHECKING:
+    from sdfsim.learned.model import Model
 
 EMA_DECAY = 0.999
 CLIP = 1.0
@@ -31,21 +34,31 @@ SMALLEST = 16  # rows and columns of a matrix that counts as hidden; smaller one
 class Run:
     """Everything that changes while training, and how to save it.
 
-    The task is an `ImpulseTask` or a `SurfaceTask`. The learning rate depends on `total`, the optimiser's steps of the
-    whole run; a `team` shares the work, and `workers` draw batches ahead.
+    The task is an `ImpulseTask`, a `SurfaceTask` or a `MotionTask`. The learning rate depends on `total`, the
+    optimiser's steps of the whole run; a `team` shares the work, and `workers` draw batches ahead. It begins with the
+    weights of `first`, where another training has made some. Raises SdfsimError where these are of another network than
+    the plan's.
     """
 
     def __init__(
-        self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE, workers: int = 0
-    ) -> None:
+        self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE,
+        workers: int = 0, first: Model | None = None,
+    ) -> None:  # fmt: skip
         from sdfsim.learned.model import new_network
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
         self.workers = workers
         self.origin = {"plan": json.loads(json.dumps(asdict(plan))), "seed": seed, "data": task.digest()}
-        self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
-        if hasattr(task, "prepare"):
+        self.network: nn.Module = new_network(plan.kind, plan.config)
+        if first is not None:
+            self.origin["first"] = digest(first.network)
+            if (first.kind, first.network.config) != (plan.kind, self.network.config):  # type: ignore[union-attr]
+                told = f"{first.name}: a network of another kind or size than the preset's"
+                raise SdfsimError(told, "train the one that it was trained as")
+            self.network.load_state_dict(first.network.state_dict())
+        self.network = self.network.to(device)
+        if hasattr(task, "prepare") and first is None:  # what comes from elsewhere has its statistics
             task.prepare(self.network, np.random.default_rng([seed, 1]), device)
         # Averaged are the trained weights; feature statistics are fixed before the first step.
         self.weights = dict(self.network.named_parameters())
@@ -117,6 +130,8 @@ class Run:
                 raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")
             if info["data"] != self.origin["data"]:
                 raise SdfsimError(f"{path} was trained on other data", "give the same --data, or choose another -o")
+            if info.get("first") != self.origin.get("first"):
+                raise SdfsimError(f"{path} began with other weights", "give the same --from, or choose another -o")
             states: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
             for key, value in arrays.items():
                 of, name = key.split("/", 1)

@@ -37,6 +37,7 @@ def train(
     budget: float = math.inf,
     workers: int = 0,
     scene: Path | None = None,
+    first: str | Path | None = None,
     allow_outside: bool = False,
     on_progress: Progress = silent,
 ) -> dict:
@@ -46,14 +47,16 @@ def train(
     Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. Recordings are what
     `sdfsim identify` reads, of one scene that says what they do not (best the one that it wrote); every sixth is held
     out. They are trained on over several steps in a row, on the CPU, with the preset "impacts" or "alone". The preset
-    is a name in `PRESETS`, or one of your own, with other `steps` if given. `resume` goes on from the checkpoint in
-    `out`, with the result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after
-    which it stops early. So many `workers` draw batches ahead, in processes of their own, and the result is the same: a
-    GPU would wait for the contacts of networks on surface nodes, which the CPU searches. Returns paths, losses and
-    processor time. Raises SdfsimError for unusable data, a checkpoint in `out` without `resume`, another run writing to
-    it, or diverged training.
+    is a name in `PRESETS`, or one of your own, with other `steps` if given. Where a model is given as `first`, a
+    bundled name or a path, its weights are those to begin with. `resume` goes on from the checkpoint in `out`, with the
+    result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after which it stops
+    early. So many `workers` draw batches ahead, in processes of their own, and the result is the same: a GPU would wait
+    for the contacts of networks on surface nodes, which the CPU searches. Returns paths, losses and processor time.
+    Raises SdfsimError for unusable data, weights to begin with of another network than the preset's, a checkpoint in
+    `out` without `resume`, another run writing to it, or diverged training.
     """
     from sdfsim.base.devices import pick_device
+    from sdfsim.learned.model import load_model
 
     plan = PRESETS[preset] if isinstance(preset, str) else preset
     folders = [data] if isinstance(data, Path) else list(data)
@@ -79,7 +82,8 @@ def train(
                 task, held_out = _motion_tasks(folders, scene, on_progress, allow_outside=allow_outside)
                 counts = {"train": task.counts[0], "validation": held_out.counts[0]}
                 made = [{"scene": scene.name, "recordings": counts}]
-        run = Run(plan, task, total, seed, place, team, workers)
+        begun = None if first is None else load_model(first)
+        run = Run(plan, task, total, seed, place, team, workers, begun)
         if checkpoint.exists():
             run.load(checkpoint)
         team.wait()
@@ -88,6 +92,8 @@ def train(
         _loop(run, held_out, out, budget, on_progress)
         report = {"steps": run.step, "seconds": run.seconds, "loss": run.loss}
         if team.leads:
+            if begun is not None:
+                made = [*made, {"weights": begun.name, "data": begun.card.get("data", [])}]
             model = run.export(preset if isinstance(preset, str) else preset.kind, made)
             report |= {"model": str(out / "model.safetensors"), "held_out_loss": held_out_loss(run, held_out)}
             try:

@@ -1,7 +1,5 @@
 """Exports, read back by the programs that they are for: trimesh, OpenUSD, MuJoCo, PyBullet, and our own `identify`."""
 
-from __future__ import annotations
-
 import csv
 import json
 import struct
@@ -11,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
-import cli
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.observed import load_recordings
@@ -21,6 +17,7 @@ from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import load_shape
+from tests.helpers.command import run
 
 SHAPES = Path(__file__).resolve().parents[2] / "samples" / "shapes"
 SECONDS = 1.2
@@ -479,12 +476,8 @@ def test_identify_reads_the_poses_of_a_run(dropped):
 # --- the command, and what goes wrong ---
 
 
-def run(*arguments: object):
-    return CliRunner().invoke(cli.app, ["export", *map(str, arguments)])
-
-
 def test_the_command_reports_what_it_wrote_and_what_it_left_out(dropped, tmp_path):
-    done = run(dropped.folder, "-o", tmp_path / "new" / "run.urdf", "--allow-outside", "--json")
+    done = run("export", dropped.folder, "-o", tmp_path / "new" / "run.urdf", "--allow-outside", "--json")
     assert done.exit_code == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["format"] == "urdf" and report["bodies"] == 10

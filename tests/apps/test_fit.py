@@ -1,7 +1,5 @@
 """Many meshes at once: in processes, on a cluster."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -9,9 +7,7 @@ import numpy as np
 import pytest
 import torch
 from joblib import parallel_config
-from typer.testing import CliRunner
 
-import cli
 from sdfsim.apps.fit import named_meshes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import cluster, parallel
@@ -21,6 +17,7 @@ from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import mesh_shape, remarks, shape_from_mesh
 from sdfsim.shape.shape import load_shape
+from tests.helpers.command import run
 
 
 @pytest.fixture
@@ -38,7 +35,7 @@ def meshes(tmp_path: Path) -> Path:
 def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: Path) -> None:
     out = tmp_path / "shapes"
     arguments = ["fit", str(meshes), "-o", str(out), "--budget", "0.3s", "--device", "cpu"]
-    done = CliRunner().invoke(cli.app, arguments)
+    done = run(*arguments)
     assert done.exit_code == 1
     assert "holed: failed: " in done.stdout and "torn: failed: " in done.stdout
     assert "box: errors" in done.stdout and "ball: errors" in done.stdout
@@ -54,7 +51,7 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
     # Again: what is there is kept, the others are tried once more; with what was missing they succeed.
     (meshes / "torn.obj").unlink()
     written = (out / "box" / "shape.json").stat().st_mtime_ns
-    found = CliRunner().invoke(cli.app, [*arguments, "--json"])
+    found = run(*arguments, "--json")
     report = json.loads(found.stdout)
     assert list(report["shapes"]) == ["ball", "box", "holed"]
     assert (out / "box" / "shape.json").stat().st_mtime_ns == written
@@ -64,15 +61,15 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
 def test_units_are_those_of_a_scene_file_and_odd_sizes_are_reported(tmp_path: Path) -> None:
     size, file, out = np.array([20.0, 30.0, 40.0]), tmp_path / "box.ply", tmp_path / "box"
     file.write_bytes(write_ply(primitives.box((20.0, 30.0, 40.0))))
-    arguments = ["fit", str(file), "-o", str(out), "--budget", "0.1s", "--device", "cpu", "--units", "cm"]
-    assert "--units" not in CliRunner().invoke(cli.app, arguments).stdout
+    arguments = ["fit", str(file), "-o", str(out), "--sdf", "grid", "--device", "cpu", "--units", "cm"]
+    assert "--units" not in run(*arguments).stdout
     shape = load_shape(out)
     np.testing.assert_allclose(np.ptp(shape.mesh.vertices, axis=0), 0.01 * size)
     assert shape.volume == pytest.approx(0.024)
     # Other options, or units, are another fit; without units, 40 m are a question.
     for options, same in ((arguments, True), ([*arguments, "--cap"], False), (arguments[:-2], False)):
         before = (out / "shape.json").stat().st_mtime_ns
-        told = CliRunner().invoke(cli.app, options).stdout
+        told = run(*options).stdout
         assert ((out / "shape.json").stat().st_mtime_ns == before) == same
     assert "it is 40 m wide in metres; if its unit is millimetres, give --units mm" in told
     for size, metres, given, note in (
@@ -86,9 +83,7 @@ def test_units_are_those_of_a_scene_file_and_odd_sizes_are_reported(tmp_path: Pa
 def test_an_error_names_the_mesh_and_not_the_folder(tmp_path: Path) -> None:
     box = primitives.box()
     (tmp_path / "holed.ply").write_bytes(write_ply(Mesh(box.vertices, box.faces[2:])))
-    done = CliRunner().invoke(
-        cli.app, ["fit", str(tmp_path / "holed.ply"), "-o", str(tmp_path / "out"), "--device", "cpu"]
-    )
+    done = run("fit", str(tmp_path / "holed.ply"), "-o", str(tmp_path / "out"), "--device", "cpu")
     assert done.exit_code == 1 and f"{tmp_path / 'holed.ply'}: not a solid" in done.stderr
     for kind in ("grid", "mesh"):
         with pytest.raises(SdfsimError, match=r"holed\.ply: not a solid"):
@@ -97,10 +92,10 @@ def test_an_error_names_the_mesh_and_not_the_folder(tmp_path: Path) -> None:
 
 def test_a_turned_gltf_is_reported(tmp_path: Path) -> None:
     mesh_shape(primitives.box((0.3, 0.2, 0.1)), name="box", kind="mesh").save(tmp_path / "box")
-    done = CliRunner().invoke(cli.app, ["export", str(tmp_path / "box"), "-o", str(tmp_path / "box.glb")])
+    done = run("export", str(tmp_path / "box"), "-o", str(tmp_path / "box.glb"))
     assert "z up is turned to glTF's y up" in done.stdout
-    arguments = ["fit", str(tmp_path / "box.glb"), "-o", str(tmp_path / "again"), "--budget", "0.1s", "--device", "cpu"]
-    assert "glTF has y up: it is turned to z up" in CliRunner().invoke(cli.app, arguments).stdout
+    arguments = ["fit", str(tmp_path / "box.glb"), "-o", str(tmp_path / "again"), "--sdf", "grid", "--device", "cpu"]
+    assert "glTF has y up: it is turned to z up" in run(*arguments).stdout
     np.testing.assert_allclose(np.ptp(load_shape(tmp_path / "again").mesh.vertices, axis=0), [0.3, 0.2, 0.1], atol=1e-6)
 
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
 from sdfsim.apps.identify import Problem, identify, report_lines, write_scene
+from sdfsim.apps.identify_picture import picture, title
 from sdfsim.apps.observed import COLUMNS, load_recordings
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import import_pybullet
@@ -151,6 +154,30 @@ def test_a_sliding_block_shows_its_friction_and_no_restitution(tmp_path, slope, 
     assert told["value"] == pytest.approx(0.3, abs=0.015)
     assert found["restitution"]["block / ground"]["value"] is None
     assert told["interval"][0] - 0.01 < 0.3 < told["interval"][1] + 0.01
+
+
+def test_the_picture_shows_what_the_recordings_tell_and_what_they_do_not(tmp_path, monkeypatch):
+    scene = sliding_block(tmp_path, noise=3e-4)
+    out = tmp_path / "found.yaml"
+    done = CliRunner().invoke(
+        cli.app, ["identify", str(tmp_path / "block.csv"), "--scene", str(scene), "-o", str(out), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["picture"] == str(out.with_suffix(".png"))
+    with Image.open(out.with_suffix(".png")) as image:
+        assert image.format == "PNG" and min(image.size) > 200
+    found = identify(*load_recordings([tmp_path / "block.csv"], scene), profiles=True)
+    profiles = {p.kind: p for p in found.profiles}
+    friction, restitution = profiles["own_friction"], profiles["own_restitution"]
+    # Stopping after v^2 / (2 g mu): what is off by a tenth of that is seen, on either side of the 0.3 it was made with.
+    assert friction.x[int(np.argmin(friction.loss))] == pytest.approx(0.3, abs=0.015)
+    assert min(friction.loss[0], friction.loss[-1]) > 1.02
+    assert restitution.interval is None and max(restitution.loss) == pytest.approx(1.0, abs=0.01)
+    assert title(restitution) == "restitution of its own: block\nnot shown by these recordings"
+    assert title(friction).startswith("friction of its own: block\n0.3")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert picture(found, tmp_path / "none.png") == "pictures need matplotlib: pip install 'sdfsim[bench]'"
+    assert not (tmp_path / "none.png").exists()
 
 
 def bounces(restitution: float, height: float, ground: float, frames: int = 200, dt: float = 0.005) -> np.ndarray:

@@ -1,7 +1,5 @@
 """Joints in files of other programs: imports and exports, judged by MuJoCo, PyBullet, OpenUSD and by hand."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -9,9 +7,8 @@ import mujoco  # noqa: TID253
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
-import cli
+from benchmarks.robots import poses
 from sdfsim import load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
@@ -20,65 +17,28 @@ from sdfsim.apps.recording_joints import ends, marks
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
-from sdfsim.scene.scene import Joint, Scene
+from sdfsim.scene.scene import Scene
+from tests.helpers.command import run
 from tests.helpers.runs import read
 
 LINK = """
-  <link name="{name}">
-    <inertial><origin xyz="{com}" rpy="{rpy}"/><mass value="{mass}"/>
-      <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial>
-    <collision><origin xyz="{at}" rpy="{turn}"/><geometry>{form}</geometry></collision>
+  <link name="{0}">
+    <inertial><origin xyz="{2}" rpy="{3}"/><mass value="{1}"/>
+      <inertia ixx="{4[0]}" ixy="0" ixz="0" iyy="{4[1]}" iyz="0" izz="{4[2]}"/></inertial>
+    <collision><origin xyz="{5}" rpy="{6}"/><geometry>{7}</geometry></collision>
   </link>"""
+# A row a link: mass, its centre and the turn of its principal axes, moments; place, turn and form of what touches.
+LINKS = {
+    "base": (4, "0 0 0.1", "0 0 0", (0.04, 0.05, 0.03), "0 0 0.1", "0 0 0", '<box size="0.2 0.2 0.2"/>'),
+    "upper": (1.5, "0.02 0 0.2", "0.3 0.2 -0.4", (0.02, 0.021, 0.004), "0 0 0.2", "0 0 0",
+              '<cylinder radius="0.04" length="0.36"/>'),
+    "slide": (0.7, "0 0.1 0", "0 0 0", (0.002, 0.001, 0.002), "0 0.1 0", "1.5707963 0 0",
+              '<capsule radius="0.03" length="0.1"/>'),
+    "tip": (0.2, "0 0 0.05", "0 0 0", (0.0002, 0.0002, 0.0001), "0 0 0.05", "0 0 0", '<sphere radius="0.04"/>'),
+}  # fmt: skip
 ARM = (
     '<robot name="arm">'
-    + LINK.format(
-        name="base",
-        com="0 0 0.1",
-        rpy="0 0 0",
-        mass=4,
-        ixx=0.04,
-        iyy=0.05,
-        izz=0.03,
-        at="0 0 0.1",
-        turn="0 0 0",
-        form='<box size="0.2 0.2 0.2"/>',
-    )
-    + LINK.format(
-        name="upper",
-        com="0.02 0 0.2",
-        rpy="0.3 0.2 -0.4",
-        mass=1.5,
-        ixx=0.02,
-        iyy=0.021,
-        izz=0.004,
-        at="0 0 0.2",
-        turn="0 0 0",
-        form='<cylinder radius="0.04" length="0.36"/>',
-    )
-    + LINK.format(
-        name="slide",
-        com="0 0.1 0",
-        rpy="0 0 0",
-        mass=0.7,
-        ixx=0.002,
-        iyy=0.001,
-        izz=0.002,
-        at="0 0.1 0",
-        turn="1.5707963 0 0",
-        form='<capsule radius="0.03" length="0.1"/>',
-    )
-    + LINK.format(
-        name="tip",
-        com="0 0 0.05",
-        rpy="0 0 0",
-        mass=0.2,
-        ixx=0.0002,
-        iyy=0.0002,
-        izz=0.0001,
-        at="0 0 0.05",
-        turn="0 0 0",
-        form='<sphere radius="0.04"/>',
-    )
+    + "".join(LINK.format(name, *row) for name, row in LINKS.items())
     + """
   <link name="tool0"/>
   <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
@@ -107,32 +67,9 @@ def imported(file: Path, **options) -> tuple[Scene, dict]:
     return load_scene(out), report
 
 
-def centres(scene: Scene, q: dict[str, float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By body: its centre of mass [3] and its axes [3, 3] with joints at `q`, roots as they are at the start."""
-    held: dict[int, Joint] = {joint.bodies[0]: joint for joint in scene.joints if not joint.collides}
-    found: dict[int, tuple[np.ndarray, Rotation]] = {-1: (np.zeros(3), Rotation.identity())}
-
-    def pose(k: int) -> tuple[np.ndarray, Rotation]:
-        if k not in found and k in held:
-            joint, value = held[k], q.get(held[k].name, 0.0)
-            place, turn = pose(joint.bodies[1])
-            own, theirs = (Rotation.from_quat(frame) for frame in joint.quat_xyzw)
-            frame, origin = turn * theirs, place + turn.apply(joint.anchor[1])
-            if joint.kind == "hinge":
-                frame = frame * Rotation.from_rotvec([value, 0.0, 0.0])
-            elif joint.kind == "slider":
-                origin = origin + frame.apply([value, 0.0, 0.0])
-            axes = frame * own.inv()
-            found[k] = origin - axes.apply(joint.anchor[0]), axes
-        elif k not in found:
-            found[k] = scene.bodies[k].position, Rotation.from_quat(scene.bodies[k].quat_xyzw)
-        return found[k]
-
-    made = {}
-    for k, body in enumerate(scene.bodies):
-        place, turn = pose(k)
-        made[body.name] = place + turn.apply(body.scale * scene.shapes[body.shape].com), turn.as_matrix()
-    return made
+def centres(scene: Scene, q: dict[str, float]) -> dict[str, np.ndarray]:
+    """By body: its centre of mass [3] with joints at `q`, roots as they are at the start."""
+    return dict(zip((body.name for body in scene.bodies), poses(scene, q)[0], strict=True))
 
 
 def inertia(scene: Scene, name: str) -> np.ndarray:
@@ -161,7 +98,7 @@ def test_urdf_has_the_poses_masses_and_inertias_that_mujoco_has(tmp_path: Path) 
         for name, value in q.items():
             data.joint(name).qpos[0] = value
         mujoco.mj_forward(model, data)
-        for name, (place, axes) in centres(scene, q).items():
+        for name, place in centres(scene, q).items():
             assert place == pytest.approx(data.body(name).xipos, abs=1e-9), name
             if trial == 0:  # the start of the scene, to which inertias belong
                 principal = data.body(name).ximat.reshape(3, 3)
@@ -170,7 +107,6 @@ def test_urdf_has_the_poses_masses_and_inertias_that_mujoco_has(tmp_path: Path) 
                 if body.motion == "dynamic":
                     assert inertia(scene, name) == pytest.approx(theirs, rel=1e-6, abs=1e-9)
                     assert body.mass == pytest.approx(float(model.body(name).mass[0]), rel=1e-9)
-            del axes
     joints = {joint.name: joint for joint in scene.joints}
     assert joints["shoulder"].limits == pytest.approx((0.2, 1.4))
     assert (joints["shoulder"].damping, joints["shoulder"].friction) == pytest.approx((0.3, 0.05))
@@ -276,7 +212,7 @@ def test_mjcf_has_the_poses_and_masses_that_mujoco_has(tmp_path: Path) -> None:
         mujoco.mj_forward(model, data)
         found = centres(scene, q)
         for name in ("mast", "boom", "hook", "load", "crate"):
-            assert found[name][0] == pytest.approx(data.body(name).xipos, abs=1e-8), name
+            assert found[name] == pytest.approx(data.body(name).xipos, abs=1e-8), name
     bodies = {body.name: body for body in scene.bodies}
     small = [body for name, body in bodies.items() if name.startswith("boom_")]
     assert len(small) == 1 and small[0].mass == pytest.approx(0.02 * float(model.body("boom").mass[0]))
@@ -494,8 +430,8 @@ def test_usd_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
 
 def test_the_command_imports(tmp_path: Path) -> None:
     file = write(tmp_path, "arm.urdf", ARM)
-    run = CliRunner().invoke(cli.app, ["import", str(file), "-o", str(tmp_path / "scene.yaml"), "--fixed", "--json"])
-    assert run.exit_code == 0, run.output
+    done = run("import", file, "-o", tmp_path / "scene.yaml", "--fixed", "--json")
+    assert done.exit_code == 0, done.output
     assert load_scene(tmp_path / "scene.yaml").bodies[0].motion == "static"
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.identify import Problem
 from sdfsim.apps.observed import cleaned, with_velocities
-from sdfsim.apps.observed_joints import held_together, jointed
+from sdfsim.apps.observed_joints import flying_trees, held_together, jointed
 from sdfsim.scene.builder import SceneBuilder
 
 ORIGIN, AXIS = np.array([0.05, 0.02, 0.0]), np.array([0.0, 0.6, 0.8])
@@ -129,6 +129,72 @@ def test_friction_and_damping_of_a_pendulum_are_those_that_repeat_it_best() -> N
     best = off(friction, damping)
     for other in ((0.0, damping), (2.0 * friction, damping), (friction, 0.0), (friction, 2.0 * damping)):
         assert off(*other) > 1.5 * best, (other, off(*other), best)
+
+
+def thrown(dt: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Poses [T, 2, 7] and velocities [T, 2, 6] (along, turning) of the child and the base of `scene("hinge")` that
+    MuJoCo throws."""
+    import mujoco
+
+    spec, fine = mujoco.MjSpec(), 20
+    spec.option.timestep, spec.option.integrator = dt / fine, mujoco.mjtIntegrator.mjINT_RK4
+    size = [0.05, 0.025, 0.025]
+    base = spec.worldbody.add_body(name="base", pos=[0, 0, 1])
+    base.add_freejoint()
+    base.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, mass=1, contype=0, conaffinity=0)
+    child = base.add_body(name="child", pos=[0.1, 0, 0])
+    child.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, mass=1, contype=0, conaffinity=0)
+    child.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, pos=ORIGIN - [0.1, 0, 0], axis=AXIS)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[:] = [0.3, -0.2, 1.0, 3.0, -5.0, 2.0, 8.0]
+    poses, speeds = np.empty((count, 2, 7)), np.empty((count, 2, 6))
+    for t in range(count):
+        mujoco.mj_forward(model, data)
+        for d, name in enumerate(("child", "base")):
+            body = data.body(name)
+            poses[t, d] = [*body.xpos, *np.roll(body.xquat, -1)]
+            speed = np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(name).id, speed, 0)
+            speeds[t, d] = [*speed[3:], *speed[:3]]
+        mujoco.mj_step(model, data, fine)
+    return poses, speeds
+
+
+def test_bodies_on_a_hinge_that_were_thrown_have_the_velocities_of_their_flight() -> None:
+    dt, count = 1.0 / 148.0, 24
+    poses, speeds = thrown(dt, count)
+    rng = np.random.default_rng(0)  # a tracker's noise
+    poses[..., :3] += 1e-4 * rng.normal(size=(count, 2, 3))
+    shaken = Rotation.from_rotvec(2e-3 * rng.normal(size=(2 * count, 3)))
+    poses[..., 3:] = (shaken * Rotation.from_quat(poses[..., 3:].reshape(-1, 4))).as_quat().reshape(count, 2, 4)
+    made = scene("hinge")
+    assert flying_trees(made) == [[0, 1]]
+    (found,) = with_velocities([cleaned("throw", dt, poses, made)], made)
+    assert found.flying.all() and found.known.all()
+    assert found.velocity == pytest.approx(speeds[..., :3], abs=0.006)
+    assert found.angular_velocity == pytest.approx(speeds[..., 3:], abs=0.08)
+
+
+def test_bodies_that_something_turns_in_a_flight_keep_what_is_seen_nearby() -> None:
+    dt, count = 1.0 / 148.0, 40
+    poses, _ = thrown(dt, count)
+    place, turn = poses[..., :3], Rotation.from_quat(poses[..., 3:].reshape(-1, 4))
+    middle = place.mean(1, keepdims=True)
+    twist = Rotation.from_rotvec(np.repeat(2.0 * np.sin(25.0 * dt * np.arange(count)), 2)[:, None] * [0.0, 0.0, 1.0])
+    place = middle + twist.apply((place - middle).reshape(-1, 3)).reshape(place.shape)
+    poses = np.concatenate([place, (twist * turn).as_quat().reshape(count, 2, 4)], -1)
+    (found,) = with_velocities([cleaned("twist", dt, poses, scene("hinge"))], scene("hinge"))
+    assert not found.flying.any()
+
+
+def test_what_hangs_on_the_world_is_no_flying_tree() -> None:
+    made = SceneBuilder().add("floor", plane={})
+    for k in range(3):
+        made.add(f"link{k}", box={"size": [0.1, 0.05, 0.05]}, position=(0.1 * k, 0, 1), mass=1)
+    made.join("top", "hinge", "link0", anchor=(0, 0, 1), axis=(0, 1, 0))
+    made.join("next", "hinge", "link1", "link0", anchor=(0.05, 0, 1), axis=(0, 1, 0))
+    assert flying_trees(made.load()) == []
 
 
 def test_jointed_bodies_do_not_fly_freely() -> None:

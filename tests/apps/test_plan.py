@@ -1,14 +1,12 @@
 """`plan` explains a scene."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
-import torch
 
 from sdfsim.apps.plan import describe, plan_lines
-from sdfsim.learned.model import Model, load_model, new_network
+from sdfsim.learned.model import load_model
+from tests.helpers.scenes import tiny_model
 
 SCENE = """
 version: 1
@@ -27,12 +25,8 @@ bodies:
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory) -> str:
-    path = tmp_path_factory.mktemp("model") / "untrained.safetensors"
-    torch.manual_seed(0)
     ranges = {"friction": [0.2, 0.3], "restitution": [0.25, 0.25]}
-    network = new_network("impulse", {"width": 8, "rounds": 1})
-    Model("untrained", "impulse", network, 0.02, 10.0, 1.0, 0.1, ranges=ranges).save(path)
-    return str(path)
+    return str(tiny_model(tmp_path_factory.mktemp("model") / "untrained.safetensors", ranges=ranges))
 
 
 @pytest.fixture

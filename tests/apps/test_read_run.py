@@ -1,7 +1,5 @@
 """A run and its scene: what was edited since is not shown with the motion of before."""
 
-from __future__ import annotations
-
 import pytest
 
 from sdfsim import Simulator, load_scene

@@ -1,7 +1,5 @@
 """What is compiled is told before it is waited for: once, where it is not kept, and nothing else is said."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What Windows and macOS do otherwise, as far as Linux can try it: consoles, locks, paths, what is not there."""
 
-from __future__ import annotations
-
 import ast
 import ntpath
 import os

@@ -1,21 +1,15 @@
 """What the commands are given, and how they are run."""
 
-from __future__ import annotations
-
 import pytest
-import torch
 
-from sdfsim.learned.model import Model, new_network
 from tests.helpers.command import SCENE
+from tests.helpers.scenes import tiny_model
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory) -> str:
     """Untrained weights: what the commands do around the network does not depend on them."""
-    path = tmp_path_factory.mktemp("model") / "untrained.safetensors"
-    torch.manual_seed(0)
-    Model("untrained", "impulse", new_network("impulse", {"width": 8, "rounds": 1}), 0.02, 10.0, 1.0, 0.1).save(path)
-    return str(path)
+    return str(tiny_model(tmp_path_factory.mktemp("model") / "untrained.safetensors"))
 
 
 @pytest.fixture

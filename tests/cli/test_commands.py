@@ -1,7 +1,5 @@
 """The command line from outside: exit codes, one line an error, one JSON object, run folders."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -157,9 +155,7 @@ def test_a_report_that_cannot_be_written_is_one_line():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [("--model", "gigantic"), ("--device", "cuda"), ("--viewer", "native")],
-    ids=lambda option: option[0],
+    "wrong", [("--model", "gigantic"), ("--device", "cuda"), ("--viewer", "native")], ids=lambda option: option[0]
 )
 def test_what_is_wrong_from_the_start_is_reported_before_work_and_deletes_nothing(
     scene, model, tmp_path, monkeypatch, wrong

@@ -1,7 +1,5 @@
 """Commands that break or are broken off: exit codes, what is told, and what is kept."""
 
-from __future__ import annotations
-
 import json
 import signal
 from functools import partial

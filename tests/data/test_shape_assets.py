@@ -22,6 +22,14 @@ def ignore(fraction: float, message: str) -> None:
     """No progress to show."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    """V-HACD by 30,000 voxels, which takes a moment."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shape_assets, "VHACD_CALL", shape_assets.VHACD_CALL.replace("1000000", "30000"))
+        yield
+
+
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory):
     """A block that is far off its origin, and a sheet: where they come from, their engine files, what came of them."""
@@ -44,8 +52,7 @@ def test_splits_are_eight_one_and_one_tenths_and_depend_on_the_name_alone():
     assert [split_of(n) for n in ("cube", "cylinder", "gear")] == ["train", "validation", "test"]
 
 
-def test_an_angle_becomes_convex_pieces_of_nearly_its_volume_without_a_word(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(shape_assets, "VHACD_CALL", shape_assets.VHACD_CALL.replace("1000000", "30000"))
+def test_an_angle_becomes_convex_pieces_of_nearly_its_volume_without_a_word(tmp_path, capfd):
     outline = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], dtype=np.float64)
     cap = np.array([[0, k, k + 1] for k in range(1, 5)])
     side = np.array([[k, (k + 1) % 6, (k + 1) % 6 + 6, k + 6] for k in range(6)])

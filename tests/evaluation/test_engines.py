@@ -1,7 +1,5 @@
 """The engines that ours is compared with do what closed forms say, from recordings and from scenes of any size."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

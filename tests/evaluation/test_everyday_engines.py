@@ -1,8 +1,6 @@
 """Other engines run everyday scenes as ours does: they move as closed forms say, and what they cannot express or finish
 is told, not failed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from math import radians, sin

@@ -1,7 +1,5 @@
 """The scenes are what they are called, and the measures are right on motions whose figures are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 
@@ -208,10 +206,7 @@ def boxes(scene: Scene) -> np.ndarray:
     return np.array([[c.min(0), c.max(0)] for c in corners])
 
 
-@pytest.mark.parametrize(
-    ("built", "count", "layers"),
-    [("tower", 5, 5), ("pyramid", 10, 4), ("wall", 22, 5)],
-)
+@pytest.mark.parametrize(("built", "count", "layers"), [("tower", 5, 5), ("pyramid", 10, 4), ("wall", 22, 5)])
 def test_stacks_touch_without_overlap_and_each_body_has_something_below(built, count, layers):
     placed = boxes({"tower": hard_cases.tower, "pyramid": hard_cases.pyramid, "wall": hard_cases.wall}[built](layers))
     assert len(placed) == count

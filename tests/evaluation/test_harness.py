@@ -1,7 +1,5 @@
 """Results are kept and resumed; digests tell contents apart; the front is what brute force finds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

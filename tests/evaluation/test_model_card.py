@@ -1,5 +1,7 @@
 """Replacing a bundled model: weights, errors and card come out of one call."""
 
+import json
+
 import pytest
 
 pytest.importorskip("pybullet")
@@ -37,6 +39,11 @@ def test_a_trained_model_is_bundled_with_its_errors(cube_data, trained, tmp_path
         and "Preset tiny, seed 2: 20 steps of\n16 frames" in card
     )
     assert "recipe movi-b" in card and "seed 1" in card
+    logged = [json.loads(line) for line in (trained.parent / "log.jsonl").read_text().splitlines()]
+    assert model.card["curve"] == [[line["step"], line["held_out_loss"]] for line in logged] and len(logged) > 5
+    assert float(rows["20"][0]) == pytest.approx(logged[-1]["held_out_loss"], abs=1e-4)
+    halfway = next(line["held_out_loss"] for line in logged if line["step"] >= 10)
+    assert f"it fell from\n{halfway:.3g} to {logged[-1]['held_out_loss']:.3g}." in card
 
 
 def _error(report: dict, size: str) -> float:

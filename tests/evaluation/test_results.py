@@ -1,7 +1,5 @@
 """Benchmarks take what their functions say, and each writes its own section of the page of results, and only that."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

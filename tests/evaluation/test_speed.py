@@ -1,7 +1,5 @@
 """The ratios of two timings that the repository keeps: none may slip back."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The hard cases as a whole: resumed, reported, and held by the ratchet."""
 
-from __future__ import annotations
-
 import functools
 import json
 from dataclasses import replace
@@ -10,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
-import cli
 from benchmarks.hard_cases import accepted, slipped_back
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json
@@ -23,6 +19,7 @@ from sdfsim.evaluation.stress import losses, rows, table, write_report
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.learned.model import Model, new_network
+from tests.helpers import command
 
 FEW = ("overlap-balls", "thin-5", "cuda")
 
@@ -132,7 +129,7 @@ def test_a_motion_that_blows_up_is_a_row_that_says_so(tmp_path, model):
 def test_the_command_ends_with_3_when_a_model_blows_up_and_with_0_otherwise(tmp_path, model):
     for weights, code in ((model, 0), (broken(model), 3)):
         out = tmp_path / f"out{code}"
-        done = CliRunner().invoke(cli.app, ["stress", "-o", str(out), "--model", weights, "--quick", "--json"])
+        done = command.run("stress", "-o", str(out), "--model", weights, "--quick", "--json")
         assert done.exit_code == code, done.stderr
         report = json.loads(done.stdout)
         assert bool(report["failed_checks"]) == bool(code) and report["quick"] is True

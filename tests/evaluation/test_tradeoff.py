@@ -1,7 +1,5 @@
 """The trade-off study: what variants change, what a scene becomes, and the whole study in small."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace
@@ -61,12 +59,12 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     monkeypatch.setattr(study, "variants", lambda *_, **__: chosen)
     monkeypatch.setattr(study, "REPEATS", 2)
     monkeypatch.setattr(study, "MOST_QUICK", 1)
-    monkeypatch.setattr(study, "ENGINES_QUICK", {"PyBullet": (5,), "MuJoCo": (5,)})
+    monkeypatch.setattr(study, "INNER_QUICK", {"PyBullet": (5,), "MuJoCo": (5,)})
 
     def absent(*_, **__):
         raise SdfsimError("MuJoCo is not installed")
 
-    monkeypatch.setitem(study.RUNS, "MuJoCo", absent)
+    monkeypatch.setitem(study.ENGINES, "MuJoCo", absent)
     before = torch.get_num_threads()
 
     def run():

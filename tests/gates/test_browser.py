@@ -1,7 +1,5 @@
 """Pages in a real browser: clicks into photos become options, and a run is watched."""
 
-from __future__ import annotations
-
 import shlex
 import signal
 import subprocess

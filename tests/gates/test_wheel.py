@@ -1,7 +1,5 @@
 """The wheel that this repository builds is whole: installed into an empty folder, away from the checkout, it works."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

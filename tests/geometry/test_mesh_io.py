@@ -1,7 +1,5 @@
 """Mesh files as other programs write them, put together here byte by byte."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

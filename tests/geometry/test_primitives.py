@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -34,13 +32,7 @@ def test_every_primitive_is_a_closed_outward_solid_near_a_metre(kind: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("kind", "empty"),
-    [
-        ("torus", [0, 0, 0]),
-        ("gear", [0, 0, 0]),
-        ("bowl", [0, 0, -0.2]),
-        ("shoe", [-0.2, 0, 0.05]),
-    ],
+    ("kind", "empty"), [("torus", [0, 0, 0]), ("gear", [0, 0, 0]), ("bowl", [0, 0, -0.2]), ("shoe", [-0.2, 0, 0.05])]
 )
 def test_holes_are_open(kind: str, empty: list[float]) -> None:
     assert MeshDistance(PRIMITIVES[kind]())(np.array([empty], dtype=float)).distance[0] > 0.02

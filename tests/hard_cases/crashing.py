@@ -1,7 +1,5 @@
 """Commands in a process of their own that ends at a chosen moment, as by a power cut, and tiny settings for them."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -16,14 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from sdfsim.data.dataset import Trajectory
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box
-from sdfsim.learned.model import Model, new_network
 from sdfsim.shape.make import analytic_shape
+from tests.helpers.scenes import tiny_model
 
 WRITING = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate")
 BALL = 0.5  # m
@@ -180,6 +177,7 @@ def tiny_reconstruct() -> None:
     from pipeline import stages
     from pipeline.field import training
     from pipeline.field.grid_field import FieldSize
+    from pipeline.mesh import meshing
 
     small = FieldSize((8, 16), (2, 2), 16, 8)
     training.PRESETS["quick"] = replace(
@@ -187,6 +185,7 @@ def tiny_reconstruct() -> None:
     )
     # One thread: its sums do not depend on how busy the machine is.
     training.train.__kwdefaults__ |= {"checkpoint_every": 0.0, "threads": 1}
+    meshing.RESOLUTION["quick"] = 64  # four times that of the field
     stages.STAGES["poses"] = replace(stages.STAGES["poses"], run=_given_poses)
     tiny_fit()
 
@@ -335,9 +334,7 @@ def works(tmp_path_factory) -> dict[str, Work]:
     home = tmp_path_factory.mktemp("inputs")
     (home / "box.ply").write_bytes(write_ply(box()))
     (home / "scene.yaml").write_text(SCENE)
-    torch.manual_seed(0)
-    network = new_network("impulse", {"width": 8, "rounds": 1})
-    Model("untrained", "impulse", network, 0.02, 10.0, 1.0, 0.1).save(home / "untrained.safetensors")
+    tiny_model(home / "untrained.safetensors")
     write_cubes(home / "data")
     (home / "photos").mkdir()
     for k in range(4):
@@ -346,7 +343,7 @@ def works(tmp_path_factory) -> dict[str, Work]:
     reconstruct = ("reconstruct", str(home / "photos"), "--preset", "quick")
     simulate = ("simulate", str(home / "scene.yaml"), "--viewer", "none")
     return {
-        "reconstruct": Work(reconstruct, (), tiny_reconstruct, of_reconstruct, 3),
+        "reconstruct": Work(reconstruct, (), tiny_reconstruct, of_reconstruct),
         "fit": Work(("fit", str(home / "box.ply")), (), tiny_fit, of_fit, 3),
         "simulate": Work(simulate, ("--resume",), tiny_simulate, of_simulate),
         "train": Work(("train", "--data", str(home / "data")), ("--resume",), tiny_train, of_train),

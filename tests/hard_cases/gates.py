@@ -1,7 +1,5 @@
 """Scenes of the hard cases, and what must hold of every rollout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

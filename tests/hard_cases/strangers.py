@@ -1,7 +1,5 @@
 """Files as strangers write them: valid scenes with what they should become, and ways to spoil scenes and bytes."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Files that claim more than they hold: weights, arrays, archives, pictures and meshes."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zipfile
@@ -16,9 +14,10 @@ from sdfsim import SdfsimError, load_shape
 from sdfsim.base import files
 from sdfsim.base.files import read_arrays
 from sdfsim.geometry.mesh_io import load_mesh
-from sdfsim.learned.model import Model, load_model, new_network
+from sdfsim.learned.model import load_model
 from sdfsim.shape.make import analytic_shape
 from tests.hard_cases.strangers import time_limit
+from tests.helpers.scenes import tiny_model
 
 
 def header_of(tensors: dict, metadata: dict | None = None) -> bytes:
@@ -54,8 +53,7 @@ CLAIMS = [
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=str)
 def test_a_model_is_what_its_weights_are(tmp_path, claim):
-    file = tmp_path / "model.safetensors"
-    Model("tiny", "impulse", new_network("impulse", {"width": 8, "rounds": 1}), 0.02, 10.0, 1.0, 0.1).save(file)
+    file = tiny_model(tmp_path / "model.safetensors")
     weights = load_file(file)
     from safetensors import safe_open
 

@@ -1,7 +1,5 @@
 """Killed at any moment: nothing torn under its final name, and the same command afterwards ends as if undisturbed."""
 
-from __future__ import annotations
-
 import random
 import signal
 from pathlib import Path

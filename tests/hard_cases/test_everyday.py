@@ -1,7 +1,5 @@
 """Everyday scenes: all checks hold but those listed here, and none of them has gone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

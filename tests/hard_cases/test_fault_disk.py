@@ -1,7 +1,5 @@
 """Files that cannot be written to their end: one clear line, nothing torn, and the same command goes on afterwards."""
 
-from __future__ import annotations
-
 import resource
 from dataclasses import replace
 from functools import partial

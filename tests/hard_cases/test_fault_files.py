@@ -1,36 +1,25 @@
 """Weights, shapes and checkpoints that are cut short or changed, and two runs in one folder: one clear line each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from typer.testing import CliRunner
 
-import cli
 from sdfsim import SdfsimError, load_shape
 from sdfsim.base.files import LOCK, locked
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box
-from sdfsim.learned.model import Model, new_network
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, with_sdf
+from tests.helpers.command import run
+from tests.helpers.scenes import tiny_model
 
 SCENE = "version: 1\nduration: 0.04\nbodies: [{name: floor, plane: {}}]\n"
 
 
-def run(*arguments: object):
-    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
-
-
 @pytest.fixture
 def model(tmp_path) -> Path:
-    path = tmp_path / "tiny.safetensors"
-    torch.manual_seed(0)
-    Model("tiny", "impulse", new_network("impulse", {"width": 8, "rounds": 1}), 0.02, 10.0, 1.0, 0.1).save(path)
-    return path
+    return tiny_model(tmp_path / "tiny.safetensors")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.999])

@@ -1,7 +1,5 @@
 """Mesh files from strangers: a shape that can be used, or one line; never a traceback, a hang or a crash."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import NamedTuple

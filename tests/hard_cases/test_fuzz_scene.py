@@ -1,7 +1,5 @@
 """Scene files from strangers: valid ones become what they say, every other one is told about; none crashes or hangs."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from pathlib import Path

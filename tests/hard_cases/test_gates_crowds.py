@@ -1,7 +1,5 @@
 """Rows 16 (flag), 18, 19 and 21: many bodies, long runs, and a single mover among much scenery."""
 
-from __future__ import annotations
-
 import gc
 from dataclasses import replace
 from pathlib import Path

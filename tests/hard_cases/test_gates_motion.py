@@ -3,8 +3,6 @@
 Of untrained networks the same is tested in tests/physics/test_free_flight.py and tests/learned/test_impulse.py.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Row 11: bodies that start inside each other part, from coincident centres too, and nothing explodes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

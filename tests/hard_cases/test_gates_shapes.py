@@ -1,7 +1,5 @@
 """Rows 9 and 12: degenerate shapes run or are refused; distances have bounded gradients wherever they are asked."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

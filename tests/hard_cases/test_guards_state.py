@@ -1,22 +1,19 @@
 """What cannot be is an error that names step, body and last good state, and what was computed stays readable."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-import cli
 from sdfsim import Rollout, SdfsimError
 from sdfsim.learned import inference
 from sdfsim.physics.bodies import State
 from sdfsim.simulate import simulator
 from sdfsim.simulate.simulator import SimulationError, Simulator
 from tests.hard_cases import gates
+from tests.helpers.command import run
 from tests.helpers.scenes import random_model
 
 BROKEN = {
@@ -104,7 +101,7 @@ def test_a_run_on_disk_is_readable_up_to_the_last_good_step(tmp_path, monkeypatc
     )
     at = int(np.random.default_rng(7).integers(3, 20))
     breaking(monkeypatch, at, "velocity", np.nan)
-    done = CliRunner().invoke(cli.app, ["simulate", str(scene), "-o", str(out), "--json", "--model", "small"])
+    done = run("simulate", scene, "-o", out, "--json", "--model", "small")
     assert done.exit_code == 3
     rollout, report = Rollout.load(out / "rollout.npz"), json.loads((out / "report.json").read_text())
     # The network is first asked when the ball meets the floor.

@@ -1,7 +1,5 @@
 """No bundled model becomes worse in a hard case by more than noise."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.hard_cases import RATCHET, slipped_back

@@ -1,7 +1,5 @@
 """Files from strangers reach nothing outside, run nothing and take no absurd memory; viewers stay on this machine."""
 
-from __future__ import annotations
-
 import ast
 import json
 import sys
@@ -9,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from typer.testing import CliRunner
 
-import cli
 from sdfsim import SceneError, SdfsimError, load_scene
 from sdfsim.geometry.mesh_io import load_mesh, write_ply
 from sdfsim.geometry.primitives import box
-from sdfsim.learned.model import Model, new_network
 from sdfsim.shape.make import analytic_shape
 from tests.hard_cases.strangers import time_limit
+from tests.helpers.command import run
+from tests.helpers.scenes import tiny_model
 
 ROOT = Path(__file__).resolve().parents[2]
 OUTSIDE = "leads out of the scene's folder"
@@ -63,13 +59,11 @@ def test_nothing_in_the_sources_runs_what_a_file_says():
 @pytest.fixture
 def home(tmp_path) -> Path:
     """A scene's folder with a mesh, an asset and a model inside, and others beside it."""
-    torch.manual_seed(0)
-    network = new_network("impulse", {"width": 8, "rounds": 1})
     for place in (tmp_path / "home", tmp_path / "other"):
         place.mkdir()
         (place / "cube.ply").write_bytes(write_ply(box()))
         analytic_shape("box", size=(1, 1, 1)).save(place / "crate")
-        Model("tiny", "impulse", network, 0.02, 10.0, 1.0, 0.1).save(place / "tiny.safetensors")
+        tiny_model(place / "tiny.safetensors")
     return tmp_path / "home"
 
 
@@ -114,9 +108,9 @@ def test_paths_that_stay_inside_are_taken_however_they_are_written(home, tmp_pat
 def test_the_commands_take_paths_outside_only_when_told(home, tmp_path):
     file = str(scene_in(home, "model: tiny.safetensors", "asset: ../other/crate"))
     for command in (["plan", file], ["simulate", file, "-o", str(tmp_path / "run"), "--viewer", "none"]):
-        refused = CliRunner().invoke(cli.app, command)
+        refused = run(*command)
         assert refused.exit_code == 1 and OUTSIDE in refused.stderr and not (tmp_path / "run").exists()
-        assert CliRunner().invoke(cli.app, [*command, "--allow-outside"]).exit_code == 0
+        assert run(*command, "--allow-outside").exit_code == 0
     assert "allow_outside: true" in (tmp_path / "run" / "config.yaml").read_text()
 
 
@@ -141,7 +135,7 @@ def test_the_side_files_of_a_mesh_stay_in_its_folder(home):
 
 def test_what_a_scene_says_cannot_command_the_terminal(home):
     file = scene_in(home, '"\\e[2J\\e]0;owned\\a": 1')
-    said = CliRunner().invoke(cli.app, ["plan", str(file)]).stderr
+    said = run("plan", str(file)).stderr
     assert "unknown key" in said and all(c.isprintable() or c == "\n" for c in said)
 
 
@@ -211,6 +205,6 @@ def test_every_viewer_is_told_where_to_listen(tmp_path, monkeypatch, web):
     fake.chmod(0o755)
     monkeypatch.setattr(viewer, "viewer_program", lambda: str(fake))
     monkeypatch.setattr(viewer, "has_screen", lambda: True)
-    done = CliRunner().invoke(cli.app, ["view", str(tmp_path / "a.rrd"), *(["--web"] if web else [])])
+    done = run("view", str(tmp_path / "a.rrd"), *(["--web"] if web else []))
     assert done.exit_code == 0 and "--bind 127.0.0.1 " in told.read_text()
     assert ("watch it at http://localhost:" in done.stderr) == web

@@ -1,7 +1,5 @@
 """A child process for work that may hang, eat all memory or crash in native code: only the child is lost then."""
 
-from __future__ import annotations
-
 import multiprocessing
 import resource
 import signal

@@ -1,7 +1,5 @@
 """Photos of solids with a closed form: a ball on a plane, and a cup, in a texture that never repeats."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

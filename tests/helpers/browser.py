@@ -1,7 +1,5 @@
 """Headless Chromium, driven over a pipe by its own protocol: a page is opened, clicked and looked at."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os
@@ -51,7 +49,7 @@ class Browser:
             "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
         )
 
-    def __enter__(self) -> Browser:
+    def __enter__(self) -> "Browser":
         return self
 
     def __exit__(self, *error: object) -> None:

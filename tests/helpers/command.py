@@ -1,7 +1,5 @@
 """The commands, as the shell calls them."""
 
-from __future__ import annotations
-
 from typer.testing import CliRunner
 
 import cli

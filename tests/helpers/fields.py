@@ -1,7 +1,6 @@
 """Small fields, and rays to train them with."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +8,8 @@ import numpy as np
 import torch
 
 from pipeline.cameras import PosedPhotos, Similarity, Sparse, View
-from pipeline.field.grid_field import (
-    FieldSize,
-)
-from pipeline.field.training import Rays
+from pipeline.field.grid_field import FieldSize
+from pipeline.field.training import Rays, Trainer
 from pipeline.inputs.photos import save_photos
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)
@@ -33,6 +30,21 @@ def toy_rays(count: int = 2000) -> Rays:
         torch.tensor([[60.0, 20, 20, 0]] * 2), torch.tensor(np.stack([np.eye(3), turn]), dtype=torch.float32),
         torch.tensor([[0.0, 0, -3], [0, 0, 3]]), torch.tensor([[40, 40]] * 2),
     )  # fmt: skip
+
+
+def assert_resumes(make: Callable[[], Trainer], steps: int, checkpoint: Path) -> None:
+    """A run that is left after some steps and goes on from a checkpoint ends as an undisturbed one, to the bit."""
+    whole, first, second = make(), make(), make()
+    for _ in range(2 * steps):
+        whole.step()
+    for _ in range(steps):
+        first.step()
+    first.save(checkpoint)
+    assert second.load(checkpoint)
+    for _ in range(steps):
+        second.step()
+    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
+        assert torch.equal(a, b)
 
 
 def posed_noise(folder: Path) -> PosedPhotos:

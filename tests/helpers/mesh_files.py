@@ -1,7 +1,5 @@
 """Mesh files as bytes."""
 
-from __future__ import annotations
-
 import json
 import struct
 

@@ -1,7 +1,5 @@
 """Photos that are made up, their cameras, and what stages report of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Runs that are interrupted, and recordings that are read back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scenes as text, and what is wrong with them."""
 
-from __future__ import annotations
-
 import pytest
 
 from sdfsim import SceneError

@@ -1,6 +1,6 @@
 """Small scenes and untrained networks: what must hold holds whatever the weights are."""
 
-from __future__ import annotations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,6 +48,14 @@ def random_model(kind: str, seed: int = 0, push: float = 0.5, **config: int) -> 
                 torch.nn.init.normal_(layer.moment.weight, std=push)
     network.eval().requires_grad_(False)
     return Model("random", kind, network, dt=0.02, gravity=10.0, length=1.0, reach=0.1)
+
+
+def tiny_model(path: Path, **known) -> Path:
+    """The file of an untrained network on the solve, of the file's name; `known` are further fields of `Model`."""
+    torch.manual_seed(0)
+    network = new_network("impulse", {"width": 8, "rounds": 1})
+    Model(path.stem, "impulse", network, 0.02, 10.0, 1.0, 0.1, **known).save(path)
+    return path
 
 
 def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:

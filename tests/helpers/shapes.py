@@ -1,7 +1,5 @@
 """Shapes: made up, and bundled."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

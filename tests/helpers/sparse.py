@@ -1,7 +1,5 @@
 """What tests of several stages take: poses and sparse points that are made up."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.cameras import PosedPhotos, Sparse

@@ -1,7 +1,5 @@
 """Surfaces and cameras around them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline.cameras import View

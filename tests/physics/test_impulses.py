@@ -11,17 +11,7 @@ from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver.impulses import solve_contacts
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
-from sdfsim.physics.solver.world import (
-    FIRST,
-    GAP,
-    KEY,
-    NORMAL,
-    NORMAL_IMPULSE,
-    SECOND,
-    TANGENTIAL,
-    TORSION,
-    VOID,
-)
+from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, NORMAL_IMPULSE, SECOND, TANGENTIAL, TORSION, VOID
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from tests.helpers.scenes import make_body as body

@@ -82,10 +82,7 @@ def between(
     """The gap between one shape, turned, at the origin and another."""
     poses = [
         Placed(np.array([k]), np.array([s], float), np.array([p], float), r.as_matrix()[None])
-        for k, s, p, r in (
-            (0, scale[0], np.zeros(3), other or Rotation.identity()),
-            (1, scale[1], place, turn),
-        )
+        for k, s, p, r in ((0, scale[0], np.zeros(3), other or Rotation.identity()), (1, scale[1], place, turn))
     ]
     return gaps([true_surface(a), true_surface(b)], *poses, np.array([np.inf]))
 

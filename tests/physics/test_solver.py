@@ -126,19 +126,6 @@ def test_what_rests_sleeps_and_wakes_when_it_is_hit_or_changed():
     assert hit.counters["asleep"].min() == 0  # the ball comes down on them
 
 
-def test_thousands_of_static_bodies_far_away_make_no_pairs():
-    one = body("mover", 0, [0, 0, 0.7], velocity=[1.0, 0, 0])
-    floor = body("floor", 1, [0, 0, 0], 0.0, motion="static")
-    pairs = []
-    for count in (10, 2000):
-        rows = [
-            body(f"s{k}", 0, [40.0 + 2 * (k % 50), 2.0 * (k // 50), 0.5], 0.0, motion="static") for k in range(count)
-        ]
-        scene = Scene((cube(1.0), analytic_shape("plane")), (one, floor, *rows), np.array([0, 0, -9.81]), 1.0)
-        pairs.append(Simulator(scene, "solver").run(steps=20).counters["pairs"])
-    np.testing.assert_array_equal(*pairs)
-
-
 def test_effects_that_are_off_do_not_act():
     scene = heap(1)
     base = Simulator(scene, "solver")

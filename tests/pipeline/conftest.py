@@ -1,7 +1,5 @@
 """Photos of noise, and stages that only note that they ran."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -3,17 +3,18 @@
 They are drawn with the ray caster and the textures of samples/photos/make.py, smaller and coarser.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageFilter
+
+from sdfsim.geometry.primitives import torus
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples" / "photos"
 TABLE_VASE = SAMPLES / "table_vase"
@@ -62,7 +63,7 @@ def still_life(make: ModuleType, seed: int, *, tile: float | None = None) -> lis
     ]
 
 
-def look(make: ModuleType, center: Iterable[float], target: Iterable[float]) -> np.ndarray:
+def look(center: Iterable[float], target: Iterable[float]) -> np.ndarray:
     """Camera-to-world matrix [4, 4], OpenGL axes, of a level camera."""
     pose = np.eye(4)
     backward = np.asarray(center, float) - np.asarray(target, float)
@@ -73,26 +74,29 @@ def look(make: ModuleType, center: Iterable[float], target: Iterable[float]) -> 
     return pose
 
 
-def orbit(make: ModuleType, count: int, *, radius: float = 1.3, span: float = 360.0) -> list[np.ndarray]:
+def orbit(count: int, *, radius: float = 1.3, span: float = 360.0) -> list[np.ndarray]:
     """Poses on an arc of `span` degrees around the still life, at two heights by turns."""
     angles = np.radians(np.arange(count) * span / count)
     return [
-        look(make, (radius * np.cos(a), radius * np.sin(a), 0.55 + 0.3 * (k % 2)), (0, 0, 0.15))
-        for k, a in enumerate(angles)
+        look((radius * np.cos(a), radius * np.sin(a), 0.55 + 0.3 * (k % 2)), (0, 0, 0.15)) for k, a in enumerate(angles)
     ]
 
 
-def shoot(make: ModuleType, parts: list, poses: list[np.ndarray], folder: Path, prefix: str = "") -> list[Path]:
-    """Renders one photo a pose into `folder`, with the poses as transforms.json."""
+def caster_of(parts: list) -> Any:
+    """What casts rays onto parts; the number of a geometry is that of its part."""
     import open3d as o3d
 
     caster = o3d.t.geometry.RaycastingScene()
     for part in parts:
         triangles = (part.vertices.astype(np.float32), part.faces.astype(np.uint32))
         caster.add_triangles(*map(o3d.core.Tensor, triangles))
+    return caster
+
+
+def shoot(make: ModuleType, parts: list, poses: list[np.ndarray], folder: Path, prefix: str = "") -> list[Path]:
+    """Renders one photo a pose into `folder`, with the poses as transforms.json."""
     folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(1)
-    paths = []
+    caster, rng, paths = caster_of(parts), np.random.default_rng(1), []
     for number, pose in enumerate(poses):
         paths.append(folder / f"{prefix}{number:03d}.jpg")
         Image.fromarray(make.render(parts, caster, pose, rng)).save(paths[-1], quality=92)
@@ -108,7 +112,7 @@ def shoot(make: ModuleType, parts: list, poses: list[np.ndarray], folder: Path, 
 def good(folder: Path, count: int = 24, seed: int = 1) -> None:
     """An ordinary set: all around a box on a floor."""
     make = studio()
-    shoot(make, still_life(make, seed), orbit(make, count), folder)
+    shoot(make, still_life(make, seed), orbit(count), folder)
 
 
 def blank_wall(folder: Path, count: int = 30) -> None:
@@ -125,8 +129,8 @@ def blank_wall(folder: Path, count: int = 30) -> None:
 def two_sets(folder: Path, larger: int = 18, smaller: int = 10) -> None:
     """Photos of two things that have nothing to do with each other, mixed in one folder."""
     make = studio()
-    shoot(make, still_life(make, 1), orbit(make, larger), folder, "box_")
-    shoot(make, still_life(make, 2), orbit(make, smaller), folder, "other_")
+    shoot(make, still_life(make, 1), orbit(larger), folder, "box_")
+    shoot(make, still_life(make, 2), orbit(smaller), folder, "other_")
 
 
 def one_spot(folder: Path, count: int = 20) -> None:
@@ -135,7 +139,7 @@ def one_spot(folder: Path, count: int = 20) -> None:
     angles = np.radians(np.arange(count) * 360 / count)
     center = np.array([0.0, 1.0, 1.1])
     ahead = [np.array([np.cos(a), np.sin(a), -0.25 - 0.1 * (k % 2)]) for k, a in enumerate(angles)]
-    poses = [look(make, center, center + step) for step in ahead]
+    poses = [look(center, center + step) for step in ahead]
     shoot(make, still_life(make, 1), poses, folder)
 
 
@@ -153,47 +157,33 @@ def half_blurred(folder: Path, source: Path = TABLE_VASE / "images", every: int 
 def repeating(folder: Path, count: int = 24) -> None:
     """The still life papered with one repeating patch."""
     make = studio()
-    shoot(make, still_life(make, 1, tile=0.12), orbit(make, count), folder)
+    shoot(make, still_life(make, 1, tile=0.12), orbit(count), folder)
 
 
 def turntable(folder: Path, count: int = 24) -> None:
     """The box turns on its own in front of a wall and on a table that stand still."""
-    import open3d as o3d
-
     make = studio()
-    parts = still_life(make, 1)
-    fixed = look(make, (1.3, 0, 0.7), (0, 0, 0.15))
+    box, *others = still_life(make, 1)
+    fixed = look((1.3, 0, 0.7), (0, 0, 0.15))
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
         a = 2 * np.pi * number / count
-        turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
         # Textures follow the unturned box, so the camera goes round it while the room is drawn from the first pose.
-        shots = []
-        for chosen, pose in ((parts, fixed), (parts[:1], fixed)):
-            if chosen is not parts:
-                pose = pose.copy()
-                pose[:3] = turn @ pose[:3]
-            caster = o3d.t.geometry.RaycastingScene()
-            for part in chosen if chosen is not parts else parts[1:]:
-                triangles = (part.vertices.astype(np.float32), part.faces.astype(np.uint32))
-                caster.add_triangles(*map(o3d.core.Tensor, triangles))
-            shown = chosen if chosen is not parts else parts[1:]
-            shots.append(make.render(shown, caster, pose, np.random.default_rng(number)))
-        room, box = shots
-        inside = box.max(-1, keepdims=True) > 0
-        Image.fromarray(np.where(inside, box, room)).save(folder / f"{number:03d}.jpg", quality=92)
+        beside = fixed.copy()
+        beside[:3] = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) @ beside[:3]
+        room, shown = (
+            make.render(parts, caster_of(parts), pose, np.random.default_rng(number))
+            for parts, pose in ((others, fixed), ([box], beside))
+        )
+        Image.fromarray(np.where(shown.max(-1, keepdims=True) > 0, shown, room)).save(
+            folder / f"{number:03d}.jpg", quality=92
+        )
 
 
-def ring(axis: Iterable[float], major: float, minor: float, segments: int = 64) -> tuple[np.ndarray, np.ndarray]:
+def ring(axis: Iterable[float], major: float, minor: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and outward faces of a torus that lies flat, its middle at `axis`."""
-    u, v = np.meshgrid(*[np.arange(segments) * 2 * np.pi / segments] * 2, indexing="ij")
-    radius = major + minor * np.cos(v)
-    vertices = np.stack([radius * np.cos(u), radius * np.sin(u), minor * np.sin(v)], -1).reshape(-1, 3)
-    vertices += np.array(list(axis))
-    k = np.arange(segments * segments)
-    right, up = (k + segments) % len(k), k // segments * segments + (k + 1) % segments
-    corner = right // segments * segments + up % segments
-    return vertices, np.concatenate([np.stack([k, right, corner], 1), np.stack([k, corner, up], 1)])
+    mesh = torus(major, minor, 64, 64)
+    return mesh.vertices + np.array(list(axis)), mesh.faces
 
 
 def hues(color: Iterable[float]) -> list[tuple[float, ...]]:
@@ -258,18 +248,13 @@ def around(count: int, radius: float, target: Iterable[float] = (0, 0, 0.12)) ->
         tilt = np.radians(elevation)
         for a in angles:
             offset = np.array([np.cos(tilt) * np.cos(a), np.cos(tilt) * np.sin(a), np.sin(tilt)])
-            poses.append(look(None, np.array(list(target)) + radius * offset, target))  # type: ignore[arg-type]
+            poses.append(look(np.array(list(target)) + radius * offset, target))
     return poses
 
 
 def shoot_labels(make: ModuleType, parts: list, poses: list[np.ndarray], count: int) -> list[np.ndarray]:
     """Which of the first `count` parts each pixel [H, W] uint8 of each photo shows, from 1 on; 0 for the others."""
-    import open3d as o3d
-
-    caster = o3d.t.geometry.RaycastingScene()
-    for part in parts:
-        caster.add_triangles(o3d.core.Tensor(part.vertices.astype(np.float32)),
-                             o3d.core.Tensor(part.faces.astype(np.uint32)))  # fmt: skip
+    caster = caster_of(parts)
     row, column = np.mgrid[0 : make.HEIGHT, 0 : make.WIDTH] + 0.5
     x, y = (column - make.WIDTH / 2) / make.FOCAL, (make.HEIGHT / 2 - row) / make.FOCAL
     found = []
@@ -301,3 +286,88 @@ def shoot_bodies(folder: Path, build: Callable[[ModuleType], tuple[list, list[st
                 Image.fromarray(255 * (labels == number).astype(np.uint8)).save(
                     folder / "masks" / name / f"{photo.stem}.png"
                 )
+
+
+def hinged(make: ModuleType, degrees: float) -> tuple[list, list[str]]:
+    """A cupboard with a shelf, a carton on it and one beside it, its door open by so many degrees; names of what moves.
+
+    The hinge is upright, through `HINGE`.
+    """
+    boards = [make.box(*ends) for ends in (
+        ((-0.25, 0.15, 0.0), (0.25, 0.17, 0.56)), ((-0.25, -0.15, 0.0), (-0.23, 0.15, 0.56)),
+        ((0.23, -0.15, 0.0), (0.25, 0.15, 0.56)), ((-0.23, -0.15, 0.0), (0.23, 0.15, 0.03)),
+        ((-0.23, -0.15, 0.53), (0.23, 0.15, 0.56)), ((-0.23, -0.11, 0.27), (0.23, 0.15, 0.29)),
+    )]  # fmt: skip
+    still = {f"board{k}": board for k, board in enumerate(boards)}
+    still["carton"] = make.box((-0.16, -0.1, 0.56), (0.06, 0.1, 0.68))
+    still["crate"] = make.box((0.31, -0.12, 0.0), (0.48, 0.1, 0.2))
+    moves = {"door": make.box((-0.25, -0.17, 0.02), (0.25, -0.15, 0.55)),
+             "handle": make.box((0.17, -0.2, 0.24), (0.195, -0.17, 0.36))}  # fmt: skip
+    a = np.radians(-degrees)
+    turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
+    return _with_moved(make, moves, still, (turn, HINGE - turn @ HINGE)), list(moves)
+
+
+HINGE = np.array([-0.25, -0.15, 0.0])  # m, a point of the axis of `hinged`
+
+
+def sliding(make: ModuleType, out: float) -> tuple[list, list[str]]:
+    """A chest with a crate on it and one beside it, its drawer out by so many metres, towards -y; names of what
+    moves."""
+    boards = [make.box(*ends) for ends in (
+        ((-0.25, 0.18, 0.0), (0.25, 0.2, 0.46)), ((-0.25, -0.18, 0.0), (-0.22, 0.18, 0.46)),
+        ((0.22, -0.18, 0.0), (0.25, 0.18, 0.46)), ((-0.22, -0.18, 0.0), (0.22, 0.18, 0.2)),
+        ((-0.22, -0.18, 0.43), (0.22, 0.18, 0.46)),
+    )]  # fmt: skip
+    still = {f"board{k}": board for k, board in enumerate(boards)}
+    still["carton"] = make.box((-0.05, -0.05, 0.46), (0.18, 0.13, 0.58))
+    still["crate"] = make.box((0.31, -0.12, 0.0), (0.48, 0.1, 0.2))
+    drawer = (
+        ((-0.215, -0.2, 0.21), (0.215, -0.18, 0.42)), ((-0.21, -0.18, 0.215), (0.21, 0.15, 0.235)),
+        ((-0.21, -0.18, 0.235), (-0.19, 0.15, 0.39)), ((0.19, -0.18, 0.235), (0.21, 0.15, 0.39)),
+        ((-0.19, 0.13, 0.235), (0.19, 0.15, 0.39)), ((-0.07, -0.225, 0.31), (0.07, -0.2, 0.33)),
+    )  # fmt: skip
+    moves = {f"drawer{k}": make.box(*ends) for k, ends in enumerate(drawer)}
+    return _with_moved(make, moves, still, (np.eye(3), np.array([0, -out, 0]))), list(moves)
+
+
+def _with_moved(make: ModuleType, moves: dict, still: dict, motion: tuple[np.ndarray, np.ndarray]) -> list:
+    """Parts in a room, the first of which have moved with their textures."""
+    wood, red, green = (0.6, 0.45, 0.28), (0.62, 0.2, 0.16), (0.2, 0.42, 0.3)
+    colors = dict.fromkeys(still, wood) | {"carton": red, "crate": green} | dict.fromkeys(moves, (0.3, 0.4, 0.6))
+    parts = in_room(make, moves | still, colors)
+    for part in parts[: len(moves)]:
+        part.vertices, part.moved = part.vertices @ motion[0].T + motion[1], motion
+    return parts
+
+
+def state_poses(make: ModuleType, count: int, radius: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """Poses around `hinged` and `sliding`, most of them in front."""
+    poses = []
+    for number in range(count):
+        # Two thirds of the way around is the front's half.
+        share = (number + rng.random()) / count
+        azimuth = -np.pi / 2 + 2 * np.pi * (share - 0.5) * (0.6 + 0.4 * abs(2 * share - 1))
+        tilt = np.radians((8, 28, 50)[number % 3] + rng.normal(0, 2))
+        way = np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
+        target = np.array([0.05, -0.1, 0.26]) + rng.normal(0, 0.02, 3)
+        poses.append(look(target + radius * (1 + rng.normal(0, 0.03)) * way, target))
+    return poses
+
+
+def shoot_state(
+    folder: Path, build: Callable[[ModuleType, float], tuple[list, list[str]]], state: float, *, seed: int,
+    count: int = 30, radius: float = 1.45,
+) -> None:  # fmt: skip
+    """Photos of `hinged` or `sliding` in one state, from all around, most of them from the front, at places of its
+    own; and the true surface of what moves and of the rest, `truth/moves.ply` and `truth/still.ply`."""
+    from sdfsim.geometry.mesh import Mesh, joined
+    from sdfsim.geometry.mesh_io import write_ply
+
+    make, rng = studio(640, 480, 620.0), np.random.default_rng(seed)
+    parts, names = build(make, state)
+    shoot(make, parts, state_poses(make, count, radius, rng), folder / "images")
+    (folder / "truth").mkdir()
+    meshes = [Mesh(part.vertices, part.faces) for part in parts[:-2]]
+    for name, some in (("moves", meshes[: len(names)]), ("still", meshes[len(names) :])):
+        (folder / "truth" / f"{name}.ply").write_bytes(write_ply(joined(some)))

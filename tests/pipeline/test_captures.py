@@ -1,7 +1,5 @@
 """Captures of phones, written by ourselves from the bundled set in each app's layout, against its true cameras."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

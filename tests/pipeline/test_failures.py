@@ -1,7 +1,5 @@
 """Photo sets with one thing wrong each, through structure-from-motion: every one gets the right diagnosis."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The field's formulas against closed forms, and the trainer's determinism."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -36,7 +34,7 @@ from pipeline.grids.interpolation import (
 )
 from pipeline.stereo.fusion import Fused
 from sdfsim.base.errors import SdfsimError
-from tests.helpers.fields import SMALL, UNIT, posed_noise, toy_rays
+from tests.helpers.fields import SMALL, UNIT, assert_resumes, posed_noise, toy_rays
 from tests.helpers.sparse import NOTHING
 
 
@@ -121,11 +119,9 @@ def test_camera_rays_match_the_slow_twin_and_projection():
     assert (depth > 0).all()
 
 
-def trainer(seed: int = 0) -> Trainer:
-    from dataclasses import replace
-
+def trainer() -> Trainer:
     settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=20, surface_points=32)
-    return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), seed)
+    return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), 0)
 
 
 def test_batches_depend_on_seed_and_iteration_only():
@@ -136,17 +132,7 @@ def test_batches_depend_on_seed_and_iteration_only():
 
 
 def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
-    whole, first, second = trainer(), trainer(), trainer(seed=0)
-    for _ in range(8):
-        whole.step()
-    for _ in range(4):
-        first.step()
-    first.save(tmp_path / "c.safetensors")
-    assert second.load(tmp_path / "c.safetensors")
-    for _ in range(4):
-        second.step()
-    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
-        assert torch.equal(a, b)
+    assert_resumes(trainer, 4, tmp_path / "c.safetensors")
 
 
 @pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "no numbers", "a tensor less", "another field"])
@@ -189,8 +175,6 @@ def test_training_lowers_the_colour_error():
 
 
 def test_masks_make_what_they_exclude_transparent():
-    from dataclasses import replace
-
     rays = toy_rays()
     masked = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
     settings = replace(PRESETS["quick"], size=SMALL, rays=128, iterations=40, surface_points=32)
@@ -253,6 +237,14 @@ def twin(grid: Tensor, points: Tensor) -> Tensor:
     return found.view(grid.shape[3], -1).t()
 
 
+def assert_alike(found: Tensor, wanted: Tensor, numbers: Tensor, rng: torch.Generator) -> None:
+    """Two results, and their gradients by the `numbers` that they come from, are the same."""
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+    weights = torch.randn(found.shape, generator=rng, dtype=torch.float64)
+    one, two = (torch.autograd.grad((result * weights).sum(), numbers)[0] for result in (found, wanted))
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(("side", "channels"), [(2, 1), (5, 4), (33, 2)])
 @pytest.mark.parametrize("way", [interpolate, by_rows])
 def test_values_and_gradient_are_those_of_the_general_sampler(side, channels, way):
@@ -262,11 +254,7 @@ def test_values_and_gradient_are_those_of_the_general_sampler(side, channels, wa
     knots = torch.linspace(-1, 1, side, dtype=torch.float64)
     points = torch.cat([inside, torch.cartesian_prod(knots, knots, knots)])
     found, wanted = way(grid, points), twin(grid, points)
-    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
-    weights = torch.randn(found.shape, generator=rng, dtype=torch.float64)
-    (one,) = torch.autograd.grad((found * weights).sum(), grid)
-    (two,) = torch.autograd.grad((wanted * weights).sum(), grid)
-    torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
+    assert_alike(found, wanted, grid, rng)
 
 
 @pytest.mark.parametrize(("side", "channels"), [(5, 1), (13, 3), (32, 2)])
@@ -285,11 +273,7 @@ def test_a_grid_in_bricks_is_one_that_is_0_where_there_are_none(side, channels, 
     grid = grid.index_put(tuple(place[inside].t()), table[inside])
     points = torch.rand(800, 3, generator=rng, dtype=torch.float64) * 2.2 - 1.1
     found, wanted = way(table, numbers, side, points), twin(grid, points)
-    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
-    weights = torch.randn(found.shape, generator=rng, dtype=torch.float64)
-    (one,) = torch.autograd.grad((found * weights).sum(), table)
-    (two,) = torch.autograd.grad((wanted * weights).sum(), table)
-    torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
+    assert_alike(found, wanted, table, rng)
 
 
 def ball_fused(side: int = 24) -> Fused:

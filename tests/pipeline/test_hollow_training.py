@@ -1,7 +1,5 @@
 """A cup from photos: training starts from fused depth, and the hollow that photos see into stays one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the report says of hollow bodies: depth, floor and wall, and whether photos see them, by rays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

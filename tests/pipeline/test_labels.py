@@ -1,7 +1,5 @@
 """Masks by object and label images: found, turned and straightened with their photos, refused where they are no use."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Materials, and how a command names them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

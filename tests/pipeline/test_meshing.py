@@ -1,7 +1,5 @@
 """The mesh stage as a whole, on a field that is drawn by hand: a table with a cup on it, and a speck in the air."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -39,7 +37,7 @@ class Drawn:
     finest = 2 / 63
     background = torch.zeros(1)
 
-    def to(self, device: str) -> Drawn:
+    def to(self, device: str) -> "Drawn":
         return self
 
     def sdf(self, points: torch.Tensor) -> torch.Tensor:

@@ -1,7 +1,5 @@
 """The paper's field: starts as a sphere, learns, resumes, and is read back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +10,7 @@ from pipeline.field.mlp_field import MlpField, MlpSize, encoded
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, MlpTrainer, Trained, Trainer, load_field, save_field
-from tests.helpers.fields import UNIT, toy_rays
+from tests.helpers.fields import UNIT, assert_resumes, toy_rays
 from tests.helpers.sparse import NOTHING
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
@@ -95,17 +93,7 @@ def test_beta_is_learned():
 
 
 def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
-    whole, first, second = trainer(), trainer(), trainer()
-    for _ in range(6):
-        whole.step()
-    for _ in range(3):
-        first.step()
-    first.save(tmp_path / "c.safetensors")
-    assert second.load(tmp_path / "c.safetensors")
-    for _ in range(3):
-        second.step()
-    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
-        assert torch.equal(a, b)
+    assert_resumes(trainer, 3, tmp_path / "c.safetensors")
 
 
 def test_the_field_is_read_back(tmp_path):

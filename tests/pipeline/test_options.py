@@ -1,7 +1,5 @@
 """Options: one model checks them, whoever gives them, and says which stages they change."""
 
-from __future__ import annotations
-
 import pytest
 import yaml
 

@@ -1,7 +1,5 @@
 """Reading photos: what is accepted, and one clear line for each thing that is not."""
 
-from __future__ import annotations
-
 import base64
 import io
 import struct

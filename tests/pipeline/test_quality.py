@@ -1,7 +1,5 @@
 """Sharpness: what a blur does, and what must not matter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter

@@ -1,7 +1,5 @@
 """What a run reports, also where it stopped."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rooms of the pipeline import only from rooms below them, and no module imports itself by way of others."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

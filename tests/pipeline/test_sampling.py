@@ -1,7 +1,5 @@
 """Where the field is asked: samples of bounded error, free space that photos prove, and the cached SDF."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

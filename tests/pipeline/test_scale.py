@@ -1,7 +1,5 @@
 """Metric scale from distances that a person knows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where a body is dropped, and the scene file that says so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

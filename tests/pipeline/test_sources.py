@@ -1,7 +1,5 @@
 """What can be given: folders, masks, transforms.json, COLMAP models; against cameras that we know."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path
@@ -152,10 +150,7 @@ def brown(x: float, y: float, k1: float, k2: float, p1: float, p2: float) -> tup
     """OpenCV's distortion, as its documentation has it."""
     r = x * x + y * y
     radial = 1 + k1 * r + k2 * r * r
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x),
-        y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y,
-    )
+    return (x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x), y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y)
 
 
 def kannala(x: float, y: float, k1: float, k2: float, k3: float, k4: float) -> tuple[float, float]:

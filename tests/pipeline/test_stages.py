@@ -1,7 +1,5 @@
 """Stages: skipped when unchanged, done again when not, resumed when killed; nothing of the user's is lost."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

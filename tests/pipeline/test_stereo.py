@@ -1,7 +1,5 @@
 """Depth from photos alone, and what is made of it, against closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

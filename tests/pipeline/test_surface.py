@@ -1,7 +1,5 @@
 """Extraction and placement against shapes that are known exactly."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

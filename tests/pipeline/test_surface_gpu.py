@@ -1,7 +1,5 @@
 """A field sampled on a GPU."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Textures, baked from photos of a pattern that is known exactly and finer than the mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training as a whole: held-out photos, budgets and resuming, and training that goes wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """How far a surface can be trusted, against closed forms and renderings whose answer is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -158,7 +156,7 @@ def view_of(make, pose: np.ndarray, number: int) -> View:
 
 def test_photos_of_one_half_ask_for_the_other_half():
     """Photos from the side of +y alone: the proposals stand at -y, and with them little of the box is left unseen."""
-    set_up = Photographed(orbit(studio(), 12, span=180.0))
+    set_up = Photographed(orbit(12, span=180.0))
     photos, weak = set_up.advice()
     assert len(photos) == 3 and weak > 0.05
     places = np.array([photo.view.center for photo in photos])
@@ -182,7 +180,7 @@ def test_photos_of_one_half_ask_for_the_other_half():
 
 
 def test_where_all_is_photographed_nothing_is_asked_for():
-    set_up = Photographed(orbit(studio(), 36))
+    set_up = Photographed(orbit(36))
     photos, weak = set_up.advice()
     assert photos == []
     told = notes({"mesh": {"trust": {}, "weak": weak, "next_photos": []}})

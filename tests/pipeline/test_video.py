@@ -1,7 +1,5 @@
 """Frames of a video: spread over the motion, the sharpest of each stretch; drawn by ourselves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

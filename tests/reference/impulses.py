@@ -6,8 +6,6 @@ An impulse j along an axis d changes it along d by j / m, with 1 / m = 1 / m1 + 
 (q x d) . I2^-1 (q x d). Contacts of an island are swept in turn: normals, which only push, then friction in its cone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,7 +47,7 @@ class Contact:
     drag: np.ndarray  # [3] and across it
     void: bool
     friction: float
-    rows: list[Row] = field(default_factory=list)  # along the normal and two tangents, where it acts
+    rows: "list[Row]" = field(default_factory=list)  # along the normal and two tangents, where it acts
     deep: float = 0.0  # speed that parts what is deep in each other
     parted: float = 0.0  # its impulse so far
     calm: float = 0.0  # the change along the normal that is wanted if nothing rebounds and nothing is pushed out

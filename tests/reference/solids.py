@@ -6,8 +6,6 @@ the same number prove it. Of solids that overlap the depth is the least -s(n), w
 of edges, and of what is round a search beside the best of these find.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

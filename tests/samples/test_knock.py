@@ -1,7 +1,5 @@
 """samples/knock.py: a ball thrown at a body of a reconstruction."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The plan says what is in play, and respects what the file switches off."""
 
-from __future__ import annotations
-
 import re
 import time
 from dataclasses import replace

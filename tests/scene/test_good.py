@@ -1,7 +1,5 @@
 """Scene files that are right become SI data."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joints of scene files: what is refused, with its line, and what the others become."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -67,7 +65,7 @@ HINGE = "name: door, type: hinge, anchor: [0.9, 0, 0], axis: [0, 0, 1]"
         ),
         (
             "{name: a, type: ball, bodies: [leaf, world], anchor: [1, 0, 0], cone_deg: 20}",
-            "axis: is required: cone_deg is told from it",
+            "axis: is required: cone_deg is measured from it",
         ),
         (
             "{name: a, type: weld, bodies: [leaf, world]}",

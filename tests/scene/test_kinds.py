@@ -1,7 +1,5 @@
 """Shapes of a scene by every kind of SDF: alike in contacts and in motion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scene files that are wrong are told about line by line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hollow shapes: only their wall has mass."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Grids and exact meshes in place of the network."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

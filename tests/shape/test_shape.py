@@ -1,7 +1,5 @@
 """Shape folders: what is saved comes back, what is spoiled is told."""
 
-from __future__ import annotations
-
 import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A mesh is fitted once, and the cache never stands in the way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

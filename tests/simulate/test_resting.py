@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sdfsim import Simulator, load_shape
-from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
+from tests.helpers.scenes import make_body
 
 EARTH = np.array([0.0, 0.0, -9.81])
 DROP = 0.1  # m, for bodies of a metre
@@ -15,17 +16,10 @@ SETTLED = 6.0  # s, after which they are to stay where they are for SECONDS
 SECONDS = 5.0
 
 
-def body(name: str, shape: int, position, motion: str = "dynamic") -> Body:
-    return Body(
-        name, shape, motion, position=np.asarray(position, dtype=float), quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        velocity=np.zeros(3), angular_velocity=np.zeros(3), scale=1.0, friction=0.5, restitution=0.5,
-        mass=1.0 if motion == "dynamic" else 0.0,
-    )  # fmt: skip
-
-
 def on_floor(shape, heights) -> Scene:
-    bodies = [body("floor", 0, [0, 0, 0], "static"), *(body(str(k), 1, [0, 0, z]) for k, z in enumerate(heights))]
-    return Scene((analytic_shape("plane"), shape), tuple(bodies), gravity=EARTH, duration=1.0)
+    floor = make_body("floor", 0, [0, 0, 0], 0.0, motion="static")
+    bodies = (floor, *(make_body(str(k), 1, [0, 0, z]) for k, z in enumerate(heights)))
+    return Scene((analytic_shape("plane"), shape), bodies, gravity=EARTH, duration=1.0)
 
 
 SHAPES = {

@@ -1,7 +1,5 @@
 """What a `Simulator` takes from its caller, and what it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

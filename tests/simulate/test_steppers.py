@@ -15,11 +15,7 @@ from sdfsim.simulate.simulator import SimulationError, Simulator
 from sdfsim.simulate.steppers import COUNTS, PHASES
 from tests.helpers.scenes import make_body, random_model, surface_model
 
-MODELS = {
-    "solver": load_model,
-    "impulse": lambda: random_model("impulse", push=0.1),
-    "sdf-sim": surface_model,
-}
+MODELS = {"solver": load_model, "impulse": lambda: random_model("impulse", push=0.1), "sdf-sim": surface_model}
 G = 9.81
 NAMES = ("position", "orientation", "velocity", "angular_velocity")
 

@@ -1,6 +1,7 @@
 """What a run goes on with: the same data, frames of this version, all that the model's card needs."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.model import load_model
 from sdfsim.training import contact_cache
+from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.train import train
 from tests.helpers.recordings import bouncing
@@ -76,3 +78,33 @@ def test_a_run_does_not_go_on_with_other_data(ball_data, presets, preset, tmp_pa
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == before
     shutil.copytree(ball_data, tmp_path / "copy")
     assert train(tmp_path / "copy", tmp_path / "run", preset=preset, steps=2, resume=True)["steps"] == 2
+
+
+@pytest.mark.parametrize("preset", ["tiny", "tiny-sdf-sim"])
+def test_a_training_begins_with_the_weights_that_it_is_given(ball_data, presets, preset, tmp_path):
+    """After one step of a tiny rate they are still those of the first training; its feature statistics stay."""
+    first = tmp_path / "first" / "model.safetensors"
+    train(ball_data, first.parent, preset=preset, steps=20)
+    slow = replace(train_module.PRESETS[preset], rate=1e-12, matrix_rate=None)
+    train(ball_data, tmp_path / "on", preset=slow, steps=1, seed=5, first=first)
+    train(ball_data, tmp_path / "anew", preset=slow, steps=1, seed=5)
+    was, on, anew = (
+        load_model(folder / "model.safetensors").network.state_dict()
+        for folder in (first.parent, tmp_path / "on", tmp_path / "anew")
+    )
+    assert all(torch.allclose(on[name], value, atol=1e-9) for name, value in was.items())
+    assert not all(torch.allclose(anew[name], value, atol=1e-3) for name, value in was.items())
+    assert load_model(tmp_path / "on" / "model.safetensors").card["data"][-1]["weights"] == "model"
+
+
+def test_weights_of_another_network_are_refused_to_begin_with(ball_data, presets, tmp_path):
+    train(ball_data, tmp_path / "first", preset="tiny", steps=2)
+    given = tmp_path / "first" / "model.safetensors"
+    for preset in ("tiny-sdf-sim", "small"):
+        with pytest.raises(SdfsimError, match="another kind or size than the preset's"):
+            train(ball_data, tmp_path / preset, preset=preset, steps=1, first=given)
+    with pytest.raises(SdfsimError, match="'nothing' not found"):
+        train(ball_data, tmp_path / "no", preset="tiny", steps=1, first="nothing")
+    train(ball_data, tmp_path / "on", preset="tiny", steps=2, first=given)
+    with pytest.raises(SdfsimError, match="began with other weights"):
+        train(ball_data, tmp_path / "on", preset="tiny", steps=2, resume=True)

@@ -1,7 +1,5 @@
 """SDF networks from exact distances: training, and the certificate at its end."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 Recipe = Literal["quick", "default", "paper"]

@@ -1,7 +1,5 @@
 """How good a fitted SDF is on points that it was not fitted to, and how well nodes stand for a surface."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """SOAP, the optimiser that fits SDF networks."""
 
-from __future__ import annotations
-
 import torch
 
 

@@ -1,7 +1,5 @@
 """Exact distances -> SDF network: recipes, the points a fit learns from, the training loop."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

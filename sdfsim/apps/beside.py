@@ -1,0 +1,102 @@
+"""A recorded motion beside a simulated one: where the run begins, and what recordings and movies show through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, write_arrays
+from sdfsim.physics import pose
+from sdfsim.physics.motion import MOTION
+from sdfsim.physics.rollout import Rollout
+from sdfsim.scene.scene import Scene
+
+FILE = "beside.npz"  # in a run folder
+COLOR = (245, 140, 20)  # RGB of what was recorded
+OPACITY = 0.5
+
+
+@dataclass(frozen=True)
+class Beside:
+    """K poses of the D bodies of a scene that move, where a recording has them."""
+
+    name: str  # of the recording
+    bodies: tuple[str, ...]  # their D names
+    time: np.ndarray  # [K] s of the run, which begins with the first
+    position: np.ndarray  # [K, D, 3] m, centres of mass
+    orientation: np.ndarray  # [K, D, 4] xyzw
+    # [D, *] position, orientation, velocity and angular_velocity at the start, as fits tell; none where it was read
+    # from a run folder
+    start: dict[str, np.ndarray]
+
+    def rows(self, scene: Scene) -> np.ndarray:
+        """[D] int64, which bodies of the scene they are."""
+        return np.array([[body.name for body in scene.bodies].index(name) for name in self.bodies], dtype=np.int64)
+
+    def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [T, D, 3] and orientations [T, D, 4] at times [T], between poses as if moved evenly; after the last
+        one, that one."""
+        return between(self.time, self.position, self.orientation, time)
+
+    def begun(self, scene: Scene) -> Scene:
+        """The scene with these bodies where the recording begins, and as fast."""
+        bodies = list(scene.bodies)
+        for d, k in enumerate(self.rows(scene)):
+            place, turn, speed, spin = (self.start[name][d] for name in MOTION)
+            away = pose.rotate(turn, bodies[k].scale * scene.shapes[bodies[k].shape].com)
+            bodies[k] = replace(bodies[k], position=place - away, quat_xyzw=turn, velocity=speed, angular_velocity=spin)
+        return replace(scene, bodies=tuple(bodies))
+
+    def off(self, scene: Scene, rollout: Rollout) -> dict[str, Any]:
+        """How far a run is from its frames while both last, of all bodies: root mean square m, mean degrees, s."""
+        both, rows = self.time <= rollout.time[-1] + 1e-9, self.rows(scene)
+        place, turn = between(rollout.time, rollout.position[:, rows], rollout.orientation[:, rows], self.time[both])
+        away = np.linalg.norm(place - self.position[both], axis=-1)
+        angle = pose.to_rotvec(pose.multiply(turn, pose.conjugate(self.orientation[both])))
+        return {
+            "recording": self.name,
+            "seconds": float(self.time[both][-1]),
+            "position_m": float(np.sqrt(np.square(away).mean())),
+            "rotation_degrees": float(np.degrees(np.linalg.norm(angle, axis=-1).mean())),
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the file."""
+        arrays = {"time": self.time, "position": self.position, "orientation": self.orientation}
+        write_arrays(path, arrays | {"name": np.array(self.name), "bodies": np.array(self.bodies, dtype=str)})
+
+
+def between(
+    time: np.ndarray, position: np.ndarray, orientation: np.ndarray, at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses at times `at` [T] of a motion [K, D, *], between its frames as if moved evenly, after the last that."""
+    if len(time) < 2:
+        return np.repeat(position, len(at), 0), np.repeat(orientation, len(at), 0)
+    after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+    part = np.clip((at - time[after - 1]) / (time[after] - time[after - 1]), 0.0, 1.0)[:, None, None]
+    place = (1.0 - part) * position[after - 1] + part * position[after]
+    turn = pose.to_rotvec(pose.multiply(orientation[after], pose.conjugate(orientation[after - 1])))
+    return place, pose.multiply(pose.from_rotvec(part * turn), orientation[after - 1])
+
+
+def beside_of(run: Path, scene: Scene) -> Beside | None:
+    """What a run, its folder or `rollout.npz`, was simulated beside; None where that was nothing. Raises SdfsimError
+    where the file is unreadable, or of other bodies."""
+    file = (run if run.is_dir() else run.parent) / FILE
+    if not file.exists():
+        return None
+    found = read_arrays(file, "a recorded motion", "simulate the scene again")
+    try:
+        names = tuple(str(name) for name in found["bodies"])
+        read = Beside(str(found["name"]), names, *(found[k] for k in ("time", "position", "orientation")), start={})
+        read.rows(scene)
+        shapes = (read.position.shape, read.orientation.shape)
+        if shapes != tuple((len(read.time), len(names), width) for width in (3, 4)):
+            raise ValueError(f"arrays of shapes {shapes}")
+    except (KeyError, ValueError) as error:
+        raise SdfsimError(f"{file}: not of this scene ({error})", "simulate the scene again") from error
+    return read
