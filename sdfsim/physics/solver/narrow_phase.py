@@ -162,7 +162,7 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, thre
     parts = reference(near)
     if threads is not None:  # known when it is compiled
         if len(pairs) >= MANY:
-            _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts)
+            _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts, surfaces)
             return near
     for p in range(len(pairs)):
         _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p, surfaces)
@@ -170,10 +170,10 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, thre
 
 
 @njit(parallel=True, **FAST)
-def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near):
+def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near, surfaces):
     for i in prange(len(pairs)):
         p = np.int64(i)  # that of a parallel loop is unsigned, for which all would be compiled once more
-        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, True)
+        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces)
 
 
 @njit(**BARE)
@@ -270,7 +270,7 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
     """
     if threads is not None:  # known when it is compiled
         if len(near.start) >= MANY:
-            _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
+            _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, surfaces)
             return
     _collide_some(
         shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1), surfaces
@@ -278,15 +278,17 @@ def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, sc
 
 
 @njit(parallel=True, **FAST)
-def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
+def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, surfaces):
     for i in prange(SHARES):
-        _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch_room(), np.int64(i))
+        _collide_share(
+            shapes, world, motion, matrix, rules, manifolds, near, gone, scratch_room(), np.int64(i), surfaces
+        )
 
 
 @njit(**BARE)
-def _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first):
+def _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, surfaces):
     room = reference(scratch)
-    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, room, first, np.int64(SHARES), True)
+    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, room, first, np.int64(SHARES), surfaces)
 
 
 @njit(**BARE)
