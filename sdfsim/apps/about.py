@@ -63,7 +63,7 @@ def about() -> dict[str, Any]:
     if sys.platform == "linux" and not _loads(DRIVER[0]):
         missing.append(f"a Vulkan driver, for view --screenshot: apt-get install {DRIVER[1]}")
     if not _compiled():
-        missing.append("the compiled contact step: the first run makes it, in about two minutes")
+        missing.append("the compiled contact step: the first run makes it, in about a minute")
     return {
         "versions": versions, "devices": devices, "cpu_threads": threads, "models": model_names(), "missing": missing,
     }  # fmt: skip
@@ -100,6 +100,6 @@ def _loads(library: str) -> bool:
 
 
 def _compiled() -> bool:
-    from sdfsim.physics.solver.run import run_steps
+    from sdfsim.physics.solver.run import HELD, NOTE, THREADS, run_steps
 
-    return is_compiled(run_steps)
+    return is_compiled(run_steps, {HELD: True, THREADS: True, NOTE: True})

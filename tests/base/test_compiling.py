@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from sdfsim.base import compiling
 from sdfsim.base.compiling import is_compiled
 from sdfsim.physics.solver import prepare as solver
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Joint, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import make_body
@@ -53,14 +52,49 @@ def test_a_function_is_compiled_where_numba_keeps_it_by_its_own_source(tmp_path,
     assert is_compiled(loaded(copy).py_func)  # runs as Python
 
 
+def test_each_form_of_a_function_with_optional_arguments_is_compiled_by_itself(tmp_path, monkeypatch):
+    from numba.core import config
+
+    file = tmp_path / "doubling.py"
+    file.write_text(SOURCE.replace("double(x)", "double(x, y)").replace("2 * x", "2 * x if y is None else x * y"))
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
+    first = loaded(file)
+    assert first(3, None) == 6
+    for function in (first, loaded(file)):
+        assert is_compiled(function) and is_compiled(function, {1: True}) and not is_compiled(function, {1: False})
+    assert first(3, 4) == 12
+    assert is_compiled(first, {1: False}) and is_compiled(loaded(file), {0: False, 1: False})
+
+
+class Uncompiled:
+    signatures = ()
+
+    def __call__(self, *arguments):
+        raise InterruptedError
+
+
 def test_it_is_said_once_for_all_scenes_of_a_process(monkeypatch, caplog):
     monkeypatch.setattr(compiling, "_said", set())
-    monkeypatch.setattr(solver, "run_steps", SimpleNamespace(signatures=[]))
+    monkeypatch.setattr(solver, "run_steps", Uncompiled())
     balls = (make_body("ball", 0, [0, 0, 1]), make_body("other", 0, [3, 0, 1]))
     for _ in range(3):
         sim = Simulator(Scene((analytic_shape("sphere", radius=0.5),), balls, np.zeros(3), 1.0))
-        assert sim.carry.scene
+        with pytest.raises(InterruptedError):
+            sim.step()
     assert caplog.text.count("compiling the contact step, once for this version") == 1
+
+
+def test_scenes_with_joints_and_with_many_bodies_are_told_of_by_themselves(monkeypatch, caplog):
+    monkeypatch.setattr(compiling, "_said", set())
+    monkeypatch.setattr(solver, "run_steps", Uncompiled())
+    balls = [make_body(f"ball {k}", 0, [3 * k, 0, 1]) for k in range(solver.CROWD)]
+    pin = Joint("pin", "ball", (0, 1), np.array([[1.5, 0, 0], [-1.5, 0, 0]]), np.array([[0.0, 0, 0, 1]] * 2))
+    for bodies, joints in ((balls[:2], ()), (balls[:2], (pin,)), (balls, ())):
+        scene = Scene((analytic_shape("sphere", radius=0.5),), tuple(bodies), np.zeros(3), 1.0, joints=joints)
+        with pytest.raises(InterruptedError):
+            Simulator(scene, "solver").step()
+    told = [line for line in caplog.messages if line.startswith("compiling")]
+    assert len(told) == 3 and "joints" in told[1] and "many bodies" in told[2]
 
 
 def test_a_run_says_nothing_of_threading_layers():

@@ -31,7 +31,7 @@ SEEDS = [seed for seed in range(31) if seed != 11]  # nothing meets in that one
 
 @njit
 def respond_to(world, work, motion, rules, manifolds):
-    solve_contacts(world, work, motion, rules, manifolds)
+    solve_contacts(world, work, motion, rules, manifolds, None)
 
 
 def pile(draw: np.random.Generator) -> Scene:

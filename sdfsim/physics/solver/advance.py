@@ -16,9 +16,9 @@ from sdfsim.physics.solver.joints import (
     roused,
     solve_with_joints,
 )
-from sdfsim.physics.solver.manifold import scratch_room
 from sdfsim.physics.solver.narrow_phase import broad_phase, narrow_phase
 from sdfsim.physics.solver.record import gathered, no_edges, noted
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.sleep import put_to_sleep, woken
 from sdfsim.physics.solver.time_of_impact import time_of_impact
 from sdfsim.physics.solver.vectors import (
@@ -38,74 +38,86 @@ from sdfsim.physics.solver.vectors import (
 )
 
 
-@njit(**FAST, inline="always")  # where it is called, and not once more by itself
-def advance(shapes, world, work, motion, rules, manifolds, held):
+@njit(**FAST, inline="always")
+def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note):
     """Advance `motion` by one step, in place, and what is known of the joints that hold bodies; time is that of
     the bodies that go, however many others there are.
+
+    All structures but `manifolds` and `held` are references. For what may be None see `run_steps`.
 
     Returns:
         The manifolds at its end; what contacts did, where it is to be noted; and counts: pairs looked at, contacts of
         the last inner step, bodies that contacts moved.
     """
+    joints = reference(held)
     matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
     span = rules.substep_dt * rules.substeps
     for b in world.going:
         to_matrix(motion.orientation, b, matrix)
         work.met[b] = False
-    manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds)
-    jointed = len(held.each.body) > 0
-    while rules.sleep and (woken(world, motion, manifolds, near) or (jointed and roused(world, motion, held))):
-        manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds)
+    manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
+    stirred = rules.sleep
+    while stirred:
+        stirred = woken(world, motion, reference(manifolds), reference(near))
+        if held is not None:
+            stirred = stirred or roused(world, motion, joints)
+        if stirred:
+            manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
-    scratch = scratch_room()
     contacts, edges = 0, no_edges()
     _shifted(world, work, motion, rules, -0.5)
-    if jointed:
-        begin_step(world, work, motion, rules, held)
+    if held is not None:
+        begin_step(world, work, motion, rules, joints)
     for k in range(rules.substeps):
         for b in world.going:
             if work.gone[b] > work.ways[b] and world.moves[b]:
                 left = rules.substep_dt * (rules.substeps - k)
-                manifolds, near = broad_phase(shapes, world, work, motion, rules, left, manifolds)
+                manifolds, near = broad_phase(shapes, world, work, motion, rules, left, manifolds, surfaces, threads)
                 break
+        # Both are used again at the end of the step, so that the references hold.
+        points, parts = reference(manifolds), reference(near)
         for b in world.going:
             for x in range(6):
                 change[b, x] = shift[b, x] = 0.0
             for x in range(9):
                 free[b, x] = 0.0
             motion.touching[b] = False
-            if world.moves[b] and motion.island[b] < 0 and (work.beside[b] or (jointed and held.graph.of_body[b] >= 0)):
+            beside = work.beside[b]
+            if held is not None:
+                beside = beside or joints.graph.of_body[b] >= 0
+            if beside and world.moves[b] and motion.island[b] < 0:
                 _prepare(world, motion, matrix, inverse, work.wrench, rules, free, b)
-        if jointed:
-            assemble(world, work, motion, rules, held, True)
-        narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, work.gone, scratch)
-        heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch)
-        if jointed:
-            system = solve_with_joints(world, work, motion, rules, manifolds, held)
+        if held is not None:
+            assemble(world, work, motion, rules, joints, True)
+        narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.gone, work.scratch, surfaces, threads)
+        heed_supports(shapes, world, work, motion, rules, points, parts, work.scratch)
+        if held is not None:
+            system = solve_with_joints(world, work, motion, rules, points, joints)
         else:
-            system = solve_contacts(world, work, motion, rules, manifolds)
+            system = solve_contacts(world, work, motion, rules, points, threads)
         contacts = len(system.where)
-        if rules.note:
-            edges = noted(motion, matrix, manifolds, system, k / rules.substeps, edges)
-        time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch)
-        if jointed:
-            kept_together(held, work.part)
+        if note is not None:
+            edges = noted(motion, matrix, points, system, k / rules.substeps, edges)
+        time_of_impact(shapes, world, work, motion, rules, points, parts, work.scratch, surfaces)
+        if held is not None:
+            kept_together(joints, work.part)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
                 moved = _move(world, motion, matrix, rules, work.wrench, change, shift, work.part[b], trial, frame, b)
                 work.gone[b] += moved
-                if jointed and held.calm[b]:  # of what only joints hold
-                    motion.touching[b] = False
+                if held is not None:
+                    if joints.calm[b]:  # of what only joints hold
+                        motion.touching[b] = False
                 work.met[b] = work.met[b] or motion.touching[b]
-    if rules.note:
+    if note is not None:
         edges = gathered(
-            world, motion, matrix, manifolds, len(near.start), (rules.substeps - 1) / rules.substeps, edges
+            world, motion, matrix, reference(manifolds), len(near.start), (rules.substeps - 1) / rules.substeps, edges
         )
     _shifted(world, work, motion, rules, 0.5)
-    if jointed:
-        end_step(world, work, motion, rules, held)
+    if held is not None:
+        end_step(world, work, motion, rules, joints)
     if rules.sleep:
-        put_to_sleep(world, motion, rules, manifolds, held.graph.of_body, held.each.body)
+        put_to_sleep(world, motion, rules, reference(manifolds), joints)
     met = 0  # of those that are awake still
     for b in world.going:
         met += work.met[b] and motion.island[b] < 0
@@ -172,7 +184,7 @@ def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, fram
         put(motion.angular, b, w)
     put(motion.position, b, along(get(motion.position, b), v, span))
     if world.moves[b] and rules.rotation and not world.isotropic[b]:
-        torque_free(world, motion, matrix, span, trial, frame, b)
+        torque_free(world, motion.orientation, motion.angular, matrix, span, trial, frame, b)
         way = norm(w) + norm(turned)
     else:
         turned = add(w, turned)

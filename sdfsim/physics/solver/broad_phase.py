@@ -63,10 +63,13 @@ def _overlap(low, high, a, other_low, other_high, b):
 @njit(**FAST)
 def near_pairs(world, motion, low, high):
     """[P, 2] bodies whose boxes overlap, in a fixed order: sweep and prune along the axis on which they spread most."""
-    going = world.going[(world.shape[world.going] >= 0) & np.isfinite(world.radius[world.going])]
-    count = len(going)
+    going, count = np.empty(len(world.going), np.int64), 0
+    for b in world.going:
+        if world.shape[b] >= 0 and math.isfinite(world.radius[b]):
+            going[count] = b
+            count += 1
     found = np.empty((max(64, 4 * count), 2), np.int64)
-    pairs = 0
+    pairs = np.int64(0)  # a literal would be a type of its own, for which all is compiled once more
     axis, widest = 0, -1.0
     for k in range(3):
         least, most = math.inf, -math.inf
@@ -74,12 +77,15 @@ def near_pairs(world, motion, low, high):
             least, most = min(least, low[going[i], k]), max(most, low[going[i], k])
         if most - least > widest:
             axis, widest = k, most - least
-    order = going[np.argsort(low[:, axis][going], kind="mergesort")]
+    lowest = np.empty(count)
     for i in range(count):
-        a = order[i]
+        lowest[i] = low[going[i], axis]
+    order = order_of(lowest)
+    for i in range(count):
+        a = going[order[i]]
         awake = _stirs(world, motion, a)
         for j in range(i + 1, count):
-            b = order[j]
+            b = going[order[j]]
             if low[b, axis] > high[a, axis]:
                 break
             if not (awake or _stirs(world, motion, b)) or not (world.moves[a] or world.moves[b]):
@@ -94,22 +100,45 @@ def near_pairs(world, motion, low, high):
                 found, pairs = _append(found, pairs, a, world.plane[k])
         if not awake:
             continue
-        last = np.searchsorted(world.low[:, world.axis], high[a, world.axis], side="right")
-        for k in range(last - 1, -1, -1):
+        for k in range(_first_above(world, high[a, world.axis]) - 1, -1, -1):
             if world.reach[k] < low[a, world.axis]:
                 break
             if _overlap(low, high, a, world.low, world.high, k) and _may_meet(world, a, world.still[k]):
                 found, pairs = _append(found, pairs, a, world.still[k])
-    found = found[:pairs]
-    # Floats, for which sorting is compiled already.
-    return found[np.argsort((found[:, 0] * len(world.shape) + found[:, 1]) * 1.0, kind="mergesort")]
+    key, ordered = np.empty(pairs), np.empty((pairs, 2), np.int64)
+    for p in range(pairs):
+        key[p] = found[p, 0] * len(world.shape) + found[p, 1]
+    order = order_of(key)
+    for p in range(pairs):
+        ordered[p, 0], ordered[p, 1] = found[order[p], 0], found[order[p], 1]
+    return ordered
+
+
+@njit(**FAST)
+def order_of(key):
+    """Where the least of an array [N] of floats is, and so on; of like ones the first comes first."""
+    return np.argsort(key, kind="mergesort")
+
+
+@njit(**BARE)
+def _first_above(world, top):
+    """The first of the static bodies, in their order, that begins above `top` along `axis`."""
+    first, last = 0, len(world.still)
+    while first < last:
+        middle = (first + last) // 2
+        if world.low[middle, world.axis] <= top:
+            first = middle + 1
+        else:
+            last = middle
+    return first
 
 
 @njit(**FAST)
 def _append(found, count, a, b):
     if count == len(found):
         more = np.empty((2 * count, 2), np.int64)
-        more[:count] = found
+        for p in range(count):
+            more[p, 0], more[p, 1] = found[p, 0], found[p, 1]
         found = more
     found[count, 0], found[count, 1] = a, b
     return found, count + 1
@@ -124,28 +153,35 @@ def carried(world, motion, pairs, old):
         a, b = old.pair[k, 0], old.pair[k, 1]
         key[k] = a * n + b
         asleep[k] = motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
-    order = np.argsort(key, kind="mergesort")
-    here = len(pairs)
-    total = here + asleep.sum()
+    order = order_of(key)
+    here = total = len(pairs)
+    for k in range(len(asleep)):
+        total += asleep[k]
     pair = np.empty((total, 2), np.int64)
     count = np.zeros(total, np.int64)
     point = np.empty((total, POINTS, COLUMNS))
-    pair[:here] = pairs
     at = 0
     for k in range(here):
+        pair[k, 0], pair[k, 1] = pairs[k, 0], pairs[k, 1]
         wanted = pairs[k, 0] * n + pairs[k, 1]
         while at < len(order) and key[order[at]] < wanted:
             at += 1
         if at < len(order) and key[order[at]] == wanted:
             known = order[at]
-            count[k] = old.count[known]
-            point[k, : count[k]] = old.point[known, : count[k]]
+            _carry_points(old, known, count, point, k)
             asleep[known] = False
     end = here
     for k in range(len(old.count)):
         if asleep[k]:
-            pair[end] = old.pair[k]
-            count[end] = old.count[k]
-            point[end, : count[end]] = old.point[k, : count[end]]
+            pair[end, 0], pair[end, 1] = old.pair[k, 0], old.pair[k, 1]
+            _carry_points(old, k, count, point, end)
             end += 1
     return Manifolds(pair[:end], count[:end], point[:end])
+
+
+@njit(**BARE)
+def _carry_points(old, known, count, point, k):
+    count[k] = old.count[known]
+    for e in range(count[k]):
+        for x in range(COLUMNS):
+            point[k, e, x] = old.point[known, e, x]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from sdfsim.physics.solver.convex import (
     BLOCK,
@@ -19,7 +20,7 @@ from sdfsim.physics.solver.convex import (
     outermost,
     rounding,
 )
-from sdfsim.physics.solver.vectors import BARE, FAST, INLINED, add, along, cross, dot, get, put, scale, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, get, put, scale, turn, turn_back
 
 RIM = 24  # points of the true circle that bound the contact of a drum's end
 MOST = 160  # corners of a clipped face
@@ -42,7 +43,7 @@ class Polygons(NamedTuple):
     picked: np.ndarray  # [CHOSEN] int64
 
 
-@njit(**FAST)
+@register_jitable
 def polygons_room():
     return Polygons(
         np.zeros((MOST, 3)), np.zeros((MOST, 3)), np.zeros((MOST, 3)), np.zeros((MOST, 3)), np.zeros(MOST),

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from sdfsim.physics.solver.vectors import (
     BARE,
-    FAST,
     INLINED,
     add,
     along,
@@ -72,7 +72,7 @@ class Simplex(NamedTuple):
     trial: np.ndarray  # [4]
 
 
-@njit(**FAST)
+@register_jitable
 def simplex_room():
     return Simplex(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), np.zeros(4))
 

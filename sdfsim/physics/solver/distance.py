@@ -43,28 +43,7 @@ class Shapes(NamedTuple):
     clump_ball: np.ndarray  # [C, 4]
     leaf_patch: np.ndarray  # [L] int64, the patch of the surface that a leaf's nodes are of
     label: np.ndarray  # int16, the patches that are nearest to places all over
-    # the fields of `Convex`: compiled loops on all cores take no tuples in tuples
-    piece_start: np.ndarray
-    piece: np.ndarray
-    vertex_start: np.ndarray
-    vertex: np.ndarray
-    face_start: np.ndarray
-    face: np.ndarray
-    loop_start: np.ndarray
-    loop: np.ndarray
-    beside_start: np.ndarray
-    beside: np.ndarray
-    around_start: np.ndarray
-    around: np.ndarray
-
-
-@njit(**BARE)
-def solids(shapes):
-    """The convex pieces of the shapes."""
-    return Convex(
-        shapes.piece_start, shapes.piece, shapes.vertex_start, shapes.vertex, shapes.face_start, shapes.face,
-        shapes.loop_start, shapes.loop, shapes.beside_start, shapes.beside, shapes.around_start, shapes.around,
-    )  # fmt: skip
+    solids: Convex  # the convex pieces of the shapes
 
 
 @njit(**ENTRY)

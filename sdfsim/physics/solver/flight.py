@@ -30,7 +30,10 @@ def pull_of(world, matrix, wrench, rules, part, b):
     """What gravity and what pulls at a body add to its velocities in a part of an inner step."""
     span = rules.substep_dt * part
     weight = scale(vector(rules.gravity), span)
-    if not wrench[b].any():
+    pulled = False
+    for x in range(6):
+        pulled = pulled or wrench[b, x] != 0.0
+    if not pulled:
         return weight, (0.0, 0.0, 0.0)
     force, torque = (wrench[b, 0], wrench[b, 1], wrench[b, 2]), (wrench[b, 3], wrench[b, 4], wrench[b, 5])
     turned = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, torque)))
@@ -38,9 +41,9 @@ def pull_of(world, matrix, wrench, rules, part, b):
 
 
 @njit(**BARE)
-def torque_free(world, motion, matrix, span, trial, frame, b):
+def torque_free(world, orientation, angular, matrix, span, trial, frame, b):
     """Rotation without torque: angular momentum is kept exactly, the pose to fourth order (Runge-Kutta-Munthe-Kaas)."""
-    w = get(motion.angular, b)
+    w = get(angular, b)
     speed = norm(w)
     if speed == 0.0:
         return
@@ -49,16 +52,16 @@ def torque_free(world, motion, matrix, span, trial, frame, b):
     h = span / stages
     for _ in range(stages):
         k1 = scale(w, h)
-        k2 = _slope(world, motion.orientation, momentum, scale(k1, 0.5), h, b, trial, frame)
-        k3 = _slope(world, motion.orientation, momentum, scale(k2, 0.5), h, b, trial, frame)
-        k4 = _slope(world, motion.orientation, momentum, k3, h, b, trial, frame)
+        k2 = _slope(world, orientation, momentum, scale(k1, 0.5), h, b, trial, frame)
+        k3 = _slope(world, orientation, momentum, scale(k2, 0.5), h, b, trial, frame)
+        k4 = _slope(world, orientation, momentum, k3, h, b, trial, frame)
         total = scale(add(add(k1, k4), scale(add(k2, k3), 2.0)), 1.0 / 6.0)
-        q = turned_by(total, motion.orientation, b)
+        q = turned_by(total, orientation, b)
         for x in range(4):
-            motion.orientation[b, x] = q[x]
-        to_matrix(motion.orientation, b, matrix)
+            orientation[b, x] = q[x]
+        to_matrix(orientation, b, matrix)
         w = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, momentum)))
-    put(motion.angular, b, w)
+    put(angular, b, w)
 
 
 @njit(**BARE)

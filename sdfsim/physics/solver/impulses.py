@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit, prange
 
 from sdfsim.physics.solver.islands import islands_of
+from sdfsim.physics.solver.manifold import points_of
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
@@ -66,16 +68,23 @@ class System(NamedTuple):
 
 
 @njit(**FAST)
-def solve_contacts(world, work, motion, rules, manifolds):
+def solve_contacts(world, work, motion, rules, manifolds, threads):
     """Solve for the impulses of all contacts; they go to the manifolds, and to `change` and `shift` of `work`.
 
     Returns:
         The equations that were solved.
     """
-    change, shift = work.change, work.shift
+    mass, change, shift = world.inverse_mass, work.change, work.shift
     system = _equations(world, work, motion, rules, manifolds)
-    _solve_all(world.inverse_mass, rules, system, change, shift, world.threads)
-    remembered(manifolds, system)
+    rows, islands, many = reference(system), len(system.start) - 1, False
+    if threads is not None:  # known when it is compiled
+        many = islands >= MANY
+        if many:
+            _solve_many(mass, rules, rows, change, shift)
+    if not many:
+        for i in range(islands):
+            _solve(mass, rules, rows, change, shift, i)
+    remembered(manifolds, rows)
     return system
 
 
@@ -93,7 +102,7 @@ def remembered(manifolds, system):
 @njit(**FAST)
 def _equations(world, work, motion, rules, manifolds):
     matrix, inverse, free = work.matrix, work.inverse, work.free
-    most = manifolds.count.sum()
+    most = points_of(manifolds, len(manifolds.count))
     where = np.empty((most, 4), np.int64)
     row = np.zeros((most, 3, WIDTH))
     mu, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
@@ -254,17 +263,6 @@ def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
     row[c, e, MASS] = 1.0 / (inverse_mass[a] + inverse_mass[b] + dot(lever, spin) + dot(counter, back))
 
 
-@njit(**INLINED)
-def _solve_all(mass, rules, system, change, shift, threads):
-    islands = len(system.start) - 1
-    if threads.ndim > 1:  # known when it is compiled
-        if islands >= MANY:
-            _solve_many(mass, rules, system, change, shift)
-            return
-    for i in range(islands):
-        _solve(mass, rules, system, change, shift, i)
-
-
 @njit(parallel=True, **FAST)
 def _solve_many(mass, rules, system, change, shift):
     for i in prange(len(system.start) - 1):
@@ -415,7 +413,7 @@ def _relax_friction(where, row, mass, change, c, most):
     return max(abs(one), abs(other)) / lesser
 
 
-@njit(**BARE)
+@njit(**BARE, inline="always")
 def _three(row, c, e, column):
     return row[c, e, column], row[c, e, column + 1], row[c, e, column + 2]
 

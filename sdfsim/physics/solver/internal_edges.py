@@ -11,11 +11,11 @@ from __future__ import annotations
 from numba import njit
 
 from sdfsim.physics.solver.convex import farthest, outside, rounding
-from sdfsim.physics.solver.distance import CELL, GRID, KIND, PLANE, distance_alone, solids
+from sdfsim.physics.solver.distance import CELL, GRID, KIND, PLANE, distance_alone
 from sdfsim.physics.solver.manifold import renewed
 from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, pair_kind
 from sdfsim.physics.solver.surface_distance import KEYS
-from sdfsim.physics.solver.vectors import BARE, INLINED, add, dot, get, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, sub, turn, turn_back
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two are one
@@ -24,7 +24,7 @@ ROUGH = 0.5  # cells, by which a grid is off at an edge at most
 LEVEL = 4.0  # slops: so much higher than the support a body may reach and be no wall
 
 
-@njit(**BARE)
+@njit(**BARE, inline="always")
 def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
     """Give contacts with what lies below a support, and beside it, the support's normal, or void them."""
     latest, following = work.latest, near.following
@@ -49,11 +49,11 @@ def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
             _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p)
 
 
-@njit(**INLINED)
+@njit(**BARE, inline="always")
 def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
-    pieces = max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
+    pieces = max(1, shapes.solids.start[t + 1] - shapes.solids.start[t])
     if pair_kind(shapes, s, t) != SOLIDS:
         for k in range(manifolds.count[p]):
             manifolds.point[p, k, VOID] = 0.0
@@ -94,7 +94,7 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
     all of what it meets at point k; and this normal, towards the body."""
     body, other = manifolds.pair[p, side], manifolds.pair[p, 1 - side]
     n = _normal(manifolds, p, k, side)
-    if shapes.piece_start[world.shape[other] + 1] == shapes.piece_start[world.shape[other]]:
+    if shapes.solids.start[world.shape[other] + 1] == shapes.solids.start[world.shape[other]]:
         return False, n  # nobody knows how far it reaches
     key = manifolds.point[p, k, KEY]
     link = work.latest[body]
@@ -140,7 +140,7 @@ def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
     point = manifolds.point[p, k]
     place = turn(work.matrix, other, (point[column], point[column + 1], point[column + 2]))
     place = add(sub(get(motion.position, other), get(motion.position, ground)), place)
-    size, t, convex = world.scale[ground], world.shape[ground], solids(shapes)
+    size, t, convex = world.scale[ground], world.shape[ground], shapes.solids
     place = scale(add(turn_back(work.matrix, ground, place), get(world.com, ground)), 1.0 / size)
     first, last = convex.start[t], convex.start[t + 1]
     if shapes.table[t, KIND] != GRID or first == last:
@@ -157,7 +157,7 @@ def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
 @njit(**BARE)
 def _reach(shapes, world, work, motion, body, key, side, m):
     """How far the piece of a body that a contact is of reaches along m."""
-    s, convex = world.shape[body], solids(shapes)
+    s, convex = world.shape[body], shapes.solids
     pieces = convex.start[s + 1] - convex.start[s]
     number = int(key) % KEYS if side == 0 else int(key) // KEYS
     piece = convex.start[s] + min(number, pieces - 1)

@@ -46,8 +46,9 @@ def islands_of(world, parent, number, where):
         start[label[c] + 1] += 1
     for i in range(islands):
         start[i + 1] += start[i]
-    fill = start[:-1].copy()
-    order = np.empty(len(where), np.int64)
+    fill, order = np.empty(islands, np.int64), np.empty(len(where), np.int64)
+    for i in range(islands):
+        fill[i] = start[i]
     for c in range(len(where)):
         order[fill[label[c]]] = c
         fill[label[c]] += 1

@@ -64,6 +64,7 @@ from sdfsim.physics.solver.impulses import (
     remembered,
 )
 from sdfsim.physics.solver.islands import join, root
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
@@ -79,6 +80,7 @@ from sdfsim.physics.solver.vectors import (
     to_matrix,
     turn,
     turned_by,
+    vector,
 )
 
 ROWS = 6
@@ -171,27 +173,6 @@ class Held(NamedTuple):
     calm: np.ndarray  # [N] bool, whether joints hold a body that nothing else touches
 
 
-class Moving(NamedTuple):
-    """What joints ask of bodies: of `World`, `Motion` and `Work`. All arrays that a function is given are copied, one
-    number after the other, which takes longer to compile than most of what is done to them."""
-
-    moves: np.ndarray
-    isotropic: np.ndarray
-    inverse_mass: np.ndarray
-    inertia: np.ndarray
-    inverse_inertia: np.ndarray
-    position: np.ndarray
-    orientation: np.ndarray
-    velocity: np.ndarray
-    angular: np.ndarray
-    matrix: np.ndarray
-    inverse: np.ndarray
-    free: np.ndarray
-    change: np.ndarray
-    touching: np.ndarray
-    island: np.ndarray
-
-
 # Kinds of bounded rows: of contacts, normal and tangential (two rows); of joints, limits, motors with friction, and the
 # friction of a ball (three rows).
 NORMAL_ROW, TANGENT_ROW, STOP_ROW, DRIVE_ROW, GRIP_ROW = range(5)
@@ -219,16 +200,6 @@ class Bounded(NamedTuple):
     see: np.ndarray  # [R, R] or [0, 0]: what a unit of impulse does along all rows, through the joints
 
 
-@njit(**FAST)
-def _moving(world, work, motion):
-    """Not one of `BARE`: these do not count the references to arrays that they return."""
-    return Moving(
-        world.moves, world.isotropic, world.inverse_mass, world.inertia, world.inverse_inertia, motion.position,
-        motion.orientation, motion.velocity, motion.angular, work.matrix, work.inverse, work.free, work.change,
-        motion.touching, motion.island,
-    )  # fmt: skip
-
-
 @njit(**BARE)
 def asleep(island, graph, c):
     for k in range(graph.comp[c], graph.comp[c + 1]):
@@ -238,17 +209,16 @@ def asleep(island, graph, c):
 
 
 @njit(**BARE)
-def _arm(matrix, body, anchor, j, s):
-    b = body[j, s]
-    a = (anchor[j, s, 0], anchor[j, s, 1], anchor[j, s, 2])
-    return a if b < 0 else turn(matrix, b, a)
+def _in_world(matrix, b, v):
+    """A vector [3] in the axes of body b (below 0 for the world) along those of the world."""
+    return vector(v) if b < 0 else turn(matrix, b, vector(v))
 
 
 @njit(**BARE)
-def _axis(matrix, body, axes, j, s, k):
-    b = body[j, s]
-    a = (axes[j, s, k, 0], axes[j, s, k, 1], axes[j, s, k, 2])
-    return a if b < 0 else turn(matrix, b, a)
+def _arms(each, matrix, j):
+    """From the centres of mass to the anchors of a joint."""
+    body, anchor = each.body, each.anchor
+    return _in_world(matrix, body[j, 0], anchor[j, 0]), _in_world(matrix, body[j, 1], anchor[j, 1])
 
 
 @njit(**BARE)
@@ -273,9 +243,8 @@ def _unit(k):
 def _errors(each, position, matrix, j, out):
     """By how much the rows of a joint do not hold."""
     kind = each.kind[j]
-    way = _between(
-        position, each.body, j, _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
-    )
+    arm, other = _arms(each, matrix, j)
+    way = _between(position, each.body, j, arm, other)
     for e in range(ROWS):
         out[j, e] = 0.0
     if kind == DISTANCE:
@@ -284,77 +253,77 @@ def _errors(each, position, matrix, j, out):
         return
     first = 3
     if kind == SLIDER:
-        out[j, 0] = dot(_axis(matrix, each.body, each.axes, j, 1, 1), way)
-        out[j, 1] = dot(_axis(matrix, each.body, each.axes, j, 1, 2), way)
+        out[j, 0] = dot(_in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]), way)
+        out[j, 1] = dot(_in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]), way)
         first = 2
     else:
         out[j, 0], out[j, 1], out[j, 2] = way[0], way[1], way[2]
     if kind == HINGE:
-        a = _axis(matrix, each.body, each.axes, j, 0, 0)
-        out[j, 3] = dot(a, _axis(matrix, each.body, each.axes, j, 1, 1))
-        out[j, 4] = dot(a, _axis(matrix, each.body, each.axes, j, 1, 2))
+        a = _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0])
+        out[j, 3] = dot(a, _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]))
+        out[j, 4] = dot(a, _in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]))
     elif kind != BALL:
         for k in range(3):
             out[j, first + k] = dot(
-                _axis(matrix, each.body, each.axes, j, 0, (k + 1) % 3),
-                _axis(matrix, each.body, each.axes, j, 1, (k + 2) % 3),
+                _in_world(matrix, each.body[j, 0], each.axes[j, 0, (k + 1) % 3]),
+                _in_world(matrix, each.body[j, 1], each.axes[j, 1, (k + 2) % 3]),
             )
 
 
 @njit(**BARE)
-def _write(line, j, e, pull, arm, other):
-    """A row along a direction at two places."""
+def _write(row, pull, arm, other):
+    """A row [12] along a direction at two places."""
     one, two = cross(arm, pull), cross(other, pull)
     for x in range(3):
-        line[j, e, x], line[j, e, 3 + x], line[j, e, 6 + x], line[j, e, 9 + x] = pull[x], one[x], -pull[x], -two[x]
+        row[x], row[3 + x], row[6 + x], row[9 + x] = pull[x], one[x], -pull[x], -two[x]
 
 
 @njit(**BARE)
-def _write_turn(line, j, e, axis):
-    """A row about an axis."""
+def _write_turn(row, axis):
+    """A row [12] about an axis."""
     for x in range(3):
-        line[j, e, x] = line[j, e, 6 + x] = 0.0
-        line[j, e, 3 + x], line[j, e, 9 + x] = axis[x], -axis[x]
+        row[x] = row[6 + x] = 0.0
+        row[3 + x], row[9 + x] = axis[x], -axis[x]
 
 
 @njit(**BARE)
 def _coordinate(each, position, matrix, j):
     """The angle, position or length of a joint, and the row along which it changes."""
     kind, state = each.kind[j], each.state
-    arm, other = _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
+    arm, other = _arms(each, matrix, j)
     way = _between(position, each.body, j, arm, other)
-    one = each.axis
     if kind == HINGE:
         a, b, c = (
-            _axis(matrix, each.body, each.axes, j, 0, 1),
-            _axis(matrix, each.body, each.axes, j, 1, 1),
-            _axis(matrix, each.body, each.axes, j, 1, 2),
+            _in_world(matrix, each.body[j, 0], each.axes[j, 0, 1]),
+            _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]),
+            _in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]),
         )
         angle = math.atan2(dot(a, c), dot(a, b))
         turns = math.floor((state[j, COORD] - angle) / (2.0 * math.pi) + 0.5)
         state[j, COORD] = angle + 2.0 * math.pi * turns
-        _write_turn(one, j, 0, _axis(matrix, each.body, each.axes, j, 0, 0))
+        _write_turn(each.axis[j, 0], _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0]))
     elif kind == SLIDER:
-        a = _axis(matrix, each.body, each.axes, j, 1, 0)
+        a = _in_world(matrix, each.body[j, 1], each.axes[j, 1, 0])
         state[j, COORD] = dot(a, way)
-        _write(one, j, 0, a, arm, add(other, way))
+        _write(each.axis[j, 0], a, arm, add(other, way))
     elif kind == BALL:
-        a, b = _axis(matrix, each.body, each.axes, j, 0, 0), _axis(matrix, each.body, each.axes, j, 1, 0)
+        a = _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0])
+        b = _in_world(matrix, each.body[j, 1], each.axes[j, 1, 0])
         n = cross(a, b)
         s = norm(n)
         state[j, COORD] = math.atan2(s, dot(a, b))
-        _write_turn(one, j, 0, scale(n, -1.0 / s) if s > 1e-9 else (0.0, 0.0, 0.0))
+        _write_turn(each.axis[j, 0], scale(n, -1.0 / s) if s > 1e-9 else (0.0, 0.0, 0.0))
     elif kind == DISTANCE:
         length = norm(way)
         state[j, COORD] = length
-        _write(one, j, 0, scale(way, 1.0 / length) if length > 1e-12 else (0.0, 0.0, 1.0), arm, other)
+        _write(each.axis[j, 0], scale(way, 1.0 / length) if length > 1e-12 else (0.0, 0.0, 1.0), arm, other)
 
 
 @njit(**BARE)
 def _rows(each, lines, position, matrix, j):
     """The rows that hold, as bodies are now."""
     kind, line, active = each.kind[j], lines.line, lines.active
-    arm, other = _arm(matrix, each.body, each.anchor, j, 0), _arm(matrix, each.body, each.anchor, j, 1)
+    arm, other = _arms(each, matrix, j)
     for e in range(ROWS):
         active[j, e] = 0
         lines.soft[j, e] = 0.0
@@ -367,75 +336,74 @@ def _rows(each, lines, position, matrix, j):
     first = 3
     if kind == SLIDER:
         far = add(other, _between(position, each.body, j, arm, other))
-        _write(line, j, 0, _axis(matrix, each.body, each.axes, j, 1, 1), arm, far)
-        _write(line, j, 1, _axis(matrix, each.body, each.axes, j, 1, 2), arm, far)
+        _write(line[j, 0], _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1]), arm, far)
+        _write(line[j, 1], _in_world(matrix, each.body[j, 1], each.axes[j, 1, 2]), arm, far)
         first = 2
     else:
         for k in range(3):
-            _write(line, j, k, _unit(k), arm, other)
+            _write(line[j, k], _unit(k), arm, other)
     for e in range(first):
         active[j, e] = 1
     if kind == HINGE:
-        a = _axis(matrix, each.body, each.axes, j, 0, 0)
+        a = _in_world(matrix, each.body[j, 0], each.axes[j, 0, 0])
         for k in range(2):
-            _write_turn(line, j, 3 + k, cross(a, _axis(matrix, each.body, each.axes, j, 1, 1 + k)))
+            _write_turn(line[j, 3 + k], cross(a, _in_world(matrix, each.body[j, 1], each.axes[j, 1, 1 + k])))
             active[j, 3 + k] = 1
     elif kind != BALL:
         for k in range(3):
             one, two = (
-                _axis(matrix, each.body, each.axes, j, 0, (k + 1) % 3),
-                _axis(matrix, each.body, each.axes, j, 1, (k + 2) % 3),
+                _in_world(matrix, each.body[j, 0], each.axes[j, 0, (k + 1) % 3]),
+                _in_world(matrix, each.body[j, 1], each.axes[j, 1, (k + 2) % 3]),
             )
-            _write_turn(line, j, first + k, cross(one, two))
+            _write_turn(line[j, first + k], cross(one, two))
             active[j, first + k] = 1
 
 
 @njit(**BARE)
-def _reads(line, j, e, velocity, angular, a, b):
-    """What a row says of velocities [N, 3] of both bodies."""
+def _reads(row, motion, a, b):
+    """What a row [12] says of the velocities of both bodies."""
     total = 0.0
     for x in range(3):
         if a >= 0:
-            total += line[j, e, x] * velocity[a, x] + line[j, e, 3 + x] * angular[a, x]
+            total += row[x] * motion.velocity[a, x] + row[3 + x] * motion.angular[a, x]
         if b >= 0:
-            total += line[j, e, 6 + x] * velocity[b, x] + line[j, e, 9 + x] * angular[b, x]
+            total += row[6 + x] * motion.velocity[b, x] + row[9 + x] * motion.angular[b, x]
     return total
 
 
 @njit(**BARE)
-def _reads_six(line, j, e, change, a, b):
+def _reads_six(row, change, a, b):
     """Likewise of [N, 6]."""
     total = 0.0
     for x in range(6):
         if a >= 0:
-            total += line[j, e, x] * change[a, x]
+            total += row[x] * change[a, x]
         if b >= 0:
-            total += line[j, e, 6 + x] * change[b, x]
+            total += row[6 + x] * change[b, x]
     return total
 
 
 @njit(**BARE)
-def _eased(moves, inverse_mass, inverse, rotation, line, j, e, a, b, out):
-    """Write what a unit of impulse along a row makes of both bodies' velocities by themselves; returns what that does
-    along the row."""
+def _eased(world, work, rules, row, a, b, out):
+    """Write what a unit of impulse along a row [12] makes of both bodies' velocities by themselves, behind the first 12
+    numbers of `out` [24]; returns what that does along the row."""
     total = 0.0
     for s in range(2):
-        body = a if s == 0 else b
+        body, first = (a, 0) if s == 0 else (b, 6)
         for x in range(6):
-            out[0, 12 + 6 * s + x] = 0.0
-        if body >= 0 and moves[body]:
-            first = 6 * s
-            spin = turn(inverse, body, (line[j, e, first + 3], line[j, e, first + 4], line[j, e, first + 5]))
+            out[12 + first + x] = 0.0
+        if body >= 0 and world.moves[body]:
+            spin = turn(work.inverse, body, (row[first + 3], row[first + 4], row[first + 5]))
             for x in range(3):
-                out[0, 12 + first + x] = inverse_mass[body] * line[j, e, first + x]
-                out[0, 15 + first + x] = spin[x] if rotation else 0.0
+                out[12 + first + x] = world.inverse_mass[body] * row[first + x]
+                out[15 + first + x] = spin[x] if rules.rotation else 0.0
             for x in range(6):
-                total += line[j, e, first + x] * out[0, 12 + first + x]
+                total += row[first + x] * out[12 + first + x]
     return total
 
 
 @njit(**BARE)
-def _springs(bodies, rules, each, lines, j):
+def _springs(world, work, motion, rules, each, lines, j):
     """Springs and damping as soft rows: a force in the middle of what it is before and after the inner step."""
     number, state, kind, h = each.number, each.state, each.kind[j], rules.substep_dt
     stiff, damping = number[j, STIFFNESS], number[j, DAMPING]
@@ -445,20 +413,14 @@ def _springs(bodies, rules, each, lines, j):
     for k in range(3 if kind == BALL else 1):
         e = 3 + k if kind == BALL else (5 if kind != DISTANCE else 1)
         if kind == BALL:
-            _write_turn(lines.line, j, e, _unit(k))
+            _write_turn(lines.line[j, e], _unit(k))
         else:
             for x in range(12):
                 lines.line[j, e, x] = each.axis[j, 0, x]
-        z = (
-            damping
-            * h
-            * _eased(
-                bodies.moves, bodies.inverse_mass, bodies.inverse, rules.rotation, lines.line, j, e, a, b, lines.eased
-            )
-        )
+        z = damping * h * _eased(world, work, rules, lines.line[j, e], a, b, lines.eased[0])
         late = 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
         give = h * (0.25 * stiff * h + damping * late)
-        before = _reads(lines.line, j, e, bodies.velocity, bodies.angular, a, b)
+        before = _reads(lines.line[j, e], motion, a, b)
         lines.active[j, e] = 2
         lines.soft[j, e] = 1.0 / give
         away = state[j, COORD] - number[j, REST] if stiff > 0.0 else 0.0
@@ -469,37 +431,36 @@ def _springs(bodies, rules, each, lines, j):
 def assemble(world, work, motion, rules, held, springs):
     """Write the rows of all joints that are awake, and factor what they make of velocities. Where rows do not hold,
     bodies are moved. `springs`: whether these are among them."""
-    bodies = _moving(world, work, motion)
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
     for c in range(len(graph.comp) - 1):
-        if asleep(bodies.island, graph, c):
+        if asleep(motion.island, graph, c):
             continue
         for attempt in range(3):
             worst = 0.0
             for k in range(graph.comp[c], graph.comp[c + 1]):
                 if graph.node[k] < 0:
                     j = -1 - graph.node[k]
-                    _coordinate(each, bodies.position, bodies.matrix, j)
+                    _coordinate(each, motion.position, work.matrix, j)
                     if each.state[j, BROKEN] > 0.0:
                         for e in range(ROWS):
                             lines.active[j, e] = 0
                             lines.error[j, e] = lines.soft[j, e] = 0.0
                         continue
-                    _rows(each, lines, bodies.position, bodies.matrix, j)
-                    _errors(each, bodies.position, bodies.matrix, j, lines.error)
+                    _rows(each, lines, motion.position, work.matrix, j)
+                    _errors(each, motion.position, work.matrix, j, lines.error)
                     for e in range(ROWS):
                         lines.wanted[j, e] = each.state[j, BEND + e] if springs else 0.0
                         worst = max(worst, abs(lines.error[j, e]))
                     if springs:
-                        _springs(bodies, rules, each, lines, j)
-            _factor(bodies, rules, graph, factors, each, lines, c)
+                        _springs(world, work, motion, rules, each, lines, j)
+            _factor(world, work, motion, rules, graph, factors, each, lines, c)
             if worst <= STRETCH or attempt == 2:
                 break
-            _mend(bodies, work.gone, world.radius, rules, graph, factors, lines, c)
+            _mend(world, work, motion, rules, graph, factors, lines, c)
 
 
 @njit(**BARE)
-def _mend(bodies, gone, radius, rules, graph, factors, lines, c):
+def _mend(world, work, motion, rules, graph, factors, lines, c):
     """Move bodies so that rows hold: as little as their masses ask for."""
     for k in range(graph.comp[c], graph.comp[c + 1]):
         for e in range(6):
@@ -521,18 +482,18 @@ def _mend(bodies, gone, radius, rules, graph, factors, lines, c):
         b = graph.node[k]
         if b >= 0:
             moved, turned = get(factors.x, k), (factors.x[k, 3], factors.x[k, 4], factors.x[k, 5])
-            put(bodies.position, b, along(get(bodies.position, b), moved, share))
+            put(motion.position, b, along(get(motion.position, b), moved, share))
             if rules.rotation:
-                q = turned_by(scale(turned, share), bodies.orientation, b)
+                q = turned_by(scale(turned, share), motion.orientation, b)
                 for x in range(4):
-                    bodies.orientation[b, x] = q[x]
-                to_matrix(bodies.orientation, b, bodies.matrix)
-            if radius[b] < math.inf:
-                gone[b] += share * (norm(moved) + norm(turned) * radius[b])
+                    motion.orientation[b, x] = q[x]
+                to_matrix(motion.orientation, b, work.matrix)
+            if world.radius[b] < math.inf:
+                work.gone[b] += share * (norm(moved) + norm(turned) * world.radius[b])
 
 
 @njit(**BARE)
-def _factor(bodies, rules, graph, factors, each, lines, c):
+def _factor(world, work, motion, rules, graph, factors, each, lines, c):
     """The matrix of masses and rows, factored block by block."""
     first, last = graph.comp[c], graph.comp[c + 1]
     for k in range(first, last):
@@ -546,12 +507,12 @@ def _factor(bodies, rules, graph, factors, each, lines, c):
         b = graph.node[k]
         if b >= 0:
             for x in range(3):
-                factors.diagonal[k, x, x] = 1.0 / bodies.inverse_mass[b]
+                factors.diagonal[k, x, x] = 1.0 / world.inverse_mass[b]
                 for y in range(3):
                     total = 0.0
                     for u in range(3):
                         for w in range(3):
-                            total += bodies.matrix[b, x, u] * bodies.inertia[b, u, w] * bodies.matrix[b, y, w]
+                            total += work.matrix[b, x, u] * world.inertia[b, u, w] * work.matrix[b, y, w]
                     factors.diagonal[k, 3 + x, 3 + y] = total
     for k in range(first, last):
         if graph.node[k] >= 0:
@@ -560,18 +521,7 @@ def _factor(bodies, rules, graph, factors, each, lines, c):
         for e in range(ROWS):
             factors.diagonal[k, e, e] = -1.0
             if lines.active[j, e] > 0:
-                eased = _eased(
-                    bodies.moves,
-                    bodies.inverse_mass,
-                    bodies.inverse,
-                    rules.rotation,
-                    lines.line,
-                    j,
-                    e,
-                    each.body[j, 0],
-                    each.body[j, 1],
-                    lines.eased,
-                )
+                eased = _eased(world, work, rules, lines.line[j, e], each.body[j, 0], each.body[j, 1], lines.eased[0])
                 factors.diagonal[k, e, e] = -lines.soft[j, e] - SOFTEN * eased
                 if eased == 0.0:
                     factors.diagonal[k, e, e] = -1.0
@@ -646,34 +596,34 @@ def _subtract(out, t, low, p, block, q):
 @njit(**BARE)
 def _substitute(graph, factors, c, first):
     """Solve for the right side `x`, which is 0 before node `first`."""
-    x, last = factors.x, graph.comp[c + 1]
+    x, low, last = factors.x, factors.low, graph.comp[c + 1]
     for k in range(first, last):
         for p in range(graph.below[k], graph.below[k + 1]):
-            r = graph.row[p]
-            for i in range(6):
-                total = 0.0
-                for u in range(6):
-                    total += factors.low[p, i, u] * x[k, u]
-                x[r, i] -= total
+            _take_off(x, graph.row[p], low[p], k)
     for k in range(last - 1, graph.comp[c] - 1, -1):
         a, b, d, e, f, g = x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5]
         for i in range(6):
             m = factors.inverse[k, i]
             x[k, i] = m[0] * a + m[1] * b + m[2] * d + m[3] * e + m[4] * f + m[5] * g
         for p in range(graph.below[k], graph.below[k + 1]):
-            r = graph.row[p]
-            for i in range(6):
-                total = 0.0
-                for u in range(6):
-                    total += factors.low[p, u, i] * x[r, u]
-                x[k, i] -= total
+            _take_off(x, k, low[p].T, graph.row[p])
 
 
 @njit(**BARE)
-def _project(bodies, graph, factors, each, lines, c, change, whole):
+def _take_off(x, k, block, of):
+    """Take from row k of x [K, 6] what a block [6, 6] makes of another row."""
+    for i in range(6):
+        total = 0.0
+        for u in range(6):
+            total += block[i, u] * x[of, u]
+        x[k, i] -= total
+
+
+@njit(**BARE)
+def _project(world, work, motion, graph, factors, each, lines, c, change, whole):
     """Let the rows hold: what `change` lacks is added. `whole`: of all velocities, as the rows want them; else of the
     change alone, which is to be none along them."""
-    free = bodies.free
+    free = work.free
     for k in range(graph.comp[c], graph.comp[c + 1]):
         n = graph.node[k]
         for e in range(6):
@@ -684,10 +634,10 @@ def _project(bodies, graph, factors, each, lines, c, change, whole):
             for e in range(ROWS):
                 if lines.active[j, e] == 0:
                     continue
-                now = _reads_six(lines.line, j, e, change, a, b)
+                now = _reads_six(lines.line[j, e], change, a, b)
                 if whole:
-                    now += _reads(lines.line, j, e, bodies.velocity, bodies.angular, a, b)
-                    now += _reads_six(lines.line, j, e, free, a, b)
+                    now += _reads(lines.line[j, e], motion, a, b)
+                    now += _reads_six(lines.line[j, e], free, a, b)
                     now += lines.soft[j, e] * lines.impulse[j, e] - lines.wanted[j, e]
                 factors.x[k, e] = now
     _substitute(graph, factors, c, graph.comp[c])
@@ -702,19 +652,19 @@ def _project(bodies, graph, factors, each, lines, c, change, whole):
 
 
 @njit(**BARE)
-def _bend(bodies, rules, graph, each, lines, trial, c):
+def _bend(world, work, motion, rules, graph, each, lines, trial, c):
     """Move the bodies as far as the inner step would, and let rows turn by as much as they do not hold there; returns
     the largest error."""
     h = rules.substep_dt
     for k in range(graph.comp[c], graph.comp[c + 1]):
         n = graph.node[k]
         if n >= 0:
-            _tried(bodies, rules, trial, n)
+            _tried(world, work, motion, rules, trial, n)
             continue
         for s in range(2):
             b = each.body[-1 - n, s]
             if b >= 0 and graph.of_body[b] < 0:
-                _tried(bodies, rules, trial, b)
+                _tried(world, work, motion, rules, trial, b)
     worst = 0.0
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] < 0:
@@ -731,24 +681,24 @@ def _bend(bodies, rules, graph, each, lines, trial, c):
 
 
 @njit(**BARE)
-def _tried(bodies, rules, trial, b):
+def _tried(world, work, motion, rules, trial, b):
     """Where a body would be after the inner step."""
-    h, change, free = rules.substep_dt, bodies.change, bodies.free
-    v, w = get(bodies.velocity, b), get(bodies.angular, b)
+    h, change, free = rules.substep_dt, work.change, work.free
+    v, w = get(motion.velocity, b), get(motion.angular, b)
     for x in range(4):
-        trial.orientation[b, x] = bodies.orientation[b, x]
+        trial.orientation[b, x] = motion.orientation[b, x]
     for x in range(3):
         for y in range(3):
-            trial.frame[b, x, y] = bodies.matrix[b, x, y]
-    if bodies.moves[b]:
+            trial.frame[b, x, y] = work.matrix[b, x, y]
+    if world.moves[b]:
         v = add(v, add((free[b, 0], free[b, 1], free[b, 2]), (change[b, 0], change[b, 1], change[b, 2])))
         w = add(w, add((free[b, 3], free[b, 4], free[b, 5]), (change[b, 3], change[b, 4], change[b, 5])))
-    put(trial.position, b, along(get(bodies.position, b), v, h))
-    if not rules.rotation and bodies.moves[b]:
+    put(trial.position, b, along(get(motion.position, b), v, h))
+    if not rules.rotation and world.moves[b]:
         return
     put(trial.angular, b, w)
-    if bodies.moves[b] and not bodies.isotropic[b]:
-        torque_free(bodies, trial, trial.frame, h, trial.turned, trial.tried, b)
+    if world.moves[b] and not world.isotropic[b]:
+        torque_free(world, trial.orientation, trial.angular, trial.frame, h, trial.turned, trial.tried, b)
     elif w[0] != 0.0 or w[1] != 0.0 or w[2] != 0.0:
         q = turned_by(scale(w, h), trial.orientation, b)
         for x in range(4):
@@ -757,7 +707,7 @@ def _tried(bodies, rules, trial, b):
 
 
 @njit(**BARE)
-def _limited(bodies, rules, graph, each, c, rows, count, steady):
+def _limited(world, work, motion, rules, graph, each, c, rows, count, steady):
     """Write the bounded rows of joints behind `count` others; returns how many there are then. `steady`: only limits
     that hold, as they are after an inner step."""
     h, number, state = rules.substep_dt, each.number, each.state
@@ -768,8 +718,8 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
         if state[j, BROKEN] > 0.0:
             continue
         a, b, coord = each.body[j, 0], each.body[j, 1], state[j, COORD]
-        before = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
-        free = before + _reads_six(each.axis, j, 0, bodies.free, a, b)
+        before = _reads(each.axis[j, 0], motion, a, b)
+        free = before + _reads_six(each.axis[j, 0], work.free, a, b)
         for side in range(2):
             end = number[j, LOW + side]
             sign = 1.0 - 2.0 * side
@@ -788,7 +738,7 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
                 aim, left = number[j, BOUNCE] * approach, math.inf
             for x in range(12):
                 rows.row[count, x] = sign * each.axis[j, 0, x]
-            _begin(bodies, rules, each, rows, count, STOP_ROW, j, aim, then)
+            _begin(world, work, motion, rules, each, rows, count, STOP_ROW, j, aim, then)
             rows.impulse[count] = 0.0 if steady else max(0.0, sign * state[j, STOP])
             rows.strong[count], rows.grip[count] = left, sign
             count += 1
@@ -804,10 +754,10 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
                 rows.row[count, 3 + e], rows.row[count, 9 + e] = 1.0, -1.0
                 now = 0.0
                 if a >= 0:
-                    now += bodies.angular[a, e] + bodies.free[a, 3 + e]
+                    now += motion.angular[a, e] + work.free[a, 3 + e]
                 if b >= 0:
-                    now -= bodies.angular[b, e] + bodies.free[b, 3 + e]
-                _begin(bodies, rules, each, rows, count, GRIP_ROW, j, 0.0, now)
+                    now -= motion.angular[b, e] + work.free[b, 3 + e]
+                _begin(world, work, motion, rules, each, rows, count, GRIP_ROW, j, 0.0, now)
                 rows.impulse[count], rows.grip[count] = state[j, DRIVE + e], grip
                 count += 1
         elif grip > 0.0 or most > 0.0:
@@ -818,31 +768,19 @@ def _limited(bodies, rules, graph, each, c, rows, count, steady):
                 aim = (state[j, TARGET] - coord) / max(number[j, TIME], h)
             for x in range(12):
                 rows.row[count, x] = each.axis[j, 0, x]
-            _begin(bodies, rules, each, rows, count, DRIVE_ROW, j, aim, free)
+            _begin(world, work, motion, rules, each, rows, count, DRIVE_ROW, j, aim, free)
             rows.impulse[count], rows.grip[count], rows.strong[count] = state[j, DRIVE], grip, most
             count += 1
     return count
 
 
 @njit(**BARE)
-def _begin(bodies, rules, each, rows, r, kind, j, aim, base):
+def _begin(world, work, motion, rules, each, rows, r, kind, j, aim, base):
     rows.kind[r], rows.of[r] = kind, j
     rows.body[r, 0], rows.body[r, 1] = each.body[j, 0], each.body[j, 1]
     rows.base[r], rows.want[r] = base, aim - base
     rows.strong[r] = rows.grip[r] = 0.0
-    rows.give[r] = 0.0
-    for s in range(2):
-        b = each.body[j, s]
-        for x in range(6):
-            rows.row[r, 12 + 6 * s + x] = 0.0
-        if b >= 0 and bodies.moves[b]:
-            first = 6 * s
-            spin = turn(bodies.inverse, b, (rows.row[r, first + 3], rows.row[r, first + 4], rows.row[r, first + 5]))
-            for x in range(3):
-                rows.row[r, 12 + first + x] = bodies.inverse_mass[b] * rows.row[r, first + x]
-                rows.row[r, 15 + first + x] = spin[x] if rules.rotation else 0.0
-            for x in range(6):
-                rows.give[r] += rows.row[r, first + x] * rows.row[r, 12 + first + x]
+    rows.give[r] = _eased(world, work, rules, rows.row[r], each.body[j, 0], each.body[j, 1], rows.row[r])
 
 
 @njit(**BARE)
@@ -893,7 +831,7 @@ def _give(moves, rows, r, impulse, change):
 
 
 @njit(**BARE)
-def _see(bodies, graph, factors, reply, rows, count):
+def _see(world, work, motion, graph, factors, reply, rows, count):
     """What a unit of impulse along each row does along all, through the joints."""
     for r in range(count):
         for s in range(2):
@@ -905,10 +843,10 @@ def _see(bodies, graph, factors, reply, rows, count):
         one = other = -1
         for s in range(2):
             b = rows.body[r, s]
-            if b < 0 or not bodies.moves[b]:
+            if b < 0 or not world.moves[b]:
                 continue
             k = graph.of_body[b]
-            if k < 0 or bodies.island[b] >= 0:
+            if k < 0 or motion.island[b] >= 0:
                 for x in range(6):
                     reply[b, x] += rows.row[r, 12 + 6 * s + x]
                 continue
@@ -1024,51 +962,51 @@ def _sweep(moves, cone, rows, count, change):
 
 
 @njit(**BARE)
-def _all_rows(bodies, rules, system, graph, each, comps, lo, hi, island, rows):
+def _all_rows(world, work, motion, rules, system, graph, each, comps, lo, hi, island, rows):
     """The bounded rows of an island, and what was known of their impulses, given to the bodies."""
-    count = _touched(bodies.inverse_mass, system, island, rows)
+    count = _touched(world.inverse_mass, system, island, rows)
     for i in range(lo, hi):
-        count = _limited(bodies, rules, graph, each, comps[i], rows, count, False)
+        count = _limited(world, work, motion, rules, graph, each, comps[i], rows, count, False)
     for r in range(count):
         if rows.impulse[r] != 0.0:
-            _give(bodies.moves, rows, r, rows.impulse[r], bodies.change)
+            _give(world.moves, rows, r, rows.impulse[r], work.change)
     return count
 
 
 @njit(**BARE)
-def _hold(bodies, rules, held, comps, lo, hi, rows, count, steady):
+def _hold(world, work, motion, rules, held, comps, lo, hi, rows, count, steady):
     """Solve for all impulses of an island so that its rows hold after the inner step."""
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
-    change, h = bodies.change, rules.substep_dt
+    change, h = work.change, rules.substep_dt
     for i in range(lo, hi):
         for k in range(graph.comp[comps[i]], graph.comp[comps[i] + 1]):
             if graph.node[k] < 0:
                 for e in range(ROWS):
                     lines.impulse[-1 - graph.node[k], e] = 0.0
-        _project(bodies, graph, factors, each, lines, comps[i], change, True)
+        _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
     for _ in range(ROUNDS):
         if count:
             for r in range(count):
                 rows.known[r] = rows.impulse[r]
                 rows.now[r] = _read(rows, r, change)
             for _ in range(rules.rounds):
-                worst = _sweep(bodies.moves, rules.cone, rows, count, change)
+                worst = _sweep(world.moves, rules.cone, rows, count, change)
                 if len(rows.see) == 0:
                     for i in range(lo, hi):
-                        _project(bodies, graph, factors, each, lines, comps[i], change, True)
+                        _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
                 if worst <= EXACT * rules.exact:
                     break
             if len(rows.see):
                 for r in range(count):
                     if rows.impulse[r] != rows.known[r]:
-                        _give(bodies.moves, rows, r, rows.impulse[r] - rows.known[r], change)
+                        _give(world.moves, rows, r, rows.impulse[r] - rows.known[r], change)
                 for i in range(lo, hi):
-                    _project(bodies, graph, factors, each, lines, comps[i], change, True)
+                    _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
         if steady:
             return
         worst = 0.0
         for i in range(lo, hi):
-            worst = max(worst, _bend(bodies, rules, graph, each, lines, held.trial, comps[i]))
+            worst = max(worst, _bend(world, work, motion, rules, graph, each, lines, held.trial, comps[i]))
         for r in range(count):
             if rows.kind[r] == STOP_ROW and rows.impulse[r] > 0.0 and rows.strong[r] < math.inf:
                 j = rows.of[r]
@@ -1084,7 +1022,7 @@ def _hold(bodies, rules, held, comps, lo, hi, rows, count, steady):
         if worst <= HOLDS:
             return
         for i in range(lo, hi):
-            _project(bodies, graph, factors, each, lines, comps[i], change, True)
+            _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
 
 
 @njit(**BARE)
@@ -1110,7 +1048,7 @@ def _room(count):
 
 
 @njit(**FAST)
-def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
+def _solve_island(world, work, motion, rules, system, held, comps, lo, hi, island):
     """An island that joints hold together: as `impulses._solve`, through the joints."""
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
     contacts = system.start[island + 1] - system.start[island]
@@ -1123,18 +1061,24 @@ def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
         deep = deep or system.wanted[c] > 0.0
         lively = lively or system.row[c, 0, WANTED] > system.calm[c, 0]
     if deep:
-        _resolve_penetration(bodies.inverse_mass, rules, system, shift, island)
+        _resolve_penetration(world.inverse_mass, rules, system, work.shift, island)
         for i in range(lo, hi):
-            _project(bodies, graph, factors, each, lines, comps[i], shift, False)
+            _project(world, work, motion, graph, factors, each, lines, comps[i], work.shift, False)
     room = _room(most)
-    count = _all_rows(bodies, rules, system, graph, each, comps, lo, hi, island, room)
-    rows = _seen(room, count if count <= DENSE else 0)
+    count = _all_rows(world, work, motion, rules, system, graph, each, comps, lo, hi, island, reference(room))
+    bounded = _seen(room, count if count <= DENSE else 0)
+    _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island, bounded, count, lively, deep)
+
+
+@njit(**BARE)
+def _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island, bounded, count, lively, deep):
+    graph, factors, each, lines, rows = held.graph, held.factors, held.each, held.rows, reference(bounded)
     if len(rows.see):
-        _see(bodies, graph, factors, held.reply, rows, count)
+        _see(world, work, motion, graph, factors, held.reply, rows, count)
     for _ in range(BREAKS):
         share = 0.5
         while True:
-            _hold(bodies, rules, held, comps, lo, hi, rows, count, False)
+            _hold(world, work, motion, rules, held, comps, lo, hi, rows, count, False)
             for r in range(count):
                 c = rows.of[r]
                 if rows.kind[r] == NORMAL_ROW:
@@ -1142,9 +1086,9 @@ def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
                     if rows.grip[r] > 0.0:
                         system.row[c, 1, IMPULSE] = rows.impulse[r + 1]
                         system.row[c, 2, IMPULSE] = rows.impulse[r + 2]
-            if not lively or share < 0.0 or not _gains(rules, system, bodies.change, island):
+            if not lively or share < 0.0 or not _gains(rules, system, work.change, island):
                 break
-            _clear(graph, system, island, comps, lo, hi, bodies.change)
+            _clear(graph, system, island, comps, lo, hi, work.change)
             for r in range(count):
                 rows.impulse[r] = 0.0
                 c = rows.of[r]
@@ -1158,21 +1102,21 @@ def _solve_island(bodies, shift, rules, system, held, comps, lo, hi, island):
             struck = rows.kind[r] == STOP_ROW and rows.strong[r] == math.inf
             touched = touched or ((rows.kind[r] == NORMAL_ROW or struck) and rows.impulse[r] > 0.0)
         for i in range(lo, hi):
-            _told(bodies, rules, graph, each, lines, held.calm, comps[i], touched or deep)
+            _told(world, work, motion, rules, graph, each, lines, held.calm, comps[i], touched or deep)
         for r in range(count):
             if rows.kind[r] >= STOP_ROW:
-                _tell(bodies, rules, each, rows, r)
+                _tell(world, work, motion, rules, each, rows, r)
         broke = False
         for i in range(lo, hi):
             if _broken(graph, each, lines, comps[i]):
                 broke = True
-                _factor(bodies, rules, graph, factors, each, lines, comps[i])
+                _factor(world, work, motion, rules, graph, factors, each, lines, comps[i])
         if not broke:
             break
         # What broke has not held: all impulses are found once more.
-        _clear(graph, system, island, comps, lo, hi, bodies.change)
+        _clear(graph, system, island, comps, lo, hi, work.change)
         if len(rows.see):
-            _see(bodies, graph, factors, held.reply, rows, count)
+            _see(world, work, motion, graph, factors, held.reply, rows, count)
         for r in range(count):
             rows.impulse[r] = 0.0
             if rows.kind[r] >= STOP_ROW and each.state[rows.of[r], BROKEN] > 0.0:
@@ -1188,7 +1132,7 @@ def _seen(rows, count):
 
 
 @njit(**BARE)
-def _told(bodies, rules, graph, each, lines, calm, c, touched):
+def _told(world, work, motion, rules, graph, each, lines, calm, c, touched):
     """Write down what the rows that hold have done."""
     h, state = rules.substep_dt, each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
@@ -1196,13 +1140,13 @@ def _told(bodies, rules, graph, each, lines, calm, c, touched):
         if n >= 0:
             calm[n] = not touched
             if touched:
-                bodies.touching[n] = True
+                motion.touching[n] = True
             continue
         j = -1 - n
         a, b = each.body[j, 0], each.body[j, 1]
-        speed = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
-        state[j, SPEED] = speed + _reads_six(each.axis, j, 0, bodies.free, a, b)
-        state[j, SPEED] += _reads_six(each.axis, j, 0, bodies.change, a, b)
+        speed = _reads(each.axis[j, 0], motion, a, b)
+        state[j, SPEED] = speed + _reads_six(each.axis[j, 0], work.free, a, b)
+        state[j, SPEED] += _reads_six(each.axis[j, 0], work.change, a, b)
         for x in range(3):
             state[j, PULL + x] = state[j, TWIST + x] = state[j, DRIVE + x] = state[j, SOFT + x] = 0.0
         state[j, STOP] = state[j, FRESH] = 0.0
@@ -1212,36 +1156,31 @@ def _told(bodies, rules, graph, each, lines, calm, c, touched):
                 continue
             if lines.active[j, e] == 2:
                 state[j, SOFT + (e - 3 if each.kind[j] == BALL else 0)] = lines.impulse[j, e]
-            _add_pull(bodies.matrix, each, j, lines.line, j, e, lines.impulse[j, e] / h)
+            _add_pull(work.matrix, each, j, lines.line[j, e], lines.impulse[j, e] / h)
 
 
 @njit(**BARE)
-def _add_pull(matrix, each, j, line, i, e, force):
-    """Add what a row does to the force and the torque on the first body, about its anchor."""
-    pull = (line[i, e, 0], line[i, e, 1], line[i, e, 2])
-    twist = sub((line[i, e, 3], line[i, e, 4], line[i, e, 5]), cross(_arm(matrix, each.body, each.anchor, j, 0), pull))
+def _add_pull(matrix, each, j, row, force):
+    """Add what a row [12] does to the force and the torque on the first body, about its anchor."""
+    arm, _ = _arms(each, matrix, j)
+    pull = vector(row)
+    twist = sub((row[3], row[4], row[5]), cross(arm, pull))
     for x in range(3):
         each.state[j, PULL + x] += force * pull[x]
         each.state[j, TWIST + x] += force * twist[x]
 
 
 @njit(**BARE)
-def _tell(bodies, rules, each, rows, r):
+def _tell(world, work, motion, rules, each, rows, r):
     """Write down what a bounded row of a joint has done."""
     j, kind, impulse, h, state = rows.of[r], rows.kind[r], rows.impulse[r], rules.substep_dt, each.state
-    pull = (rows.row[r, 0], rows.row[r, 1], rows.row[r, 2])
-    twist = sub(
-        (rows.row[r, 3], rows.row[r, 4], rows.row[r, 5]), cross(_arm(bodies.matrix, each.body, each.anchor, j, 0), pull)
-    )
-    for x in range(3):
-        state[j, PULL + x] += impulse / h * pull[x]
-        state[j, TWIST + x] += impulse / h * twist[x]
+    _add_pull(work.matrix, each, j, rows.row[r], impulse / h)
     if kind == STOP_ROW:
         state[j, STOP] += rows.grip[r] * impulse
     elif kind == DRIVE_ROW:
         state[j, DRIVE] = impulse
         if rows.strong[r] > 0.0:
-            before = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, each.body[j, 0], each.body[j, 1])
+            before = _reads(each.axis[j, 0], motion, each.body[j, 0], each.body[j, 1])
             mean = 0.5 * (before + state[j, SPEED])
             own = impulse + (rows.grip[r] if mean > 0.0 else -rows.grip[r])
             state[j, DRIVE + 1] = min(max(own, -rows.strong[r]), rows.strong[r])
@@ -1272,14 +1211,14 @@ def _broken(graph, each, lines, c):
 
 
 @njit(**FAST)
-def _islands(bodies, parent, number, graph, where):
+def _islands(world, work, motion, graph, where):
     """Contacts and connected joints ordered by island: bodies that move, joined by both.
 
     Returns:
         start [I + 1] and order [C] of contacts, and the same of what joints connect, of which those that sleep are left
         out.
     """
-    connected = len(graph.comp) - 1
+    parent, number, connected = work.parent, work.number, len(graph.comp) - 1
     for k in range(len(graph.node)):
         if graph.node[k] >= 0:
             parent[graph.node[k]], number[graph.node[k]] = graph.node[k], -1
@@ -1294,11 +1233,11 @@ def _islands(bodies, parent, number, graph, where):
                 if own[c] >= 0:
                     join(parent, own[c], graph.node[k])
                 own[c] = graph.node[k]
-        if asleep(bodies.island, graph, c):
+        if asleep(motion.island, graph, c):
             own[c] = -1
     for c in range(len(where)):
         a, b = where[c, 2], where[c, 3]
-        if bodies.moves[a] and bodies.moves[b]:
+        if world.moves[a] and world.moves[b]:
             join(parent, a, b)
     islands = 0
     label, group = np.empty(len(where), np.int64), np.empty(connected, np.int64)
@@ -1329,7 +1268,9 @@ def _sorted(label, count):
             start[label[c] + 1] += 1
     for i in range(count):
         start[i + 1] += start[i]
-    fill, order = start[:-1].copy(), np.empty(len(label), np.int64)
+    fill, order = np.empty(count, np.int64), np.empty(len(label), np.int64)
+    for i in range(count):
+        fill[i] = start[i]
     for c in range(len(label)):
         if label[c] >= 0:
             order[fill[label[c]]] = c
@@ -1337,20 +1278,20 @@ def _sorted(label, count):
     return start, order
 
 
-@njit(**FAST)
+@njit(**FAST, inline="always")
 def solve_with_joints(world, work, motion, rules, manifolds, held):
     """Solve for the impulses of all contacts and joints, as `impulses.solve_contacts`, which it returns what of."""
-    bodies = _moving(world, work, motion)
     graph = held.graph
     found = _equations(world, work, motion, rules, manifolds)
-    start, order, begin, comps = _islands(bodies, work.parent, work.number, graph, found.where)
+    start, order, begin, comps = _islands(world, work, motion, graph, found.where)
     system = System(found.where, found.row, found.friction, found.wanted, found.pushed, found.calm, start, order)
+    equations = reference(system)
     for i in range(len(start) - 1):
         if begin[i + 1] > begin[i]:
-            _solve_island(bodies, work.shift, rules, system, held, comps, begin[i], begin[i + 1], np.int64(i))
+            _solve_island(world, work, motion, rules, equations, held, comps, begin[i], begin[i + 1], np.int64(i))
         else:
-            _solve(bodies.inverse_mass, rules, system, bodies.change, work.shift, np.int64(i))
-    remembered(manifolds, system)
+            _solve(world.inverse_mass, rules, equations, work.change, work.shift, np.int64(i))
+    remembered(manifolds, equations)
     return system
 
 
@@ -1384,7 +1325,7 @@ def _resting(touching, graph, c):
 
 
 @njit(**BARE)
-def _kick(bodies, rules, graph, each, lines, c, share):
+def _kick(world, work, motion, rules, graph, each, lines, c, share):
     """A share of what springs, damping, motors and friction have given in the last inner step, to velocities."""
     state = each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
@@ -1398,52 +1339,47 @@ def _kick(bodies, rules, graph, each, lines, c, share):
             impulse = share * (state[j, SOFT + e] + state[j, DRIVE + e])
             if impulse == 0.0:
                 continue
-            line, i, row = each.axis, j, 0
+            row = each.axis[j, 0]
             if each.kind[j] == BALL:
-                row = 3 + e
-                line = lines.line
-                _write_turn(line, j, row, _unit(e))
-            eased = _eased(
-                bodies.moves, bodies.inverse_mass, bodies.inverse, rules.rotation, line, i, row, a, b, lines.eased
-            )
+                row = lines.line[j, 3 + e]
+                _write_turn(row, _unit(e))
+            eased = _eased(world, work, rules, row, a, b, lines.eased[0])
             if each.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # of which the motor's work is told
-                before = _reads(line, i, row, bodies.velocity, bodies.angular, a, b)
+                before = _reads(row, motion, a, b)
                 state[j, GIVEN] += share * state[j, DRIVE + 1] * (before + 0.5 * impulse * eased)
             for s in range(2):
                 body = each.body[j, s]
-                if body >= 0 and bodies.moves[body]:
+                if body >= 0 and world.moves[body]:
                     for x in range(3):
-                        bodies.velocity[body, x] += impulse * lines.eased[0, 12 + 6 * s + x]
-                        bodies.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
+                        motion.velocity[body, x] += impulse * lines.eased[0, 12 + 6 * s + x]
+                        motion.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
 
 
-@njit(**FAST)
+@njit(**FAST, inline="always")
 def begin_step(world, work, motion, rules, held):
     """Velocities at an instant become those of the inner step before it, see `advance._shifted`. Where nothing is known
     of impulses they are found first."""
-    bodies = _moving(world, work, motion)
     graph, each, lines = held.graph, held.each, held.rows
     fresh = False
     for j in range(len(each.body)):
         each.state[j, GIVEN] = 0.0
         fresh = fresh or each.state[j, FRESH] > 0.0
     for c in range(len(graph.comp) - 1):
-        if not asleep(bodies.island, graph, c):
+        if not asleep(motion.island, graph, c):
             _ready(world, work, rules, graph, c, 1.0)
     if fresh:
         _find_first(world, work, motion, rules, held)
     for c in range(len(graph.comp) - 1):
-        if not asleep(bodies.island, graph, c) and not _resting(bodies.touching, graph, c):
+        if not asleep(motion.island, graph, c) and not _resting(motion.touching, graph, c):
             for k in range(graph.comp[c], graph.comp[c + 1]):
                 if graph.node[k] < 0:
-                    _coordinate(each, bodies.position, bodies.matrix, -1 - graph.node[k])
-            _kick(bodies, rules, graph, each, lines, c, -0.5)
+                    _coordinate(each, motion.position, work.matrix, -1 - graph.node[k])
+            _kick(world, work, motion, rules, graph, each, lines, c, -0.5)
 
 
 @njit(**FAST)
 def _find_first(world, work, motion, rules, held):
     """The impulses of joints that nothing is known of, as if there were no contact."""
-    bodies = _moving(world, work, motion)
     graph, each = held.graph, held.each
     from_contacts = System(
         np.empty((0, 4), np.int64), np.empty((0, 3, WIDTH)), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)),
@@ -1455,53 +1391,59 @@ def _find_first(world, work, motion, rules, held):
         fresh = False
         for k in range(graph.comp[c], graph.comp[c + 1]):
             fresh = fresh or (graph.node[k] < 0 and each.state[-1 - graph.node[k], FRESH] > 0.0)
-        if not fresh or asleep(bodies.island, graph, c):
+        if not fresh or asleep(motion.island, graph, c):
             continue
         one[0] = c
-        _solve_island(bodies, work.shift, rules, from_contacts, held, one, np.int64(0), np.int64(1), np.int64(0))
+        _solve_island(
+            world, work, motion, rules, reference(from_contacts), held, one, np.int64(0), np.int64(1), np.int64(0)
+        )
         for k in range(graph.comp[c], graph.comp[c + 1]):
             if graph.node[k] >= 0:
-                bodies.touching[graph.node[k]] = False
+                motion.touching[graph.node[k]] = False
             else:
                 each.state[-1 - graph.node[k], GIVEN] = 0.0
 
 
-@njit(**FAST)
+@njit(**BARE)
+def _hold_steady(world, work, motion, rules, held, one, bounded, count):
+    rows = reference(bounded)
+    if len(rows.see):
+        _see(world, work, motion, held.graph, held.factors, held.reply, rows, count)
+    _hold(world, work, motion, rules, held, one, np.int64(0), np.int64(1), rows, count, True)
+
+
+@njit(**FAST, inline="always")
 def end_step(world, work, motion, rules, held):
     """Velocities of the last inner step become those at its end, which joints let be."""
-    bodies = _moving(world, work, motion)
-    graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
+    graph, each, lines = held.graph, held.each, held.rows
     one = np.empty(1, np.int64)
     for c in range(len(graph.comp) - 1):
-        if not asleep(bodies.island, graph, c):
+        if not asleep(motion.island, graph, c):
             _ready(world, work, rules, graph, c, 0.0)
     assemble(world, work, motion, rules, held, False)
     for c in range(len(graph.comp) - 1):
-        if asleep(bodies.island, graph, c) or _resting(bodies.touching, graph, c):
+        if asleep(motion.island, graph, c) or _resting(motion.touching, graph, c):
             continue
-        _kick(bodies, rules, graph, each, lines, c, 0.5)
+        _kick(world, work, motion, rules, graph, each, lines, c, 0.5)
         one[0] = c
         rows = _room(np.int64(2 * (graph.comp[c + 1] - graph.comp[c])))
-        count = _limited(bodies, rules, graph, each, c, rows, np.int64(0), True)
-        rows = _seen(rows, count if count <= DENSE else 0)
-        if len(rows.see):
-            _see(bodies, graph, factors, held.reply, rows, count)
-        _hold(bodies, rules, held, one, np.int64(0), np.int64(1), rows, count, True)
+        count = _limited(world, work, motion, rules, graph, each, c, reference(rows), np.int64(0), True)
+        _hold_steady(world, work, motion, rules, held, one, _seen(rows, count if count <= DENSE else 0), count)
         for k in range(graph.comp[c], graph.comp[c + 1]):
             n = graph.node[k]
             if n >= 0:
                 for x in range(3):
-                    bodies.velocity[n, x] += bodies.change[n, x]
+                    motion.velocity[n, x] += work.change[n, x]
                     if rules.rotation:
-                        bodies.angular[n, x] += bodies.change[n, 3 + x]
+                        motion.angular[n, x] += work.change[n, 3 + x]
             else:
                 j = -1 - n
                 a, b = each.body[j, 0], each.body[j, 1]
-                speed = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
-                each.state[j, SPEED] = speed + _reads_six(each.axis, j, 0, bodies.change, a, b)
+                speed = _reads(each.axis[j, 0], motion, a, b)
+                each.state[j, SPEED] = speed + _reads_six(each.axis[j, 0], work.change, a, b)
     for j in range(len(each.body)):
         a, b = each.body[j, 0], each.body[j, 1]
-        each.state[j, SPEED] = _reads(each.axis, j, 0, bodies.velocity, bodies.angular, a, b)
+        each.state[j, SPEED] = _reads(each.axis[j, 0], motion, a, b)
 
 
 @njit(**BARE)

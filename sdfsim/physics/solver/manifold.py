@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from sdfsim.physics.solver.clipping import Polygons, polygons_room
 from sdfsim.physics.solver.convex import Simplex, simplex_room
 from sdfsim.physics.solver.distance import KIND, SIZE, SPHERE
-from sdfsim.physics.solver.vectors import BARE, FAST, add, along, dot, get, scale, sub, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, add, along, dot, get, scale, sub, turn, turn_back
 from sdfsim.physics.solver.world import (
     COLUMNS,
     FIRST,
@@ -55,7 +56,7 @@ class Scratch(NamedTuple):
     polygons: Polygons
 
 
-@njit(**FAST)
+@register_jitable
 def scratch_room():
     most = FOUND + POINTS
     return Scratch(
@@ -66,6 +67,15 @@ def scratch_room():
         np.empty(most, np.int64),
         simplex_room(), polygons_room(),
     )  # fmt: skip
+
+
+@njit(**BARE)
+def points_of(manifolds, pairs):
+    """How many points the manifolds of the first so many pairs have."""
+    total = 0
+    for m in range(pairs):
+        total += manifolds.count[m]
+    return total
 
 
 @njit(**BARE)

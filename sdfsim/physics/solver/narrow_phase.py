@@ -25,7 +25,6 @@ from sdfsim.physics.solver.distance import (
     SIZE,
     SPHERE,
     distance_alone,
-    solids,
 )
 from sdfsim.physics.solver.manifold import (
     FOUND,
@@ -37,6 +36,7 @@ from sdfsim.physics.solver.manifold import (
     thinned,
     write,
 )
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.surface_distance import (
     KEYS,
     at_least,
@@ -98,7 +98,7 @@ class Near(NamedTuple):
 
 
 @njit(**FAST)
-def broad_phase(shapes, world, work, motion, rules, span, old):
+def broad_phase(shapes, world, work, motion, rules, span, old, surfaces, threads):
     """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
 
     Of `work` it sets how far each body may go until it must be looked around again, and who has somebody near.
@@ -109,7 +109,7 @@ def broad_phase(shapes, world, work, motion, rules, span, old):
     swept(world, work, motion, rules, span)
     pairs = near_pairs(world, motion, work.low, work.high)
     manifolds = carried(world, motion, pairs, old)
-    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin)
+    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin, surfaces, threads)
     for p in range(len(pairs)):
         if near.count[p, 0] + near.count[p, 1] > 0:
             work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True
@@ -119,7 +119,7 @@ def broad_phase(shapes, world, work, motion, rules, span, old):
 @njit(**BARE)
 def pair_kind(shapes, s, t):
     """How two shapes are looked at."""
-    table, start = shapes.table, shapes.piece_start
+    table, start = shapes.table, shapes.solids.start
     one, other = is_round(table, s), is_round(table, t)
     first, second = start[s + 1] > start[s], start[t + 1] > start[t]
     if one or other:
@@ -132,8 +132,8 @@ def pair_kind(shapes, s, t):
     return SOLIDS if (first or table[s, KIND] == PLANE) and (second or table[t, KIND] == PLANE) else SURFACES
 
 
-@njit(**FAST)
-def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
+@njit(**FAST, inline="always")
+def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, threads):
     """What of P pairs is nearer than the bodies may go; [N] `ways` of each."""
     count = len(pairs)
     start = np.zeros((count, 2), np.int64)
@@ -147,40 +147,37 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
             if way == SURFACES and not is_round(shapes.table, own):
                 total += shapes.clump_leaf[shapes.clump_start[own + 1]] - shapes.clump_leaf[shapes.clump_start[own]]
             elif way == SOLIDS and side == 0:
-                pieces = shapes.piece_start[s + 1] - shapes.piece_start[s]
-                total += pieces * max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
+                pieces = shapes.solids.start[s + 1] - shapes.solids.start[s]
+                total += pieces * max(1, shapes.solids.start[t + 1] - shapes.solids.start[t])
     wide = 0
     for leaf in range(len(shapes.leaf_node) - 1):
         wide = max(wide, shapes.leaf_node[leaf + 1] - shapes.leaf_node[leaf])
     near = Near(
         start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total), np.zeros((total, 3)),
-        np.full(count, -math.inf), np.full(count, -math.inf), np.empty(total, np.int32), np.empty(total * wide),
+        np.empty(count), np.empty(count), np.empty(total, np.int32), np.empty(total * wide),
         np.empty(total, np.bool_), np.empty((total, 3)), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
-    _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, world.threads)
+    for p in range(count):
+        near.looked[p] = near.away_all[p] = -math.inf
+    parts = reference(near)
+    if threads is not None:  # known when it is compiled
+        if len(pairs) >= MANY:
+            _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts, surfaces)
+            return near
+    for p in range(len(pairs)):
+        _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p, surfaces)
     return near
 
 
-@njit(**INLINED)
-def _near_all(shapes, world, motion, matrix, pairs, ways, reach, near, threads):
-    if threads.ndim > 1:  # known when it is compiled
-        if len(pairs) >= MANY:
-            _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
-            return
-    for p in range(len(pairs)):
-        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
-
-
 @njit(parallel=True, **FAST)
-def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near):
+def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near, surfaces):
     for i in prange(len(pairs)):
         p = np.int64(i)  # that of a parallel loop is unsigned, for which all would be compiled once more
-        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
+        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces)
 
 
 @njit(**BARE)
-def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
-    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces):
     a, b = pairs[p, 0], pairs[p, 1]
     most = ways[a] + ways[b] + reach
     way = pair_kind(shapes, world.shape[a], world.shape[b])
@@ -193,11 +190,19 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
         other = b if one == a else a
         w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         k = world.scale[other]
-        d = distance_alone(table, brick, sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
+        d = distance_alone(shapes.table, shapes.brick, shapes.sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
         s = world.shape[one]
         size = (shapes.table[s, SIZE] + shapes.table[s, SIZE + 1]) * world.scale[one]
         near.count[p, 0] = 1 if d * k - size <= most else 0
         return
+    if surfaces is not None:
+        _near_leaves(shapes, world, motion, matrix, pairs, most, near, p)
+
+
+@njit(**BARE)
+def _near_leaves(shapes, world, motion, matrix, pairs, most, near, p):
+    """The leaves of either surface that are near the other."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
     for side in range(2):
         one, other = pairs[p, side], pairs[p, 1 - side]
         s, t = world.shape[one], world.shape[other]
@@ -227,7 +232,7 @@ def origin(position, matrix, coms, body):
 @njit(**BARE)
 def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
     """The pairs of convex pieces whose balls are near each other."""
-    convex = solids(shapes)
+    convex = shapes.solids
     s, t = world.shape[a], world.shape[b]
     offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
     plane, up = shapes.table[t, KIND] == PLANE, turn(matrix, b, (0.0, 0.0, 1.0))
@@ -257,40 +262,44 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
     near.count[p, 0] = at - near.start[p, 0]
 
 
-@njit(**BARE)
-def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
+@njit(**BARE, inline="always")
+def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, surfaces, threads):
     """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
 
     `gone` [N] is how far any point of a body may have moved since `near` was made.
     """
-    _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, world.threads)
-
-
-@njit(**INLINED)
-def _collide_all(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, threads):
-    if threads.ndim > 1:  # known when it is compiled
+    if threads is not None:  # known when it is compiled
         if len(near.start) >= MANY:
-            _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
+            _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, surfaces)
             return
-    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1))
+    _collide_some(
+        shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, np.int64(0), np.int64(1), surfaces
+    )
 
 
 @njit(parallel=True, **FAST)
-def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
+def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, surfaces):
     for i in prange(SHARES):
-        t, scratch = np.int64(i), scratch_room()
-        _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, t, np.int64(SHARES))
+        _collide_share(
+            shapes, world, motion, matrix, rules, manifolds, near, gone, scratch_room(), np.int64(i), surfaces
+        )
 
 
 @njit(**BARE)
-def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, step):
+def _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, surfaces):
+    room = reference(scratch)
+    _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, room, first, np.int64(SHARES), surfaces)
+
+
+@njit(**BARE)
+def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, step, surfaces):
     """Every so many pairs, from the first on."""
     for p in range(first, len(near.start), step):
-        _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+        _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p, surfaces)
 
 
-@njit(**INLINED)
-def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p):
+@njit(**BARE, inline="always")
+def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p, surfaces):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     if near.count[p, 0] + near.count[p, 1] == 0:
         manifolds.count[p] = 0
@@ -314,6 +323,14 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
             count = first_to_touch(rules, scratch.found, count)
         manifolds.count[p] = renewed(rules, manifolds.point, p, known, scratch, count)
         return
+    if surfaces is not None:
+        _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, went, since, first, scratch, p)
+
+
+@njit(**BARE)
+def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, went, since, first, scratch, p):
+    """The manifold of a pair of which at least one is neither convex nor made of convex pieces."""
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     known = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
     manifolds.count[p] = known
     # Numbers of one type, or all would be compiled once more.
@@ -405,7 +422,7 @@ def _approach_margin(world, motion, rules, a, b):
 @njit(**BARE)
 def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p):
     """The points at which the convex pieces of two bodies touch or may soon; how many."""
-    convex, found, polygons = solids(shapes), scratch.found, scratch.polygons
+    convex, found, polygons = shapes.solids, scratch.found, scratch.polygons
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
     offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
@@ -506,12 +523,12 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
 
 
 @njit(**BARE)
-def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh, room):
+def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh, room, surfaces):
     """The least distance of pair p with its two bodies at `place` and `frame`, of the parts that were near; `least`
     where all are farther, and any that is less than `enough`. `went` is how much nearer two points may have come since
     `near` was made; whether the poses are those of the bodies, so that `near` may take up how far parts are
     (`refresh`)."""
-    table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, solids(shapes)
+    table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, shapes.solids
     s, t = shape[pairs[p, 0]], shape[pairs[p, 1]]
     way = pair_kind(shapes, s, t)
     if way == SOLIDS:
@@ -539,34 +556,48 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
         return least
     for side in range(2):
         s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
-        w, c = map_between(place, frame, scales, coms, side, 1 - side)
-        k = scales[1 - side]
         if is_round(table, s) and way == ROUND:
-            half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
+            w, c = map_between(place, frame, scales, coms, side, 1 - side)
+            k, half = scales[1 - side], table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
             for e in range(-2, 3):
                 d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
-        elif near.count[p, side] > 0 and not is_round(table, s):
-            first, last = near.start[p, side], near.start[p, side] + near.count[p, side]
-            front = first
-            if refresh:
-                for i in range(first, last):
-                    if near.away[i] - went < least:
-                        near.away[i] = went + beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
-                        front = i if near.away[i] < near.away[front] else front
-            # The nearest leaf first: the others are then seldom near enough to be looked into.
-            for n in range(first - 1, last):
-                i = front if n < first else n
-                if n == front or near.away[i] - went >= least:
-                    continue
-                e = near.leaf[i]
-                if refresh or beyond(shapes, t, w, c, k, scales[side], e) < least:
-                    there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
-                    for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
-                        p_u = get(shapes.node, u)
-                        if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
-                            d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
-                            least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
-                    if least < enough:
-                        return least
+        elif surfaces is not None:
+            if way == SURFACES and near.count[p, side] > 0 and not is_round(table, s):
+                least = _nearest_node(
+                    shapes, s, t, place, frame, scales, coms, side, near, p, went, least, enough, refresh
+                )
+                if least < enough:
+                    return least
+    return least
+
+
+@njit(**BARE)
+def _nearest_node(shapes, s, t, place, frame, scales, coms, side, near, p, went, least, enough, refresh):
+    """`nearest` of the nodes of one body's near leaves to the other."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    w, c = map_between(place, frame, scales, coms, side, 1 - side)
+    k = scales[1 - side]
+    first, last = near.start[p, side], near.start[p, side] + near.count[p, side]
+    front = first
+    if refresh:
+        for i in range(first, last):
+            if near.away[i] - went < least:
+                near.away[i] = went + beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
+                front = i if near.away[i] < near.away[front] else front
+    # The nearest leaf first: the others are then seldom near enough to be looked into.
+    for n in range(first - 1, last):
+        i = front if n < first else n
+        if n == front or near.away[i] - went >= least:
+            continue
+        e = near.leaf[i]
+        if refresh or beyond(shapes, t, w, c, k, scales[side], e) < least:
+            there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
+            for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
+                p_u = get(shapes.node, u)
+                if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
+                    d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
+                    least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
+            if least < enough:
+                return least
     return least

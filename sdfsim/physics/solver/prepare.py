@@ -21,8 +21,9 @@ from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.physics.solver.edges import nodes_within
 from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows, Trial
+from sdfsim.physics.solver.manifold import scratch_room
 from sdfsim.physics.solver.record import Edges
-from sdfsim.physics.solver.run import Kept, Script, run_steps
+from sdfsim.physics.solver.run import HELD, NOTE, SURFACES, THREADS, Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.physics.validity import NO_LIMITS, Fault, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -50,7 +51,6 @@ class Compiled:
     their compiled `shapes`."""
 
     def __init__(self, bodies: Bodies, state: State, shapes: kinds.Shapes | None = None) -> None:
-        warn_compiling(run_steps, "the contact step", "two minutes")
         self.bodies = bodies
         self.shapes = shapes or compiled_shapes(bodies.contact)
         self.place(state)
@@ -58,7 +58,8 @@ class Compiled:
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
         self.world = compiled_world(self.bodies, state, self.shapes)
-        if self.world.threads.ndim > 1:
+        self.threads = True if np.count_nonzero(self.world.moves) >= CROWD else None
+        if self.threads:
             numba.get_num_threads()  # starts them: code that was kept takes it that they run
         n = len(self.bodies)
         self.work = compiled.Work(
@@ -67,23 +68,43 @@ class Compiled:
             part=np.ones(n), ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
+            scratch=scratch_room(),
         )  # fmt: skip
         self.held = held_by(self.bodies)
+        # Threads are not for one kind of pairs alone.
+        self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
+        self._announced: set[bool] = set()  # with and without what contacts did
         self._load: np.ndarray | None = None
         self._latest: State | None = None  # what `_motion` and `_manifolds` are the arrays of
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules, steps: int = 1,
-        script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, keep: bool = False,
+        script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, note: bool = False, keep: bool = False,
     ) -> tuple[Any, ...]:  # fmt: skip
-        """So many steps: `motion` is written to. Returns what `run_steps` does, and last what is kept of each."""
+        """So many steps: `motion` is written to. `note`: whether what contacts did is wanted. Returns what `run_steps`
+        does, and last what is kept of each."""
         n, count = steps if keep else 0, len(self.bodies)
+        joints = 0 if self.held is None else len(self.held.each.body)
         kept = Kept(
             np.empty((n, count, 3)), np.empty((n, count, 4)), np.empty((n, count, 3)), np.empty((n, count, 3)),
-            np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, len(self.held.each.body), 7)),
+            np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, joints, 7)),
         )  # fmt: skip
+        if note not in self._announced:
+            self._announced.add(note)
+            _announce(joints > 0, self.surfaces is not None, self.threads is not None, note)
         # An integer of another kind would be compiled for anew.
-        bodies = (self.shapes, self.world, self.work, motion, rules, manifolds, self.held)
+        bodies = (
+            self.shapes,
+            self.world,
+            self.work,
+            motion,
+            rules,
+            manifolds,
+            self.held,
+            self.surfaces,
+            self.threads,
+            note or None,
+        )
         return *run_steps(*bodies, script, most, kept, TOUCHING, int(steps)), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
@@ -92,12 +113,13 @@ class Compiled:
         if state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
-            if state.joints is not None and self.bodies.joints is not None:
+            if self.held is not None:
                 each = self.held.each
-                each.state[:] = state.joints
-                each.number[:], each.state[:, joint_columns.TARGET] = jointed.driven(
-                    self.bodies.joints, state.joints, state.drive
-                )
+                each.state[:] = 0.0 if state.joints is None else state.joints
+                if state.joints is not None and self.bodies.joints is not None:
+                    each.number[:], each.state[:, joint_columns.TARGET] = jointed.driven(
+                        self.bodies.joints, state.joints, state.drive
+                    )
         if state.load is not self._load:
             self.work.wrench[:] = 0.0 if state.load is None else state.load
             self._load = state.load
@@ -105,7 +127,7 @@ class Compiled:
         script, time = _script(self.bodies.tracks, state.time, rules.substep_dt * rules.substeps, steps)
         self._latest = None  # where the rest of this does not come to its end
         manifolds, edges, counts, done, body, wrong, before, given, pair, point, kept = self.run(
-            motion, self._manifolds, rules, steps, script, most, keep=keep
+            motion, self._manifolds, rules, steps, script, most, note=options.record, keep=keep
         )
         fault = None
         if body >= 0:
@@ -128,13 +150,22 @@ class Compiled:
         )  # fmt: skip
         arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
         moved = {name: array[rows] for name, array in zip(MOTION, arrays, strict=True)}
-        known = None
-        if state.joints is not None:
+        known = state.joints
+        if self.held is not None and state.joints is not None:
             known = self.held.each.state.copy()
             known[:, joint_columns.TARGET] = state.joints[:, joint_columns.TARGET]  # as `driven` was told it
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         asleep = int((motion.island[rows] >= 0).sum())
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
+
+
+def _announce(joints: bool, surfaces: bool, threads: bool, note: bool) -> None:
+    """Tell that the step is about to be compiled for such scenes, where it is."""
+    words = {"joints": joints, "hollow shapes": surfaces and not threads, "many bodies": threads, "a network": note}
+    given = [word for word, some in words.items() if some]
+    what = "the contact step" + (f" for scenes with {', '.join(given)}" if given else "")
+    missing = {HELD: not joints, SURFACES: not surfaces, THREADS: not threads, NOTE: not note}
+    warn_compiling(run_steps, what, "two minutes" if joints else "a minute", missing)
 
 
 @dataclass(frozen=True)
@@ -231,7 +262,7 @@ def compiled_rules(options: Options) -> compiled.Rules:
     return compiled.Rules(
         gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,
         options.restitution, options.rotation, options.sleep, options.margin, options.adds, options.cone,
-        options.record, ahead=ahead, slop=min(SLOP, SLOP_A_TIME * inner), rounds=rounds,
+        ahead=ahead, slop=min(SLOP, SLOP_A_TIME * inner), rounds=rounds,
     )  # fmt: skip
 
 
@@ -244,13 +275,17 @@ def _manifolds(touch: Touch | None) -> compiled.Manifolds:
     return compiled.Manifolds(touch.pair, touch.count, touch.point)
 
 
+def meet_as_surfaces(shapes: Sequence[ContactGeometry]) -> bool:
+    """Whether any is: where all are convex, or made of convex pieces, they collide as solids."""
+    return any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
+
+
 def compiled_shapes(shapes: Sequence[ContactGeometry]) -> kinds.Shapes:
     """The shapes of a scene, baked where they have no closed form."""
     table = np.zeros((len(shapes), kinds.FIELDS))
     table[:, kinds.CELL], table[:, kinds.PATCH] = 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
-    # Where all shapes are convex, or made of convex pieces, none is met as a surface.
-    met = any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
+    met = meet_as_surfaces(shapes)
     surfaces = [shape.surface if met else NO_SURFACE for shape in shapes]
     for row, shape, surface in zip(table, shapes, surfaces, strict=True):
         row[kinds.THICKNESS] = shape.thickness
@@ -271,8 +306,7 @@ def compiled_shapes(shapes: Sequence[ContactGeometry]) -> kinds.Shapes:
             sample.append(grid.fine.reshape(-1))
     arrays = (np.concatenate(parts) for parts in (brick, sample))
     solids = [shape.solids for shape in shapes]
-    parts = (table, *arrays, *_joined(surfaces), np.concatenate(label), *_packed(solids))
-    return kinds.Shapes(*parts)
+    return kinds.Shapes(table, *arrays, *_joined(surfaces), label=np.concatenate(label), solids=_packed(solids))
 
 
 def _joined(surfaces: list[ContactSurface]) -> tuple[np.ndarray, ...]:
@@ -362,17 +396,16 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
         apart=np.zeros(0, np.int64) if bodies.joints is None else jointed.apart(bodies.joints, len(bodies)),
-        threads=np.zeros((0, 0) if np.count_nonzero(moves) >= CROWD else 0),
     )  # fmt: skip
 
 
-def held_by(bodies: Bodies) -> Held:
-    """The joints of a scene, with room for what an inner step makes of them."""
-    empty = np.zeros((0, 3))
-    joints = bodies.joints or jointed.joints_of((), empty, length=1.0, time=1.0, mass=1.0)
+def held_by(bodies: Bodies) -> Held | None:
+    """The joints of a scene, with room for what an inner step makes of them; None where there is none."""
+    joints = bodies.joints
+    if joints is None or not len(joints):
+        return None
     order = jointed.ordered(joints, bodies.moves)
-    j, k, f = len(joints), len(order.node), len(order.row)
-    n = len(bodies) if j else 0
+    n, j, k, f = len(bodies), len(joints), len(order.node), len(order.row)
 
     def room(*shape: int) -> np.ndarray:
         return np.zeros(shape)

@@ -7,7 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.solver.broad_phase import order_of
 from sdfsim.physics.solver.impulses import IMPULSE, met_half_way
+from sdfsim.physics.solver.manifold import points_of
 from sdfsim.physics.solver.vectors import BARE, FAST, get, sub, turn
 from sdfsim.physics.solver.world import GAP, NORMAL, NORMAL_IMPULSE, TANGENTIAL
 
@@ -34,11 +36,14 @@ def no_edges():
 @njit(**FAST)
 def noted(motion, matrix, manifolds, system, when, edges):
     """The edges with those contacts of an inner step that acted; `when` is the part of the step that was over."""
-    acted = np.flatnonzero(system.row[:, 0, IMPULSE] > 0.0)
-    edges, e = _longer(edges, len(acted))
-    for c in acted:
-        _put(motion, matrix, manifolds, system.where[c, 0], system.where[c, 1], when, edges, e)
-        e += 1
+    acted = 0
+    for c in range(len(system.where)):
+        acted += system.row[c, 0, IMPULSE] > 0.0
+    edges, e = _longer(edges, acted)
+    for c in range(len(system.where)):
+        if system.row[c, 0, IMPULSE] > 0.0:
+            _put(motion, matrix, manifolds, system.where[c, 0], system.where[c, 1], when, edges, e)
+            e += 1
     return edges
 
 
@@ -49,22 +54,24 @@ def gathered(world, motion, matrix, manifolds, pairs, when, edges):
     Args:
         pairs: of how many manifolds, the first ones, bodies are near.
     """
-    edges, e = _longer(edges, manifolds.count[:pairs].sum())
+    edges, e = _longer(edges, points_of(manifolds, pairs))
     for m in range(pairs):
         for k in range(manifolds.count[m]):
             if manifolds.point[m, k, NORMAL_IMPULSE] == 0.0:
                 _put(motion, matrix, manifolds, m, k, when, edges, e)
                 e += 1
-    key = edges.pair[:e, 0] * len(world.shape) + edges.pair[:e, 1]
+    key = np.empty(e)
+    for i in range(e):
+        key[i] = edges.pair[i, 0] * len(world.shape) + edges.pair[i, 1]
     whole = Edges(np.empty((e, 2), np.int64), np.empty((e, WIDTH)))
     kept = first = last = 0
-    for e in np.argsort(key, kind="mergesort"):
+    for e in order_of(key):
         if key[e] != key[last]:
             first = kept
         last = e
         twin = _twin(whole.value, first, kept, edges.value, e)
         if twin < 0:
-            whole.pair[kept], whole.value[kept] = edges.pair[e], edges.value[e]
+            _carry(edges, e, whole, kept)
             kept += 1
         elif edges.value[e, WEIGHT] > 0.0:
             _merge(whole.value, twin, edges.value, e)
@@ -76,8 +83,16 @@ def _longer(edges, more):
     """The edges with room for `more` behind them, and how many there were."""
     count = len(edges.pair)
     longer = Edges(np.empty((count + more, 2), np.int64), np.empty((count + more, WIDTH)))
-    longer.pair[:count], longer.value[:count] = edges.pair, edges.value
+    for e in range(count):
+        _carry(edges, e, longer, e)
     return longer, count
+
+
+@njit(**BARE)
+def _carry(edges, e, to, k):
+    to.pair[k, 0], to.pair[k, 1] = edges.pair[e, 0], edges.pair[e, 1]
+    for x in range(WIDTH):
+        to.value[k, x] = edges.value[e, x]
 
 
 @njit(**BARE)

@@ -11,9 +11,11 @@ from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
 from sdfsim.physics.solver.joints import given, stored
 from sdfsim.physics.solver.record import no_edges
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.survey import broken, energy, touching
-from sdfsim.physics.solver.vectors import BARE, ENTRY, add, dot, get, put, sub
+from sdfsim.physics.solver.vectors import BARE, ENTRY, FAST, add, dot, get, put, sub
 
+HELD, SURFACES, THREADS, NOTE = 6, 7, 8, 9  # the places of those arguments of `run_steps` that may be None
 ROOM = 64  # contact points that a recording has room for at first
 
 
@@ -39,11 +41,17 @@ class Kept(NamedTuple):
 
 
 @njit(**ENTRY, nogil=True)
-def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most, kept, within, steps):
+def run_steps(
+    shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, most, kept, within, steps
+):
     """Advance `motion`, and what `held` knows of joints, by so many steps, in place; the first state that cannot be
     ends it early.
 
     Args:
+        held: None where no joint holds bodies. What asks for what is None is not compiled.
+        surfaces: True where shapes may meet as surfaces, else None.
+        threads: True where there may be so many pairs that they are worth their while, else None.
+        note: True where what contacts did in the step is wanted, see `record`, else None.
         most: [5] what a state may be, see `survey.broken`.
         within: bodies that are no farther apart touch.
 
@@ -53,6 +61,8 @@ def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most,
         it; where that body was before that step; what pulls have given; and of all steps that are kept, one after the
         other, the pairs of bodies that touch [C, 2] and the points [C, 3] where they do.
     """
+    shapes, world, work = reference(shapes), reference(world), reference(work)
+    motion, rules, told = reference(motion), reference(rules), reference(kept)
     going, dt = world.going, rules.substep_dt * rules.substeps
     place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
     pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
@@ -65,7 +75,7 @@ def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most,
         for i in range(len(going)):
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
-        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds, held)
+        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note)
         for s in range(len(script.body)):
             b = script.body[s]
             for x in range(3):
@@ -80,33 +90,65 @@ def run_steps(shapes, world, work, motion, rules, manifolds, held, script, most,
                 )
                 if wrong >= 0:
                     return manifolds, edges, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
-        pulled = _pulled(going, work.wrench, motion, place, spin, dt) + given(held.each)
+        pulled = _pulled(going, work.wrench, motion, place, spin, dt)
+        if held is not None:
+            pulled += given(held.each)
         total += pulled
         if len(kept.depth):
-            kept.position[k], kept.orientation[k] = motion.position, motion.orientation
-            kept.velocity[k], kept.angular_velocity[k] = motion.velocity, motion.angular
-            kept.energy[k, 0], kept.energy[k, 1] = _energies(world, motion, rules)
-            kept.energy[k, 1] += stored(held.each)
-            for j in range(len(held.each.body)):
-                kept.joint[k, j, 0] = held.each.state[j, COORD]
-                for x in range(6):
-                    kept.joint[k, j, 1 + x] = held.each.state[j, PULL + x]
-            kept.energy[k, 2] = pulled
+            _keep(told, k, world, motion, rules, counts, pulled)
+            if held is not None:
+                _keep_joints(told, k, held.each)
             here = touching(manifolds, motion.position, motion.orientation, within)
-            while found + len(here.pair) > len(pair):
-                pair, point = np.concatenate((pair, pair)), np.concatenate((point, point))
-            pair[found : found + len(here.pair)], point[found : found + len(here.pair)] = here.pair, here.point
-            found += len(here.pair)
-            for x in range(3):
-                kept.count[k, x] = counts[x]
-            asleep = 0
-            for b in going:
-                asleep += motion.island[b] >= 0
-            kept.count[k, 3], kept.count[k, 4] = asleep, len(here.pair)
-            kept.depth[k] = 0.0
-            for gap in here.gap:
-                kept.depth[k] = max(kept.depth[k], -gap)
+            pair, point = _with_room(pair, point, found, found + len(here.pair))
+            told.count[k, 4], told.depth[k] = len(here.pair), 0.0
+            for e in range(len(here.pair)):
+                pair[found, 0], pair[found, 1] = here.pair[e, 0], here.pair[e, 1]
+                put(point, found, get(here.point, e))
+                told.depth[k] = max(told.depth[k], -here.gap[e])
+                found += 1
     return manifolds, edges, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
+
+
+@njit(**BARE)
+def _keep(kept, k, world, motion, rules, counts, pulled):
+    """What is kept of step k, but for joints and where bodies touch."""
+    for b in range(len(motion.position)):
+        for x in range(3):
+            kept.position[k, b, x], kept.velocity[k, b, x] = motion.position[b, x], motion.velocity[b, x]
+            kept.angular_velocity[k, b, x] = motion.angular[b, x]
+        for x in range(4):
+            kept.orientation[k, b, x] = motion.orientation[b, x]
+    kept.energy[k, 0], kept.energy[k, 1] = _energies(world, motion, rules)
+    kept.energy[k, 2] = pulled
+    for x in range(3):
+        kept.count[k, x] = counts[x]
+    kept.count[k, 3] = 0
+    for b in world.going:
+        kept.count[k, 3] += motion.island[b] >= 0
+
+
+@njit(**BARE)
+def _keep_joints(kept, k, each):
+    kept.energy[k, 1] += stored(each)
+    for j in range(len(each.body)):
+        kept.joint[k, j, 0] = each.state[j, COORD]
+        for x in range(6):
+            kept.joint[k, j, 1 + x] = each.state[j, PULL + x]
+
+
+@njit(**FAST)
+def _with_room(pair, point, count, wanted):
+    """Pairs [P, 2] and points [P, 3], of which `count` count, with room for as many as are wanted."""
+    room = len(pair)
+    if wanted <= room:
+        return pair, point
+    while room < wanted:
+        room *= 2
+    pairs, points = np.empty((room, 2), np.int64), np.empty((room, 3))
+    for e in range(count):
+        pairs[e, 0], pairs[e, 1] = pair[e, 0], pair[e, 1]
+        put(points, e, get(point, e))
+    return pairs, points
 
 
 @njit(**BARE)

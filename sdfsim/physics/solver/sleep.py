@@ -36,18 +36,17 @@ def woken(world, motion, manifolds, near):
 
 
 @njit(**FAST)
-def put_to_sleep(world, motion, rules, manifolds, of_node, joint):
-    """Freeze the islands all of which have stayed where they were for long enough; joints join as contacts do.
-
-    Args:
-        of_node: [N] int64, below 0 for bodies that no joint holds.
-        joint: [J, 2] int64, the bodies of joints, -1 for the world.
-    """
-    n = len(world.shape)
+def put_to_sleep(world, motion, rules, manifolds, held):
+    """Freeze the islands all of which have stayed where they were for long enough; joints join as contacts do. `held`
+    is None where there is none."""
+    n, rests = len(world.shape), False
     for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
             continue
-        if (motion.touching[b] or of_node[b] >= 0) and _strayed(world, motion, b, 0) < rules.stray:
+        stays = motion.touching[b]
+        if held is not None:
+            stays = stays or held.graph.of_body[b] >= 0
+        if stays and _strayed(world, motion, b, 0) < rules.stray:
             motion.quiet[b] += 1
         else:
             motion.quiet[b] = 0
@@ -56,24 +55,18 @@ def put_to_sleep(world, motion, rules, manifolds, of_node, joint):
         if motion.quiet[b] == 0 or (motion.quiet[b] >= rules.rest and not _balanced(world, motion, rules, b)):
             motion.quiet[b] = 0
             _drop_anchor(motion, b, 0)
-    if motion.quiet.max() < rules.rest:
+        rests = rests or motion.quiet[b] >= rules.rest
+    if not rests:
         return
     parent = np.arange(n)
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         if manifolds.count[m] and world.moves[a] and world.moves[b]:
             join(parent, a, b)
-    for j in range(len(joint)):
-        a, b = joint[j, 0], joint[j, 1]
-        if a >= 0 and b >= 0 and world.moves[a] and world.moves[b]:
-            join(parent, a, b)
     restless = np.zeros(n, np.bool_)
-    for j in range(len(joint)):
-        for s in range(2):
-            a, b = joint[j, s], joint[j, 1 - s]
-            if a >= 0 and b >= 0 and world.scripted[b] and world.moves[a]:
-                if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
-                    restless[root(parent, a)] = True
+    if held is not None:
+        _join_held(world, held.each.body, parent)
+        _stir_held(world, motion, held.each.body, parent, restless)
     for b in range(n):
         if world.moves[b] and motion.island[b] < 0 and motion.quiet[b] < rules.rest:
             restless[root(parent, b)] = True
@@ -82,13 +75,35 @@ def put_to_sleep(world, motion, rules, manifolds, of_node, joint):
         if manifolds.count[m] and world.scripted[b]:
             if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
                 restless[root(parent, a)] = True
-    number = motion.island.max() + 1
+    number = 0
+    for b in range(n):
+        number = max(number, motion.island[b] + 1)
     for b in range(n):
         if world.moves[b] and motion.island[b] < 0 and not restless[root(parent, b)]:
             motion.island[b] = number + root(parent, b)
             put(motion.velocity, b, (0.0, 0.0, 0.0))
             put(motion.angular, b, (0.0, 0.0, 0.0))
             motion.touching[b] = True
+
+
+@njit(**BARE)
+def _join_held(world, joint, parent):
+    """Join what joints [J, 2] connect, -1 for the world."""
+    for j in range(len(joint)):
+        a, b = joint[j, 0], joint[j, 1]
+        if a >= 0 and b >= 0 and world.moves[a] and world.moves[b]:
+            join(parent, a, b)
+
+
+@njit(**BARE)
+def _stir_held(world, motion, joint, parent, restless):
+    """What a joint holds to a body that is led along does not rest."""
+    for j in range(len(joint)):
+        for s in range(2):
+            a, b = joint[j, s], joint[j, 1 - s]
+            if a >= 0 and b >= 0 and world.scripted[b] and world.moves[a]:
+                if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
+                    restless[root(parent, a)] = True
 
 
 @njit(**BARE)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.solver.manifold import points_of
 from sdfsim.physics.solver.vectors import BARE, ENTRY, add, dot, get, put, rotated, scale, sub, turn, vector
 from sdfsim.physics.solver.world import GAP, NORMAL, NORMAL_IMPULSE, TANGENTIAL
 
@@ -70,7 +71,7 @@ def energies(mass, inertia, gravity, position, orientation, velocity, angular):
 @njit(**ENTRY)
 def touching(manifolds, position, orientation, within):
     """The contacts of bodies that are no farther apart than `within`."""
-    most = manifolds.count.sum()
+    most = points_of(manifolds, len(manifolds.count))
     pair, gap = np.empty((most, 2), np.int64), np.empty(most)
     place, normal, impulse = np.empty((most, 3)), np.empty((most, 3)), np.empty((most, 3))
     e = 0
@@ -81,7 +82,7 @@ def touching(manifolds, position, orientation, within):
             if point[GAP] <= within:
                 n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
                 drag = (point[TANGENTIAL], point[TANGENTIAL + 1], point[TANGENTIAL + 2])
-                pair[e], gap[e] = manifolds.pair[m], point[GAP]
+                pair[e, 0], pair[e, 1], gap[e] = first, manifolds.pair[m, 1], point[GAP]
                 put(place, e, add(get(position, first), rotated(orientation, first, vector(point), 1.0)))
                 put(normal, e, n)
                 put(impulse, e, add(scale(n, point[NORMAL_IMPULSE]), drag))

@@ -15,8 +15,8 @@ from sdfsim.physics.solver.vectors import BARE, FAST, along, get, norm, put, sca
 THIN = 0.4  # of a wall: who goes farther in an inner step is watched on its way
 
 
-@njit(**BARE)
-def time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch):
+@njit(**BARE, inline="always")
+def time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch, surfaces):
     """How much of the inner step each body may move, so that none passes through what is thinner than its way."""
     free, change, part = work.free, work.change, work.part
     for b in world.going:
@@ -32,7 +32,9 @@ def time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch)
         depth = _harmless(shapes, world, a, b)
         away = near.away_all[p] - work.gone[a] - work.gone[b]
         if speed * rules.substep_dt > depth and not away > speed * rules.substep_dt:
-            free_part = _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth)
+            free_part = _until_near(
+                shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth, surfaces
+            )
             part[a], part[b] = min(part[a], free_part), min(part[b], free_part)
 
 
@@ -56,7 +58,7 @@ def _harmless(shapes, world, a, b):
 
 
 @njit(**FAST)
-def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth):
+def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth, surfaces):
     """How much of the inner step a pair may move until it overlaps a little: conservative advancement."""
     free, change = work.free, work.change
     gone = work.gone[manifolds.pair[p, 0]] + work.gone[manifolds.pair[p, 1]]
@@ -80,7 +82,7 @@ def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p,
         rest = max((1.0 - t) * way - deep, -0.5 * deep)  # what is no nearer is not met before the end
         gap = nearest(
             shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, rest,
-            0.0 if t == 0.0 else -0.5 * deep, t == 0.0, scratch.simplex,
+            0.0 if t == 0.0 else -0.5 * deep, t == 0.0, scratch.simplex, surfaces,
         )  # fmt: skip
         # Or they are in contact already, and it is answered.
         if gap >= rest or (t == 0.0 and gap <= 0.0):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from sdfsim.physics.solver.manifold import Scratch
 
 POINTS = 24  # of a manifold at most
 # Columns of a contact point: where it is on either body (about its centre of mass, in its axes), the unit normal from
@@ -58,9 +61,6 @@ class World(NamedTuple):
     reach: np.ndarray  # [M] the highest end so far along `axis`
     axis: int  # 0, 1 or 2
     apart: np.ndarray  # [E] int64, which bodies joints keep from touching, see `physics.joints.apart`
-    # [0, 0] where there may be so many pairs that threads are worth their while, else [0]: loops on all cores take a
-    # quarter of the time in which all is compiled, and are compiled for worlds of another type only.
-    threads: np.ndarray = np.zeros(0)
 
 
 class Work(NamedTuple):
@@ -90,6 +90,7 @@ class Work(NamedTuple):
     parent: np.ndarray
     number: np.ndarray
     latest: np.ndarray  # [N] int64 for finding the contacts of a body
+    scratch: Scratch
 
 
 class Motion(NamedTuple):
@@ -131,7 +132,6 @@ class Rules(NamedTuple):
     margin: float = 0.0  # all bodies but planes are larger by this than their distances say
     adds: bool = False  # whether what is pushed out adds to the speed of a rebound
     cone: bool = True  # whether friction is bounded by a cone; else along two axes, each by itself
-    note: bool = False  # whether what contacts did in the step is wanted, see `record`
     ahead: float = 0.0  # new points are looked for so much time farther, as fast as two bodies move against each other
     contact_margin: float = 0.02  # contacts are kept up to this distance, and while they have slid by no more
     search_margin: float = 0.004  # new ones are looked for up to this one and twice the margin

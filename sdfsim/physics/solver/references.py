@@ -1,0 +1,73 @@
+"""Structures of arrays by reference, compiled.
+
+Numba passes a NamedTuple as all numbers of all its arrays, each by itself: a hundred arrays are some thousand arguments
+of every function, which take most of the time in which these are compiled, and much of that of a call. A reference is
+one argument. Its fields are read as those of the tuple are; a field that is a NamedTuple is a reference again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+from numba import types
+from numba.core import cgutils, config
+from numba.core.imputils import impl_ret_borrowed
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
+
+
+class Reference(types.Opaque):
+    """The place of a NamedTuple of the type `of`."""
+
+    def __init__(self, of: types.NamedTuple) -> None:
+        self.of = of
+        # The name is part of those of all functions that have one: the whole type would be thousands of letters.
+        kind = hashlib.sha256(of.name.encode()).hexdigest()[:12]
+        super().__init__(f"{of.instance_class.__name__}@{kind}")
+
+
+register_model(Reference)(models.OpaqueModel)
+
+
+@infer_getattr
+class _Fields(AttributeTemplate):
+    key = Reference
+
+    def generic_resolve(self, reference: Reference, name: str) -> types.Type | None:
+        if name not in reference.of.fields:
+            return None
+        field = reference.of.types[reference.of.fields.index(name)]
+        return Reference(field) if isinstance(field, types.NamedTuple) else field
+
+
+@lower_getattr_generic(Reference)
+def _field(context: Any, builder: Any, reference: Reference, place: Any, name: str) -> Any:
+    at = reference.of.fields.index(name)
+    field = reference.of.types[at]
+    whole = builder.bitcast(place, context.get_value_type(reference.of).as_pointer())
+    here = cgutils.gep_inbounds(builder, whole, 0, at)
+    if isinstance(field, types.NamedTuple):
+        return builder.bitcast(here, cgutils.voidptr_t)
+    return impl_ret_borrowed(context, builder, field, builder.load(here))
+
+
+@intrinsic
+def _reference(typing: Any, value: types.Type) -> Any:
+    if isinstance(value, types.NoneType):
+        return value(value), lambda context, builder, signature, arguments: context.get_dummy_value()
+    if not isinstance(value, types.NamedTuple):
+        return None
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        slot = cgutils.alloca_once(builder, arguments[0].type)
+        builder.store(arguments[0], slot)
+        return builder.bitcast(slot, cgutils.voidptr_t)
+
+    return Reference(value)(value), code
+
+
+# A reference to a NamedTuple, for compiled code; of None it is None. Numba frees arrays behind the last use of the
+# variable that holds them: a reference is to be taken of an argument, or of what is used once more after all that uses
+# the reference.
+reference: Any = (lambda value: value) if vars(config)["DISABLE_JIT"] else _reference
