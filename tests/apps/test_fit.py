@@ -61,7 +61,20 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
 def test_units_are_those_of_a_scene_file_and_odd_sizes_are_reported(tmp_path: Path) -> None:
     size, file, out = np.array([20.0, 30.0, 40.0]), tmp_path / "box.ply", tmp_path / "box"
     file.write_bytes(write_ply(primitives.box((20.0, 30.0, 40.0))))
-    arguments = ["fit", str(file), "-o", str(out), "--sdf", "grid", "--device", "cpu", "--units", "cm"]
+    arguments = [
+        "fit",
+        str(file),
+        "-o",
+        str(out),
+        "--recipe",
+        "quick",
+        "--budget",
+        "1s",
+        "--device",
+        "cpu",
+        "--units",
+        "cm",
+    ]
     assert "--units" not in run(*arguments).stdout
     shape = load_shape(out)
     np.testing.assert_allclose(np.ptp(shape.mesh.vertices, axis=0), 0.01 * size)
@@ -94,7 +107,18 @@ def test_a_turned_gltf_is_reported(tmp_path: Path) -> None:
     mesh_shape(primitives.box((0.3, 0.2, 0.1)), name="box", kind="mesh").save(tmp_path / "box")
     done = run("export", str(tmp_path / "box"), "-o", str(tmp_path / "box.glb"))
     assert "z up is turned to glTF's y up" in done.stdout
-    arguments = ["fit", str(tmp_path / "box.glb"), "-o", str(tmp_path / "again"), "--sdf", "grid", "--device", "cpu"]
+    arguments = [
+        "fit",
+        str(tmp_path / "box.glb"),
+        "-o",
+        str(tmp_path / "again"),
+        "--recipe",
+        "quick",
+        "--budget",
+        "1s",
+        "--device",
+        "cpu",
+    ]
     assert "glTF has y up: it is turned to z up" in run(*arguments).stdout
     np.testing.assert_allclose(np.ptp(load_shape(tmp_path / "again").mesh.vertices, axis=0), [0.3, 0.2, 0.1], atol=1e-6)
 
