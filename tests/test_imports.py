@@ -140,7 +140,7 @@ def test_the_solver_runs_without_torch(tmp_path):
     """As `sdfsim simulate` does, of a scene of closed forms."""
     code = (
         "import atexit, sys\nfrom cli import app\n"
-        "names = ('torch', 'open3d', 'rerun', 'trimesh', 'skimage')\n"
+        "names = ('torch', 'open3d', 'rerun', 'trimesh', 'skimage', 'scipy.linalg', 'scipy.spatial', 'scipy.sparse')\n"
         "atexit.register(lambda: print([m for m in names if m in sys.modules]))\n"
         f"args = ['simulate', 'samples/tower.yaml', '--seconds', '0.02', '--viewer', 'none', '-o', '{tmp_path}/run']\n"
         "app(args)"

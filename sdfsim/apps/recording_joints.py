@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from sdfsim.physics import pose
 from sdfsim.scene.scene import Joint, Scene
 
 MOST_SHOWN = 256  # joints of a scene, beyond which none is shown: each takes bodies out of the crowds
@@ -70,13 +70,13 @@ def ends(joints: Sequence[Joint], place: np.ndarray, turn: np.ndarray, scene: Sc
     for j, joint in enumerate(joints):
         for side, k in enumerate(joint.bodies):
             offset = _from_com(scene, joint, side)
-            found[:, j, side] = offset if k < 0 else place[:, k] + Rotation.from_quat(turn[:, k]).apply(offset)
+            found[:, j, side] = offset if k < 0 else place[:, k] + pose.rotate(turn[:, k], offset)
     return found
 
 
 def _placed(scene: Scene, joint: Joint, side: int, strips: list[np.ndarray], color: tuple[int, int, int]) -> Mark:
-    frame, origin = Rotation.from_quat(joint.quat_xyzw[side]), _from_com(scene, joint, side)
-    return Mark(joint.bodies[side], [frame.apply(strip) + origin for strip in strips], color)
+    frame, origin = joint.quat_xyzw[side], _from_com(scene, joint, side)
+    return Mark(joint.bodies[side], [pose.rotate(frame, strip) + origin for strip in strips], color)
 
 
 def _from_com(scene: Scene, joint: Joint, side: int) -> np.ndarray:

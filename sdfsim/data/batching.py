@@ -1,7 +1,9 @@
 """Many trajectories at once: as one set of bodies, and simulated again by a model."""
 
+from __future__ import annotations
+
 from dataclasses import replace
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -18,6 +20,9 @@ from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.batch import placed, side_by_side
 from sdfsim.simulate.steppers import Frames, FreeFlight, Stepper, stepper_of
+
+if TYPE_CHECKING:
+    from sdfsim.physics.solver.prepare import SharedShapes
 
 BATCH = 50  # trajectories simulated side by side
 PLANE = analytic_shape("plane")
@@ -78,9 +83,13 @@ def scene_of(
 
 
 def centred(shape: Shape) -> Shape:
-    """The shape with its centre of mass at the origin, as trajectories need it. A shape that has it there already is
-    returned itself, with its contact geometry."""
-    return replace(shape, com=np.zeros(3)) if shape.com.any() else shape
+    """The shape with its centre of mass at the origin, as trajectories need it, and with the contact geometry that it
+    has: contacts know nothing of centres of mass."""
+    if not shape.com.any():
+        return shape
+    other = replace(shape, com=np.zeros(3))
+    vars(other)["contact"] = shape.contact
+    return other
 
 
 def state_at(trajectories: list[Trajectory], frames: list[int], like: State) -> State:
@@ -110,6 +119,8 @@ def roll_out(
     friction is bounded along two axes. "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit
     code 3) for a state that is not finite.
     """
+    from sdfsim.physics.solver.prepare import SharedShapes  # numba takes its time to load
+
     stepper = stepper_of(model, contact=contact, free_flight=free_flight)
     units = model_units(stepper, group[0])
     gravity = np.asarray(group[0].gravity, dtype=np.float64) / units.acceleration
@@ -121,19 +132,20 @@ def roll_out(
     # The solve is fastest with one trajectory at a time, on all cores; a network with all of them in one graph.
     alone = model.kind == SOLVER
     groups = [[t] for t in group] if alone else [group]
-    jobs = [(some, known, plane, units, stepper, options, steps, floor) for some in groups]
+    shared = SharedShapes()
+    jobs = [(some, known, plane, units, stepper, options, steps, floor, shared) for some in groups]
     found = dict(threads(_rolled, jobs)) if alone else {0: _rolled(*jobs[0])}
     return [t for k in range(len(jobs)) for t in found[k]]
 
 
 def _rolled(
     group: list[Trajectory], shapes: dict[str, Shape], plane: Shape, units: Units, stepper: Stepper, options: Options,
-    steps: int, floor: tuple[float, float],
+    steps: int, floor: tuple[float, float], shared: SharedShapes,
 ) -> list[Trajectory]:  # fmt: skip
     """The predicted motion of trajectories that are simulated side by side."""
     bodies, start = merged(group, [0] * len(group), shapes, units, floor, plane)
     start = stepper.began(start, bodies, options)
-    _, carry = stepper.advance(start, stepper.init(bodies, start, options), steps, keep=True)
+    _, carry = stepper.advance(start, stepper.init(bodies, start, options, shared), steps, keep=True)
     frames = cast("Frames", carry.frames)
     whole = Motion(*(np.concatenate([getattr(start, name)[None], getattr(frames, name)]) for name in MOTION))
     broken = (~np.isfinite(np.concatenate([whole.position, whole.orientation], -1)).all(-1)).sum(1)

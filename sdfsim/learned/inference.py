@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -35,13 +34,15 @@ def step_graph(
     time = options.dt / known
     length, moves = time * time, bodies.moves[rows]
     heaviest = float(bodies.mass[rows].max()) or 1.0
-    start, spin = before.orientation[rows], before.angular_velocity[rows]
+    (place, start, speed, spin), (later, turned, solved_speed, solved_spin) = (
+        [state.rows_of(name, rows) for name in MOTION] for state in (before, solved)
+    )
     turn, still = pose.to_matrix(start), ~moves[:, None]
     inertia = bodies.inertia[rows]
     inverse = turn @ np.linalg.inv(inertia) @ turn.swapaxes(-1, -2) * (moves & options.rotation)[:, None, None]
     free = np.where(still, spin, torque_free(start, spin, inertia, options.dt)[1]) if options.rotation else spin
     fall = options.dt * np.asarray(options.gravity) * moves[:, None]
-    turned = pose.to_rotvec(pose.multiply(solved.orientation[rows], pose.conjugate(start)))
+    turned = pose.to_rotvec(pose.multiply(turned, pose.conjugate(start)))
 
     def tensor(values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values))
@@ -57,13 +58,13 @@ def step_graph(
     return rows, ContactGraph(
         inverse_mass=tensor(bodies.inverse_mass[rows] * heaviest),
         inverse_inertia=tensor(inverse * (heaviest * length**2)),
-        velocity=tensor(before.velocity[rows] / time),
+        velocity=tensor(speed / time),
         angular=tensor(spin * time),
-        free_velocity=tensor((before.velocity[rows] + fall) / time),
+        free_velocity=tensor((speed + fall) / time),
         free_angular=tensor(free * time),
-        solved_velocity=tensor(solved.velocity[rows] / time),
-        solved_angular=tensor(solved.angular_velocity[rows] * time),
-        mean_velocity=tensor((solved.position[rows] - before.position[rows]) / (options.dt * time)),
+        solved_velocity=tensor(solved_speed / time),
+        solved_angular=tensor(solved_spin * time),
+        mean_velocity=tensor((later - place) / (options.dt * time)),
         mean_angular=tensor(turned * (time / options.dt)),
         first=first,
         second=second,
@@ -106,11 +107,11 @@ def changed(
             ("mean_velocity", "mean_velocity"), ("mean_angular", "mean_angular"),
         )
     }  # fmt: skip
-    arrays = {name: getattr(solved, name).copy() for name in MOTION}
-    arrays["position"][rows] += change["mean_velocity"] * time * options.dt
-    arrays["velocity"][rows] += change["velocity"] * time
+    moved = {name: solved.rows_of(name, rows) for name in MOTION}
+    moved["position"] += change["mean_velocity"] * time * options.dt
+    moved["velocity"] += change["velocity"] * time
     if options.rotation:
         turn = pose.from_rotvec(change["mean_angular"] * graph.dt)
-        arrays["orientation"][rows] = pose.normalise(pose.multiply(turn, arrays["orientation"][rows]))
-        arrays["angular_velocity"][rows] += change["angular"] / time
-    return replace(solved, **arrays)
+        moved["orientation"] = pose.normalise(pose.multiply(turn, moved["orientation"]))
+        moved["angular_velocity"] += change["angular"] / time
+    return solved.with_rows(rows, moved)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,11 @@ class Bodies:
     def __len__(self) -> int:
         return len(self.shape)
 
+    @cached_property
+    def movers(self) -> np.ndarray:
+        """[A] int64, the dynamic bodies."""
+        return np.flatnonzero(self.moves)
+
 
 @dataclass(frozen=True)
 class Touch(Rows):
@@ -194,8 +200,8 @@ class State(Motion):
 
 def awake(bodies: Bodies, state: State) -> np.ndarray:
     """[A] int64, the dynamic bodies that are not asleep."""
-    moves = bodies.moves if state.touch is None else bodies.moves & (state.touch.island < 0)
-    return np.flatnonzero(moves)
+    rows = bodies.movers
+    return rows if state.touch is None else rows[state.touch.rows_of("island", rows) < 0]
 
 
 def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:

@@ -84,7 +84,7 @@ def driven(bodies: Bodies, state: State, dt: float) -> State:
     if bodies.tracks is None:
         return state
     velocity, angular = bodies.tracks.velocity(state.time, dt)
-    return _put(state, bodies.tracks.body, velocity=velocity, angular_velocity=angular)
+    return state.with_rows(bodies.tracks.body, {"velocity": velocity, "angular_velocity": angular})
 
 
 def fly(bodies: Bodies, state: State, options: Options) -> State:
@@ -94,21 +94,21 @@ def fly(bodies: Bodies, state: State, options: Options) -> State:
         pull = options.gravity
         if state.load is not None:
             pull = pull + bodies.inverse_mass[rows, None] * state.load[rows, :3]
-        place, velocity = ballistic(state.position[rows], state.velocity[rows], pull, options.dt)
+        place, velocity = (state.rows_of(name, rows) for name in ("position", "velocity"))
+        place, velocity = ballistic(place, velocity, pull, options.dt)
         if options.rotation:
             turned = _turned(bodies, state, rows, options.dt)
         else:
-            turned = (state.orientation[rows], np.zeros_like(velocity))
-        after = _put(after, rows, **dict(zip(MOTION, (place, turned[0], velocity, turned[1]), strict=True)))
+            turned = (state.rows_of("orientation", rows), np.zeros_like(velocity))
+        after = after.with_rows(rows, dict(zip(MOTION, (place, turned[0], velocity, turned[1]), strict=True)))
     if bodies.tracks is not None:
         place, orientation = bodies.tracks.at(state.time + options.dt)
-        after = _put(after, bodies.tracks.body, position=place, orientation=orientation)
-    return replace(
-        after,
-        earlier_position=_shift(state.earlier_position, state.position),
-        earlier_orientation=_shift(state.earlier_orientation, state.orientation),
-        time=state.time + options.dt,
-    )
+        after = after.with_rows(bodies.tracks.body, {"position": place, "orientation": orientation})
+    earlier: dict[str, np.ndarray] = {}
+    if state.earlier_position is not None and state.earlier_orientation is not None:
+        earlier["earlier_position"] = np.stack([state.earlier_position[1], state.position])
+        earlier["earlier_orientation"] = np.stack([state.earlier_orientation[1], state.orientation])
+    return after.with_rows(rows[:0], {}, time=state.time + options.dt, **earlier)
 
 
 def with_history(state: State, bodies: Bodies, options: Options, changed: np.ndarray | None = None) -> State:
@@ -126,7 +126,8 @@ def with_history(state: State, bodies: Bodies, options: Options, changed: np.nda
 
 def _turned(bodies: Bodies, state: State, rows: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Orientation and angular velocity after free flight; a torque acts half before and half after it."""
-    orientation, angular, inertia = state.orientation[rows], state.angular_velocity[rows], bodies.inertia[rows]
+    orientation, angular = (state.rows_of(name, rows) for name in ("orientation", "angular_velocity"))
+    inertia = bodies.inertia[rows]
     if state.load is None:
         return torque_free(orientation, angular, inertia, dt)
     half = 0.5 * dt * state.load[rows, 3:, None]
@@ -137,15 +138,3 @@ def _turned(bodies: Bodies, state: State, rows: np.ndarray, dt: float) -> tuple[
 
     orientation, angular = torque_free(orientation, angular + twisted(orientation), inertia, dt)
     return orientation, angular + twisted(orientation)
-
-
-def _put(state: State, rows: np.ndarray, **values: np.ndarray) -> State:
-    """The state with the given rows of some arrays replaced."""
-    changed = {name: getattr(state, name).copy() for name in values}
-    for name, value in values.items():
-        changed[name][rows] = value
-    return replace(state, **changed)
-
-
-def _shift(earlier: np.ndarray | None, now: np.ndarray) -> np.ndarray | None:
-    return None if earlier is None else np.stack([earlier[1], now])

@@ -10,19 +10,40 @@ class Rows:
     """A frozen record of arrays with a row for each body."""
 
     def with_rows(self, rows: np.ndarray, changed: dict[str, np.ndarray], **others: Any) -> Self:
-        """The record with other rows in some arrays, and `others` in place of what else it holds.
+        """The record with other rows (ascending) in some arrays, and `others` in place of what else it holds.
 
         An array is put together when it is first asked for: what is not looked at costs the changed rows alone,
-        however many bodies there are.
+        however many bodies there are, and however often rows have been changed before.
         """
+        before, known, values = self.parts or (self, rows, {})
+        if not np.array_equal(rows, known):
+            known = np.union1d(known, rows)
+            values = {name: self.rows_of(name, known) for name in {**values, **changed}}
+            place = np.searchsorted(known, rows)
+            for name, value in changed.items():
+                values[name][place] = value
+        else:
+            values = values | changed
         new = object.__new__(type(self))
-        new.__dict__.update({name: value for name, value in vars(self).items() if name not in changed}, **others)
-        new.__dict__.update(_before=self, _rows=rows, _changed=changed)
+        new.__dict__.update({name: value for name, value in vars(self).items() if name not in values}, **others)
+        new.__dict__.update(_before=before, _rows=known, _changed=values)
         return new
+
+    def rows_of(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """A copy of some rows of an array, which is not put together for them."""
+        before, known, values = self.parts or (self, rows, {})
+        if name not in values or not len(known):
+            return getattr(self, name)[rows]
+        found = getattr(before, name)[rows]
+        place = np.minimum(np.searchsorted(known, rows), len(known) - 1)
+        held = known[place] == rows
+        found[held] = values[name][place[held]]
+        return found
 
     @property
     def parts(self) -> tuple[Self, np.ndarray, dict[str, np.ndarray]] | None:
-        """What `with_rows` has made it of: the other record, the rows, and what they hold; None for one made whole."""
+        """What `with_rows` has made it of: a record that is whole, the rows, and what they hold; None for a whole
+        one."""
         known = vars(self)
         return (known["_before"], known["_rows"], known["_changed"]) if "_before" in known else None
 

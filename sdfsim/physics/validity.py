@@ -1,14 +1,14 @@
 """What a state and a scene must be for their motion to mean anything."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.bodies import Bodies, Units
 from sdfsim.physics.free_flight import MOST_TURN
-from sdfsim.physics.motion import Motion
+from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.contact_geometry import check_pieces
 
@@ -63,16 +63,16 @@ def fault_of(body: int, wrong: int, state: Motion, before: np.ndarray, dt: float
 
 
 def first_fault(state: Motion, dt: float, rows: np.ndarray | None = None, before: Motion | None = None) -> Fault | None:
-    """The first of the bodies in `rows` [N] bool (None: all) whose state cannot be, a step of `dt` after `before`; None
+    """The first of the bodies `rows` [A] int64 (None: all) whose state cannot be, a step of `dt` after `before`; None
     when all are sound. In model units."""
     from sdfsim.physics.solver import survey  # numba takes its time to load
 
-    rows = np.ones(len(state.position), bool) if rows is None else rows
-    earlier = state.position if before is None else before.position
-    moved = (state.position, state.orientation, state.velocity, state.angular_velocity)
-    place, turn, speed, spin = map(np.ascontiguousarray, moved)
-    body, wrong = survey.first_fault(rows, place, turn, speed, spin, np.ascontiguousarray(earlier), dt, limits(dt))
-    return None if body < 0 else fault_of(body, wrong, state, earlier[body], dt)
+    rows = np.arange(len(state.position)) if rows is None else rows
+    found = Motion(*(np.ascontiguousarray(state.rows_of(name, rows)) for name in MOTION))
+    earlier = found.position if before is None else np.ascontiguousarray(before.rows_of("position", rows))
+    moved = (found.position, found.orientation, found.velocity, found.angular_velocity)
+    row, wrong = survey.first_fault(np.ones(len(rows), bool), *moved, earlier, dt, limits(dt))
+    return None if row < 0 else replace(fault_of(row, wrong, found, earlier[row], dt), body=int(rows[row]))
 
 
 def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:

@@ -42,6 +42,7 @@ from sdfsim.simulate.steppers import (
 )
 
 if TYPE_CHECKING:
+    from sdfsim.physics.solver.prepare import SharedShapes
     from sdfsim.scene.builder import SceneBuilder
 
 GLANCE = 0.1  # s between two looks at a run that goes on
@@ -145,6 +146,7 @@ class Simulator(LiveScene):
         self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
+        self._shared: SharedShapes | None = None  # with simulators of other scenes
         self._si: tuple[State, Moment] | None = None  # a state that others differ from in some rows, and the same in SI
         self._options = Options(
             gravity=gravity,
@@ -224,7 +226,7 @@ class Simulator(LiveScene):
     def carry(self) -> Carry:
         """What the stepper keeps of this run, made on first use."""
         if self._carry is None:
-            self._carry = self.stepper.init(self.bodies, self._state, self._options)
+            self._carry = self.stepper.init(self.bodies, self._state, self._options, self._shared)
             self._carry.checked = True
         return self._carry
 
@@ -353,7 +355,7 @@ class Simulator(LiveScene):
         before, rows, changed = parts
         if self._si is None or self._si[0] is not before:
             self._si = before, whole(before)
-        moved = {name: changed[name] * unit for name, unit in u.motion.items()}
+        moved = {name: changed[name] * unit for name, unit in u.motion.items() if name in changed}
         return self._si[1].with_rows(rows, moved, time=state.time * u.time)
 
     def _advance(self, count: int, *, keep: bool = False) -> None:
@@ -495,20 +497,28 @@ def run_all(
 ) -> list[Rollout]:  # fmt: skip
     """`run` of a `Simulator` of every scene, made with these options, on all cores: in threads where the steps are
     compiled code that needs nothing of Python and has no threads of its own, else in processes. Raises as these do."""
-    from sdfsim.physics.solver.prepare import CROWD  # numba takes its time to load
+    from sdfsim.physics.solver.prepare import CROWD, SharedShapes  # numba takes its time to load
 
     model = model or load_model()
     few = all(sum(b.motion == "dynamic" for b in scene.bodies) < CROWD for scene in scenes)
     pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
-    jobs = [([scenes[k] for k in piece], model, options, seconds, steps) for piece in pieces]
-    found = dict((threads if few and model.kind == SOLVER else parallel)(_run_each, jobs))
+    together = few and model.kind == SOLVER
+    shared = SharedShapes() if together else None
+    jobs = [([scenes[k] for k in piece], model, options, seconds, steps, shared) for piece in pieces]
+    found = dict((threads if together else parallel)(_run_each, jobs))
     return [rollout for k in range(len(jobs)) for rollout in found[k]]
 
 
 def _run_each(
-    scenes: list[Scene], model: Model, options: dict[str, Any], seconds: float | None, steps: int | None
-) -> list[Rollout]:
-    return [Simulator(scene, model, **options).run(seconds, steps) for scene in scenes]
+    scenes: list[Scene], model: Model, options: dict[str, Any], seconds: float | None, steps: int | None,
+    shared: SharedShapes | None,
+) -> list[Rollout]:  # fmt: skip
+    found = []
+    for scene in scenes:
+        simulator = Simulator(scene, model, **options)
+        simulator._shared = shared
+        found.append(simulator.run(seconds, steps))
+    return found
 
 
 def check_seconds(seconds: float) -> None:

@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -38,7 +37,7 @@ if TYPE_CHECKING:  # numba and torch take their time to load
     from sdfsim.learned.impulse import ImpulseNetwork
     from sdfsim.learned.near import Contacts, Pairs
     from sdfsim.learned.tensors import BodyTensors
-    from sdfsim.physics.solver.prepare import Compiled, Steps
+    from sdfsim.physics.solver.prepare import Compiled, SharedShapes, Steps
     from sdfsim.physics.solver.record import Edges
 
 FreeFlight = Literal["exact", "learned"]
@@ -89,11 +88,6 @@ class Carry:
     edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
     near: Contacts | Pairs | None = None  # where a network on surface nodes saw bodies near each other
 
-    @cached_property
-    def moving(self) -> int:
-        """How many bodies are dynamic."""
-        return int(self.bodies.moves.sum())
-
     @contextmanager
     def timed(self, phase: str) -> Iterator[None]:
         """Add the time that a block takes to a phase."""
@@ -140,13 +134,13 @@ class Stepper:
         """A start state, completed with what the first step needs."""
         return state
 
-    def init(self, bodies: Bodies, state: State, options: Options) -> Carry:
-        """The carry of a run that starts from `state`."""
+    def init(self, bodies: Bodies, state: State, options: Options, shared: SharedShapes | None = None) -> Carry:
+        """The carry of a run that starts from `state`. Runs of many scenes can share their shapes."""
         if not self.distances:
             return Carry(bodies, options)
         from sdfsim.physics.solver.prepare import Compiled
 
-        return Carry(bodies, options, scene=Compiled(bodies, state))
+        return Carry(bodies, options, scene=Compiled(bodies, state, shared))
 
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
         """The state after the user has changed pose, velocities or load of the bodies `changed` [N] bool, or gravity.
@@ -159,20 +153,20 @@ class Stepper:
     def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
         """Make `n` steps, and `keep` their frames. A `checked` carry ends them at the first state that cannot be. The
         counts of the carry are those of the last step that is kept."""
-        bodies, dt, frames = carry.bodies, carry.options.dt, []
+        bodies, dt, rows, frames = carry.bodies, carry.options.dt, carry.bodies.movers, []
         carry.done, carry.fault, carry.given, carry.frames = 0, None, 0.0, None
         for _ in range(n):
             known = carry.counts, carry.near
             carry.counts = dict.fromkeys(carry.counts, 0.0)
             after = self._step(driven(bodies, state, dt), carry)
-            asleep = np.zeros(len(bodies), bool) if after.touch is None else after.touch.island >= 0
+            asleep = np.zeros(len(rows), bool) if after.touch is None else after.touch.rows_of("island", rows) >= 0
             if carry.checked:
-                carry.fault = first_fault(after, dt, bodies.moves & ~asleep, state)
+                carry.fault = first_fault(after, dt, rows[~asleep], state)
                 if carry.fault is not None:
                     carry.counts, carry.near = known
                     break
-            carry.counts |= {"asleep": asleep.sum(), "free": carry.moving - asleep.sum() - carry.counts["active"]}
-            given = _given(state, after, dt)
+            carry.counts |= {"asleep": asleep.sum(), "free": len(rows) - asleep.sum() - carry.counts["active"]}
+            given = _given(state, after, rows, dt)
             carry.given, carry.done, state = carry.given + given, carry.done + 1, after
             if keep:
                 frames.append((after, given, dict(carry.counts), self.touching(after, carry)))
@@ -224,12 +218,12 @@ class Solver(Stepper):
         carry.frames = None
         if made.done:
             active, asleep = carry.counts["active"], made.counts[3]
-            carry.counts |= {"asleep": asleep, "free": carry.moving - asleep - active, "contact_ms": spent}
+            carry.counts |= {"asleep": asleep, "free": len(carry.bodies.movers) - asleep - active, "contact_ms": spent}
         if keep:
             kept = {name: getattr(made.kept, name)[: made.done] for name in made.kept._fields}
             pairs, contacts, active, asleep, touching = kept.pop("count").T
             counts = {"pairs": pairs, "contacts": contacts, "active": active, "asleep": asleep}
-            counts |= {"free": carry.moving - asleep - active, "contact_ms": np.full(made.done, spent)}
+            counts |= {"free": len(carry.bodies.movers) - asleep - active, "contact_ms": np.full(made.done, spent)}
             counts = {name: counts.get(name, np.zeros(made.done)).astype(float) for name in (*COUNTS, *PHASES)}
             carry.frames = Frames(**kept, touching=touching, pair=made.pair, point=made.point, counts=counts)
         return made.state, carry
@@ -370,13 +364,15 @@ class OnSurfaces(Stepper):
         return replace(free, **arrays)
 
 
-def _given(before: State, after: State, dt: float) -> float:
-    """The work of pulling forces and torques in a step."""
+def _given(before: State, after: State, rows: np.ndarray, dt: float) -> float:
+    """The work of pulling forces and torques at the bodies `rows` in a step."""
     if before.load is None:
         return 0.0
-    force, torque = before.load[:, :3], before.load[:, 3:]
-    turning = 0.5 * dt * (before.angular_velocity + after.angular_velocity)
-    return float((force * (after.position - before.position)).sum() + (torque * turning).sum())
+    force, torque = before.load[rows, :3], before.load[rows, 3:]
+    place, spin = (
+        [state.rows_of(name, rows) for state in (before, after)] for name in ("position", "angular_velocity")
+    )
+    return float((force * (place[1] - place[0])).sum() + (torque * (0.5 * dt * (spin[0] + spin[1]))).sum())
 
 
 def energies_of(bodies: Bodies, state: State, gravity: np.ndarray) -> tuple[float, float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +19,11 @@ from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
 from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
-from sdfsim.physics.solver.prepare import Compiled, compiled_shapes
+from sdfsim.physics.solver.prepare import Compiled, SharedShapes
 from sdfsim.training.batches import moved
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 
-SETS = 8  # sets of shapes that are kept as the compiled code wants them
 CPU = torch.device("cpu")
 WARM_BATCHES = 20  # batches that set the feature statistics before the first step
 
@@ -57,8 +55,7 @@ class SurfaceTask:
         self.counts = [len(self.trajectories)]
         self.dt = self.trajectories[0].dt
         self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
-        # Scenes of a batch have few sets of shapes, mostly all of them.
-        self.compiled = lru_cache(SETS)(compiled_shapes)
+        self.shared = SharedShapes()
 
     def __getstate__(self) -> tuple:
         """A process that draws batches makes its own."""
@@ -88,7 +85,7 @@ class SurfaceTask:
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
         bodies, state, after = self.scenes(rng, count, team)
-        scene = Compiled(bodies, state, self.compiled(bodies.contact)) if self.family.distances else None
+        scene = Compiled(bodies, state, self.shared) if self.family.distances else None
         bodies, state = body_tensors(bodies, CPU), state_tensors(state, CPU)
         # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
         target = target_acceleration(bodies, state, *map(torch.from_numpy, after))

@@ -1,5 +1,6 @@
 """Only what is in play is computed: stages that are off are never entered, and the network sees what touches."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -98,6 +99,32 @@ def test_scenery_far_away_is_never_asked(dropped, make):
     for name in ("pairs", "contacts", "nodes", "edges", "active", "free"):
         assert (one.counters[name] == other.counters[name]).all(), name
     assert one.counters["edges"].sum() > 0
+
+
+def allocated(simulator: Simulator) -> int:
+    """Bytes that a few steps hold at most beyond what was there before: whoever goes over all bodies makes an array."""
+    for _ in simulator.steps(3):
+        pass  # what is made once
+    tracemalloc.start()
+    for _ in simulator.steps(3):
+        pass
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return most
+
+
+@pytest.mark.parametrize("way", ["solver", "impulse", "no contact", "led along"])
+def test_a_step_makes_no_array_of_all_scenery(dropped, way):
+    model = random_model("impulse") if way == "impulse" else "solver"
+    if way == "no contact":
+        dropped = replace(dropped, effects=replace(Effects(), contact="off"))
+    if way == "led along":
+        path = Waypoints(np.array([0.0, 9.0]), np.array([[5.0, 0, 1], [6, 0, 1]]), np.array([[0.0, 0, 0, 1]] * 2))
+        led = make_body("led", 0, [5, 0, 1], motion="kinematic", mass=0.0, path=path)
+        dropped, model = replace(dropped, bodies=(*dropped.bodies, led)), random_model("impulse")
+    many = 5000
+    few, all_of_them = (allocated(Simulator(with_scenery(dropped, count), model)) for count in (10, many))
+    assert all_of_them < few + many  # not one byte each
 
 
 def seen_by(model) -> list:

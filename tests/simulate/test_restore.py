@@ -30,7 +30,10 @@ def simulator() -> Simulator:
 
 
 def same(one: State, other: State) -> bool:
-    mine, theirs = one.arrays(), other.arrays()
+    return same_arrays(one.arrays(), other.arrays())
+
+
+def same_arrays(mine: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> bool:
     for arrays in (mine, theirs):  # behind the points of a pair there is room for more, with anything in it
         counted = np.arange(arrays["touch.point"].shape[1]) < arrays["touch.count"][:, None]
         arrays["touch.point"] = np.where(counted[:, :, None], arrays["touch.point"], 0.0)
@@ -128,3 +131,22 @@ def test_a_file_that_holds_no_state_is_refused(tmp_path):
         State.read(file)
     with pytest.raises(SdfsimError, match="cannot be read as a state"):
         State.read(tmp_path / "none.npz")
+
+
+def test_a_step_of_which_all_sleep_looks_at_nobody_and_changes_nothing(simulator):
+    simulator.reset()
+    simulator.step(simulator.steps_in(2.0))
+    before, work = simulator.state, simulator.carry.scene.work
+    looked_at = [work.matrix, work.low, work.high, work.ways, work.change, work.free]
+    for array in looked_at:
+        array[:] = np.nan
+    after = simulator.run(steps=5)
+    assert all(np.isnan(array).all() for array in looked_at)
+    now, then = simulator.state.arrays(), before.arrays()
+    assert now.pop("time") > then.pop("time") and same_arrays(now, then)
+    assert (after.counters["asleep"] == 3).all() and not after.counters["pairs"].any()
+    assert (after.contact_count == after.contact_count[0]).all() and after.contact_count[0] > 0
+    simulator["box"].push((4.0, 0, 0))
+    simulator.step(2)
+    assert not simulator["box"].asleep and simulator["leaf"].asleep
+    assert np.isfinite(simulator.state.position).all() and simulator["box"].velocity[0] > 1.0

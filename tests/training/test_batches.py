@@ -111,7 +111,7 @@ def test_shapes_are_compiled_once_for_all_batches(ball_data, monkeypatch):
         made.append(shapes)
         return known(shapes)
 
-    monkeypatch.setattr("sdfsim.training.surface_task.compiled_shapes", counted)
+    monkeypatch.setattr(prepare, "compiled_shapes", counted)
     task = SurfaceTask(ball_data, "train", PRESETS["sdf-sim"])
     for step in range(5):
         task.draw(np.random.default_rng(step), 4)

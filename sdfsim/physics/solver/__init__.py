@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -38,5 +40,21 @@ def kept() -> Iterator[None]:
         settings.CACHE_DIR = before
 
 
+def _without_blas() -> None:
+    """Load numba's arrays without SciPy's BLAS, which numba loads to see whether it is there: it takes a tenth of a
+    second, and no kernel asks for it. Who does asks for it again."""
+    linalg: Any = import_module("numba.np.linalg")
+    asked = getattr(linalg, "ensure_blas", None)
+    if asked is None or "numba.np.arraymath" in sys.modules:
+        return
+    linalg.ensure_blas = lambda: None
+    try:
+        arrays: Any = import_module("numba.np.arraymath")
+    finally:
+        linalg.ensure_blas = asked
+    arrays.ensure_blas = asked
+
+
+_without_blas()
 with kept():
     from sdfsim.physics.solver import run as run

@@ -35,7 +35,7 @@ def swept(world, work, motion, rules, span):
 
 
 @njit(**BARE)
-def _stirs(world, motion, b):
+def stirs(world, motion, b):
     """Whether a body is awake, or led along."""
     if world.scripted[b]:
         return norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0
@@ -83,12 +83,12 @@ def near_pairs(world, motion, low, high):
     order = order_of(lowest)
     for i in range(count):
         a = going[order[i]]
-        awake = _stirs(world, motion, a)
+        awake = stirs(world, motion, a)
         for j in range(i + 1, count):
             b = going[order[j]]
             if low[b, axis] > high[a, axis]:
                 break
-            if not (awake or _stirs(world, motion, b)) or not (world.moves[a] or world.moves[b]):
+            if not (awake or stirs(world, motion, b)) or not (world.moves[a] or world.moves[b]):
                 continue
             if _overlap(low, high, a, low, high, b) and _may_meet(world, a, b):
                 swap = (b < a and world.moves[b]) or not world.moves[a]
@@ -96,7 +96,7 @@ def near_pairs(world, motion, low, high):
         if not world.moves[a]:
             continue
         for k in range(len(world.plane)):
-            if (awake or _stirs(world, motion, world.plane[k])) and _may_meet(world, a, world.plane[k]):
+            if (awake or stirs(world, motion, world.plane[k])) and _may_meet(world, a, world.plane[k]):
                 found, pairs = _append(found, pairs, a, world.plane[k])
         if not awake:
             continue

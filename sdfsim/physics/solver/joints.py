@@ -1482,6 +1482,13 @@ def roused(world, motion, held):
 
 
 @njit(**BARE)
+def rest_held(each):
+    """A step in which all that joints hold sleeps."""
+    for j in range(len(each.body)):
+        each.state[j, GIVEN] = each.state[j, SPEED] = 0.0
+
+
+@njit(**BARE)
 def given(each):
     """What motors have given in a step."""
     total = 0.0

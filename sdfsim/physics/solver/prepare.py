@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Any
 
 import numba
@@ -46,18 +47,41 @@ NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 6
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
 
 
-class Compiled:
-    """One scene, its bodies in model units, as the compiled step wants it. Many scenes of the same shapes can share
-    their compiled `shapes`."""
+class SharedShapes:
+    """Compiled shapes for many scenes, in threads too: of scenes with the same shapes, or with some of them, the first
+    ones compile them."""
 
-    def __init__(self, bodies: Bodies, state: State, shapes: kinds.Shapes | None = None) -> None:
+    def __init__(self) -> None:
+        self._lock = Lock()
+        # Of scenes in which shapes meet as surfaces, and of others, which need none.
+        self._known: dict[bool, tuple[tuple[ContactGeometry, ...], kinds.Shapes]] = {}
+
+    def of(self, contact: Sequence[ContactGeometry]) -> tuple[kinds.Shapes, np.ndarray]:
+        """Compiled shapes, and where each [S] int64 of a scene is among them."""
+        with self._lock:
+            met = meet_as_surfaces(contact)
+            known, shapes = self._known.get(met, ((), None))
+            if shapes is None or not set(contact) <= set(known):
+                known = tuple(dict.fromkeys((*known, *contact)))
+                shapes = compiled_shapes(known)
+                self._known[met] = known, shapes
+        place = {shape: k for k, shape in enumerate(known)}
+        return shapes, np.array([place[shape] for shape in contact], np.int64)
+
+
+class Compiled:
+    """One scene, its bodies in model units, as the compiled step wants it; with others that have some of its shapes it
+    can share them."""
+
+    def __init__(self, bodies: Bodies, state: State, shared: SharedShapes | None = None) -> None:
         self.bodies = bodies
-        self.shapes = shapes or compiled_shapes(bodies.contact)
+        self.shapes, row = (shared or SharedShapes()).of(bodies.contact)
+        self._shape = np.where(bodies.shape >= 0, row[bodies.shape], -1) if len(row) else bodies.shape
         self.place(state)
 
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
-        self.world = compiled_world(self.bodies, state, self.shapes)
+        self.world = compiled_world(replace(self.bodies, shape=self._shape), state, self.shapes)
         self.threads = True if np.count_nonzero(self.world.moves) >= CROWD else None
         if self.threads:
             numba.get_num_threads()  # starts them: code that was kept takes it that they run
@@ -102,7 +126,12 @@ class Compiled:
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make so many steps of the contact solve from `state`, fewer where one leads to a state that is more than
         `most` lets it be (see `survey.broken`); `keep` what a recording wants of each."""
-        if state is not self._latest:
+        if (moved := self._moved_since(state)) is not None:
+            rows, changed = moved
+            arrays = (self._motion.position, self._motion.orientation, self._motion.velocity, self._motion.angular)
+            for name, array in zip(MOTION, arrays, strict=True):
+                array[rows] = changed[name]
+        elif state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
             if self.held is not None:
@@ -149,6 +178,14 @@ class Compiled:
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         asleep = int((motion.island[rows] >= 0).sum())
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
+
+    def _moved_since(self, state: State) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
+        """Rows of a state that differs from the latest one in these alone, such as a network makes it; else None."""
+        latest, parts = self._latest, state.parts
+        if state is latest or latest is None or parts is None or parts[0] is not self._before:
+            return None
+        alike = ("touch", "load", "joints", "drive")
+        return parts[1:] if all(getattr(state, name) is getattr(latest, name) for name in alike) else None
 
 
 def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool, note: bool) -> None:

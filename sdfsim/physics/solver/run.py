@@ -9,9 +9,10 @@ from numba import njit
 
 from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
-from sdfsim.physics.solver.joints import given, stored
+from sdfsim.physics.solver.joints import given, rest_held, stored
 from sdfsim.physics.solver.record import no_edges
 from sdfsim.physics.solver.references import reference
+from sdfsim.physics.solver.sleep import rests
 from sdfsim.physics.solver.survey import broken, energy, touching
 from sdfsim.physics.solver.vectors import BARE, ENTRY, FAST, add, dot, get, put, sub
 
@@ -75,7 +76,15 @@ def run_steps(
         for i in range(len(going)):
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
-        manifolds, edges, counts = advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note)
+        if rules.sleep and rests(world, motion):
+            edges, counts = no_edges(), (0, 0, 0)
+            _rest_on(world, work, motion)
+            if held is not None:
+                rest_held(held.each)
+        else:
+            manifolds, edges, counts = advance(
+                shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note
+            )
         for s in range(len(script.body)):
             b = script.body[s]
             for x in range(3):
@@ -107,6 +116,13 @@ def run_steps(
                 told.depth[k] = max(told.depth[k], -here.gap[e])
                 found += 1
     return manifolds, edges, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
+
+
+@njit(**BARE)
+def _rest_on(world, work, motion):
+    """A step of which all sleep: it would find nobody near another, and leave them as they are."""
+    for b in world.going:
+        motion.touching[b] = work.met[b] = False
 
 
 @njit(**BARE)

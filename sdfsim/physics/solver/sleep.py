@@ -7,8 +7,18 @@ import math
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.solver.broad_phase import stirs
 from sdfsim.physics.solver.islands import join, root
 from sdfsim.physics.solver.vectors import BARE, FAST, get, norm, put, sub
+
+
+@njit(**BARE)
+def rests(world, motion):
+    """Whether all bodies that move sleep, and nothing is led along."""
+    for b in world.going:
+        if stirs(world, motion, b):
+            return False
+    return True
 
 
 @njit(**BARE)
