@@ -22,7 +22,7 @@ from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
 
-VERSION = 7  # of what is kept on disk, beside that of the grid that surfaces are sampled from
+VERSION = 8  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
@@ -31,8 +31,6 @@ APART, DENSEST_ON_GRID = 2.0, 8000  # cells between nodes on the surface of a gr
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 ROUNDED = 0.1  # cells that the grid of a fit is off on an edge of its mesh that it rounds off
 ALONG_EDGE, MOST_ON_EDGES = 2.0, 4000  # cells between nodes of such an edge, and how many of them a shape has at most
-# Of a solid's largest extent, from where its nodes look out, and of its thickness: not out of the other side of a wall.
-INWARD, SHALLOW = 0.004, 0.4
 
 _log = logging.getLogger(__name__)
 
@@ -47,7 +45,6 @@ class ContactSurface:
 
     node: np.ndarray  # [K, 3] m, leaf by leaf
     cover: np.ndarray  # [K] m, how far the surface around a node goes that is nearer to it than to others
-    inward: np.ndarray  # [K, 3] m, from each a little into the solid, away from all faces that meet there
     leaf_node: np.ndarray  # [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1]
     leaf_ball: np.ndarray  # [L, 4] m, centre and radius
     leaf_patch: np.ndarray  # [L] int64, the patch of the surface that a leaf's nodes are of
@@ -109,7 +106,7 @@ class ContactGeometry:
         if isinstance(self.sdf, ClosedForm):
             return ContactSurface(**self._surface())
         faces = () if self.pieces else (self.mesh.vertices, self.mesh.faces)
-        known = digest(self.sdf, self.nodes, [*self.pieces], *faces, LEAF, CLUMP, INWARD, SHALLOW, ROUNDED, APART)
+        known = digest(self.sdf, self.nodes, [*self.pieces], *faces, LEAF, CLUMP, ROUNDED, APART)
         path = user_cache("contact") / f"{known}-{BAKE_VERSION}-{VERSION}.npz"
         return ContactSurface(**cached_arrays(path, "the contact surface of a shape", self._surface))
 
@@ -136,10 +133,7 @@ class ContactGeometry:
                 np.maximum.at(cover, nearest, away)
                 cover += grid.cell
         node, patch = patches.pop("node"), patches.pop("patch")
-        extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
-        shallow = self.grid.thickness if self.grid else self.thickness
-        inward = min(INWARD * extent, SHALLOW * shallow) * inwards(sdf, node)
-        return {**in_leaves(node, patch, cover, inward), **patches}
+        return {**in_leaves(node, patch, cover, inwards(sdf, node)), **patches}
 
 
 def between(nodes: np.ndarray, samples: np.ndarray, spacing: float) -> np.ndarray:
@@ -223,12 +217,12 @@ def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarr
     return nearest
 
 
-def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, inward: np.ndarray) -> dict[str, np.ndarray]:
+def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, facing: np.ndarray) -> dict[str, np.ndarray]:
     """Nodes [K, 3] in the order of leaves, and these in clumps. A leaf has nodes of one patch only, and of one side of
-    a wall: its deepest node stands for all of it, and from behind a wall no way leads along the surface."""
+    a wall, which they face: its deepest node stands for all of it, and from behind a wall no way leads along the
+    surface."""
     leaves: list[np.ndarray] = []
     clump_leaf, clump_ball = [0], [np.zeros((0, 4))]
-    facing = inward / np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
     for clump in _split(node, np.arange(len(node)), CLUMP) if len(node) else []:
         sided = np.column_stack([node, 0.5 * np.ptp(node[clump], axis=0).max() * facing])
         leaves += [leaf for p in np.unique(patch[clump]) for leaf in _split(sided, clump[patch[clump] == p], LEAF)]
@@ -236,7 +230,7 @@ def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, inward: np
         clump_ball.append(_ball(node[clump], cover[clump]))
     order = np.concatenate([np.zeros(0, np.int64), *leaves])
     return {
-        "node": node[order], "cover": cover[order], "inward": inward[order],
+        "node": node[order], "cover": cover[order],
         "leaf_node": np.cumsum([0, *map(len, leaves)], dtype=np.int64),
         "leaf_ball": np.concatenate([np.zeros((0, 4)), *(_ball(node[leaf], cover[leaf]) for leaf in leaves)]),
         "leaf_patch": np.array([patch[leaf[0]] for leaf in leaves], dtype=np.int64),

@@ -43,7 +43,7 @@ APART = 1e-3  # of the thickness: so far apart overlapping solids are moved
 ALONG, AS_MUCH = 1.0 - 1e-9, 1e-9
 EXACT = 1e-14  # squared distances are found to this part
 FEW = 48  # vertices that are looked at in turn; of more, neighbours of neighbours
-STEPS, ROUNDS = 48, 10  # of GJK, and of normals
+STEPS, ROUNDS = 48, 16  # of GJK, and of normals
 
 
 class Convex(NamedTuple):
@@ -188,7 +188,7 @@ def closest(convex, matrix, pair, n, known, enough, room):
                 continue
             start = scale(v, 1.0 / length)
         found = _least_deep(convex, matrix, pair, start, thick, enough, room)
-        if found[0] > best[0]:
+        if found[0] > best[0] + AS_MUCH * thick:  # of two that are as good the one that was found in fewer rounds
             best = found
     return best
 

@@ -16,6 +16,7 @@ from sdfsim.physics.solver.vectors import BARE, ENTRY, INLINED, along, dot, get,
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
 TINY = 1e-12
+EVEN = 1e-9  # of the size: on an edge of a closed form the face that comes first has the normal, and not rounding
 
 
 # Columns of the table of shapes: kind; sizes (sphere: radius; capsule and cylinder: radius, half height, of a capsule
@@ -35,7 +36,6 @@ class Shapes(NamedTuple):
     sample: np.ndarray  # float32 distances, at the corners of bricks and in bricks
     node: np.ndarray  # [K, 3] surface nodes, leaf by leaf
     cover: np.ndarray  # [K] how far the surface around a node goes that is nearer to it than to others
-    inward: np.ndarray  # [K, 3] from each a little into the solid, away from all faces that meet there
     leaf_node: np.ndarray  # [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1]
     leaf_ball: np.ndarray  # [L, 4] centre and radius of a ball around these
     clump_start: np.ndarray  # [S + 1] int64, shape s has clumps clump_start[s] : clump_start[s + 1]
@@ -112,12 +112,12 @@ def _box(p, a, b, c):
     sz = -1.0 if p[2] < 0.0 else 1.0
     x, y, z = sx * p[0] - a, sy * p[1] - b, sz * p[2] - c
     out = (max(x, 0.0), max(y, 0.0), max(z, 0.0))
-    length = norm(out)
-    if length > TINY:
+    length, even = norm(out), EVEN * (a + b + c)
+    if length > even:
         return length, (sx * out[0] / length, sy * out[1] / length, sz * out[2] / length)
-    if x >= y and x >= z:
+    if x >= y - even and x >= z - even:
         return x, (sx, 0.0, 0.0)
-    if y >= z:
+    if y >= z - even:
         return y, (0.0, sy, 0.0)
     return z, (0.0, 0.0, sz)
 
@@ -127,11 +127,11 @@ def _cylinder(p, radius, half):
     r = math.sqrt(p[0] * p[0] + p[1] * p[1])
     cx, cy = (p[0] / r, p[1] / r) if r > TINY else (1.0, 0.0)
     sz = -1.0 if p[2] < 0.0 else 1.0
-    x, z = r - radius, sz * p[2] - half
-    if x > 0.0 and z > 0.0:
+    x, z, even = r - radius, sz * p[2] - half, EVEN * (radius + half)
+    if x > even and z > even:
         length = math.sqrt(x * x + z * z)
         return length, (cx * x / length, cy * x / length, sz * z / length)
-    if x > z:
+    if x > z - even:
         return x, (cx, cy, 0.0)
     return z, (0.0, 0.0, sz)
 

@@ -352,7 +352,7 @@ def _joined(surfaces: list[ContactSurface]) -> tuple[np.ndarray, ...]:
 
     clumps = np.cumsum([0, *(len(surface.clump_ball) for surface in surfaces)])
     return (
-        whole("node"), whole("cover"), whole("inward"), ends("leaf_node"), whole("leaf_ball"), clumps,
+        whole("node"), whole("cover"), ends("leaf_node"), whole("leaf_ball"), clumps,
         ends("clump_leaf"), whole("clump_ball"), whole("leaf_patch"),
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from sdfsim.physics.solver.distance import (
     distance_alone,
     patch_of,
 )
-from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
+from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, TIE, write
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # patches of a shape at most
@@ -138,8 +138,7 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
     or deepest by now, as far as bodies have moved since, is not asked again.
     """
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
-    flat = table[s, KIND] == PLANE  # whose distance has one normal: no look from within
-    kept, most = 0, NEAR * table[s, CELL] * k / own if table[s, KIND] == GRID else math.inf
+    flat, kept = table[s, KIND] == PLANE, 0
     wide = len(near.node_away) // max(1, len(near.away))
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i, best = near.leaf[at], near.deepest[at]
@@ -167,19 +166,16 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
                 d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
                 low = d
             else:
-                within, back = _within_wall(get(shapes.inward, u), most)
-                q = add(p, within)
-                low = max(low, bound - own * (norm(sub(q, there)) + back))  # near to one that is far
+                low = max(low, bound - own * norm(sub(p, there)))  # near to one that is far
                 if low - around > look or low - outward > lowest:
                     near.node_away[known], closest = low + went, min(closest, low - around)
                     continue
-                d, n = distance(table, brick, sample, s, mapped(w, c, q))
-                bound, there = k * at_least(table, s, d), q
-                low = bound - own * back
-                d = k * d - k * _along_normal(w, within, n)
+                d, n = distance(table, brick, sample, s, mapped(w, c, p))
+                low = bound = k * at_least(table, s, d)
+                d, there = k * d, p
             near.node_away[known], closest = low + went, min(closest, low - around)
             score = d - OUTWARD * own * norm(p)
-            if d - around <= look and (score < lowest or (score == lowest and u < chosen)):
+            if d - around <= look and score < lowest - TIE * look:
                 deepest, chosen, lowest, facing = d, u, score, n
         near.away[at], near.deepest[at] = closest + went, chosen if chosen >= 0 else first
         near.away_all[pair] = min(near.away_all[pair], near.away[at])
@@ -216,7 +212,7 @@ def _chosen(scratch, kept, level):
     while chosen < SIDE:
         first = -1
         for e in range(kept):
-            if used[e] == 0 and (first < 0 or depth[e] < depth[first]):
+            if used[e] == 0 and (first < 0 or depth[e] < depth[first] - TIE * level):
                 first = e
         if first < 0:
             break
@@ -232,7 +228,7 @@ def _chosen(scratch, kept, level):
             for e in range(kept):
                 if used[e] != 1 and key[e] == key[first] and dot(n, get(normal, e)) > ALIKE:
                     used[e] = 2
-                    if depth[e] <= depth[first] + level and dot(d, get(place, e)) > most:
+                    if depth[e] <= depth[first] + level and dot(d, get(place, e)) > most + TIE * level:
                         outer, most = e, dot(d, get(place, e))
             known = outer < 0
             for e in range(start, chosen):
@@ -244,23 +240,6 @@ def _chosen(scratch, kept, level):
             used[e] = 1 if used[e] == 2 else used[e]
         used[first] = 1
     return chosen
-
-
-@njit(**BARE)
-def _within_wall(inward, most):
-    """The way from a node to where it looks out from, and how long it is; shorter into a much larger body.
-
-    On an edge of the other solid its distance has two normals, and the one that parts two stacked boxes is not always
-    the nearer. From within the own solid only the face that is met is near.
-    """
-    long = norm(inward)
-    return (inward, long) if long <= most else (scale(inward, most / long), most)
-
-
-@njit(**BARE)
-def _along_normal(w, within, n):
-    """How far a way of a shape goes along a normal of the other, at the other's scale."""
-    return dot((dot(w[0], within), dot(w[1], within), dot(w[2], within)), n)
 
 
 @njit(**INLINED)
