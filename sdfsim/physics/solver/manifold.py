@@ -31,9 +31,6 @@ CANDIDATES = 256  # leaves of nodes that may touch, of which
 SIDE = 40  # at most become points
 EACH = 4  # points of a manifold that are of the same two patches
 ALIKE = 0.9  # cosine between normals that are taken for one
-# A point is preferred to one before it if it is deeper, farther or farther out by this part of how far is looked, or it
-# is as good: else rounding would choose between the points of what is symmetric, such as a ring that lies flat.
-TIE = 1e-4
 OUTWARD = 1e-3  # how much deeper another point must be to be preferred to one that is farther out by a length
 
 
@@ -183,7 +180,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
     chosen, lowest = -1, 1e300
     for e in range(total):
         away[e], alike[e] = 1e300, 0
-        if every[e, GAP] < lowest - TIE * rules.contact_margin:
+        if every[e, GAP] < lowest:
             chosen, lowest = e, every[e, GAP]
     kept = 0
     while chosen >= 0 and kept < POINTS:
@@ -200,7 +197,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
             if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
                 alike[e] += 1
             away[e] = min(away[e], gone + 0.01 * turned)
-            if away[e] > (1.0 + TIE) * farthest and alike[e] < EACH:
+            if away[e] > farthest and alike[e] < EACH:
                 farthest, following = away[e], e
         chosen = following
     return kept
@@ -216,7 +213,7 @@ def renewed(rules, point, p, known, scratch, count):
             every[k, x] = point[p, k, x]
     same = rules.contact_margin * rules.contact_margin
     if count > POINTS:
-        count = thinned(rules, scratch, count)
+        count = thinned(scratch, count)
     for e in range(count):
         twin, least = -1, same
         for k in range(known):
@@ -240,7 +237,7 @@ def renewed(rules, point, p, known, scratch, count):
 
 
 @njit(**BARE)
-def thinned(rules, scratch, count):
+def thinned(scratch, count):
     """Of many points as many as a manifold holds: the deepest, then always the one that is farthest from those chosen.
     They come first in `found`."""
     found, away = scratch.found, scratch.away
@@ -248,7 +245,7 @@ def thinned(rules, scratch, count):
         away[e] = 1e300
     kept, chosen = 0, 0
     for e in range(count):
-        if found[e, GAP] < found[chosen, GAP] - TIE * rules.contact_margin:
+        if found[e, GAP] < found[chosen, GAP]:
             chosen = e
     while kept < POINTS:
         away[chosen], away[kept] = away[kept], away[chosen]
@@ -263,6 +260,6 @@ def thinned(rules, scratch, count):
                 gone += (found[e, FIRST + x] - found[last, FIRST + x]) ** 2
                 gone += 0.01 * (found[e, NORMAL + x] - found[last, NORMAL + x]) ** 2
             away[e] = min(away[e], gone)
-            if away[e] > (1.0 + TIE) * away[chosen]:
+            if away[e] > away[chosen]:
                 chosen = e
     return kept

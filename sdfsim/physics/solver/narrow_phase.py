@@ -445,7 +445,7 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
             near.away[at] = gap + went
             if gap <= look:
                 if count + CHOSEN > FOUND:
-                    count = thinned(rules, scratch, count)
+                    count = thinned(scratch, count)
                 picked, arm = touching_points(
                     convex, matrix, pair, plane, near.held[at], gap, n, own, his, look, polygons
                 )

@@ -19,7 +19,7 @@ from sdfsim.physics.solver.distance import (
     distance_alone,
     patch_of,
 )
-from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, TIE, write
+from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # patches of a shape at most
@@ -175,7 +175,7 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
                 d, there = k * d, p
             near.node_away[known], closest = low + went, min(closest, low - around)
             score = d - OUTWARD * own * norm(p)
-            if d - around <= look and score < lowest - TIE * look:
+            if d - around <= look and (score < lowest or (score == lowest and u < chosen)):
                 deepest, chosen, lowest, facing = d, u, score, n
         near.away[at], near.deepest[at] = closest + went, chosen if chosen >= 0 else first
         near.away_all[pair] = min(near.away_all[pair], near.away[at])
@@ -212,7 +212,7 @@ def _chosen(scratch, kept, level):
     while chosen < SIDE:
         first = -1
         for e in range(kept):
-            if used[e] == 0 and (first < 0 or depth[e] < depth[first] - TIE * level):
+            if used[e] == 0 and (first < 0 or depth[e] < depth[first]):
                 first = e
         if first < 0:
             break
@@ -228,7 +228,7 @@ def _chosen(scratch, kept, level):
             for e in range(kept):
                 if used[e] != 1 and key[e] == key[first] and dot(n, get(normal, e)) > ALIKE:
                     used[e] = 2
-                    if depth[e] <= depth[first] + level and dot(d, get(place, e)) > most + TIE * level:
+                    if depth[e] <= depth[first] + level and dot(d, get(place, e)) > most:
                         outer, most = e, dot(d, get(place, e))
             known = outer < 0
             for e in range(start, chosen):
