@@ -7,7 +7,7 @@
     python benchmarks/scale.py many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
     python benchmarks/scale.py roofline
-        what a distance and a row of impulses cost, beside what the machine could do: docs/scale.md
+        what a distance, a contact and a row of impulses cost, beside what the machine could do: docs/scale.md
 
 Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
 holds is not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
@@ -45,8 +45,10 @@ from sdfsim.learned.model import load_model
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.solver.distance import distances
-from sdfsim.physics.solver.impulses import IMPULSE, MASS, WANTED, WIDTH, System, _balance
+from sdfsim.physics.solver.impulses import IMPULSE, MASS, WANTED, WIDTH, System, _balance, _equations
 from sdfsim.physics.solver.prepare import compiled_rules, compiled_shapes
+from sdfsim.physics.solver.references import reference
+from sdfsim.physics.solver.world import COLUMNS as OF_POINT
 from sdfsim.physics.solver.world import Rules
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
@@ -224,11 +226,14 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {scenes}", markdown(rows))
 
 
-# Operations (a product, a sum, a comparison or a root each) and bytes of one distance and one row, counted in
-# `physics/solver/distance.py` (`_grid`) and `physics/solver/impulses.py` (`_relax`): eight samples and the number of a
-# brick, and the columns of the table of shapes; a row, and the changes of two bodies' velocities, read and written.
+# Operations (a product, a sum, a comparison or a root each) and bytes of one distance, one contact and one row, counted
+# in `physics/solver/distance.py` (`_grid`) and `physics/solver/impulses.py` (`_equations`, `_relax`): eight samples and
+# the number of a brick, and the columns of the table of shapes; a point, poses, inertias and velocities of two bodies,
+# and three rows, written twice as they are made of zeros; a row, and the changes of two bodies' velocities, read and
+# written.
 DISTANCE, ROW = (95, 8 * 4 + 8 + 15 * 8), (52, 17 * 8 + 2 * 2 * 6 * 8 + 4 * 8)
-PLACES, ROWS, ISLAND, SWEEPS = 200_000, 4096, 64, 50
+CONTACT = (583, OF_POINT * 8 + 2 * (18 + 15) * 8 + 2 * 3 * WIDTH * 8 + 11 * 8)
+PLACES, ROWS, ISLAND, SWEEPS, BOXES, AGAIN = 200_000, 4096, 64, 50, 60, 50
 
 
 def roofline() -> None:
@@ -243,6 +248,7 @@ def roofline() -> None:
         ("the machine: copies of 256 MiB", (0, 1), 1 / bandwidth),
         ("a distance of a grid, places in turn", DISTANCE, distance_time(scattered=False)),
         ("a distance of a grid, places anywhere", DISTANCE, distance_time(scattered=True)),
+        ("a contact: its three rows", CONTACT, contact_time()),
         ("a row of impulses, and its change", ROW, row_time()),
     ):
         rate, speed = operations / seconds, moved / seconds
@@ -301,6 +307,25 @@ def distance_time(*, scattered: bool) -> float:
     places = places + generator.uniform(-0.01, 0.01, places.shape)
     places = places[generator.permutation(PLACES) if scattered else np.lexsort(np.round(places, 2).T)]
     return best(lambda: distances(table.table, table.brick, table.sample, 0, places)) / PLACES
+
+
+@njit(error_model="numpy")
+def _written(world, work, motion, rules, manifolds, times: int) -> int:
+    count = 0
+    for _ in range(times):
+        some = reference(world), reference(work), reference(motion), reference(rules), reference(manifolds)
+        count += len(_equations(*some).where)
+    return count
+
+
+def contact_time() -> float:
+    """s in which the rows of a contact are written, of boxes that rest on a floor."""
+    simulator = Simulator(apart(BOXES), "solver")
+    simulator.step(30)
+    scene: Any = simulator.carry.scene
+    rules = compiled_rules(simulator.options)
+    known = scene.world, scene.work, scene._motion, rules, scene._manifolds
+    return best(lambda: _written(*known, AGAIN)) / _written(*known, AGAIN)
 
 
 @njit(error_model="numpy")

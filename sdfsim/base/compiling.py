@@ -7,10 +7,12 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from threading import Lock
 from typing import Any
 
 _log = logging.getLogger(__name__)
-_said: set[str] = set()
+_lock = Lock()
+_ready: set[str] = set()  # what has been compiled, or found to be, in this process
 
 
 # The module's path first: what is pickled needs it to be read.
@@ -30,20 +32,23 @@ def compile_before(
     just been compiled rounds differently, and a run could not be repeated bit by bit. Where nothing can be kept the
     first call compiles.
     """
-    if what in _said or is_compiled(function, missing):
-        return
-    _said.add(what)
-    _log.warning("compiling %s, once for this version: about %s", what, takes)
-    try:
-        function._cache._impl.locator.ensure_cache_path()
-    except (AttributeError, OSError):
-        return
-    from numba import typeof
+    with _lock:  # of several threads that need it one has it compiled
+        if what in _ready:
+            return
+        _ready.add(what)
+        if is_compiled(function, missing):
+            return
+        _log.warning("compiling %s, once for this version: about %s", what, takes)
+        try:
+            function._cache._impl.locator.ensure_cache_path()
+        except (AttributeError, OSError):
+            return
+        from numba import typeof
 
-    name = (function.py_func.__module__, function.py_func.__qualname__)
-    wanted = pickle.dumps((*name, tuple(typeof(each) for each in arguments)))
-    path = json.dumps([*sys.path]).encode() + b"\n"
-    subprocess.run([sys.executable, "-c", _CHILD], input=path + wanted, capture_output=True, check=False)
+        name = (function.py_func.__module__, function.py_func.__qualname__)
+        wanted = pickle.dumps((*name, tuple(typeof(each) for each in arguments)))
+        path = json.dumps([*sys.path]).encode() + b"\n"
+        subprocess.run([sys.executable, "-c", _CHILD], input=path + wanted, capture_output=True, check=False)
 
 
 def _compile_here(wanted: bytes) -> None:

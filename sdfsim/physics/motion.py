@@ -16,7 +16,7 @@ class Rows:
         however many bodies there are, and however often rows have been changed before.
         """
         before, known, values = self.parts or (self, rows, {})
-        if not np.array_equal(rows, known):
+        if rows is not known and not np.array_equal(rows, known):
             known = np.union1d(known, rows)
             values = {name: self.rows_of(name, known) for name in {**values, **changed}}
             place = np.searchsorted(known, rows)

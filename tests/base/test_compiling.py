@@ -74,7 +74,7 @@ def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, cap
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
-    monkeypatch.setattr(compiling, "_said", set())
+    monkeypatch.setattr(compiling, "_ready", set())
     double = importlib.import_module(f"doubling_{cache}").double
     compile_before(double, (3,), "doubling", "a second")
     assert caplog.messages == ["compiling doubling, once for this version: about a second"]
@@ -90,7 +90,7 @@ class Uncompiled:
 
 
 def test_it_is_said_once_for_all_scenes_of_a_process(monkeypatch, caplog):
-    monkeypatch.setattr(compiling, "_said", set())
+    monkeypatch.setattr(compiling, "_ready", set())
     monkeypatch.setattr(solver, "run_steps", Uncompiled())
     balls = (make_body("ball", 0, [0, 0, 1]), make_body("other", 0, [3, 0, 1]))
     for _ in range(3):
@@ -101,7 +101,7 @@ def test_it_is_said_once_for_all_scenes_of_a_process(monkeypatch, caplog):
 
 
 def test_scenes_with_joints_and_with_many_bodies_are_told_of_by_themselves(monkeypatch, caplog):
-    monkeypatch.setattr(compiling, "_said", set())
+    monkeypatch.setattr(compiling, "_ready", set())
     monkeypatch.setattr(solver, "run_steps", Uncompiled())
     balls = [make_body(f"ball {k}", 0, [3 * k, 0, 1]) for k in range(solver.CROWD)]
     pin = Joint("pin", "ball", (0, 1), np.array([[1.5, 0, 0], [-1.5, 0, 0]]), np.array([[0.0, 0, 0, 1]] * 2))
@@ -133,6 +133,6 @@ def test_what_is_compiled_already_is_not_reported(caplog):
     sim = Simulator(Scene((analytic_shape("sphere", radius=0.5),), (make_body("a", 0, [0, 0, 1]),), np.zeros(3), 1.0))
     sim.step(1)
     caplog.clear()
-    compiling._said.clear()
+    compiling._ready.clear()
     Simulator(sim.scene).step(1)
     assert "compiling" not in caplog.text

@@ -10,6 +10,7 @@ from sdfsim.data.dataset import Trajectory
 from sdfsim.learned import inference
 from sdfsim.learned.model import Model, load_model, new_network
 from sdfsim.physics.motion import MOTION
+from sdfsim.physics.solver import prepare
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
@@ -42,7 +43,8 @@ def model_of(name: str, seed: int = 0) -> Model:
     return random_model("impulse", seed, width=24, rounds=3, alone=int(name == "alone"))
 
 
-def test_recordings_in_a_batch_move_as_each_alone(box_shape):
+def recordings(counts: tuple[int, ...]) -> list[Trajectory]:
+    """One frame each of so many boxes."""
     draw = np.random.default_rng(4)
 
     def recording(count: int) -> Trajectory:
@@ -56,11 +58,23 @@ def test_recordings_in_a_batch_move_as_each_alone(box_shape):
             gravity=np.array([0.0, 0.0, -10.0]),
         )  # fmt: skip
 
-    group, model = [recording(count) for count in (2, 1, 3, 2)], model_of("random")
+    return [recording(count) for count in counts]
+
+
+def test_recordings_in_a_batch_move_as_each_alone(box_shape):
+    group, model = recordings((2, 1, 3, 2)), model_of("random")
     together = roll_out(model, group, {"box": box_shape}, 8)
     for one, same in zip(group, together, strict=True):
         (alone,) = roll_out(model, [one], {"box": box_shape}, 8)
         np.testing.assert_allclose(alone.velocity, same.velocity, atol=1e-4)
+
+
+def test_a_shape_off_its_centre_of_mass_is_made_ready_once_for_all_recordings(box_shape, monkeypatch):
+    made, known = [], prepare.compiled_shapes
+    monkeypatch.setattr(prepare, "compiled_shapes", lambda shapes: made.append(shapes) or known(shapes))
+    box = replace(box_shape, com=np.array([0.01, 0.0, 0.0]))
+    assert len(roll_out(load_model("solver"), recordings((2, 1, 3, 2)), {"box": box}, 2)) == 4
+    assert len(made) == 1 and made[0][0] is box.contact
 
 
 @pytest.mark.parametrize("impacts", [0, 1])

@@ -43,6 +43,12 @@ def stirs(world, motion, b):
 
 
 @njit(**BARE)
+def frozen(world, motion, a, b):
+    """Whether nothing happens between two bodies, the first of which moves, until either is woken."""
+    return motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
+
+
+@njit(**BARE)
 def _may_meet(world, a, b):
     if len(world.apart):
         for k in range(world.apart[a], world.apart[a + 1]):
@@ -152,7 +158,7 @@ def carried(world, motion, pairs, old):
     for k in range(len(old.count)):
         a, b = old.pair[k, 0], old.pair[k, 1]
         key[k] = a * n + b
-        asleep[k] = motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
+        asleep[k] = frozen(world, motion, a, b)
     order = order_of(key)
     here = total = len(pairs)
     for k in range(len(asleep)):

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
+from sdfsim.physics.solver.broad_phase import frozen
 from sdfsim.physics.solver.islands import islands_of
-from sdfsim.physics.solver.manifold import points_of
 from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.vectors import (
     BARE,
@@ -102,14 +102,17 @@ def remembered(manifolds, system):
 @njit(**FAST)
 def _equations(world, work, motion, rules, manifolds):
     matrix, inverse, free = work.matrix, work.inverse, work.free
-    most = points_of(manifolds, len(manifolds.count))
+    most = 0
+    for m in range(len(manifolds.count)):
+        if not frozen(world, motion, manifolds.pair[m, 0], manifolds.pair[m, 1]):
+            most += manifolds.count[m]
     where = np.empty((most, 4), np.int64)
     row = np.zeros((most, 3, WIDTH))
     mu, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
     count = np.int64(0)  # a literal would be a type of its own, for which all is compiled once more
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
-        if motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b]):
+        if frozen(world, motion, a, b):
             continue
         friction = world.friction[a] * world.friction[b] if rules.friction else 0.0
         bounce = world.restitution[a] * world.restitution[b] if rules.restitution else 0.0

@@ -99,6 +99,7 @@ class Compiled:
         self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
         self._announced: set[bool] = set()  # with and without what contacts did
         self._load: np.ndarray | None = None
+        self._options: Options | None = None  # what `_rules` are of
         self._latest: State | None = None  # what `_motion` and `_manifolds` are the arrays of
 
     def run(
@@ -144,7 +145,9 @@ class Compiled:
         if state.load is not self._load:
             self.work.wrench[:] = 0.0 if state.load is None else state.load
             self._load = state.load
-        rules, motion = compiled_rules(options), self._motion
+        if options is not self._options:
+            self._options, self._rules = options, compiled_rules(options)
+        rules, motion = self._rules, self._motion
         script, time = _script(self.bodies.tracks, state.time, rules.substep_dt * rules.substeps, steps)
         self._latest = None  # where the rest of this does not come to its end
         manifolds, edges, counts, done, body, wrong, before, given, pair, point, kept = self.run(

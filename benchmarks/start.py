@@ -1,0 +1,75 @@
+"""How long a command takes from nothing to its end, and how much memory, and a box that falls: RESULTS.md.
+
+    python -m benchmarks.start [--rounds 7]
+
+Every case is a process of its own, all of them in turn; medians. Compiled code and what else is kept on disk is there
+from a first round, which is left out. Processor time says what a free machine would take where this one was not free.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+
+from benchmarks.results import ROOT, in_turn, script, write_section
+from sdfsim.base.errors import SdfsimError
+from sdfsim.evaluation.harness import markdown, number
+
+OURS = """
+import sdfsim
+scene = sdfsim.Scene(model="solver")
+scene.add("box", box={"size": (0.2, 0.2, 0.2)}, position=(0, 0, 2), mass=1.0).add("floor", plane={})
+sdfsim.Simulator(scene).run(0.4)
+"""
+MUJOCO = """
+import mujoco
+box = '<body pos="0 0 2"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+text = f'<mujoco><worldbody><geom type="plane" size="9 9 1"/>{box}</worldbody></mujoco>'
+model = mujoco.MjModel.from_xml_string(text)
+data = mujoco.MjData(model)
+while data.time < 0.4:
+    mujoco.mj_step(model, data)
+"""
+
+
+# A process has from its parent how much memory that had: a small one starts each.
+LAUNCH = """
+import resource, subprocess, sys, time
+began = time.perf_counter()
+subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(time.perf_counter() - began, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+"""
+
+
+def ended(command: list[str]) -> tuple[float, ...]:
+    """s by the clock and of the processor that a command takes, and MiB at most. Raises SdfsimError where it fails."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    started = [sys.executable, "-c", LAUNCH, *command]
+    done = subprocess.run(started, cwd=ROOT, env=kept, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SdfsimError(f"{' '.join(command)}: failed")
+    return tuple(map(float, done.stdout.split()))
+
+
+def main(*, rounds: int = 7) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        ours = [sys.executable, "-c", "from cli import app; app()"]
+        tower = [*ours, "simulate", "samples/tower.yaml", "-o", scratch]
+        cases = {
+            "`sdfsim --help`": [*ours, "--help"],
+            "`sdfsim simulate samples/tower.yaml --viewer none`": [*tower, "--viewer", "none"],
+            "the same with a recording": tower,
+            "a box that falls for 0.4 s": [sys.executable, "-c", OURS],
+            "the same in MuJoCo": [sys.executable, "-c", MUJOCO],
+        }
+        found = np.median(in_turn([lambda some=some: ended(some) for some in cases.values()], rounds), axis=0)
+    rows = [("from nothing", "s", "s of the processor", "MiB")]
+    rows += [(name, *map(number, values)) for name, values in zip(cases, found, strict=True)]
+    write_section("start", "python -m benchmarks.start", markdown(rows))
+
+
+if __name__ == "__main__":
+    script(__doc__, main)
