@@ -519,7 +519,7 @@ def _partners(
     names = [link.name for link in links]
     listed = []
     for k in range(count):
-        others = {b if a == k else a for a, b in denied if k in (a, b)}
+        others = {b if a == k else a for a, b in denied - own if k in (a, b)}  # what a joint holds is kept apart by it
         if not others or "plane" in {part.kind for part in links[k].solid or links[k].shown}:
             continue
         found[k] = []

@@ -81,3 +81,33 @@ def test_samples_are_copied_to_be_changed(installed, tmp_path):
     call(installed, tmp_path, "-c", "import sdfsim; assert len(sdfsim.load_scene('samples/pile.yaml').shapes) > 5")
     assert len(list((tmp_path / "samples" / "photos" / "table_vase" / "images").glob("*.jpg"))) == 48
     assert "small" in call(installed, tmp_path, program, "info")
+
+
+def test_a_users_type_checker_knows_what_functions_take_and_give(installed, tmp_path):
+    """Each line that ends in `# wrong` has one error, and no other line has any."""
+    text = """\
+import sdfsim
+
+scene = sdfsim.Scene(duration=1.0).add("ball", sphere={"radius": 0.1}, mass=0.2)
+scene.add("cup", mesh="cup.obj", weight=2.0)  # wrong
+simulator = sdfsim.Simulator(scene)
+ball = simulator["ball"]
+ball.velocity = (1.0, 0.0, 0.0)
+ball.speed  # wrong
+rollout = simulator.run(seconds=0.2, on_progress=lambda share, line: None)
+height: float = rollout.position[-1, 0, 2]
+names: int = rollout.names  # wrong
+sdfsim.reconstruct("PHOTOS", "room", preset="quick", distance=("a.jpg:1,2", "a.jpg:3,4", 1.2), progress=print)
+sdfsim.reconstruct("PHOTOS", "room", preset="quickest")  # wrong
+sdfsim.reconstruct("PHOTOS", "room", sise=1.2)  # wrong
+sdfsim.simulate("tower", "run", viewer="none", second=0.1)  # wrong
+sdfsim.export("run", "run.glb", fps=24)["files"]
+"""
+    (tmp_path / "mine.py").write_text(text)
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(installed)]}))
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--outputjson", "-p", str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    found = [d for d in json.loads(done.stdout)["generalDiagnostics"] if d["severity"] == "error"]
+    assert {Path(d["file"]).name for d in found} == {"mine.py"}
+    wrong = [k for k, line in enumerate(text.splitlines()) if line.endswith("# wrong")]
+    assert sorted(d["range"]["start"]["line"] for d in found) == wrong
