@@ -124,6 +124,17 @@ def test_urdf_tells_what_it_leaves_out_and_what_it_made_otherwise(tmp_path: Path
     assert any("shoulder starts at 0.2 rad" in line for line in report["notes"])
 
 
+def test_what_is_added_to_a_robot_touches_all_links_that_overlap_no_other(tmp_path: Path) -> None:
+    """A joint keeps its links apart by itself; a list is for other links that are in each other at the start."""
+    free, _ = imported(write(tmp_path / "free", "arm.urdf", ARM), fixed=True)
+    assert [body.collides_with for body in free.bodies] == [None] * 4
+    thick = ARM.replace('<cylinder radius="0.04" length="0.36"/>', '<cylinder radius="0.3" length="0.7"/>')
+    crossed, report = imported(write(tmp_path / "crossed", "arm.urdf", thick), fixed=True)
+    lists = {body.name: body.collides_with for body in crossed.bodies}
+    assert lists["base"] is lists["slide"] is None and lists["upper"] is not None and "tip" not in lists["upper"]
+    assert any("collides_with" in line and "upper" in line for line in report["notes"])
+
+
 def test_a_urdf_with_efforts_can_be_driven_and_is_limp_until_then(tmp_path: Path) -> None:
     file = write(tmp_path, "arm.urdf", ARM)
     scene, _ = imported(file, fixed=True)
