@@ -80,7 +80,7 @@ def simulate(
     ]
     tell_failed(session, report)
     if "recording" in report:
-        lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
+        lines.append(f"watch it: sdfsim view {out}   (or: rerun {report['recording']})")
     lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
     session.report(report, lines)
     if viewer == "web":
@@ -122,7 +122,7 @@ def samples(
 @command
 def view(
     session: Session,
-    recording: Annotated[Path, typer.Argument(help="rollout.rrd", show_default=False)],
+    recording: Annotated[Path, typer.Argument(help="Run folder or rollout.rrd.", show_default=False)],
     web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
     picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,

@@ -47,15 +47,20 @@ def _shown(value: Any) -> str:
     return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
 
 
-_LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names"}
+_LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names", "joints": "be a list"}
 _LENGTHS = {"quat_xyzw": 4, "quat_wxyz": 4, "limits": 2, "limits_deg": 2, "grid": 3}
 
 
+def _numbers(name: str) -> str:
+    """What a list of numbers of that name holds; all that are not named here are vectors."""
+    return f"{_LENGTHS.get(name, 3)} numbers"
+
+
 def _many(value: Any, name: str) -> str:
-    """How many entries a list of that name has; all that are not named here are vectors."""
+    """How many entries a list of that name has."""
     if name == "bodies" and not any(isinstance(entry, str) for entry in value):
         return "have at least one body"
-    return _LISTS.get(name) or f"be {_LENGTHS.get(name, 3)} numbers"
+    return _LISTS.get(name) or f"be {_numbers(name)}"
 
 
 # What other programs call keys that have another name here; the first that is known counts.
@@ -103,7 +108,7 @@ def _told(error: Any, table: "type[Table]") -> str:
         "too_short": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
         "too_long": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
         "literal_error": f"must be one of {allowed} (got {got})",
-        "list_type": f"must be a list (got {got})",
+        "list_type": f"must be {'a list' if key in _LISTS else _numbers(str(key))} (got {got})",
         "dict_type": f"must be a mapping (got {got})",
     }
     return texts.get(kind, f"must be a text (got {got})")

@@ -21,6 +21,8 @@ BODY = [
     ("restitution: 1.5", "bodies[0].restitution: must be <= 1 (got 1.5)"),
     ("positon: [0, 0, 0]", "bodies[0].positon: unknown key (did you mean 'position'?)"),
     ("position: [0, 0]", "bodies[0].position: must be 3 numbers (got 2)"),
+    ("position: 0.5", "bodies[0].position: must be 3 numbers (got 0.5)"),
+    ("quat_xyzw: none", "bodies[0].quat_xyzw: must be 4 numbers (got 'none')"),
     ("position: [0, inf, 0]", "bodies[0].position[1]: must be a number in m (got 'inf')"),
     ("motion: static, velocity: [0, 0, 1]", "bodies[0].velocity: must be zero: a static body does not move"),
     ("motion: driven", "bodies[0].motion: must be one of static, dynamic, kinematic (got 'driven')"),
