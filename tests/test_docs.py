@@ -20,6 +20,9 @@ PAGES = [
 ]
 
 
+OURS = re.compile(r"(?<![\w./-])(?:sdfsim|pipeline|benchmarks|tests|samples)/[\w/]+\.py\b")
+
+
 def examples(name: str, folder: Path) -> dict:
     """The names that the Python blocks of a page leave, run in order in a folder with the samples."""
     shutil.copytree(ROOT / "samples", folder / "samples", ignore=shutil.ignore_patterns("photos"))
@@ -76,6 +79,12 @@ def test_the_functions_that_how_it_works_names_exist():
     there = set(re.findall(r"(?:def|class) (\w+)|^(\w+)\b", sources, re.MULTILINE))
     assert len(named) > 40
     assert not named - {name for pair in there for name in pair}
+
+
+def test_the_files_that_pages_name_exist():
+    named = {(page.name, path) for page in PAGES for path in re.findall(OURS, page.read_text(encoding="utf-8"))}
+    assert len(named) > 60
+    assert not [pair for pair in sorted(named) if not (ROOT / pair[1]).exists()]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
