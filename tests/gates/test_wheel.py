@@ -24,8 +24,9 @@ def wheel(tmp_path_factory) -> Path:
     home = tmp_path_factory.mktemp("wheel")
     left_out = shutil.ignore_patterns(".*", "tests", "docs", "benchmarks", "runs", "build", "*.egg-info", "__pycache__")
     shutil.copytree(ROOT, home / "source", ignore=left_out)
-    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(home)]
-    subprocess.run([*build, str(home / "source")], check=True, cwd=home)
+    build = [sys.executable, "-m", "pip", "wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(home)]
+    done = subprocess.run([*build, str(home / "source")], check=True, cwd=home, capture_output=True, text=True)
+    assert "would be ignored" not in done.stdout + done.stderr  # what setuptools says of folders that it does not know
     (made,) = home.glob("*.whl")
     return made
 
