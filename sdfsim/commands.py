@@ -69,7 +69,7 @@ def simulate(
     median = report["step_ms_median"]
     lines = [
         f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
-        + ("" if median is None else f" (median {median:.1f} ms a step)"),
+        + ("" if median is None else f" (median {float(f'{median:.2g}'):g} ms a step)"),
         f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
         *run.ending_lines(report),
         *run.beside_lines(report),
