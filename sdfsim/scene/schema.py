@@ -418,6 +418,7 @@ class BodyTable(Turned):
     collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(
         "`all`, or a list of names: two bodies touch where each lists the other", None
     )
+    avoids: list[Text] = key("names of bodies that it never touches, whatever their lists say", [])
     count: Whole | None = key("how many copies; without it, as many as the grid has places", None, ge=1)
     arrange: Arrange | None = key("where the copies are", None)
 
@@ -624,7 +625,8 @@ class JointTable(Table):
 
 def _named(bodies: list, joints: Any) -> Iterator[tuple[Loc, str]]:
     """Where lists of bodies and joints name bodies, and what they name, as far as they are lists."""
-    for of, entries, key in (("bodies", bodies, "collides_with"), ("joints", joints, "bodies")):
+    named = ("bodies", bodies, "collides_with"), ("bodies", bodies, "avoids"), ("joints", joints, "bodies")
+    for of, entries, key in named:
         for i, entry in enumerate(entries if isinstance(entries, list) else ()):
             names = entry.get(key) if isinstance(entry, dict) else None
             for k, name in enumerate(names if isinstance(names, list) else ()):
@@ -686,9 +688,10 @@ class SceneTable(Table):
             for key in ("velocity", "angular_velocity") if self.motion_of(body) == "static" else ():
                 if np.any(getattr(body, key)):
                     yield ("bodies", i, key), "must be zero: a static body does not move"
-            for k, partner in enumerate(body.collides_with or []):
-                if partner not in first and partner not in copies and "[" in partner:
-                    yield ("bodies", i, "collides_with", k), _no_body(partner, copies)
+            for key in ("collides_with", "avoids"):
+                for k, partner in enumerate(getattr(body, key) or []):
+                    if partner not in first and partner not in copies and "[" in partner:
+                        yield ("bodies", i, key, k), _no_body(partner, copies)
         yield from self._joint_faults()
 
     def _joint_faults(self) -> Iterator[Fault]:

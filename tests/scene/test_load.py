@@ -28,6 +28,7 @@ BODY = [
     ("motion: driven", "bodies[0].motion: must be one of static, dynamic, kinematic (got 'driven')"),
     ("quat_xyzw: [0, 0, 0, 0]", "bodies[0].quat_xyzw: must not be zero"),
     ("collides_with: [flor]", "bodies[0].collides_with[0]: no body is called 'flor' (did you mean 'floor'?)"),
+    ("avoids: [flor]", "bodies[0].avoids[0]: no body is called 'flor' (did you mean 'floor'?)"),
     ("collides_with: none", "bodies[0].collides_with: must be all, or a list of names (got 'none')"),
     ("count: 2.5", "bodies[0].count: must be a whole number (got 2.5)"),
     ("count: 3", "bodies[0].count: needs arrange: {grid: [nx, ny, nz], spacing: metres} (got 3 at one place)"),
