@@ -174,14 +174,14 @@ def test_what_networks_change_on_real_tosses_is_the_same_everywhere():
 
 
 def test_what_far_scenery_costs_is_the_same_everywhere():
-    """Nothing beside the solver, and with a network what the page says."""
+    """Nothing, with the solver and with a network on top of it."""
     table = section("contact step", page("benchmarks/RESULTS.md"))
     solver, small = (
         numbers(cells(table, f"the same with all of `Simulator`, {model}")[-1])[0] for model in ("solver", "small")
     )
     assert solver <= 1.1 and "costs the same beside 10,000 static bodies as beside 10" in page("docs/scale.md")
-    told = re.search(r"takes (\S+) times as long beside 10,000\s+static", page("benchmarks/RESULTS.md"))
-    assert told and numbers(told[1]) == [round(small)]
+    told = "Static bodies far away cost nothing, with the solver and with the network on top of it."
+    assert small <= 1.1 and told in page("benchmarks/RESULTS.md")
 
 
 def test_how_many_everyday_checks_hold_is_the_same_everywhere():
