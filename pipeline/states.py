@@ -26,7 +26,7 @@ from pipeline.field.training import load_field
 from pipeline.inputs.labels import FOLDER, NAMES, load_names
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, save_photos
 from pipeline.mesh.joint import JOINT, PART, HeldPart, find_joint
-from pipeline.mesh.moved import CELLS, alike, label_images, load_state, part_of, which_move
+from pipeline.mesh.moving_part import CELLS, alike, label_images, load_state, part_of, which_move
 from pipeline.mesh.placement import check_distance, load_placement
 from pipeline.options import options_of
 from pipeline.stages import RECORD, Instead, Project, check_apart, number_of, read_record, run_all

@@ -10,8 +10,8 @@ from PIL import Image
 from pydantic import TypeAdapter
 
 from pipeline.cameras import View, save_views
+from pipeline.inputs.bit_depth import common_white
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
-from pipeline.inputs.deep import common_white
 from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, read_photo, sharpness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES

@@ -30,7 +30,7 @@ from sdfsim.base.files import check_writable, write_bytes, write_text
 from sdfsim.base.parallel import StageProgress
 from sdfsim.geometry.gltf import GltfWriter, light
 from sdfsim.geometry.mesh import Mesh, convex_hull
-from sdfsim.geometry.mesh_io import wavefront
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES, wavefront
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.collision_filter import contact_groups
@@ -185,7 +185,9 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     elif not source.exists():
         raise SdfsimError(f"{source}: there is no such folder or file", "give a run folder, scene.yaml or Shape folder")
     else:
-        raise SdfsimError(f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder")
+        hint = f"sdfsim fit {source} -o FOLDER makes a Shape folder of a mesh"
+        message = f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder"
+        raise SdfsimError(message, hint if source.suffix.lower() in MESH_SUFFIXES else "")
     if run is not None:
         time, turn = run.time, run.orientation.copy()
         turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]

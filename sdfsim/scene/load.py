@@ -125,6 +125,10 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
 def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:
     """The first copy, without its mass."""
     partners, path = entry.collides_with, None
+    if entry.avoids:
+        avoided = {n for p in entry.avoids for n in groups.get(p, [p])}
+        known = (n for p in (groups if partners is None else partners) for n in groups.get(p, [p]))
+        partners = [n for n in known if n not in avoided]
     position, quat = (np.array(entry.position), entry.rotation()) if entry.plane is None else entry.plane.pose()
     if entry.path:
         times, places, turns = zip(*((p.time, p.position, p.rotation()) for p in entry.path), strict=True)
