@@ -50,7 +50,7 @@ def reconstruct_states(
 
     Takes stages and options as `reconstruct` does, for both states; the size is that of the first state's scene.
     Returns the report of the scene, or of the last stage that was wanted, and its folder. Raises SdfsimError as
-    `reconstruct` and `find_joint` do, and where the photos cannot be posed together, or come with cameras or masks.
+    `reconstruct`, `tie` and `find_joint` do, and where the photos come with masks.
     """
     out, given = Path(out), (Path(first), Path(second))
     if given[0].resolve() == given[1].resolve():

@@ -170,7 +170,8 @@ def test_the_picture_of_names_shows_the_axis_along_the_part_and_the_way_of_a_sli
     """The part hangs on the hinge at x = 0.3 in its second state; along the axis it goes from 0 to 0.6."""
     part = Mesh(np.array([[0.3, 0, 0], [0.3, 0, 0.6], [0.1, 0.35, 0.6]]), np.array([[0, 1, 2]]))
     parts = Parts(None, None, {PART: part}, 0.0)
-    assert np.allclose(axis_ends(parts, HELD), [[0.3, 0, 0], [0.3, 0, 0.6]])
+    along = axis_ends(parts, HELD)
+    assert along is not None and np.allclose(along, [[0.3, 0, 0], [0.3, 0, 0.6]])
     slides = replace(HELD, kind="slider", travel=0.2, turn=np.eye(3), shift=np.array([0, 0, -0.2]))
     ends = axis_ends(parts, slides)
     assert ends is not None and np.allclose(ends, [[0.3, 0, 0.4], [0.3, 0, 0.6]])
