@@ -20,7 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SHELL = {"as_json", "verbose", "device", "photos", "sources", "scene", "source", "out", "cluster"}
 OTHERWISE = {"first": "from_stage", "last": "until_stage"}
 OWN = {("export", "scene"): "scene_file"}
-FOLDERS = {("fit", "sdf")}  # of folders that `mesh` has written, which `run_stage` does
+# Of folders that `mesh` has written, which `run_stage` does, and of two states, which `reconstruct_states` does.
+FOLDERS = {("fit", "sdf"), ("reconstruct", "joint"), ("reconstruct", "other")}
 
 
 @pytest.mark.parametrize("name", ["reconstruct", "fit", "simulate", "export"])

@@ -2,6 +2,8 @@
 
 Every body has one body node and its surface nodes, joined both ways (up: to the body node). A surface node within the
 contact radius of another body joins that body's node both ways. No surface node is ever joined to another.
+
+`families.py` lists what is not as in the networks' own papers.
 """
 
 from __future__ import annotations

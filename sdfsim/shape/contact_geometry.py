@@ -22,13 +22,12 @@ from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
 
-VERSION = 7  # of what is kept on disk, beside that of the grid that surfaces are sampled from
+VERSION = 6  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
-ONTO = 3  # steps of a node onto the surface
 ROUNDED = 0.1  # cells that the grid of a fit is off on an edge of its mesh that it rounds off
 ALONG_EDGE, MOST_ON_EDGES = 2.0, 4000  # cells between nodes of such an edge, and how many of them a shape has at most
 # Of a solid's largest extent, from where its nodes look out, and of its thickness: not out of the other side of a wall.
@@ -120,10 +119,10 @@ class ContactGeometry:
             nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
             patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
         else:
-            nodes = self.nodes
+            edges = self.nodes[:0]
             if grid is not None and isinstance(sdf, MlpSdf) and not self.pieces:
-                nodes = np.concatenate([onto(sdf, grid, nodes), on_edges(self.mesh, grid)])
-            patches = patches_of(sdf, nodes, self.pieces)
+                edges = on_edges(self.mesh, grid)
+            patches = patches_of(sdf, np.concatenate([self.nodes, edges]), self.pieces)
             cover = np.zeros(len(patches["node"]))
             if grid is not None and len(cover):
                 from scipy.spatial import KDTree
@@ -136,14 +135,6 @@ class ContactGeometry:
         shallow = self.grid.thickness if self.grid else self.thickness
         inward = min(INWARD * extent, SHALLOW * shallow) * inwards(sdf, node)
         return {**in_leaves(node, patch, cover, inward), **patches}
-
-
-def onto(sdf: Sdf, grid: BakedGrid, nodes: np.ndarray) -> np.ndarray:
-    """Nodes [K, 3] m of the mesh that was fitted, on the surface that the grid has: a contact that stays on a node
-    beside it carries a body too high, until the surface next to the node is found within the other body."""
-    for _ in range(ONTO):
-        nodes = nodes - interpolated(grid, nodes)[:, None] * sdf(nodes)[1]
-    return nodes
 
 
 def on_edges(mesh: Mesh, grid: BakedGrid) -> np.ndarray:

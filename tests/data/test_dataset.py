@@ -90,7 +90,7 @@ def test_datasets_of_another_version_of_the_teacher_are_refused_and_those_of_oth
     ours = {"recipe": "movi-b", "engine": "pybullet", "engine_settings": {"timeStep": 0.004}}
     for version in ({}, {"teacher": 9}):
         write_json(tmp_path / "dataset.json", ours | version)
-        with pytest.raises(SdfsimError, match=r"\bteacher\b.*\b2$"):
+        with pytest.raises(SdfsimError, match=r"(?m)\bteacher\b.*\b2$"):
             read_info(tmp_path)
     for others in ({"recipe": "balls"}, {**ours, "engine": "mujoco"}, ours | {"teacher": TEACHER_VERSION}):
         write_json(tmp_path / "dataset.json", others)

@@ -102,7 +102,7 @@ def test_a_path_in_an_archive_leads_nowhere(site, tmp_path):
 def test_without_a_network_it_says_what_to_put_where(site):
     site.close()
     folder = site.cache / "sdfsim" / "public" / "kubasic"
-    with pytest.raises(SdfsimError, match=f"^{site.url}/cone.tar.gz: .*refused$") as caught:
+    with pytest.raises(SdfsimError, match=f"(?m)^{site.url}/cone.tar.gz: .*refused$") as caught:
         public_folder(Path("kubasic"))
     assert caught.value.hint == f"put these files into {folder} by hand: {VISUAL}, {COLLISION}"
     for file in (VISUAL, COLLISION):

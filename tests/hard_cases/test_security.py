@@ -27,10 +27,10 @@ def sources() -> list[Path]:
 
 
 BANNED_MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "shelve", "marshal"}
-BANNED_CALLS = {"eval", "exec", "os.system", "os.popen", "torch.load", "joblib.load", "yaml.load", "yaml.load_all",
+BANNED_CALLS = {"eval", "exec", "os.system", "os.popen", "joblib.load", "yaml.load", "yaml.load_all",
                 "yaml.full_load", "yaml.unsafe_load", "pandas.read_pickle", "np.fromregex"}  # fmt: skip
 SAFE_ARGUMENTS = {"np.load": ("allow_pickle", "False"), "numpy.load": ("allow_pickle", "False"),
-                  "yaml.compose": ("Loader", "yaml.SafeLoader")}  # fmt: skip
+                  "yaml.compose": ("Loader", "yaml.SafeLoader"), "torch.load": ("weights_only", "True")}  # fmt: skip
 
 
 def unsafe(source: str) -> list[str]:

@@ -13,7 +13,8 @@ MODULES = {
 # From the ground up. What lies in no folder is a room of its own.
 FLOORS = (
     ("progress", "materials", "naming", "cameras", "grids"), ("options",), ("inputs",), ("sfm",), ("stereo",),
-    ("field",), ("mesh",), ("scene_writer", "report", "measure"), ("stages",), ("commands",),
+    ("field",), ("mesh",), ("scene_writer", "report", "measure"), ("stages",), ("states",),
+    ("commands",),
 )  # fmt: skip
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 

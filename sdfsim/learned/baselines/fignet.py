@@ -4,6 +4,8 @@ Nodes are the vertices of meshes and one node a body. EdgeSet join neighbours on
 and the faces of two bodies that are near each other. A face edge knows the closest points of the two faces; its message
 has a part for each of the receiving face's three vertices, in the order of their distance to its closest point. FIGNet*
 is FIGNet without mesh edges.
+
+`families.py` lists what is not as in the networks' own papers.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 Nodes are the vertices of meshes. Mesh edges join neighbours, world edges join vertices of different bodies within a
 radius: a small one in *mgn*, a large one in *mgn-large*. There are no body nodes; shape matching makes motions rigid.
+
+`families.py` lists what is not as in the networks' own papers.
 """
 
 from __future__ import annotations

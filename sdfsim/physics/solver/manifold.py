@@ -39,9 +39,8 @@ class Scratch(NamedTuple):
 
     found: np.ndarray  # [FOUND, COLUMNS] new points
     every: np.ndarray  # [FOUND + POINTS, COLUMNS] with those that were known
-    # depth, low, node, leaf, key, normal, place, used: [CANDIDATES] and [CANDIDATES, 3] of nodes that may become points
+    # depth, node, leaf, key, normal, place, used: [CANDIDATES] and [CANDIDATES, 3] of nodes that may become points
     depth: np.ndarray
-    low: np.ndarray
     node: np.ndarray
     leaf: np.ndarray
     key: np.ndarray
@@ -60,9 +59,8 @@ class Scratch(NamedTuple):
 def scratch_room():
     most = FOUND + POINTS
     return Scratch(
-        np.empty((FOUND, COLUMNS)), np.empty((most, COLUMNS)), np.empty(CANDIDATES), np.empty(CANDIDATES),
-        np.empty(CANDIDATES, np.int64), np.empty(CANDIDATES, np.int64), np.empty(CANDIDATES, np.int64),
-        np.empty((CANDIDATES, 3)),
+        np.empty((FOUND, COLUMNS)), np.empty((most, COLUMNS)), np.empty(CANDIDATES), np.empty(CANDIDATES, np.int64),
+        np.empty(CANDIDATES, np.int64), np.empty(CANDIDATES, np.int64), np.empty((CANDIDATES, 3)),
         np.empty((CANDIDATES, 3)), np.empty(CANDIDATES, np.int64), np.empty(SIDE, np.int64), np.empty(most),
         np.empty(most, np.int64),
         simplex_room(), polygons_room(),

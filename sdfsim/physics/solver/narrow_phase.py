@@ -342,11 +342,8 @@ def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, wen
             near.away_all[p] = -math.inf
             return
     for side in range(2):
-        count = nodes_near(
-            shapes, world, motion, matrix, rules.substep_dt, look, a, b, side, near, p, went, since, scratch, count
-        )
-    if known == 0:
-        count = first_to_touch(rules, scratch.found, count)
+        count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, since, scratch, count)
+    count = first_to_touch(rules, scratch.found, count)
     manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, none > one)
     _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 

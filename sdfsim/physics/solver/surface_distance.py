@@ -20,21 +20,7 @@ from sdfsim.physics.solver.distance import (
     patch_of,
 )
 from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
-from sdfsim.physics.solver.vectors import (
-    BARE,
-    INLINED,
-    add,
-    along,
-    cross,
-    dot,
-    get,
-    norm,
-    put,
-    scale,
-    sub,
-    turn,
-    turn_back,
-)
+from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # patches of a shape at most
 ROUNDS = 12  # of refinement
@@ -43,7 +29,6 @@ FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
 ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they must lead, in strides
 WAYS = 8  # in which the outermost nodes of a face are looked for
 ONTO_IT = 0.05  # cells: so near a surface is a place on it
-MOST_AHEAD = 0.1  # rad that a body turns in half an inner step, for where contacts will be
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
 SHORTEST, AHEAD = 2.5, 4.0  # the first one again: of the last, and of the way since, at least
 
@@ -71,25 +56,6 @@ def map_between(position, matrix, scales, coms, a, b):
 
 
 @njit(**BARE)
-def map_ahead(motion, matrix, scales, coms, a, b, span, w, c):
-    """`map_between` after a time `span`: to first order, and after a turn of `MOST_AHEAD` at most."""
-    turning = sub(get(motion.angular, a), get(motion.angular, b))
-    span *= min(1.0, MOST_AHEAD / max(norm(turning) * span, 1e-300))
-    between = sub(get(motion.position, a), get(motion.position, b))
-    going = sub(sub(get(motion.velocity, a), get(motion.velocity, b)), cross(get(motion.angular, b), between))
-    turning, going = turn_back(matrix, b, turning), turn_back(matrix, b, going)
-    middle = scale(add(turn_back(matrix, b, between), get(coms, b)), 1.0 / scales[b])
-    x, y, z = turning[0] * span, turning[1] * span, turning[2] * span
-    later = (
-        add(w[0], sub(scale(w[2], y), scale(w[1], z))),
-        add(w[1], sub(scale(w[0], z), scale(w[2], x))),
-        add(w[2], sub(scale(w[1], x), scale(w[0], y))),
-    )
-    shift = add(scale(going, span / scales[b]), cross((x, y, z), sub(c, middle)))
-    return later, add(c, shift)
-
-
-@njit(**BARE)
 def mapped(w, c, p):
     return dot(w[0], p) + c[0], dot(w[1], p) + c[1], dot(w[2], p) + c[2]
 
@@ -101,7 +67,7 @@ def is_round(table, s):
 
 
 @njit(**INLINED)
-def nodes_near(shapes, world, motion, matrix, span, look, a, b, side, near, pair, went, way, scratch, count):
+def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, way, scratch, count):
     """Where the surface of one body is near another: from the deepest nodes of its near leaves down the other's
     distance; added to what is found. `way` is by how much the two have moved since they were last looked at."""
     if near.count[pair, side] == 0:
@@ -109,9 +75,6 @@ def nodes_near(shapes, world, motion, matrix, span, look, a, b, side, near, pair
     one, other = (a, b) if side == 0 else (b, a)
     r, s = world.shape[one], world.shape[other]
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
-    # Where a body that rolls is nearest half way through the inner step. Where it is nearest now, it would sink in
-    # meanwhile, and gain what it takes to lift it out.
-    later, shift = map_ahead(motion, matrix, world.scale, world.com, one, other, 0.5 * span, w, c)
     k, own = world.scale[other], world.scale[one]
     size = shapes.clump_ball[shapes.clump_start[r], 3]
     kept = _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch)
@@ -142,37 +105,20 @@ def nodes_near(shapes, world, motion, matrix, span, look, a, b, side, near, pair
                 there, normal = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, q))
                 if there < d:
                     p, d, n, stride = q, there, normal, short
-        # A node may stand off the surface that its grid has, on an edge that the grid rounds off: it is met, and so is
-        # the surface beside it, before the node lets go.
-        off = -math.inf
-        if shapes.table[r, KIND] == GRID:
-            off = distance_alone(shapes.table, shapes.brick, shapes.sample, r, p)
-        if off > ONTO_IT * shapes.table[r, CELL] and k * d <= look and count < FOUND - 1:
-            _write_point(world, matrix, scratch.found, count, side, one, other, w, c, p, k * d, n, key)
-            count += 1
-            p = _foot(shapes, r, p)
-            _, n = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, p))
-        d = distance_alone(shapes.table, shapes.brick, shapes.sample, s, mapped(later, shift, p))
-        p = _refined(
-            shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, later, shift, k / own, p, d, n
+        p, d, n = _refined(
+            shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
         )
-        d, n = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, p))
         if at >= 0:
             near.placed[at] = True
             put(near.place, at, p)
-        if k * d <= look:
-            _write_point(world, matrix, scratch.found, count, side, one, other, w, c, p, k * d, n, key)
-            count += 1
+        if d > look:
+            continue
+        # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
+        mine = sub(scale(p, own), get(world.com, one))
+        theirs = sub(along(scale(mapped(w, c, p), k), n, -d), get(world.com, other))
+        write(scratch.found, count, side, mine, theirs, turn(matrix, other, n), d, key)
+        count += 1
     return count
-
-
-@njit(**BARE)
-def _write_point(world, matrix, found, count, side, one, other, w, c, p, d, n, key):
-    """A contact of place p of shape `one`, at the distance d m of the other along its normal n there."""
-    # Both about the centres of mass: p, and its foot on the other.
-    mine = sub(scale(p, world.scale[one]), get(world.com, one))
-    theirs = sub(along(scale(mapped(w, c, p), world.scale[other]), n, -d), get(world.com, other))
-    write(found, count, side, mine, theirs, turn(matrix, other, n), d, key)
 
 
 @njit(**BARE)
@@ -248,11 +194,6 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
         else:
             worst = kept
             kept += 1
-        # How deep the surface around the node may be, as steep as it is there: half the way to where others are nearer.
-        inwards = get(shapes.inward, chosen)
-        straight = _along_normal(w, inwards, facing) * k / (own * max(norm(inwards), 1e-300))
-        steep = math.sqrt(max(0.0, 1.0 - straight * straight))
-        scratch.low[worst] = deepest - 0.5 * own * shapes.cover[chosen] * steep
         place = mapped(w, c, get(shapes.node, chosen))
         patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, place)
         scratch.depth[worst], scratch.node[worst], scratch.leaf[worst] = deepest, chosen, at
@@ -265,10 +206,9 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
 @njit(**INLINED)
 def _chosen(scratch, kept, level):
     """Of candidates that face the same way the deepest, and of those that are about as deep the outermost to all sides:
-    the corners of a face, in whatever order its leaves are. And the outermost of those around which the surface may be
-    as deep. How many, to scratch.pick."""
-    depth, low, key, normal, place, pick, used = (
-        scratch.depth, scratch.low, scratch.key, scratch.normal, scratch.place, scratch.pick, scratch.used,
+    the corners of a face, in whatever order its leaves are. How many, to scratch.pick."""
+    depth, key, normal, place, pick, used = (
+        scratch.depth, scratch.key, scratch.normal, scratch.place, scratch.pick, scratch.used,
     )  # fmt: skip
     for e in range(kept):
         used[e] = 0
@@ -288,23 +228,18 @@ def _chosen(scratch, kept, level):
         for way in range(WAYS):
             angle = 2.0 * math.pi * way / WAYS
             d = add(scale(u, math.cos(angle)), scale(v, math.sin(angle)))
-            outer, most, beside, farthest = -1, -math.inf, -1, -math.inf
+            outer, most = -1, -math.inf
             for e in range(kept):
                 if used[e] != 1 and key[e] == key[first] and dot(n, get(normal, e)) > ALIKE:
                     used[e] = 2
-                    out = dot(d, get(place, e))
-                    if depth[e] <= depth[first] + level:
-                        if out > most:
-                            outer, most = e, out
-                    elif low[e] <= depth[first] + level and out > farthest:
-                        beside, farthest = e, out
-            for e in (outer, beside):
-                known = e < 0
-                for i in range(start, chosen):
-                    known = known or pick[i] == e
-                if not known and chosen < SIDE:
-                    pick[chosen] = e
-                    chosen += 1
+                    if depth[e] <= depth[first] + level and dot(d, get(place, e)) > most:
+                        outer, most = e, dot(d, get(place, e))
+            known = outer < 0
+            for e in range(start, chosen):
+                known = known or pick[e] == outer
+            if not known and chosen < SIDE:
+                pick[chosen] = outer
+                chosen += 1
         for e in range(kept):
             used[e] = 1 if used[e] == 2 else used[e]
         used[first] = 1
@@ -329,9 +264,10 @@ def _along_normal(w, within, n):
 
 
 @njit(**INLINED)
-def _refined(table, brick, sample, stride, least, s, t, w, c, ratio, p, d, n):
+def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
     """From a place p on shape s, at the distance d of t with the normal n in t's axes, down the distance along the
-    surface of s, in steps of `stride` at first and `least` at last. `ratio` is the scale of t over that of s."""
+    surface of s, in steps of `stride` at first and `least` at last: place, distance at the scale of t, and normal."""
+    ratio = k / own
     _, m = distance(table, brick, sample, s, p)
     way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and how steep the distance was along it
     for _ in range(ROUNDS):
@@ -372,7 +308,7 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, ratio, p, d, n):
             stride *= share
         if not better:
             break
-    return p
+    return p, k * d, n
 
 
 @njit(**BARE)

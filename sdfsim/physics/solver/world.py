@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from sdfsim.physics.solver.manifold import Scratch
 
 POINTS = 24  # of a manifold at most
 # Columns of a contact point: where it is on either body (about its centre of mass, in its axes), the unit normal from
@@ -90,7 +87,7 @@ class Work(NamedTuple):
     parent: np.ndarray
     number: np.ndarray
     latest: np.ndarray  # [N] int64 for finding the contacts of a body
-    scratch: Scratch
+    scratch: NamedTuple  # `manifold.Scratch`
 
 
 class Motion(NamedTuple):
