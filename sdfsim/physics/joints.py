@@ -38,6 +38,7 @@ from sdfsim.scene.scene import Joint
 EFFORT = 3
 NEVER = 1e4  # model units of speed
 
+
 @dataclass(frozen=True)
 class Joints:
     """J joints of N bodies; lengths, times and masses in model units."""
