@@ -439,7 +439,7 @@ def assets(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path):
+def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path, caplog):
     import mujoco
 
     half = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]) * 0.1
@@ -451,6 +451,12 @@ def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path):
     shape.save(tmp_path / "angle")
     report = export(tmp_path / "angle", tmp_path / "angle.xml")
     assert len(report["files"]) >= 4  # the scene, the mesh and two pieces at least
+    told = "cutting the shape angle into convex pieces"
+    assert caplog.text.count(told) == 1  # it takes long, and nobody sees a bar
+    caplog.clear()
+    stages = []
+    export(tmp_path / "angle", tmp_path / "angle.urdf", on_progress=lambda stage, *_: stages.append(stage))
+    assert told not in caplog.text and "convex pieces" in stages
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "angle.xml"))
     assert model.body("angle").mass[0] == pytest.approx(1000 * 0.003)
     corners = model.mesh_vert.reshape(-1, 3)
