@@ -52,8 +52,8 @@ FOLLOWS = 0.6  # of what moves: where less of it goes with one motion, more than
 AGREED = 12  # features at least that show the same motion
 BY_CHANCE = 0.05  # of the features that look alike: so many lie right by chance
 ONE = "give two states between which one thing has moved"
-# Of how far both states' surfaces differ, what is the same all over and so no draw shows; on rendered sets the joint was
-# off by about as much.
+# Of how far both states' surfaces differ: what is the same all over, and so no draw shows. On rendered sets the joint
+# was off by about as much.
 COMMON = 0.1
 DRAWS = 8  # of patches of the surface, and features, by which the doubt is measured
 
