@@ -38,8 +38,8 @@ def test_the_python_examples_run(tmp_path, monkeypatch):
 
 
 def test_the_examples_for_robotics_do_what_they_say(tmp_path, monkeypatch):
-    """The ball comes to rest in the bowl, in both engines; the bowl slides the less the rougher it is; the dog stands on
-    its motors."""
+    """The ball comes to rest in the bowl, in both engines; the bowl slides the less the rougher it is; the dog
+    stands."""
     monkeypatch.chdir(tmp_path)
     import pybullet_data
 
