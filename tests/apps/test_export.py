@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
 from sdfsim.apps.export import Take, export
 from sdfsim.apps.observed import load_recordings
+from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape, mesh_shape
@@ -461,6 +463,16 @@ def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path, caplog):
     assert model.body("angle").mass[0] == pytest.approx(1000 * 0.003)
     corners = model.mesh_vert.reshape(-1, 3)
     assert np.isfinite(corners).all() and model.ngeom == len(report["files"]) - 1
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_python_is_warned_of_shapes_that_are_made_for_an_export(tmp_path, monkeypatch, caplog, shown):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "brick.ply").write_bytes(write_ply(primitives.box()))
+    shape = "brick: {mesh: brick.ply, sdf: grid, resolution: 16}"
+    (tmp_path / "scene.yaml").write_text(f"version: 1\nshapes: {{{shape}}}\nbodies: [{{name: a, shape: brick}}]\n")
+    export(tmp_path / "scene.yaml", tmp_path / "a.glb", **({"on_progress": lambda *_: None} if shown else {}))
+    assert ("making the shape brick" in caplog.text) != shown
 
 
 def test_a_shape_becomes_one_urdf(tmp_path):
