@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sdfsim.apps.import_robot import import_robot
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import load_shape
 from tests.helpers.everyday import COUNTS, MISSED
@@ -41,8 +42,12 @@ def test_the_python_examples_run(tmp_path, monkeypatch):
 
 
 def test_the_examples_for_robotics_do_what_they_say(tmp_path, monkeypatch):
-    """The ball comes to rest in the bowl, in both engines; the bowl slides the less the rougher it is."""
+    """The ball comes to rest in the bowl, in both engines; the bowl slides the less the rougher it is; the dog
+    stands."""
     monkeypatch.chdir(tmp_path)
+    import pybullet_data
+
+    import_robot(Path(pybullet_data.getDataPath()) / "a1" / "a1.urdf", tmp_path / "dog.yaml", floor=True)
     names = examples("robotics.md", tmp_path)
     bowl, ball = names["rollout"].position[-1, 2:4]
     assert np.linalg.norm((ball - bowl)[:2]) < 0.05 and ball[2] == pytest.approx(0.45, abs=0.01)  # it rolls to and fro
@@ -50,6 +55,12 @@ def test_the_examples_for_robotics_do_what_they_say(tmp_path, monkeypatch):
     assert names["there"][2] == pytest.approx(names["ours"][2], abs=0.01)
     assert names["touching"] and names["bowl"].velocity[0] > 0.05
     assert len(names["slid"]) == 10
+    dog, bends = names["dog"], {"hip": 0.0, "upper": 0.8, "lower": -1.6}
+    held = {f"{leg}_{part}_joint": bend for leg in ("FR", "FL", "RR", "RL") for part, bend in bends.items()}
+    assert {name: dog.joint(name).angle for name in held} == pytest.approx(held, abs=0.05)
+    # Of the thigh and the calf, 0.2 m each, above a foot of 2 cm.
+    assert dog["trunk"].position[2] == pytest.approx(0.4 * np.cos(0.8) + 0.02, abs=0.03)
+    assert (tmp_path / "dog.png").exists()
 
 
 @pytest.mark.parametrize(

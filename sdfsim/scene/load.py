@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
+from sdfsim.base.warned import warn_once
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.document import Document
 from sdfsim.scene.joints import joints_of
@@ -66,6 +67,10 @@ def load_scene(
     document.check()
     loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
+    notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", []))
+    if on_progress is silent:
+        for note in notes:
+            warn_once(note)
     return Scene(
         shapes=tuple(shapes.values()),
         bodies=tuple(bodies),
@@ -76,7 +81,7 @@ def load_scene(
         effects=Effects(**dict(table.effects)),
         path=path,
         missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
-        notes=tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", [])),
+        notes=notes,
         caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
         joints=joints,
     )
