@@ -5,9 +5,9 @@
     python benchmarks/reconstruct.py room -o DIR [--capture record3d]    # or patches
 
 Runs the whole chain on samples/photos/table_vase, or on one of the sets that samples/photos/make.py draws, rendered
-into DIR-room (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
-prints pose errors, surface errors, how these go with the uncertainty that the run gave, and times. A folder of photos
-without `transforms.json` and `truth.ply` gets the report only.
+into DIR-NAME (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
+prints pose errors, surface errors, how these go with the uncertainty that the run gave, how far a ball falls into the
+vase, and times. A folder of photos without `transforms.json` and `truth.ply` gets the report only.
 
     python benchmarks/reconstruct.py touching -o DIR
     python benchmarks/reconstruct.py shelf -o DIR [--kind clicks]
@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -43,8 +44,11 @@ from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas
 from sdfsim.base.console import Session
 from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_text
 from sdfsim.geometry.mesh import Mesh, signed_volume
 from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
+from sdfsim.shape.shape import load_shape
+from sdfsim.simulate.simulator import Simulator
 
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
@@ -52,6 +56,7 @@ RENDERED = ("touching", "shelf")
 KINDS = ("masks", "plain", "clicks")
 JOINTS = {"hinged": 50.0, "sliding": 0.2}  # degrees, and m, from the first state to the second
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
+BALL = 0.02  # m, the radius of the ball that is dropped into the vase, whose neck has one of 4.6 cm
 
 
 def moved_onto(views: list[View], about: dict[str, Any]) -> tuple[Similarity, np.ndarray]:
@@ -199,6 +204,26 @@ def vase_size(mesh: Any) -> dict[str, float]:
     return {"hollow_cm": 100 * float(top - np.median(hit)), "height_cm": 100 * float(top - TABLE)}
 
 
+def dropped_ball(folder: Path, name: str) -> dict[str, float]:
+    """Drops a ball of `BALL` m radius into the vase of a run, a body, and tells where its centre is at last: below the
+    rim and beside the middle, cm, in the axes of the vase, however that stands by then."""
+    scene = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
+    assets = {key: shape for key, shape in scene["shapes"].items() if "asset" in shape}
+    bodies = [body for body in scene["bodies"] if "plane" in body or body["shape"] in assets]
+    number, vase = next((k, body) for k, body in enumerate(bodies) if body["name"] == name)
+    shape = load_shape(folder / assets[vase["shape"]]["asset"])
+    low, high = shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)
+    middle = (low + high) / 2
+    start = [*(np.array(vase["position"][:2]) + middle[:2]), vase["position"][2] + high[2] + 2 * BALL]
+    ball = {"name": "ball", "shape": "ball", "position": [float(x) for x in start], "density": 1000.0}
+    scene |= {"shapes": {**assets, "ball": {"sphere": {"radius": BALL}}}, "bodies": [*bodies, ball], "duration": 3.0}
+    write_text(folder / "ball.yaml", yaml.safe_dump(scene, sort_keys=False))
+    rollout = Simulator(folder / "ball.yaml").run()
+    turn = Rotation.from_quat(rollout.orientation[-1, number])
+    at = turn.inv().apply(rollout.position[-1, -1] - rollout.position[-1, number]) + shape.com
+    return {"below_rim_cm": 100 * float(high[2] - at[2]), "aside_cm": 100 * float(np.linalg.norm((at - middle)[:2]))}
+
+
 def _read(file: Path) -> Any:
     import open3d as o3d
 
@@ -216,9 +241,10 @@ def _scene(mesh: Any) -> Any:
 def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     """All errors of a finished run against the truth beside its photos."""
     poses, move = pose_errors(load_views(folder / "poses"), photos)
+    surface = surface_errors(folder, photos, move)
     return {
-        "poses": poses, "surface_percent_of_table_width": surface_errors(folder, photos, move),
-        "trust": trust_errors(folder, photos, move),
+        "poses": poses, "surface_percent_of_table_width": surface, "trust": trust_errors(folder, photos, move),
+        "ball": {name: dropped_ball(folder, name) for name in surface["vase"] if name != "truth"},
     }  # fmt: skip
 
 

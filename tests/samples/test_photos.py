@@ -1,15 +1,20 @@
 """What samples/photos/make.py draws is solid."""
 
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
-from benchmarks.reconstruct import PHOTOS, drawn
+from benchmarks.reconstruct import BALL, PHOTOS, drawn, dropped_ball
+from sdfsim.shape.make import analytic_shape
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "samples" / "photos"))
 import make
+
+SHAPES = Path(__file__).parents[2] / "samples" / "shapes"
 
 
 @pytest.mark.parametrize("part", [make.leaves, make.cloth])
@@ -42,3 +47,22 @@ def test_names_of_sets_are_folders_and_other_folders_stay(tmp_path, monkeypatch)
     assert drawn(Path(other), tmp_path / "run") == tmp_path / f"run-{other}"
     assert made == [(other, tmp_path / f"run-{other}")]
     assert drawn(tmp_path, tmp_path / "run") == tmp_path and len(made) == 1
+
+
+@pytest.mark.parametrize("kind", ["vase", "box"])
+def test_a_ball_falls_as_far_into_the_vase_as_that_is_hollow(tmp_path, kind):
+    """To its floor; a box has no hollow, so the ball lies on it."""
+    size, depth = 0.3, 0.0
+    if kind == "vase":
+        depth = make.VASE_OUTER[-1][1] - make.VASE_INNER[-1][1]
+        shutil.copytree(SHAPES / "vase", tmp_path / "assets" / "object1")
+    else:
+        analytic_shape("box", size=3 * [size], name="object1").save(tmp_path / "assets" / "object1")
+    at = [0.3, 0.2, 0.0 if kind == "vase" else size / 2]
+    body = {"name": "object1", "shape": "object1", "position": at, "density": 1500.0, "friction": 0.7}
+    bodies = [{"name": "floor", "plane": {}, "friction": 0.8}, body]
+    scene = {"version": 1, "shapes": {"object1": {"asset": "assets/object1"}}, "bodies": bodies}
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scene))
+    found = dropped_ball(tmp_path, "object1")
+    assert found["below_rim_cm"] == pytest.approx(100 * (depth - BALL), abs=0.4)
+    assert found["aside_cm"] < 4
