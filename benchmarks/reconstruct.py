@@ -138,7 +138,8 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     `surface`: all of the reconstructed surface, table, vase and floor, to the truth. `object`: its part within 10 cm
     of the table and vase and above the floor. `missing`: from the truth as the cameras see it (table and vase) to the
     reconstruction; `complete_percent` is the share of it within 1 %. `vase`: see `vase_size`, of the bodies at its
-    place and of the truth. `body`: of these bodies, 1.5 cm above what they stand on, to the truth.
+    place and of the truth; `vase_seen_cm`: see `seen_depth`. `body`: of these bodies, 1.5 cm above what they stand on,
+    to the truth.
     """
     import open3d as o3d
 
@@ -179,6 +180,8 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     vases = {name: body for name, body in objects.items() if np.abs(body.get_center()[:2] - VASE).max() < 0.1}
     standing = {name: np.asarray(body.vertices) for name, body in vases.items()}
     standing = {name: at[at[:, 2] > at[:, 2].min() + 0.015] for name, at in standing.items()}
+    rim = np.asarray(truth.vertices)[np.linalg.norm(np.asarray(truth.vertices)[:, :2] - VASE, axis=1) < 0.1, 2].max()
+    seen_cm = seen_depth(truth, about, float(rim))
     corners = np.asarray(truth.vertices)[np.asarray(truth.triangles)]
     truth.remove_triangles_by_mask(corners[:, :, 2].max(1) < TABLE + 1e-3)
     return {
@@ -191,13 +194,39 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
         "up_error_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
+        "vase_seen_cm": seen_cm,
     }
+
+
+def near_axis() -> np.ndarray:
+    """Places [P, 2] m within 2 cm of the vase's axis."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    return np.concatenate([VASE + r * np.stack([np.cos(angle), np.sin(angle)], 1) for r in (0.0, 0.01, 0.02)])
+
+
+def seen_depth(truth: Any, about: dict[str, Any], rim: float) -> float:
+    """How far below the rim of the vase, cm, three photos of a transforms.json see places near its axis, by rays: the
+    median of these places. `rim` is its height, m."""
+    scene, at, step = _scene(truth), near_axis(), 0.005
+    poses = [np.array(frame["transform_matrix"]) for frame in about["frames"]]
+    for number in range(round(rim / step)):
+        places = np.concatenate([at, np.full((len(at), 1), rim - number * step)], 1)
+        count = np.zeros(len(places))
+        for pose in poses:
+            away = places - pose[:3, 3]
+            x, y, z = (away @ pose[:3, :3]).T
+            u, v = about["cx"] - about["fl_x"] * x / z, about["cy"] + about["fl_y"] * y / z
+            rays = np.concatenate([np.broadcast_to(pose[:3, 3], away.shape), away], 1)
+            free = scene.cast_rays(rays.astype(np.float32))["t_hit"].numpy() > 1 - 1e-4
+            count += free & (z < 0) & (u > 0) & (u < about["w"]) & (v > 0) & (v < about["h"])
+        if np.median(count) < 3:
+            return 100 * step * max(0, number - 1)
+    return 100 * rim
 
 
 def vase_size(mesh: Any) -> dict[str, float]:
     """Height, and how deep it is hollow, cm: what rays straight down within 2 cm of the axis meet below the rim."""
-    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    at = np.concatenate([VASE + r * np.stack([np.cos(angle), np.sin(angle)], 1) for r in (0.0, 0.01, 0.02)])
+    at = near_axis()
     down = np.concatenate([at, np.full((len(at), 1), 2.0), np.tile([0.0, 0, -1], (len(at), 1))], 1)
     top = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(-1, 3)[:, 2].max()
     hit = 2.0 - _scene(mesh).cast_rays(down.astype(np.float32))["t_hit"].numpy()
