@@ -1,20 +1,54 @@
-"""Warns before a compilation that takes long."""
+"""Compilations that take long: announced, and made where they change nothing of what is then run."""
 
+import json
 import logging
-from collections.abc import Mapping
+import pickle
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
 _log = logging.getLogger(__name__)
 _said: set[str] = set()
 
 
-def warn_compiling(function: Any, what: str, takes: str, missing: Mapping[int, bool] | None = None) -> None:
-    """Warn, once in a process, that `what` is about to be compiled: where the compiled `function` is neither in memory
-    nor in numba's cache for this source. `missing`: see `is_compiled`."""
+# The module's path first: what is pickled needs it to be read.
+_CHILD = (
+    "import sys, json; sys.path[:] = json.loads(sys.stdin.buffer.readline());"
+    "from sdfsim.base.compiling import _compile_here; _compile_here(sys.stdin.buffer.read())"
+)
+
+
+def compile_before(
+    function: Any, arguments: Sequence[Any], what: str, takes: str, missing: Mapping[int, bool] | None = None
+) -> None:
+    """Have a `function` of numba, that is neither in memory nor in numba's cache for this source, compiled for such
+    arguments, and warn once in a process that `what` is. `missing`: see `is_compiled`.
+
+    It is compiled in a process of its own, and this one loads what that has kept, as all later ones do: code that has
+    just been compiled rounds differently, and a run could not be repeated bit by bit. Where nothing can be kept the
+    first call compiles.
+    """
     if what in _said or is_compiled(function, missing):
         return
     _said.add(what)
     _log.warning("compiling %s, once for this version: about %s", what, takes)
+    try:
+        function._cache._impl.locator.ensure_cache_path()
+    except (AttributeError, OSError):
+        return
+    from numba import typeof
+
+    name = (function.py_func.__module__, function.py_func.__qualname__)
+    wanted = pickle.dumps((*name, tuple(typeof(each) for each in arguments)))
+    path = json.dumps([*sys.path]).encode() + b"\n"
+    subprocess.run([sys.executable, "-c", _CHILD], input=path + wanted, capture_output=True, check=False)
+
+
+def _compile_here(wanted: bytes) -> None:
+    module, name, types = pickle.loads(wanted)
+    getattr(import_module(module), name).compile(types)
 
 
 def is_compiled(function: Any, missing: Mapping[int, bool] | None = None) -> bool:

@@ -370,9 +370,16 @@ def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
     dt = np.diff(rollout.time)[:, None, None]
     change = np.diff(rollout.velocity, axis=0) - scene.gravity * dt
     fast = np.linalg.norm(rollout.velocity, axis=2)
-    least = 0.02 * np.linalg.norm(scene.gravity) * dt[..., 0] + 1e-6 * np.maximum(fast[1:], fast[:-1]) + 1e-9
+    strength = float(np.linalg.norm(scene.gravity))
+    least = 0.02 * strength * dt[..., 0] + 1e-6 * np.maximum(fast[1:], fast[:-1]) + 1e-9
     pushed = np.zeros(fast.shape, bool)
     pushed[1:] = (np.linalg.norm(change, axis=2) > least) & dynamic
+    # The velocity of a body that has just been touched may be that of the inner step before: gravity then acts for up
+    # to half a step longer in the next one.
+    if strength:
+        down = scene.gravity / strength
+        longer = np.clip(change @ down, 0.0, 0.5 * strength * dt[..., 0])[..., None] * down
+        pushed[2:] &= ~pushed[1:-1] | (np.linalg.norm(change - longer, axis=2) > least)[1:]
     if "energy_given" in rollout.counters:
         pushed &= np.asarray(rollout.counters["energy_given"] == 0)[:, None]
     if rollout.meta.get("free_flight") == "learned":

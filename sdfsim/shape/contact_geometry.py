@@ -22,11 +22,12 @@ from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
 
-VERSION = 6  # of what is kept on disk, beside that of the grid that surfaces are sampled from
+VERSION = 7  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
+APART, DENSEST_ON_GRID = 2.0, 8000  # cells between nodes on the surface of a grid at least, and how many it has at most
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 ROUNDED = 0.1  # cells that the grid of a fit is off on an edge of its mesh that it rounds off
 ALONG_EDGE, MOST_ON_EDGES = 2.0, 4000  # cells between nodes of such an edge, and how many of them a shape has at most
@@ -108,7 +109,7 @@ class ContactGeometry:
         if isinstance(self.sdf, ClosedForm):
             return ContactSurface(**self._surface())
         faces = () if self.pieces else (self.mesh.vertices, self.mesh.faces)
-        known = digest(self.sdf, self.nodes, [*self.pieces], *faces, LEAF, CLUMP, INWARD, SHALLOW, ROUNDED)
+        known = digest(self.sdf, self.nodes, [*self.pieces], *faces, LEAF, CLUMP, INWARD, SHALLOW, ROUNDED, APART)
         path = user_cache("contact") / f"{known}-{BAKE_VERSION}-{VERSION}.npz"
         return ContactSurface(**cached_arrays(path, "the contact surface of a shape", self._surface))
 
@@ -119,15 +120,19 @@ class ContactGeometry:
             nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
             patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
         else:
-            edges = self.nodes[:0]
-            if grid is not None and isinstance(sdf, MlpSdf) and not self.pieces:
-                edges = on_edges(self.mesh, grid)
-            patches = patches_of(sdf, np.concatenate([self.nodes, edges]), self.pieces)
+            nodes, samples = self.nodes, self.nodes[:0]
+            if grid is not None:
+                samples = surface_samples(grid)
+                if not self.pieces:
+                    edges = on_edges(self.mesh, grid) if isinstance(sdf, MlpSdf) else nodes[:0]
+                    nodes = np.concatenate([nodes, edges])
+                    nodes = np.concatenate([nodes, between(nodes, samples, APART * grid.cell)])
+            patches = patches_of(sdf, nodes, self.pieces)
             cover = np.zeros(len(patches["node"]))
             if grid is not None and len(cover):
                 from scipy.spatial import KDTree
 
-                away, nearest = KDTree(patches["node"]).query(surface_samples(grid))
+                away, nearest = KDTree(patches["node"]).query(samples)
                 np.maximum.at(cover, nearest, away)
                 cover += grid.cell
         node, patch = patches.pop("node"), patches.pop("patch")
@@ -135,6 +140,19 @@ class ContactGeometry:
         shallow = self.grid.thickness if self.grid else self.thickness
         inward = min(INWARD * extent, SHALLOW * shallow) * inwards(sdf, node)
         return {**in_leaves(node, patch, cover, inward), **patches}
+
+
+def between(nodes: np.ndarray, samples: np.ndarray, spacing: float) -> np.ndarray:
+    """Of samples [P, 3] m of a surface those that lie between its nodes [K, 3], at least `spacing` m apart.
+
+    The nodes of a network are few. What rolls from one to the next sinks in between them, until the way down the
+    distance leads there, and what lifts it out again is energy from nothing.
+    """
+    from scipy.spatial import KDTree
+
+    while len(kept := one_per_voxel(samples, spacing)) > DENSEST_ON_GRID:
+        spacing *= 1.25
+    return kept[KDTree(nodes).query(kept)[0] > 0.5 * spacing] if len(nodes) else kept
 
 
 def on_edges(mesh: Mesh, grid: BakedGrid) -> np.ndarray:

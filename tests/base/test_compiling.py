@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sdfsim.base import compiling
-from sdfsim.base.compiling import is_compiled
+from sdfsim.base.compiling import compile_before, is_compiled
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Joint, Scene
 from sdfsim.shape.make import analytic_shape
@@ -64,6 +64,22 @@ def test_each_form_of_a_function_with_optional_arguments_is_compiled_by_itself(t
         assert is_compiled(function) and is_compiled(function, {1: True}) and not is_compiled(function, {1: False})
     assert first(3, 4) == 12
     assert is_compiled(first, {1: False}) and is_compiled(loaded(file), {0: False, 1: False})
+
+
+@pytest.mark.parametrize("cache", ["True", "False"])
+def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, caplog, cache):
+    from numba.core import config
+
+    (tmp_path / f"doubling_{cache}.py").write_text(SOURCE.replace("True", cache))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(compiling, "_said", set())
+    double = importlib.import_module(f"doubling_{cache}").double
+    compile_before(double, (3,), "doubling", "a second")
+    assert caplog.messages == ["compiling doubling, once for this version: about a second"]
+    assert is_compiled(double) == (cache == "True") and double(3) == 6
+    assert (sum(double.stats.cache_hits.values()), len(double.stats.cache_misses)) == (1, 0) or cache == "False"
 
 
 class Uncompiled:

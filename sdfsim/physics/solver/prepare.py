@@ -10,7 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from sdfsim.base.compiling import warn_compiling
+from sdfsim.base.compiling import compile_before
 from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
@@ -89,23 +89,15 @@ class Compiled:
             np.empty((n, count, 3)), np.empty((n, count, 4)), np.empty((n, count, 3)), np.empty((n, count, 3)),
             np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, joints, 7)),
         )  # fmt: skip
+        # An integer of another kind would be compiled for anew.
+        arguments = (
+            self.shapes, self.world, self.work, motion, rules, manifolds, self.held, self.surfaces, self.threads,
+            note or None, script, most, kept, TOUCHING, int(steps),
+        )  # fmt: skip
         if note not in self._announced:
             self._announced.add(note)
-            _announce(joints > 0, self.surfaces is not None, self.threads is not None, note)
-        # An integer of another kind would be compiled for anew.
-        bodies = (
-            self.shapes,
-            self.world,
-            self.work,
-            motion,
-            rules,
-            manifolds,
-            self.held,
-            self.surfaces,
-            self.threads,
-            note or None,
-        )
-        return *run_steps(*bodies, script, most, kept, TOUCHING, int(steps)), kept
+            _compiled(arguments, joints > 0, self.surfaces is not None, self.threads is not None, note)
+        return *run_steps(*arguments), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make so many steps of the contact solve from `state`, fewer where one leads to a state that is more than
@@ -159,13 +151,13 @@ class Compiled:
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
 
 
-def _announce(joints: bool, surfaces: bool, threads: bool, note: bool) -> None:
-    """Tell that the step is about to be compiled for such scenes, where it is."""
+def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool, note: bool) -> None:
+    """See that the step is compiled for scenes with these in them."""
     words = {"joints": joints, "hollow shapes": surfaces and not threads, "many bodies": threads, "a network": note}
     given = [word for word, some in words.items() if some]
     what = "the contact step" + (f" for scenes with {', '.join(given)}" if given else "")
     missing = {HELD: not joints, SURFACES: not surfaces, THREADS: not threads, NOTE: not note}
-    warn_compiling(run_steps, what, "two minutes" if joints else "a minute", missing)
+    compile_before(run_steps, arguments, what, "two minutes" if joints else "a minute", missing)
 
 
 @dataclass(frozen=True)
