@@ -6,7 +6,7 @@
 Ray casting with open3d. Every texture is made here from seeded noise and random cells and never repeats, because
 repeating textures make structure-from-motion converge to wrong cameras. Table and vase are the same in both sets.
 `room` is what one photographs: wood, glaze, tiles, a cloth and a plant in soft light, exposed a little differently from
-photo to photo; 18 of the photos look down into the vase. `patches` has texture everywhere and no gloss: a benchmark
+photo to photo; 16 of the photos look down into the vase. `patches` has texture everywhere and no gloss: a benchmark
 for the geometry alone.
 World frame: metres, z up, floor at z = 0.
 """
@@ -28,8 +28,7 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
 MIDDLE, MOUTH = (0.02, 0.0, 0.46), (0.10, -0.04, 0.70)
 RINGS = {
     "room": (
-        (10, 3, 1.95, 0.5, MIDDLE), (10, 17, 1.95, 0.0, MIDDLE), (10, 37, 1.9, 0.1, MIDDLE), (12, 62, 1.4, 0.25, MOUTH),
-        (6, 76, 1.4, 0.0, MOUTH),
+        (9, 3, 1.95, 0.5, MIDDLE), (11, 17, 1.95, 0.0, MIDDLE), (12, 40, 1.9, 0.1, MIDDLE), (16, 66, 1.4, 0.25, MOUTH),
     ),
     "patches": (
         (12, 3, 1.95, 0.5, MIDDLE), (14, 17, 1.95, 0.0, MIDDLE), (13, 37, 1.9, 0.1, MIDDLE),
