@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from pipeline.commands import distill, fit, joint, measure, mesh, poses, reconstruct
-from sdfsim.commands import motion
+from sdfsim import commands
 
 YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
 
@@ -29,18 +29,19 @@ def options(
         bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
-    """Rigid-body simulation over learned signed-distance functions, from photos to motion."""
+    """Rigid-body simulation over learned signed-distance functions, from photos to commands."""
     # Libraries make some 100,000 objects that stay; to look for cycles among them again and again as they load takes
     # a sixth of the time to the first step.
     gc.set_threshold(YOUNG)
 
 
 COMMANDS = [reconstruct, measure, poses, distill, mesh, joint, fit]
-COMMANDS += [motion.simulate, motion.samples, motion.plan, motion.view, motion.render, motion.identify, motion.export]
-COMMANDS += [motion.dataset, motion.train, motion.evaluate, motion.tradeoff, motion.stress, motion.info]
+COMMANDS += [commands.simulate, commands.samples, commands.plan, commands.view, commands.render, commands.identify]
+COMMANDS += [commands.export, commands.dataset, commands.train, commands.evaluate, commands.tradeoff, commands.stress]
+COMMANDS += [commands.info]
 for command in COMMANDS:
     app.command()(command)
-app.command("import")(motion.import_)
+app.command("import")(commands.import_)
 
 if __name__ == "__main__":
     app()

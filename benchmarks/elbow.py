@@ -31,7 +31,7 @@ from sdfsim.base.files import read_arrays, write_json, write_text
 from sdfsim.data.public_tosses import ARM, ELBOW, LINK, PIVOT, Links, links_of, lowest, upright
 from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.evaluation.engines import engine_module
-from sdfsim.evaluation.harness import one_thread
+from sdfsim.evaluation.harness import markdown, one_thread
 from sdfsim.evaluation.metrics import interval
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -361,6 +361,19 @@ def bullet(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict
     return _links(place, Rotation.from_quat(turn.reshape(-1, 4)), angle)
 
 
+def table(result: dict[str, tuple[np.ndarray, np.ndarray]]) -> str:
+    """Of each engine's errors [3, B] on the tosses that its parameters were found on, and on the others; best first."""
+    heads = "links apart, % of a link", "turned, degrees", "hinge, degrees", "sdfsim less it", "the same on the 60"
+    rows = [("", *heads)]
+    for name, (fitted, judged) in sorted(result.items(), key=lambda item: item[1][1][0].mean()):
+        cells = [f"{np.mean(e):.1f} +- {interval(e)[1] - np.mean(e):.1f}" for e in judged]
+        less = judged if name == "sdfsim" or "sdfsim" not in result else result["sdfsim"][1] - judged
+        apart = " / ".join("{:.1f} [{:.1f}, {:.1f}]".format(np.mean(e), *interval(e)) for e in less)
+        known = ", ".join(f"{np.mean(e):.1f}" for e in fitted)
+        rows.append((name, *cells, "" if less is judged else apart, known))
+    return markdown(rows)
+
+
 HINGE = {"drag": (0.0, 0.05), "damping_of_hinge": (0.0, 0.005), "inertia": (0.7, 2.0), "friction": (0.05, 0.6)}
 Engine = Callable[[Sequence[Start], float, np.ndarray, dict[str, float]], Motion]
 ENGINES: dict[str, tuple[Engine, dict[str, tuple[float, float]]]] = {
@@ -409,16 +422,11 @@ def main(tosses: Path, out: Path, rounds: int, only: Sequence[str]) -> None:
             errors(engine(fit, dt, gravity, values), fit_truth),
             errors(engine(test, dt, gravity, values), test_truth),
         )
-    rows = ["| | links apart, % of a link | turned, degrees | hinge, degrees | the same on the 60 |"]
-    rows.append("| --- | ---: | ---: | ---: | ---: |")
-    for name, (_, fitted, judged) in result.items():
-        cells = [f"{np.mean(e):.1f} +- {interval(e)[1] - np.mean(e):.1f}" for e in judged]
-        rows.append(f"| {name} | {' | '.join(cells)} | {fitted[0].mean():.1f} %, {fitted[1].mean():.1f} |")
     kept = {n: {"values": v, "fit": f.tolist(), "test": j.tolist()} for n, (v, f, j) in result.items()}
     write_json(out / f"elbow-{'-'.join(result)}.json", kept)
     for name, (values, *_) in result.items():
         print(name, values)
-    print("\n".join(rows))
+    print(table({name: (fitted, judged) for name, (_, fitted, judged) in result.items()}))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
 SPREADS = 3.0  # standard deviations that count as noise
 SHARE = 0.05  # of a figure: what another machine's rounding may change where repetitions agree
-PICTURES = {"stack": "stability_stacks.png", "bounce": "stability_bounces.png", "slope": "stability_slopes.png"}
+PICTURES = {"bounce": "stability_bounces.png", "slope": "stability_slopes.png"}
 
 
 def accepted(study: Study) -> dict[str, Any]:

@@ -11,9 +11,9 @@ import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-from pipeline.options import COMMAND, Options, options_of, read_config, write_config
+from pipeline.options import COMMAND, OptionKeys, Options, options_of, read_config, write_config
 from pipeline.progress import Progress
 from pipeline.report import write_report
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
@@ -160,12 +160,18 @@ STAGES = {
 
 def reconstruct(
     photos: str | Path, out: str | Path, *, from_stage: str | None = None, until_stage: str | None = None,
-    progress: Callable[[str, float, str], None] | None = None, **options: Any,
+    progress: Callable[[str, float, str], None] | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
     """Photos -> a scene that can be simulated.
 
+        sdfsim.reconstruct("PHOTOS", "room", preset="quick", size=1.8, progress=print)
+
+    `options` are those of `sdfsim reconstruct --help` by the same names, `seed` and `recipe` (see `OptionKeys`);
+    `from_stage` and `until_stage` are its --from and --until. `progress` is called with the stage, its share that is
+    done, and a line.
+
     Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
-    `out`, and returns the report. Skips a stage whose inputs, options (see `Options`) and version are those of its last
+    `out`, and returns the report. Skips a stage whose inputs, options and version are those of its last
     run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises SdfsimError for bad
     photos or options (exit code 1), or where poses or surface are not good enough (3).
     """
@@ -185,8 +191,9 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, 
     """Photos -> camera poses: the first two stages, as `reconstruct` does them; options that are not given (None) are
     those of the folder's config.yaml, where there is one."""
     kept = read_config(Path(out)).model_dump() if (Path(out) / CONFIG).exists() else {}
-    given = {key: value for key, value in changes.items() if value is not None}
-    return reconstruct(**{**kept, **given, "photos": photos}, out=out, until_stage="poses", progress=progress)
+    given: dict[str, Any] = kept | {key: value for key, value in changes.items() if value is not None}
+    given["photos"] = photos
+    return reconstruct(**given, out=out, until_stage="poses", progress=progress)
 
 
 def run_stage(

@@ -24,7 +24,7 @@ cat <<TEXT
 
 A picture of it:          $picture
 a movie of it:            $sdfsim render $out/rollout -o movie.mp4
-Watch it:                 $sdfsim view $out/rollout/rollout.rrd
-in the browser:           $sdfsim view $out/rollout/rollout.rrd --web
+Watch it:                 $sdfsim view $out/rollout
+in the browser:           $sdfsim view $out/rollout --web
 cameras and surface:      $sdfsim view $out/scene/reconstruction.rrd
 TEXT

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sdfsim.apps.import_robot import import_robot
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import load_shape
+from tests.helpers.everyday import COUNTS, MISSED
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -17,6 +19,9 @@ PAGES = [
     ROOT / "benchmarks" / "RESULTS.md",
     *sorted((ROOT / "docs").glob("*.md")),
 ]
+
+
+OURS = re.compile(r"(?<![\w./-])(?:sdfsim|pipeline|benchmarks|tests|samples)/[\w/]+\.py\b")
 
 
 def examples(name: str, folder: Path) -> dict:
@@ -37,8 +42,12 @@ def test_the_python_examples_run(tmp_path, monkeypatch):
 
 
 def test_the_examples_for_robotics_do_what_they_say(tmp_path, monkeypatch):
-    """The ball comes to rest in the bowl, in both engines; the bowl slides the less the rougher it is."""
+    """The ball comes to rest in the bowl, in both engines; the bowl slides the less the rougher it is; the dog
+    stands."""
     monkeypatch.chdir(tmp_path)
+    import pybullet_data
+
+    import_robot(Path(pybullet_data.getDataPath()) / "a1" / "a1.urdf", tmp_path / "dog.yaml", floor=True)
     names = examples("robotics.md", tmp_path)
     bowl, ball = names["rollout"].position[-1, 2:4]
     assert np.linalg.norm((ball - bowl)[:2]) < 0.05 and ball[2] == pytest.approx(0.45, abs=0.01)  # it rolls to and fro
@@ -46,6 +55,12 @@ def test_the_examples_for_robotics_do_what_they_say(tmp_path, monkeypatch):
     assert names["there"][2] == pytest.approx(names["ours"][2], abs=0.01)
     assert names["touching"] and names["bowl"].velocity[0] > 0.05
     assert len(names["slid"]) == 10
+    dog, bends = names["dog"], {"hip": 0.0, "upper": 0.8, "lower": -1.6}
+    held = {f"{leg}_{part}_joint": bend for leg in ("FR", "FL", "RR", "RL") for part, bend in bends.items()}
+    assert {name: dog.joint(name).angle for name in held} == pytest.approx(held, abs=0.05)
+    # Of the thigh and the calf, 0.2 m each, above a foot of 2 cm.
+    assert dog["trunk"].position[2] == pytest.approx(0.4 * np.cos(0.8) + 0.02, abs=0.03)
+    assert (tmp_path / "dog.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -75,6 +90,12 @@ def test_the_functions_that_how_it_works_names_exist():
     there = set(re.findall(r"(?:def|class) (\w+)|^(\w+)\b", sources, re.MULTILINE))
     assert len(named) > 40
     assert not named - {name for pair in there for name in pair}
+
+
+def test_the_files_that_pages_name_exist():
+    named = {(page.name, path) for page in PAGES for path in re.findall(OURS, page.read_text(encoding="utf-8"))}
+    assert len(named) > 60
+    assert not [pair for pair in sorted(named) if not (ROOT / pair[1]).exists()]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -125,11 +146,19 @@ def test_the_readmes_errors_are_the_results(row, other):
         assert degrees == pytest.approx(true_degrees, abs=0.06)
 
 
-def test_the_solvers_errors_on_other_pages_are_the_results():
-    metres, degrees, *_ = cells(section("MOVi-B", page("benchmarks/RESULTS.md")), "`solver`")
-    metres, degrees = f"{numbers(metres)[0]:.3f} m", f"{numbers(degrees)[0]:.1f}°"
-    assert f"the contact solve on the convex pieces {metres}, {degrees}" in page("docs/paper.md")
-    assert f"today's has {metres} and {degrees} on test" in page("docs/simulator.md")
+def test_errors_on_movi_b_are_the_results_on_every_page():
+    """Of the solver wherever they stand, of `small` in its card, where those of its training stand beside them."""
+    table = section("MOVi-B", page("benchmarks/RESULTS.md"))
+    short, turn, long, further = (numbers(cell)[0] for cell in cells(table, "`solver`"))
+    assert f"the contact solve on the convex pieces {short:g} m, {turn:g}°" in page("docs/paper.md")
+    assert f"today's has {short:g} m and {turn:g}° on test" in page("docs/simulator.md")
+    assert f"{turn:g}°, and {long:g} m, {further:g}° on the same" in page("docs/gpu.md")
+    for name in ("gnn", "sdf-sim"):
+        told = [numbers(cell)[0] for cell in cells(page(f"sdfsim/models/{name}.md"), "`solver` on the same")]
+        assert told == [short, turn, long, further][: len(told)] and len(told) >= 3
+    of_small = [numbers(cell)[0] for cell in cells(table, "`small`")]
+    told = re.search(r"On today's solve it has (.*?) \(\[RESULTS", page("sdfsim/models/small.md"), re.DOTALL)
+    assert told and numbers(told[1]) == of_small
 
 
 def test_errors_beside_hopnet_are_the_results():
@@ -167,9 +196,14 @@ def test_what_far_scenery_costs_is_the_same_everywhere():
 
 
 def test_how_many_everyday_checks_hold_is_the_same_everywhere():
-    held = cells(section("everyday", page("benchmarks/RESULTS.md")), "all")[0]
-    told = re.search(r"(\d+) of (\d+) checks hold", page("docs/stability.md"))
-    assert told and held == f"{told[1]} / {told[2]}"
+    forms, others = (sum(count) for count in zip(*COUNTS.values(), strict=True))
+    held = {kind: f"{others - len(missed)} of {others}" for kind, missed in MISSED.items()}
+    assert cells(section("everyday", page("benchmarks/RESULTS.md")), "all")[0] == f"{forms} / {forms}"
+    stability, readme = (" ".join(page(name).split()) for name in ("docs/stability.md", "README.md"))
+    assert f"{forms} of {forms} checks hold" in stability
+    assert f"all {forms} hold too. With meshes {held['mesh']} hold, with grids {held['grid']}." in stability
+    told = f"hold with closed forms, {held['mesh']} with meshes and {held['grid']} with sampled grids"
+    assert f"{forms} of {forms} {told}" in readme
 
 
 def test_errors_of_reconstructions_name_one_direction():

@@ -7,7 +7,7 @@ import numpy as np
 from pi_heif import register_heif_opener
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from pipeline.inputs.deep import OTHERWISE, TIFFS, deep_header, deep_values, eight_bits
+from pipeline.inputs.bit_depth import OTHERWISE, TIFFS, deep_header, deep_values, eight_bits
 from sdfsim.base.errors import SdfsimError
 
 register_heif_opener(thumbnails=False)

@@ -10,8 +10,8 @@ from PIL import Image
 from pydantic import TypeAdapter
 
 from pipeline.cameras import View, save_views
+from pipeline.inputs.bit_depth import common_white
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
-from pipeline.inputs.deep import common_white
 from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, read_photo, sharpness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
@@ -42,7 +42,6 @@ class Photo:
     sharpness: float  # see `sharpness`; 0.2 to 0.6 for photos in focus
     fault: str = ""  # "too dark", "blurred" or nothing
     depth: bool = False  # whether depth came with it
-    state: int = 0  # of a thing that is photographed in two states, which one it shows
 
     def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
         """Pixels [P, 2] of the prepared photo, of camera `view`, from those of the user's photo."""

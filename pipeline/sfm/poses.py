@@ -95,12 +95,11 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 5,  # of what the child writes, which a run that goes on takes up
+        "version": 4,  # of what the child writes, which a run that goes on takes up
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
         "pairs": seen_together(load_views(known)) if known.exists() else None,
-        "states": {photo.name: photo.state for photo in photos},
         "partners": int(np.clip(SHARE * len(photos), *PARTNERS)), "all_up_to": ALL_UP_TO,
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []

@@ -374,13 +374,6 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
     return {name: len(points[key]) for key, name in images.items()}, pairs
 
 
-def of_one_state(job: dict, pairs: list) -> list:
-    """The pairs whose photos show a thing in the same state. What has moved between two states contradicts the right
-    poses, and may have more matches than what stands still."""
-    state = job["states"]
-    return [pair for pair in pairs if state[pair[0]] == state[pair[1]]]
-
-
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
     """What the matches show without poses: `counts` of each photo, `pairs` (with the share of matches that did not
     move between the photos), and the share of `turn_only` pairs."""
@@ -434,21 +427,21 @@ def main(job_path: str) -> None:
     if job["known_cameras"]:
         best, cameras = from_known(pycolmap, job, database, out), []
     else:
-        best, cameras = best_mapping(pycolmap, job, database, of_one_state(job, pairs), out)
+        best, cameras = best_mapping(pycolmap, job, database, pairs, out)
         if len(posed_in(best)) < job["count"] and job["exhaustive_up_to"] < job["count"] <= job["all_up_to"]:
             # What looks least alike may be what joins those that were left out to the others.
             print("phase matches", flush=True)
             matches(pycolmap, {**job, "exhaustive_up_to": job["count"]}, database)
             print("phase mapping", flush=True)
             counts, pairs = read_pairs(pycolmap, database)
-            best, cameras = best_mapping(pycolmap, job, database, of_one_state(job, pairs), out)
+            best, cameras = best_mapping(pycolmap, job, database, pairs, out)
     result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
     if best:
         result["views"] = views_in(best)
         result["cameras"] = cameras
-        result["agreement"] = agreement(of_one_state(job, pairs), result["views"])
+        result["agreement"] = agreement(pairs, result["views"])
         judges = read_pairs(pycolmap, Path(job["judge"]))[1] if job["judge"] else pairs
-        result["judged"] = agreement(of_one_state(job, judges), result["views"])  # by the matches of the first attempt
+        result["judged"] = agreement(judges, result["views"])  # by the matches of the first attempt
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
         save_points(best, out / "sparse.npz")

@@ -7,11 +7,11 @@ docs/export.md says it of each format.
 import csv
 import importlib
 import io
+import logging
 import re
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
@@ -27,10 +27,10 @@ from sdfsim.apps.recording import body_colors, framed, is_infinite, shown, with_
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, write_bytes, write_text
-from sdfsim.base.parallel import StageProgress
+from sdfsim.base.parallel import StageProgress, of_stage, silent_stages
 from sdfsim.geometry.gltf import GltfWriter, light
 from sdfsim.geometry.mesh import Mesh, convex_hull
-from sdfsim.geometry.mesh_io import wavefront
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES, wavefront
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.collision_filter import contact_groups
@@ -38,6 +38,8 @@ from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
+
+_log = logging.getLogger(__name__)
 
 # Concavity relative to the size; and a search a third as long as CoACD's own, which finds pieces as good.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
@@ -115,7 +117,7 @@ def export(
     fps: float | None = None,
     collide: Collide = "pieces",
     allow_outside: bool = False,
-    on_progress: StageProgress = lambda stage, fraction, message: None,
+    on_progress: StageProgress = silent_stages,
 ) -> dict[str, Any]:
     """Write a run (folder or rollout.npz), a scene.yaml, a sample by its name or a Shape folder in the format that the
     ending of `out` names (see `FORMATS`).
@@ -170,7 +172,7 @@ def _path(what: str, given: Any, wanted: str) -> Path:
 
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
-    progress = partial(on_progress, "shapes")
+    progress = of_stage(on_progress, "shapes")
     run, source = None, source if source.exists() else find_scene(source, or_run=True)
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
@@ -185,7 +187,9 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     elif not source.exists():
         raise SdfsimError(f"{source}: there is no such folder or file", "give a run folder, scene.yaml or Shape folder")
     else:
-        raise SdfsimError(f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder")
+        hint = f"sdfsim fit {source} -o FOLDER makes a Shape folder of a mesh"
+        message = f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder"
+        raise SdfsimError(message, hint if source.suffix.lower() in MESH_SUFFIXES else "")
     if run is not None:
         time, turn = run.time, run.orientation.copy()
         turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
@@ -262,6 +266,8 @@ def _write_assets(
     for done, k in enumerate(drawn):
         on_progress("convex pieces", done / len(drawn), f"of {shapes[k].name}")
         seen[k] = obj(take.shapes[k], shapes[k].mesh)
+        if k in wanted and on_progress is silent_stages and not own_pieces(shapes[k]):
+            _log.warning("cutting the shape %s into convex pieces: some seconds, or a minute", shapes[k].name)
         pieces = convex_pieces(shapes[k]) if k in wanted else []
         cut[k] = [obj(f"{take.shapes[k]}-{i}", piece) for i, piece in enumerate(pieces)]
     return seen, cut

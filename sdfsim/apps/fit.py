@@ -11,6 +11,7 @@ from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, locked, read_json, visible
 from sdfsim.base.parallel import Progress, parallel, silent
+from sdfsim.base.warned import warn_once
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_textured
 from sdfsim.scene.schema import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall
@@ -60,8 +61,16 @@ def fit(
     options = Options(recipe, budget, cap, thicken, units)
     sources = [Path(source)] if isinstance(source, Path | str) else [Path(one) for one in source]
     if len(sources) == 1 and not sources[0].is_dir():
-        return fit_file(sources[0], Path(out), options, device=device, on_progress=on_progress)
-    return fit_many(named_meshes(sources), Path(out), options, device=device, on_progress=on_progress)
+        report = fit_file(sources[0], Path(out), options, device=device, on_progress=on_progress)
+        found = {Path(out).name: report}
+    else:
+        report = fit_many(named_meshes(sources), Path(out), options, device=device, on_progress=on_progress)
+        found = report["shapes"]
+    if on_progress is silent:
+        for name, one in found.items():
+            for note in one.get("notes", []):
+                warn_once(f"{name}: {note}")
+    return report
 
 
 def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:

@@ -149,11 +149,11 @@ def write_scene(
         ]
         lift[2] = -min(corners, default=0.0)
         scene.add(FLOOR, plane={}, friction=1.0, restitution=0.0)
-    partners = _partners(whole, [shape for shape, *_ in made], poses, floor, notes)
+    avoided = _avoided(whole, [shape for shape, *_ in made], poses, notes)
     folders: list[Path] = []
     names = [link.name for link in whole.links]
     files = dict(zip(names, plain_names(names), strict=True))
-    for link, (shape, keys, _, mass), pose, touches in zip(whole.links, made, poses, partners, strict=True):
+    for link, (shape, keys, _, mass), pose, others in zip(whole.links, made, poses, avoided, strict=True):
         if "asset" in keys and shape is not None:
             folders.append(shape.save(folder / files[link.name]))
             keys = keys | {"asset": folders[-1]}
@@ -168,7 +168,7 @@ def write_scene(
         motion |= {key: _round(value) for key, value in speeds.items() if np.any(value) and not link.still}
         quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
         turned = {} if abs(quat[3]) > 1 - 1e-15 else {"quat_xyzw": _round(quat)}
-        touched = {} if touches is None else {"collides_with": touches}
+        touched = {} if others is None else {"avoids": others} if others else {"collides_with": []}
         entry: dict[str, Any] = {
             **keys,
             "position": _round(pose[:3, 3] + lift),
@@ -469,10 +469,10 @@ def _sizes(part: Part) -> list:
 # --- who touches whom ---
 
 
-def _partners(
-    robot: Robot, shapes: list[Shape | None], poses: list[np.ndarray], floor: bool, notes: list[str]
+def _avoided(
+    robot: Robot, shapes: list[Shape | None], poses: list[np.ndarray], notes: list[str]
 ) -> list[list[str] | None]:
-    """What `collides_with` lists of each link; None: all. Jointed bodies do not touch anyway."""
+    """What each link `avoids`; None: nothing, an empty list: all. Jointed bodies do not touch anyway."""
     links, count = robot.links, len(robot.links)
     rigid = list(range(count))  # what moves as one, and all that is still
     still = [k for k, link in enumerate(links) if link.still]
@@ -515,19 +515,12 @@ def _partners(
                 overlapping.append(f"{links[a].name} and {links[b].name}")
     if overlapping:
         notes.append(named("links that overlap at the start do not touch each other", overlapping))
-    found: list[list[str] | None] = [None] * count
-    names = [link.name for link in links]
-    listed = []
-    for k in range(count):
-        others = {b if a == k else a for a, b in denied if k in (a, b)}
-        if not others or "plane" in {part.kind for part in links[k].solid or links[k].shown}:
-            continue
-        found[k] = []
-        if not bare[k]:
-            found[k] = [FLOOR] * floor + [names[j] for j in range(count) if j != k and j not in others]
-            listed.append(names[k])
-    if listed:
-        notes.append(named("links with lists in collides_with: what you add to the scene goes into these", listed))
+    found: list[list[str] | None] = [[] if alone else None for alone in bare]
+    for k in (k for k in range(count) if not bare[k]):
+        others = {b if a == k else a for a, b in denied - own if k in (a, b)}  # what a joint holds is kept apart by it
+        others = sorted(j for j in others if not bare[j])
+        if others and "plane" not in {part.kind for part in links[k].solid or links[k].shown}:
+            found[k] = [links[j].name for j in others]
     return found
 
 

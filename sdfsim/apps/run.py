@@ -4,7 +4,6 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +28,7 @@ from sdfsim.base.files import (
     write_json,
     write_text,
 )
-from sdfsim.base.parallel import Progress, StageProgress, silent
+from sdfsim.base.parallel import Progress, StageProgress, of_stage, silent, silent_stages
 from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics.bodies import State, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
@@ -63,7 +62,7 @@ def simulate(
     seed: int | None = None,
     viewer: Viewer = "file",
     device: str = "auto",
-    on_progress: StageProgress = lambda stage, fraction, message: None,
+    on_progress: StageProgress = silent_stages,
     say: Callable[[str], None] = lambda line: None,
     allow_outside: bool = False,
     until_settled: bool = False,
@@ -95,7 +94,7 @@ def simulate(
     check_own(out, "simulate", *_RESULTS)
     check_screen(viewer)
     scene_file = find_scene(scene_file)
-    scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
+    scene = load_scene(scene_file, of_stage(on_progress, "shapes"), allow_outside=allow_outside)
     for note in scene.notes:
         say(note)
     known = fingerprints(scene)

@@ -79,9 +79,9 @@ def has_screen() -> bool:
 
 
 def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lambda line: None) -> None:
-    """Open a recording, and wait until the viewer is closed; `say` is told the address of a page in the browser
-    (`web`). Raises SdfsimError for no such recording, no screen for a window, or where it fails."""
-    _check_recording(recording)
+    """Open a recording, or that of a run folder, and wait until the viewer is closed; `say` is told the address of a
+    page in the browser (`web`). Raises SdfsimError for no such recording, no screen for a window, or where it fails."""
+    recording = _recording(recording)
     port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
     if web:
         say(f"watch it at {_page(page_port, port)}")
@@ -97,7 +97,7 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
 def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> None:
     """Write what the viewer shows of a recording `at` a time in s (default: the end) as a PNG, without a screen. Raises
     SdfsimError for no such recording or time, no graphics driver, or a file that cannot be written."""
-    _check_recording(recording)
+    recording = _recording(recording)
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")
     port = _free_port()
@@ -148,9 +148,15 @@ def _end(process: subprocess.Popen) -> None:
         process.wait()
 
 
-def _check_recording(file: Path) -> None:
+def _recording(place: Path) -> Path:
+    """The recording of a run folder or of a reconstruction, or the file itself. Raises SdfsimError where none is."""
+    inside = [place / name for name in ("rollout.rrd", "reconstruction.rrd") if (place / name).is_file()]
+    file = inside[0] if inside else place
     if not file.is_file() or file.open("rb").read(3) != b"RRF":
-        raise SdfsimError(f"{file}: no such recording", "give a rollout.rrd that simulate has written")
+        raise SdfsimError(
+            f"{place}: no such recording", "give a run folder, or a rollout.rrd that simulate has written"
+        )
+    return file
 
 
 def viewer_program() -> str:

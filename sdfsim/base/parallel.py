@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
+from functools import partial
 from timeit import timeit
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,16 @@ SCHEDULER_ANSWERS = 10.0  # s, within which
 
 
 def silent(fraction: float, message: str) -> None:
-    """Progress that is not shown."""
+    """Progress that is not shown: what takes long, and what a command would print, is then warned of."""
+
+
+def silent_stages(stage: str, fraction: float, message: str) -> None:
+    """The same of several stages."""
+
+
+def of_stage(on_progress: StageProgress, stage: str) -> Progress:
+    """The progress of one of several stages."""
+    return silent if on_progress is silent_stages else partial(on_progress, stage)
 
 
 _most = 0  # threads that torch has by default; 0 before `choose_threads` asks

@@ -71,7 +71,7 @@ class SceneBuilder:
         body = _plain({"name": name, **({"shape": name} if shape else {}),
                        **{key: value for key, value in keys.items() if key not in _OF_SHAPE}})  # fmt: skip
         shapes = {name: shape} if shape else {key: self._shapes.get(key, _ANY) for key in [body.get("shape")] if key}
-        lone = {"version": VERSION, "shapes": shapes, "bodies": [_without(body, "collides_with")]}
+        lone = {"version": VERSION, "shapes": shapes, "bodies": [_without(body, "collides_with", "avoids")]}
         _refuse(lone, f"body {name!r}", {("shapes", name): "", ("bodies", 0): ""} if shape else {("bodies", 0): ""})
         self._shapes |= {name: shape} if shape else {}
         self._bodies.append(body)

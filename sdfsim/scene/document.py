@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from sdfsim.base.errors import SceneError
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 
 MOST_BYTES = 16 * 2**20  # of a file
 MOST_VALUES = 500_000  # of a file, each as often as an alias repeats it
@@ -87,6 +88,11 @@ def _text_of(path: Path) -> str:
     try:
         if path.exists() and not path.is_dir() and not path.is_file():
             raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may have no end
+        if path.is_file() and path.suffix.lower() in MESH_SUFFIXES:
+            scene = f"shapes: {{thing: {{mesh: {path.name}, sdf: grid}}}}"
+            raise SceneError(
+                [f"{path}: a mesh is not a scene"], f"name it in one: {scene} (docs/vfx.md has one to copy)"
+            )
         if path.is_file() and path.stat().st_size > MOST_BYTES:
             raise SceneError([f"{path}: too large for a scene (at most {MOST_BYTES // 2**20} MiB)"])
         return path.read_bytes().decode("utf-8")

@@ -48,6 +48,7 @@ class BodyKeys(TypedDict, total=False):
     friction: float | None
     restitution: float | None
     collides_with: Literal["all"] | Sequence[str] | None
+    avoids: Sequence[str]
     path: Sequence[Group] | None
     count: int | None
     arrange: Group | None

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
+from sdfsim.base.warned import warn_once
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.document import Document
 from sdfsim.scene.joints import joints_of
@@ -66,6 +67,10 @@ def load_scene(
     document.check()
     loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
+    notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", []))
+    if on_progress is silent:
+        for note in notes:
+            warn_once(note)
     return Scene(
         shapes=tuple(shapes.values()),
         bodies=tuple(bodies),
@@ -76,7 +81,7 @@ def load_scene(
         effects=Effects(**dict(table.effects)),
         path=path,
         missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
-        notes=tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", [])),
+        notes=notes,
         caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
         joints=joints,
     )
@@ -125,6 +130,10 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
 def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:
     """The first copy, without its mass."""
     partners, path = entry.collides_with, None
+    if entry.avoids:
+        avoided = {n for p in entry.avoids for n in groups.get(p, [p])}
+        known = (n for p in (groups if partners is None else partners) for n in groups.get(p, [p]))
+        partners = [n for n in known if n not in avoided]
     position, quat = (np.array(entry.position), entry.rotation()) if entry.plane is None else entry.plane.pose()
     if entry.path:
         times, places, turns = zip(*((p.time, p.position, p.rotation()) for p in entry.path), strict=True)

@@ -47,15 +47,20 @@ def _shown(value: Any) -> str:
     return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
 
 
-_LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names"}
+_LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names", "joints": "be a list"}
 _LENGTHS = {"quat_xyzw": 4, "quat_wxyz": 4, "limits": 2, "limits_deg": 2, "grid": 3}
 
 
+def _numbers(name: str) -> str:
+    """What a list of numbers of that name holds; all that are not named here are vectors."""
+    return f"{_LENGTHS.get(name, 3)} numbers"
+
+
 def _many(value: Any, name: str) -> str:
-    """How many entries a list of that name has; all that are not named here are vectors."""
+    """How many entries a list of that name has."""
     if name == "bodies" and not any(isinstance(entry, str) for entry in value):
         return "have at least one body"
-    return _LISTS.get(name) or f"be {_LENGTHS.get(name, 3)} numbers"
+    return _LISTS.get(name) or f"be {_numbers(name)}"
 
 
 # What other programs call keys that have another name here; the first that is known counts.
@@ -103,7 +108,7 @@ def _told(error: Any, table: "type[Table]") -> str:
         "too_short": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
         "too_long": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
         "literal_error": f"must be one of {allowed} (got {got})",
-        "list_type": f"must be a list (got {got})",
+        "list_type": f"must be {'a list' if key in _LISTS else _numbers(str(key))} (got {got})",
         "dict_type": f"must be a mapping (got {got})",
     }
     return texts.get(kind, f"must be a text (got {got})")
@@ -413,6 +418,7 @@ class BodyTable(Turned):
     collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(
         "`all`, or a list of names: two bodies touch where each lists the other", None
     )
+    avoids: list[Text] = key("names of bodies that it never touches, whatever their lists say", [])
     count: Whole | None = key("how many copies; without it, as many as the grid has places", None, ge=1)
     arrange: Arrange | None = key("where the copies are", None)
 
@@ -619,7 +625,8 @@ class JointTable(Table):
 
 def _named(bodies: list, joints: Any) -> Iterator[tuple[Loc, str]]:
     """Where lists of bodies and joints name bodies, and what they name, as far as they are lists."""
-    for of, entries, key in (("bodies", bodies, "collides_with"), ("joints", joints, "bodies")):
+    named = ("bodies", bodies, "collides_with"), ("bodies", bodies, "avoids"), ("joints", joints, "bodies")
+    for of, entries, key in named:
         for i, entry in enumerate(entries if isinstance(entries, list) else ()):
             names = entry.get(key) if isinstance(entry, dict) else None
             for k, name in enumerate(names if isinstance(names, list) else ()):
@@ -681,9 +688,10 @@ class SceneTable(Table):
             for key in ("velocity", "angular_velocity") if self.motion_of(body) == "static" else ():
                 if np.any(getattr(body, key)):
                     yield ("bodies", i, key), "must be zero: a static body does not move"
-            for k, partner in enumerate(body.collides_with or []):
-                if partner not in first and partner not in copies and "[" in partner:
-                    yield ("bodies", i, "collides_with", k), _no_body(partner, copies)
+            for key in ("collides_with", "avoids"):
+                for k, partner in enumerate(getattr(body, key) or []):
+                    if partner not in first and partner not in copies and "[" in partner:
+                        yield ("bodies", i, key, k), _no_body(partner, copies)
         yield from self._joint_faults()
 
     def _joint_faults(self) -> Iterator[Fault]:

@@ -77,8 +77,17 @@ class Simulator(LiveScene):
         for state in simulator.steps(100):               # or `step(n)`: n steps at once
             print(state.time, ball.position, simulator.contact_points())
 
-    `rollouts` runs many variants of the scene on all cores. `frames` yields a run in pieces, to be shown as it goes on.
-    `restore` goes back to a `state` of before.
+    What there is, in the order in which you may need it:
+
+        run              all of the motion
+        simulator[name]  a body: read it, set it, push it, pull it
+        step, steps      go on by n steps: the state after all of them, or after each
+        contact_points   where bodies touch, with forces and normals
+        joint            a joint by its name: its angle, its motor (`JointHandle`)
+        reset            back to the start
+        state, restore   keep a state, and go back to it
+        rollouts         many variants of the scene, on all cores
+        frames           a run in pieces, to be shown as it goes on
 
     Args:
         scene: bodies, shapes, gravity; one written in Python, or the path of a file or the name of a sample, is loaded

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
 from sdfsim.apps.export import Take, export
 from sdfsim.apps.observed import load_recordings
+from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape, mesh_shape
@@ -439,7 +441,7 @@ def assets(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path):
+def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path, caplog):
     import mujoco
 
     half = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]) * 0.1
@@ -451,10 +453,26 @@ def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path):
     shape.save(tmp_path / "angle")
     report = export(tmp_path / "angle", tmp_path / "angle.xml")
     assert len(report["files"]) >= 4  # the scene, the mesh and two pieces at least
+    told = "cutting the shape angle into convex pieces"
+    assert caplog.text.count(told) == 1  # it takes long, and nobody sees a bar
+    caplog.clear()
+    stages = []
+    export(tmp_path / "angle", tmp_path / "angle.urdf", on_progress=lambda stage, *_: stages.append(stage))
+    assert told not in caplog.text and "convex pieces" in stages
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "angle.xml"))
     assert model.body("angle").mass[0] == pytest.approx(1000 * 0.003)
     corners = model.mesh_vert.reshape(-1, 3)
     assert np.isfinite(corners).all() and model.ngeom == len(report["files"]) - 1
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_python_is_warned_of_shapes_that_are_made_for_an_export(tmp_path, monkeypatch, caplog, shown):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "brick.ply").write_bytes(write_ply(primitives.box()))
+    shape = "brick: {mesh: brick.ply, sdf: grid, resolution: 16}"
+    (tmp_path / "scene.yaml").write_text(f"version: 1\nshapes: {{{shape}}}\nbodies: [{{name: a, shape: brick}}]\n")
+    export(tmp_path / "scene.yaml", tmp_path / "a.glb", **({"on_progress": lambda *_: None} if shown else {}))
+    assert ("making the shape brick" in caplog.text) != shown
 
 
 def test_a_shape_becomes_one_urdf(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from joblib import parallel_config
 
-from sdfsim.apps.fit import named_meshes
+from sdfsim.apps.fit import fit, named_meshes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.geometry import primitives
@@ -91,6 +91,16 @@ def test_units_are_those_of_a_scene_file_and_odd_sizes_are_reported(tmp_path: Pa
     ):  # fmt: skip
         told = "\n".join(remarks(file, primitives.box((size, 1.0, 1.0)), metres, given=given))
         assert ("--units" in told) == bool(note) and note in told
+
+
+def test_python_is_warned_of_what_the_command_prints(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "lid.ply").write_bytes(write_ply(primitives.box((20.0, 30.0, 40.0))))
+    how: dict = {"recipe": "quick", "budget": 1.0, "device": "cpu"}
+    fit(tmp_path / "lid.ply", tmp_path / "seen", **how, on_progress=lambda fraction, message: None)
+    assert "m wide" not in caplog.text
+    for _ in range(2):
+        fit(tmp_path / "lid.ply", tmp_path / "lid", **how)
+    assert caplog.text.count("lid: it is 40 m wide in metres; if its unit is millimetres") == 1
 
 
 def test_an_error_names_the_mesh_and_not_the_folder(tmp_path: Path) -> None:

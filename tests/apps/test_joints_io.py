@@ -17,6 +17,7 @@ from sdfsim.apps.recording_joints import ends, marks
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
+from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
 from tests.helpers.command import run
 from tests.helpers.runs import read
@@ -122,6 +123,23 @@ def test_urdf_tells_what_it_leaves_out_and_what_it_made_otherwise(tmp_path: Path
     assert any("velocity of <limit>" in line for line in report["left_out"])
     assert any("tool0" in line for line in report["notes"])
     assert any("shoulder starts at 0.2 rad" in line for line in report["notes"])
+
+
+def test_links_that_overlap_avoid_each_other_and_nothing_else(tmp_path: Path) -> None:
+    """A joint keeps its links apart by itself; what is added to a robot touches all of it."""
+    free, _ = imported(write(tmp_path / "free", "arm.urdf", ARM), fixed=True)
+    assert [body.collides_with for body in free.bodies] == [None] * 4
+    thick = ARM.replace('<cylinder radius="0.04" length="0.36"/>', '<cylinder radius="0.3" length="0.7"/>')
+    file = write(tmp_path / "crossed", "arm.urdf", thick)
+    _, report = imported(file, fixed=True)
+    assert any("overlap" in line and "upper and tip" in line for line in report["notes"])
+    more = (
+        SceneBuilder.read(file.with_name("scene.yaml")).add("ball", sphere={"radius": 0.1}, position=(0, 0, 3)).load()
+    )
+    group, allowed = contact_groups(more.bodies)
+    row = {body.name: g for body, g in zip(more.bodies, group, strict=True)}
+    assert not allowed[row["upper"], row["tip"]] and allowed[row["base"], row["tip"]]
+    assert all(allowed[row["ball"], row[name]] for name in ("base", "upper", "slide", "tip"))
 
 
 def test_a_urdf_with_efforts_can_be_driven_and_is_limp_until_then(tmp_path: Path) -> None:

@@ -48,3 +48,17 @@ def test_the_time_that_a_run_was_asked_for_is_its_end(tmp_path, monkeypatch, at,
     else:
         viewer._picture(process, "", tmp_path / "x.png", at)
         assert Client.shown == pytest.approx(shown, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["rollout.rrd", "reconstruction.rrd"])
+def test_a_folder_is_shown_by_the_recording_in_it(tmp_path, monkeypatch, name):
+    opened: list[list[str]] = []
+    monkeypatch.setattr(
+        viewer.subprocess, "run", lambda command, check: opened.append(command) or SimpleNamespace(returncode=0)
+    )
+    with pytest.raises(SdfsimError, match="no such recording"):
+        viewer.show(tmp_path, web=True)
+    (tmp_path / name).write_bytes(b"RRF2")
+    for place in (tmp_path, tmp_path / name):
+        viewer.show(place, web=True)
+        assert str(tmp_path / name) in opened.pop()

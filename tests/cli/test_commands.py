@@ -30,7 +30,7 @@ def test_simulate_leaves_a_run_folder_and_says_how_to_watch_it(scene, model, tmp
     assert sorted(p.name for p in out.iterdir()) == ["config.yaml", "report.json", "rollout.npz", "rollout.rrd"]
     config = yaml.safe_load((out / "config.yaml").read_text())
     assert config["seconds"] == 0.1 and config["seed"] == 3 and config["model"] == model
-    assert f"sdfsim view {out / 'rollout.rrd'}" in done.stdout
+    assert f"sdfsim view {out}   (or: rerun {out / 'rollout.rrd'})" in done.stdout
     rollout, report = Rollout.load(out / "rollout.npz"), json.loads((out / "report.json").read_text())
     assert len(rollout) == report["steps"] and report["status"] == "done" and report["finite"]
     fallen = 5 - 0.5 * 9.81 * rollout.time**2
@@ -129,6 +129,8 @@ def test_wrong_usage_is_code_2(arguments):
         (("fit", "{run}.obj", "-o", "{run}"), "no such mesh file"),
         (("fit", "{mesh}", "-o", "{scene}/shape"), "{scene}/shape: cannot be written"),
         (("view", "{run}.rrd"), "no such recording"),
+        (("simulate", "{mesh}", "-o", "{run}"), "mesh.ply: a mesh is not a scene"),
+        (("export", "{mesh}", "-o", "{run}.glb"), "mesh.ply: not a run folder"),
         (("evaluate", "{run}", "--model", "{model}"), "{run}"),
         (("train", "--data", "{run}", "-o", "{run}/out"), "{run}"),
     ],

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 NUMBERS = ("duration", "radius", "spacing", "offset", "scale", "mass", "density", "friction", "restitution", "time")
 INTEGERS = ("version", "seed", "count", "resolution", "nodes")
 VECTORS = ("gravity", "size", "position", "velocity", "angular_velocity", "normal", "grid", "euler_xyz_deg")
-WORDS = ("motion", "sdf", "units", "contact", "friction_effect", "sleep", "collides_with")
 
 NOT_A_NUMBER = ("heavy", "'1'", "[1]", "{}", "null", "true", ".nan", "-.inf", "1e999", "0x10", "1_000", "1:30", "''")
 NOT_AN_INTEGER = (*NOT_A_NUMBER, "1.5", "9" * 30)

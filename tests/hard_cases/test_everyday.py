@@ -4,25 +4,13 @@ import numpy as np
 import pytest
 
 from sdfsim.evaluation.everyday import ROWS, Check, Setting, checks, most, near
+from tests.helpers.everyday import COUNTS, MISSED
 
 FAST = ("slender", "edges", "gentle", "bullets", "elastic", "before_touch", "thin_floors", "flat_drops")
 # Three sizes and orientations, and what solids are made of.
 SETTINGS = (
     Setting(), Setting(kind="mesh"), Setting(size=0.02, yaw=37.0), Setting(size=1.0, yaw=121.0), Setting(kind="grid"),
 )  # fmt: skip
-# Checks by row: of closed forms where a shape has one, and of meshes and grids.
-COUNTS = {
-    "slender": (6, 6), "heaps": (16, 16), "seams": (61, 61), "thin_floors": (30, 30), "rolling": (96, 160),
-    "facets": (14, 14), "round_on_meshes": (56, 56), "flat_drops": (108, 108), "slabs": (90, 90), "spins": (28, 28),
-    "gentle": (9, 4), "edges": (21, 21), "elastic": (5, 5), "bullets": (6, 6), "before_touch": (8, 8),
-}  # fmt: skip
-MISSED = {
-    "mesh": {"heaps: pencil over a bowl: overlap"},
-    "grid": {
-        "heaps: pencil over a bowl: overlap", "heaps: pencil over a bowl: height",
-        "rolling: hoop at 3 m/s on a box: overlap", "rolling: hoop at 3 m/s on a plane: overlap",
-    },
-}  # fmt: skip
 
 
 def close(check: Check) -> bool:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import cli
 from pipeline.cameras import View
 from pipeline.mesh.joint import FoundJoint, find_joint, scene_keys, split
-from pipeline.mesh.moved import State
+from pipeline.mesh.moving_part import State
 from pipeline.mesh.visibility import Visibility
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh, joined

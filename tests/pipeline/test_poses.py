@@ -556,7 +556,7 @@ def test_photos_are_paired_with_those_that_have_most_in_common(tmp_path):
 
 @pytest.mark.parametrize(("posed", "again"), [(40, False), (39, True)])
 def test_what_looks_least_alike_is_matched_too_where_photos_are_left_out(posed, again, tmp_path, monkeypatch):
-    job = {**ORDINARY, "count": 40, "all_up_to": 150, "seed": 0, "known_cameras": "", "judge": "", "states": {}}
+    job = {**ORDINARY, "count": 40, "all_up_to": 150, "seed": 0, "known_cameras": "", "judge": ""}
     (tmp_path / "job.json").write_text(json.dumps(job))
     limits: list[int] = []
     monkeypatch.setattr(worker, "watch_parent", lambda: None)

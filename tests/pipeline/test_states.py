@@ -6,25 +6,23 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.cameras import Similarity, View, load_poses, save_views
+from pipeline.cameras import Similarity
 from pipeline.mesh.bodies import Parts
 from pipeline.mesh.joint import PART, Doubt, HeldPart, load_held
 from pipeline.mesh.meshing import axis_ends
+from pipeline.mesh.moving_part import tied
 from pipeline.mesh.placement import Placement
 from pipeline.scene_writer import holder_of, scene_text
-from pipeline.sfm.worker import of_one_state
-from pipeline.states import check_tied, merge, reconstruct_states, take_poses
+from pipeline.states import reconstruct_states
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
-from sdfsim.base.files import write_arrays, write_json
 from sdfsim.geometry.mesh import Mesh
 from tests.helpers.command import run as command
-from tests.helpers.photos import NAMES, noise, write_transforms
+from tests.helpers.photos import noise
 
 
 @pytest.fixture
@@ -61,91 +59,45 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["open", "second"]
 
 
-def test_photos_with_nothing_in_common_are_not_posed_together(two, tmp_path):
-    with pytest.raises(SdfsimError, match="cannot be posed together: camera poses: only 0 of 6 photos") as told:
-        reconstruct_states(two[0], two[1], tmp_path / "out")
-    assert told.value.exit_code == EXIT_QUALITY and "leave most of what the photos show as it is" in told.value.hint
-
-
-def test_masks_and_known_cameras_are_refused(two, tmp_path):
+def test_masks_are_refused(two, tmp_path):
     shut, opened = two
     noise(opened / "masks", ["0.png", "1.png", "2.png"], (80, 80))
     with pytest.raises(SdfsimError, match="takes no masks"):
         reconstruct_states(shut, opened, tmp_path / "out")
-    noise(tmp_path / "posed", NAMES)
-    with pytest.raises(SdfsimError, match="takes none that are known"):
-        reconstruct_states(write_transforms(tmp_path / "posed"), shut, tmp_path / "other")
 
 
-def camera(name: str) -> View:
-    return View(name, name, 80, 80, 90.0, 40.0, 40.0, 0.0, np.eye(3), np.array([float(name[:4]), 0, 3.0]))
+@pytest.mark.parametrize("moved", [0.0, 0.3])
+def test_states_are_tied_by_what_stands_still(moved: float):
+    """A third of the places have moved, as on a door full of texture, and as many are wrong."""
+    rng = np.random.default_rng(4)
+    true = Similarity(1.7, Rotation.from_rotvec([0.4, -0.2, 1.1]).as_matrix(), np.array([0.3, -1.0, 0.2]))
+    here = rng.uniform(-1, 1, (3000, 3))
+    goes = np.repeat([moved, 0.0], [1000, 2000])[:, None] * [0, 1.0, 0]
+    there = true.points(here + goes) + 0.004 * rng.normal(size=here.shape)
+    wrong = rng.uniform(-1, 1, (1000, 3)), rng.uniform(-2, 2, (1000, 3))
+    pairs = np.concatenate([here, wrong[0]]), np.concatenate([there, wrong[1]])
+    found, patches = tied(*pairs, 0.02, 0.034)
+    assert patches > 1000
+    assert np.abs(found.points(here[1000:]) - true.points(here[1000:])).max() < 0.002
+    assert found.scale == pytest.approx(true.scale, rel=1e-3)
 
 
-@pytest.fixture
-def posed(tmp_path) -> tuple[list[Any], Any]:
-    """Two states of four photos each, posed together: photo 3 (of the first state) has no pose. Point 0 is seen in both
-    states, 1 in the first alone, 2 by one photo of each."""
-    from pipeline import stages
-    from pipeline.inputs.photos import prepare_photos
-
-    states = []
-    for name in ("shut", "open"):
-        given = noise(tmp_path / name, [f"{name}{k}.png" for k in range(4)], (80, 80))
-        state = stages.Project(tmp_path / "out" / name, stages.options_of(photos=str(given)))
-        prepare_photos(given, state.place("photos"))
-        states.append(state)
-    together = stages.Project(tmp_path / "out" / "together", stages.options_of(photos="x"))
-    together.place("photos").mkdir(parents=True)
-    merge(states, together.place("photos"))
-    place = together.place("poses")
-    place.mkdir()
-    save_views([camera(f"{k:04d}.jpg") for k in range(8) if k != 3], place / "cameras.json")
-    seen = [(0, 0), (0, 1), (0, 3), (0, 4), (1, 0), (1, 2), (2, 1), (2, 5)]  # point and view
-    write_arrays(place / "sparse.npz", {
-        "xyz": np.arange(9.0).reshape(3, 3), "rgb": np.zeros((3, 3), np.uint8), "error": np.ones(3),
-        "point_of": np.array([point for point, _ in seen]), "view_of": np.array([view for _, view in seen]),
-    })  # fmt: skip
-    left = [{"photo": "first/shut3.png", "why": "dark"}, {"photo": "second/x.png", "why": "blurred"}]
-    record = {"fingerprint": "", "inputs": "", "made": "", "seconds": 0.0, "report": {"left_out": left, "photos": 8}}
-    write_json(place / "stage.json", record)
-    return states, together
+def test_a_patch_has_one_vote_however_much_there_is_to_see_on_it():
+    """Nine tenths of the places are on a small part that has moved."""
+    rng = np.random.default_rng(5)
+    still, door = rng.uniform(-1, 1, (600, 3)), rng.uniform([-0.1, -0.1, 0], [0.1, 0.1, 0.005], (5400, 3))
+    pairs = np.concatenate([still, door]), np.concatenate([still, door + np.array([0.5, 0.2, 0])])
+    found, _ = tied(*pairs, 0.02, 0.02)
+    assert np.allclose(found.points(still), still, atol=1e-6)
 
 
-def test_each_state_takes_its_own_cameras_and_points(posed, tmp_path):
-    states, together = posed
-    for number, (names, xyz, point_of) in enumerate([
-        (["shut0.png", "shut1.png", "shut2.png"], [[0, 1, 2], [3, 4, 5]], [0, 0, 1, 1]),
-        (["open0.png", "open1.png", "open2.png", "open3.png"], [[0, 1, 2]], [0, 0]),
-    ]):  # fmt: skip
-        work = tmp_path / f"poses{number}"
-        work.mkdir()
-        report = take_poses(states, together, number, work)
-        found = load_poses(work)
-        assert [view.source for view in found.views] == names
-        assert [view.name for view in found.views] == [f"{k:04d}.jpg" for k in range(len(names))]
-        assert [view.translation[0] for view in found.views] == ([0, 1, 2], [4, 5, 6, 7])[number]
-        assert found.sparse.xyz.tolist() == xyz and found.sparse.point_of.tolist() == point_of
-        assert report["posed"] == len(names) and report["photos"] == 4
-        assert [one["photo"] for one in report["left_out"]] == (["shut3.png"], ["x.png"])[number]
-
-
-def test_poses_of_mostly_one_state_or_without_common_points_are_refused(posed):
-    states, together = posed
-    with pytest.raises(SdfsimError, match="only 2 points are seen in both states"):
-        check_tied(states, together)
-    views = load_poses(together.place("poses")).views
-    save_views(views[:4], together.place("poses") / "cameras.json")
-    sparse = {"xyz": np.zeros((1, 3)), "rgb": np.zeros((1, 3), np.uint8), "error": np.ones(1),
-              "point_of": np.array([0]), "view_of": np.array([0])}  # fmt: skip
-    write_arrays(together.place("poses") / "sparse.npz", sparse)
-    with pytest.raises(SdfsimError, match="only 1 of 4 photos could be posed with the other state's"):
-        check_tied(states, together)
-
-
-def test_poses_are_judged_by_photos_of_one_state():
-    """What has moved between two states contradicts the right poses."""
-    pairs = [("a", "b", 1, 2), ("a", "c", 3, 4), ("d", "c", 5, 6)]
-    assert of_one_state({"states": {"a": 0, "b": 0, "c": 1, "d": 1}}, pairs) == [pairs[0], pairs[2]]
+def test_states_with_nothing_in_common_are_refused():
+    rng = np.random.default_rng(6)
+    with pytest.raises(SdfsimError, match="too little in common: they look alike in") as told:
+        tied(rng.uniform(-1, 1, (900, 3)), rng.uniform(-1, 1, (900, 3)), 0.02, 0.02)
+    assert told.value.exit_code == EXIT_QUALITY and "leave most of what the photos show as it is" in told.value.hint
+    with pytest.raises(SdfsimError, match="they look alike in 0 places, 50 are needed"):
+        tied(np.zeros((0, 3)), np.zeros((0, 3)), 0.02, 0.02)
 
 
 SWING = Rotation.from_rotvec([0, 0, math.radians(-60)]).as_matrix()
@@ -218,7 +170,8 @@ def test_the_picture_of_names_shows_the_axis_along_the_part_and_the_way_of_a_sli
     """The part hangs on the hinge at x = 0.3 in its second state; along the axis it goes from 0 to 0.6."""
     part = Mesh(np.array([[0.3, 0, 0], [0.3, 0, 0.6], [0.1, 0.35, 0.6]]), np.array([[0, 1, 2]]))
     parts = Parts(None, None, {PART: part}, 0.0)
-    assert np.allclose(axis_ends(parts, HELD), [[0.3, 0, 0], [0.3, 0, 0.6]])
+    along = axis_ends(parts, HELD)
+    assert along is not None and np.allclose(along, [[0.3, 0, 0], [0.3, 0, 0.6]])
     slides = replace(HELD, kind="slider", travel=0.2, turn=np.eye(3), shift=np.array([0, 0, -0.2]))
     ends = axis_ends(parts, slides)
     assert ends is not None and np.allclose(ends, [[0.3, 0, 0.4], [0.3, 0, 0.6]])

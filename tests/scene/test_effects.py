@@ -9,6 +9,7 @@ import pytest
 
 from sdfsim import SceneError, SdfsimError, load_scene
 from sdfsim.scene import collision_filter
+from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups, count_pairs
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Effects
@@ -58,6 +59,20 @@ def test_pairs_need_both_sides(scene):
     assert (pairs.total, pairs.unmoved, pairs.excluded, pairs.possible) == (6, 0, 3, 3)  # a-floor, b-c, c-floor
     expected = sum(may_touch(x, y) for i, x in enumerate(scene().bodies) for y in scene().bodies[i + 1 :])
     assert expected == 3
+
+
+def test_what_a_body_avoids_it_does_not_touch_and_all_else_it_does():
+    """By name, copies too; whichever of two bodies says so, and beside a list of partners."""
+    scene = SceneBuilder().add("floor", plane={}).add("a", sphere={"radius": 0.1}, avoids=["many"])
+    scene.add("many", shape="a", arrange={"grid": [2, 1, 1], "spacing": 1}, position=(3, 0, 1))
+    scene.add("b", shape="a", position=(9, 0, 1), avoids=["many[1]", "floor"], collides_with=["floor", "a", "many"])
+    bodies = scene.load().bodies
+    group, allowed = contact_groups(bodies)
+    apart = {
+        (x.name, y.name) for i, x in enumerate(bodies) for j, y in enumerate(bodies) if not allowed[group[i], group[j]]
+    }
+    one_way = {("a", "many[0]"), ("a", "many[1]"), ("b", "many[1]"), ("b", "floor")}
+    assert {pair for pair in apart if pair[0] != pair[1]} == one_way | {(y, x) for x, y in one_way}
 
 
 def test_groups_and_counts_say_what_every_single_pair_says(scene):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sdfsim import SceneError, load_scene
+from sdfsim import Scene, SceneError, load_scene
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.shape.make import analytic_shape
@@ -21,11 +21,14 @@ BODY = [
     ("restitution: 1.5", "bodies[0].restitution: must be <= 1 (got 1.5)"),
     ("positon: [0, 0, 0]", "bodies[0].positon: unknown key (did you mean 'position'?)"),
     ("position: [0, 0]", "bodies[0].position: must be 3 numbers (got 2)"),
+    ("position: 0.5", "bodies[0].position: must be 3 numbers (got 0.5)"),
+    ("quat_xyzw: none", "bodies[0].quat_xyzw: must be 4 numbers (got 'none')"),
     ("position: [0, inf, 0]", "bodies[0].position[1]: must be a number in m (got 'inf')"),
     ("motion: static, velocity: [0, 0, 1]", "bodies[0].velocity: must be zero: a static body does not move"),
     ("motion: driven", "bodies[0].motion: must be one of static, dynamic, kinematic (got 'driven')"),
     ("quat_xyzw: [0, 0, 0, 0]", "bodies[0].quat_xyzw: must not be zero"),
     ("collides_with: [flor]", "bodies[0].collides_with[0]: no body is called 'flor' (did you mean 'floor'?)"),
+    ("avoids: [flor]", "bodies[0].avoids[0]: no body is called 'flor' (did you mean 'floor'?)"),
     ("collides_with: none", "bodies[0].collides_with: must be all, or a list of names (got 'none')"),
     ("count: 2.5", "bodies[0].count: must be a whole number (got 2.5)"),
     ("count: 3", "bodies[0].count: needs arrange: {grid: [nx, ny, nz], spacing: metres} (got 3 at one place)"),
@@ -162,7 +165,7 @@ def test_a_wrong_kind_of_sdf_is_one_fault_not_two(load):
     assert len(problems_of(load, f"version: 1\nshapes:\n  b: {shape}\nbodies:\n  - {{name: a, shape: b}}\n")) == 1
 
 
-def test_a_mesh_without_units_is_asked_for_them_where_it_is_large(tmp_path):
+def test_a_mesh_without_units_is_asked_for_them_where_it_is_large(tmp_path, caplog):
     (tmp_path / "part.ply").write_bytes(write_ply(primitives.box((80.0, 40.0, 5.0))))
     for units, size, note in (("", 80.0, True), (", units: mm", 0.08, False), (", units: m", 80.0, False)):
         (tmp_path / "scene.yaml").write_text(
@@ -172,3 +175,16 @@ def test_a_mesh_without_units_is_asked_for_them_where_it_is_large(tmp_path):
         assert np.ptp(scene.shapes[0].mesh.vertices, axis=0).max() == pytest.approx(size)
         told = ("p: it is 80 m wide in metres; if its unit is millimetres, give --units mm (units: mm)",)
         assert scene.notes == (told if note else ())
+    load_scene(tmp_path / "scene.yaml")
+    # Who calls from Python sees no notes: it is warned of, once.
+    assert [record.getMessage() for record in caplog.records if "units" in record.getMessage()] == list(told)
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_python_warns_of_a_mesh_in_millimetres_that_a_scene_of_its_own_has(tmp_path, caplog, shown):
+    name = f"plate{shown}"
+    (tmp_path / "plate.ply").write_bytes(write_ply(primitives.box((120.0, 40.0, 5.0))))
+    built = Scene().add(name, mesh=tmp_path / "plate.ply", sdf="mesh", motion="static")
+    for _ in range(2):
+        built.load(*([lambda fraction, message: None] if shown else []))
+    assert caplog.text.count(f"{name}: it is 120 m wide in metres") == (not shown)

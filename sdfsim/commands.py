@@ -69,7 +69,7 @@ def simulate(
     median = report["step_ms_median"]
     lines = [
         f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
-        + ("" if median is None else f" (median {median:.1f} ms a step)"),
+        + ("" if median is None else f" (median {float(f'{median:.2g}'):g} ms a step)"),
         f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
         *run.ending_lines(report),
         *run.beside_lines(report),
@@ -80,7 +80,7 @@ def simulate(
     ]
     tell_failed(session, report)
     if "recording" in report:
-        lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
+        lines.append(f"watch it: sdfsim view {out}   (or: rerun {report['recording']})")
     lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
     session.report(report, lines)
     if viewer == "web":
@@ -122,7 +122,7 @@ def samples(
 @command
 def view(
     session: Session,
-    recording: Annotated[Path, typer.Argument(help="rollout.rrd", show_default=False)],
+    recording: Annotated[Path, typer.Argument(help="Run folder or rollout.rrd.", show_default=False)],
     web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
     picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,

@@ -1,1 +1,0 @@
-"""The commands: arguments -> one call -> report. Heavy imports happen inside them."""
