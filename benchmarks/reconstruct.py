@@ -5,9 +5,9 @@
     python benchmarks/reconstruct.py room -o DIR [--capture record3d]    # or patches
 
 Runs the whole chain on samples/photos/table_vase, or on one of the sets that samples/photos/make.py draws, rendered
-into DIR-room (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
-prints pose errors, surface errors, how these go with the uncertainty that the run gave, and times. A folder of photos
-without `transforms.json` and `truth.ply` gets the report only.
+into DIR-NAME (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
+prints pose errors, surface errors, how these go with the uncertainty that the run gave, how far a ball falls into the
+vase, and times. A folder of photos without `transforms.json` and `truth.ply` gets the report only.
 
     python benchmarks/reconstruct.py touching -o DIR
     python benchmarks/reconstruct.py shelf -o DIR [--kind clicks]
@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -43,8 +44,11 @@ from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas
 from sdfsim.base.console import Session
 from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_text
 from sdfsim.geometry.mesh import Mesh, signed_volume
 from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
+from sdfsim.shape.shape import load_shape
+from sdfsim.simulate.simulator import Simulator
 
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
@@ -52,6 +56,7 @@ RENDERED = ("touching", "shelf")
 KINDS = ("masks", "plain", "clicks")
 JOINTS = {"hinged": 50.0, "sliding": 0.2}  # degrees, and m, from the first state to the second
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
+BALL = 0.02  # m, the radius of the ball that is dropped into the vase, whose neck has one of 4.6 cm
 
 
 def moved_onto(views: list[View], about: dict[str, Any]) -> tuple[Similarity, np.ndarray]:
@@ -133,7 +138,8 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     `surface`: all of the reconstructed surface, table, vase and floor, to the truth. `object`: its part within 10 cm
     of the table and vase and above the floor. `missing`: from the truth as the cameras see it (table and vase) to the
     reconstruction; `complete_percent` is the share of it within 1 %. `vase`: see `vase_size`, of the bodies at its
-    place and of the truth. `body`: of these bodies, 1.5 cm above what they stand on, to the truth.
+    place and of the truth; `vase_seen_cm`: see `seen_depth`. `body`: of these bodies, 1.5 cm above what they stand on,
+    to the truth.
     """
     import open3d as o3d
 
@@ -174,6 +180,8 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     vases = {name: body for name, body in objects.items() if np.abs(body.get_center()[:2] - VASE).max() < 0.1}
     standing = {name: np.asarray(body.vertices) for name, body in vases.items()}
     standing = {name: at[at[:, 2] > at[:, 2].min() + 0.015] for name, at in standing.items()}
+    rim = np.asarray(truth.vertices)[np.linalg.norm(np.asarray(truth.vertices)[:, :2] - VASE, axis=1) < 0.1, 2].max()
+    seen_cm = seen_depth(truth, about, float(rim))
     corners = np.asarray(truth.vertices)[np.asarray(truth.triangles)]
     truth.remove_triangles_by_mask(corners[:, :, 2].max(1) < TABLE + 1e-3)
     return {
@@ -186,17 +194,63 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
         "up_error_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
+        "vase_seen_cm": seen_cm,
     }
+
+
+def near_axis() -> np.ndarray:
+    """Places [P, 2] m within 2 cm of the vase's axis."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    return np.concatenate([VASE + r * np.stack([np.cos(angle), np.sin(angle)], 1) for r in (0.0, 0.01, 0.02)])
+
+
+def seen_depth(truth: Any, about: dict[str, Any], rim: float) -> float:
+    """How far below the rim of the vase, cm, three photos of a transforms.json see places near its axis, by rays: the
+    median of these places. `rim` is its height, m."""
+    scene, at, step = _scene(truth), near_axis(), 0.005
+    poses = [np.array(frame["transform_matrix"]) for frame in about["frames"]]
+    for number in range(round(rim / step)):
+        places = np.concatenate([at, np.full((len(at), 1), rim - number * step)], 1)
+        count = np.zeros(len(places))
+        for pose in poses:
+            away = places - pose[:3, 3]
+            x, y, z = (away @ pose[:3, :3]).T
+            u, v = about["cx"] - about["fl_x"] * x / z, about["cy"] + about["fl_y"] * y / z
+            rays = np.concatenate([np.broadcast_to(pose[:3, 3], away.shape), away], 1)
+            free = scene.cast_rays(rays.astype(np.float32))["t_hit"].numpy() > 1 - 1e-4
+            count += free & (z < 0) & (u > 0) & (u < about["w"]) & (v > 0) & (v < about["h"])
+        if np.median(count) < 3:
+            return 100 * step * max(0, number - 1)
+    return 100 * rim
 
 
 def vase_size(mesh: Any) -> dict[str, float]:
     """Height, and how deep it is hollow, cm: what rays straight down within 2 cm of the axis meet below the rim."""
-    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    at = np.concatenate([VASE + r * np.stack([np.cos(angle), np.sin(angle)], 1) for r in (0.0, 0.01, 0.02)])
+    at = near_axis()
     down = np.concatenate([at, np.full((len(at), 1), 2.0), np.tile([0.0, 0, -1], (len(at), 1))], 1)
     top = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(-1, 3)[:, 2].max()
     hit = 2.0 - _scene(mesh).cast_rays(down.astype(np.float32))["t_hit"].numpy()
     return {"hollow_cm": 100 * float(top - np.median(hit)), "height_cm": 100 * float(top - TABLE)}
+
+
+def dropped_ball(folder: Path, name: str) -> dict[str, float]:
+    """Drops a ball of `BALL` m radius into the vase of a run, a body, and tells where its centre is at last: below the
+    rim and beside the middle, cm, in the axes of the vase, however that stands by then."""
+    scene = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
+    assets = {key: shape for key, shape in scene["shapes"].items() if "asset" in shape}
+    bodies = [body for body in scene["bodies"] if "plane" in body or body["shape"] in assets]
+    number, vase = next((k, body) for k, body in enumerate(bodies) if body["name"] == name)
+    shape = load_shape(folder / assets[vase["shape"]]["asset"])
+    low, high = shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)
+    middle = (low + high) / 2
+    start = [*(np.array(vase["position"][:2]) + middle[:2]), vase["position"][2] + high[2] + 2 * BALL]
+    ball = {"name": "ball", "shape": "ball", "position": [float(x) for x in start], "density": 1000.0}
+    scene |= {"shapes": {**assets, "ball": {"sphere": {"radius": BALL}}}, "bodies": [*bodies, ball], "duration": 3.0}
+    write_text(folder / "ball.yaml", yaml.safe_dump(scene, sort_keys=False))
+    rollout = Simulator(folder / "ball.yaml").run()
+    turn = Rotation.from_quat(rollout.orientation[-1, number])
+    at = turn.inv().apply(rollout.position[-1, -1] - rollout.position[-1, number]) + shape.com
+    return {"below_rim_cm": 100 * float(high[2] - at[2]), "aside_cm": 100 * float(np.linalg.norm((at - middle)[:2]))}
 
 
 def _read(file: Path) -> Any:
@@ -216,9 +270,10 @@ def _scene(mesh: Any) -> Any:
 def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     """All errors of a finished run against the truth beside its photos."""
     poses, move = pose_errors(load_views(folder / "poses"), photos)
+    surface = surface_errors(folder, photos, move)
     return {
-        "poses": poses, "surface_percent_of_table_width": surface_errors(folder, photos, move),
-        "trust": trust_errors(folder, photos, move),
+        "poses": poses, "surface_percent_of_table_width": surface, "trust": trust_errors(folder, photos, move),
+        "ball": {name: dropped_ball(folder, name) for name in surface["vase"] if name != "truth"},
     }  # fmt: skip
 
 

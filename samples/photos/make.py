@@ -4,9 +4,10 @@
     python samples/photos/make.py room --out DIR        # or patches: one of the two sets into another folder
 
 Ray casting with open3d. Every texture is made here from seeded noise and random cells and never repeats, because
-repeating textures make structure-from-motion converge to wrong cameras. Table, vase and cameras are the same in both
-sets. `room` is what one photographs: wood, glaze, tiles, a cloth and a plant in soft light, exposed a little
-differently from photo to photo. `patches` has texture everywhere and no gloss: a benchmark for the geometry alone.
+repeating textures make structure-from-motion converge to wrong cameras. Table and vase are the same in both sets.
+`room` is what one photographs: wood, glaze, tiles, a cloth and a plant in soft light, exposed a little differently from
+photo to photo; 16 of the photos look down into the vase. `patches` has texture everywhere and no gloss: a benchmark
+for the geometry alone.
 World frame: metres, z up, floor at z = 0.
 """
 
@@ -22,6 +23,18 @@ import numpy as np
 
 SETS, BUNDLED = ("room", "patches"), "patches"
 WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
+# Rings of cameras: how many, degrees above the level, m from what they look at, by which share of a step they are
+# turned, and what they look at. The lowest look under the table top: what no photo shows cannot be reconstructed.
+MIDDLE, MOUTH = (0.02, 0.0, 0.46), (0.10, -0.04, 0.70)
+RINGS = {
+    "room": (
+        (9, 3, 1.95, 0.5, MIDDLE), (11, 17, 1.95, 0.0, MIDDLE), (12, 40, 1.9, 0.1, MIDDLE), (16, 66, 1.4, 0.25, MOUTH),
+    ),
+    "patches": (
+        (12, 3, 1.95, 0.5, MIDDLE), (14, 17, 1.95, 0.0, MIDDLE), (13, 37, 1.9, 0.1, MIDDLE),
+        (9, 60, 1.75, 0.25, MIDDLE),
+    ),
+}  # fmt: skip
 SUPERSAMPLE = 3
 QUALITY = 88  # of JPEG
 EXPOSURE, BALANCE = 0.05, 0.012  # of the room's photos, standard deviations of the logarithm
@@ -300,7 +313,7 @@ def terrazzo(seed: int, side: int, texel: float, tile: float) -> np.ndarray:
             np.array(chips)[rng.integers(0, len(chips), cell.max() + 1)]
             * rng.uniform(0.8, 1.15, cell.max() + 1)[:, None]
         )
-        image = over(image, own[cell].astype(np.float32), 0.85 * shown)
+        image = over(image, own[cell].astype(np.float32), 0.45 * shown)
     image += (tint[number] + 0.025 * noise(rng, side, side, 300, 6)[..., None]).astype(np.float32)
     seam = np.abs(((np.arange(side) * texel + tile / 2) % tile) - tile / 2) < 0.005
     return np.clip(over(image, (0.34, 0.33, 0.31), 0.9 * (seam[:, None] | seam)), 0.02, 0.98)
@@ -330,6 +343,16 @@ def glaze(seed: int, dipped: float, colors: list, under: list, dots: tuple) -> n
     share = soft(-0.002, 0.003, thick)
     image = over(over(body, colors[0], 0.8 * soft(-0.006, 0.0, thick) * (1 - share)), top, share)
     return closed(np.clip(image, 0.02, 0.98).astype(np.float32), margin)
+
+
+def lining(seed: int, colors: list, spots: tuple, shape: tuple[int, ...]) -> np.ndarray:
+    """A light glaze [H, W, 3] with cloudy tone and large iron spots, as it lines a pot."""
+    rng = np.random.default_rng(seed)
+    height, width = shape[0], shape[1] + 60
+    image = ramp(colors, np.clip(0.6 + 0.3 * noise(rng, height, width, 48, 4), 0, 1))
+    image = over(image, spots, 0.5 * soft(0.8, 1.1, noise(rng, height, width, (28, 44), 3)))
+    image = spotted(rng, image, spots, 30, 7.0, 0.8)
+    return closed(np.clip(image, 0.02, 0.98).astype(np.float32), 60)
 
 
 def plaster(seed: int) -> np.ndarray:
@@ -492,7 +515,9 @@ def build_room() -> list[Part]:
     teal = [(0.42, 0.30, 0.20), (0.14, 0.36, 0.40), (0.10, 0.30, 0.42), (0.24, 0.52, 0.56), (0.08, 0.20, 0.34)]
     honey = [(0.36, 0.22, 0.12), (0.66, 0.42, 0.18), (0.80, 0.60, 0.30), (0.54, 0.30, 0.14), (0.86, 0.72, 0.44)]
     clay = [(0.50, 0.25, 0.16), (0.66, 0.36, 0.24), (0.78, 0.48, 0.34)]
-    turned("vase", glaze(2, 0.19, teal, cream, (0.30, 0.17, 0.10)), 0.05)
+    vase = glaze(2, 0.19, teal, cream, (0.30, 0.17, 0.10))
+    vase[len(vase) // 2 :] = lining(8, cream, (0.34, 0.19, 0.11), vase.shape)[len(vase) // 2 :]
+    turned("vase", vase, 0.05)
     turned("bowl", glaze(5, 0.035, honey, cream, (0.26, 0.15, 0.09)), 0.05)
     pot = glaze(6, 0.3, clay, clay, (0.36, 0.17, 0.11))
     rng = np.random.default_rng(7)
@@ -548,18 +573,16 @@ def sample_texture(part: Part, points: np.ndarray, normals: np.ndarray, uv: np.n
     return out.reshape(-1, 3)[:count]
 
 
-def cameras() -> list[np.ndarray]:
-    """48 camera-to-world matrices [4, 4], OpenGL axes (x right, y up, looking along -z), on four rings."""
+def cameras(name: str) -> list[np.ndarray]:
+    """48 camera-to-world matrices [4, 4], OpenGL axes (x right, y up, looking along -z), on the rings of a set."""
     rng = np.random.default_rng(5)
     poses = []
-    # The lowest ring looks under the table top: what no photo shows cannot be reconstructed.
-    rings = ((12, 3, 1.95, 0.5), (14, 17, 1.95, 0.0), (13, 37, 1.9, 0.1), (9, 60, 1.75, 0.25))
-    for count, elevation, radius, phase in rings:
+    for count, elevation, radius, phase, middle in RINGS[name]:
         for k in range(count):
             azimuth = 2 * np.pi * (k + phase) / count + rng.normal(0, 0.03)
             tilt = np.radians(elevation + rng.normal(0, 2))
             distance = radius * (1 + rng.normal(0, 0.03))
-            target = np.array([0.02, 0.0, 0.46]) + rng.normal(0, 0.03, 3)
+            target = np.array(middle) + rng.normal(0, 0.03, 3)
             backward = np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
             right = np.cross([0, 0, 1], backward)
             right /= np.linalg.norm(right)
@@ -704,13 +727,15 @@ def _lit_mesh(part: Part, longest: float) -> tuple[np.ndarray, np.ndarray, np.nd
 
     if part.mapping in ("lathe", "uv"):
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
-        return mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), mesh.vertex_normals.copy(), part.uv
+        normals = mesh.vertex_normals.astype(np.float32)
+        return mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), normals, part.uv
     flat = part.vertices[part.faces].reshape(-1, 3)
     vertices, faces = trimesh.remesh.subdivide_to_size(flat, np.arange(len(flat)).reshape(-1, 3), longest, max_iter=20)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     key = np.concatenate([vertices[faces].reshape(-1, 3), np.repeat(mesh.face_normals, 3, 0)], 1).round(6)
     unique, inverse = np.unique(key, axis=0, return_inverse=True)
-    return unique[:, :3].astype(np.float32), inverse.reshape(-1, 3).astype(np.uint32), unique[:, 3:], None
+    vertices, normals = np.split(unique.astype(np.float32), 2, 1)
+    return vertices, inverse.reshape(-1, 3).astype(np.uint32), normals, None
 
 
 def write_truth(parts: list[Part], path: Path) -> None:
@@ -768,7 +793,7 @@ def make_set(name: str, folder: Path, views: int | None = None) -> None:
             return render(parts, caster, pose, rng)
 
     frames = []
-    for index, pose in enumerate(cameras()[:views]):
+    for index, pose in enumerate(cameras(name)[:views]):
         file = f"images/{index:03d}.jpg"
         cv2.imwrite(str(folder / file), photo(pose)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         frames.append({"file_path": file, "transform_matrix": pose.tolist()})

@@ -1,15 +1,20 @@
 """What samples/photos/make.py draws is solid."""
 
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
-from benchmarks.reconstruct import PHOTOS, drawn
+from benchmarks.reconstruct import BALL, PHOTOS, VASE, drawn, dropped_ball, seen_depth
+from sdfsim.shape.make import analytic_shape
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "samples" / "photos"))
 import make
+
+SHAPES = Path(__file__).parents[2] / "samples" / "shapes"
 
 
 @pytest.mark.parametrize("part", [make.leaves, make.cloth])
@@ -42,3 +47,51 @@ def test_names_of_sets_are_folders_and_other_folders_stay(tmp_path, monkeypatch)
     assert drawn(Path(other), tmp_path / "run") == tmp_path / f"run-{other}"
     assert made == [(other, tmp_path / f"run-{other}")]
     assert drawn(tmp_path, tmp_path / "run") == tmp_path and len(made) == 1
+
+
+@pytest.mark.parametrize("kind", ["vase", "box"])
+def test_a_ball_falls_as_far_into_the_vase_as_that_is_hollow(tmp_path, kind):
+    """To its floor; a box has no hollow, so the ball lies on it."""
+    size, depth = 0.3, 0.0
+    if kind == "vase":
+        depth = make.VASE_OUTER[-1][1] - make.VASE_INNER[-1][1]
+        shutil.copytree(SHAPES / "vase", tmp_path / "assets" / "object1")
+    else:
+        analytic_shape("box", size=3 * [size], name="object1").save(tmp_path / "assets" / "object1")
+    at = [0.3, 0.2, 0.0 if kind == "vase" else size / 2]
+    body = {"name": "object1", "shape": "object1", "position": at, "density": 1500.0, "friction": 0.7}
+    bodies = [{"name": "floor", "plane": {}, "friction": 0.8}, body]
+    scene = {"version": 1, "shapes": {"object1": {"asset": "assets/object1"}}, "bodies": bodies}
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scene))
+    found = dropped_ball(tmp_path, "object1")
+    assert found["below_rim_cm"] == pytest.approx(100 * (depth - BALL), abs=0.4)
+    assert found["aside_cm"] < 4
+
+
+@pytest.mark.parametrize(("high", "photos"), [(0.6, 3), (1.1, 3), (1.1, 2)])
+def test_how_deep_photos_see_into_a_tube(high, photos):
+    """A tube of radius r, open at the top, and cameras D beside its axis and H above its rim: a line to the axis d
+    below the rim passes that where d (D - r) < H r. Places beside the axis are seen as deep on the whole."""
+    import open3d as o3d
+
+    radius, rim, away = 0.15, 0.8, 1.2
+    turn = np.arange(64) * 2 * np.pi / 64
+    circle = VASE + radius * np.stack([np.cos(turn), np.sin(turn)], 1)
+    vertices = np.concatenate([np.column_stack([circle, np.full(64, z)]) for z in (0.0, rim)])
+    k, following = np.arange(64), (np.arange(64) + 1) % 64
+    faces = np.concatenate([np.stack([k, following, k + 64], 1), np.stack([following, following + 64, k + 64], 1)])
+    tube = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
+    frames = []
+    for number in range(photos):
+        angle = 0.1 + number * 2 * np.pi / photos
+        center = np.array([*(VASE + away * np.array([np.cos(angle), np.sin(angle)])), rim + high])
+        backward = center - np.array([*VASE, rim])
+        backward /= np.linalg.norm(backward)
+        right = np.cross([0, 0, 1], backward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.column_stack([right, np.cross(backward, right), backward, center])
+        frames.append({"transform_matrix": pose.tolist()})
+    about = {"fl_x": 500.0, "fl_y": 500.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480, "frames": frames}
+    wanted = high * radius / (away - radius) if photos > 2 else 0.0
+    assert seen_depth(tube, about, rim) == pytest.approx(100 * wanted, abs=1.5)
