@@ -5,8 +5,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh test
 .venv/bin/ruff check .
 .venv/bin/pyright
-# What hollow shapes and joints need is compiled once and kept. Code that has just been compiled rounds differently from
-# the same code out of the cache, and tests compare runs bit by bit.
+# What hollow shapes and joints need is compiled once and kept, before both processes of tests would compile it.
 warm() { .venv/bin/python -c 'import sys, sdfsim; sdfsim.Simulator(f"samples/{sys.argv[1]}.yaml").step(2)' "$1"; }
 warm door &
 warm knocked_vase

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import pickle
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ _lock = Lock()
 _ready: set[str] = set()  # what has been compiled, or found to be, in this process
 
 
-# The module's path first: what is pickled needs it to be read.
+# The path of modules first: types are read by what is in them.
 _CHILD = (
     "import sys, json; sys.path[:] = json.loads(sys.stdin.buffer.readline());"
     "from sdfsim.base.compiling import _compile_here; _compile_here(sys.stdin.buffer.read())"
@@ -44,15 +43,19 @@ def compile_before(
         except (AttributeError, OSError):
             return
         from numba import typeof
+        from numba.core.serialize import dumps
 
         name = (function.py_func.__module__, function.py_func.__qualname__)
-        wanted = pickle.dumps((*name, tuple(typeof(each) for each in arguments)))
+        wanted = dumps((*name, tuple(typeof(each) for each in arguments)))
         path = json.dumps([*sys.path]).encode() + b"\n"
         subprocess.run([sys.executable, "-c", _CHILD], input=path + wanted, capture_output=True, check=False)
 
 
 def _compile_here(wanted: bytes) -> None:
-    module, name, types = pickle.loads(wanted)
+    """What the process that started this one wants compiled."""
+    from numba.core.serialize import loads
+
+    module, name, types = loads(wanted)
     getattr(import_module(module), name).compile(types)
 
 

@@ -61,14 +61,16 @@ def test_a_state_that_cannot_be_is_named_and_the_last_good_one_kept(kind, monkey
 
 
 def breaking(monkeypatch, at_call: int, name: str, value: float) -> None:
-    """At its `at_call`th call the network on the solve writes `value` into the array `name`, for the last body."""
+    """At its `at_call`th call the network on the solve answers `value` in the array `name`, for the last body."""
     real, calls = inference.corrected, []
 
     def corrected(*given) -> State:
         calls.append(1)
         after = real(*given)
         if len(calls) == at_call:
-            getattr(after, name)[-1, 0] = value
+            broken = getattr(after, name).copy()
+            broken[-1, 0] = value
+            after = replace(after, **{name: broken})
         return after
 
     monkeypatch.setattr(inference, "corrected", corrected)
