@@ -22,7 +22,7 @@ from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
 
-VERSION = 9  # of what is kept on disk, beside that of the grid that surfaces are sampled from
+VERSION = 11  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
@@ -140,10 +140,13 @@ def between(nodes: np.ndarray, samples: np.ndarray, spacing: float) -> np.ndarra
     """Of samples [P, 3] m of a surface those that lie between its nodes [K, 3], at least `spacing` m apart.
 
     The nodes of a network are few. What rolls from one to the next sinks in between them, until the way down the
-    distance leads there, and what lifts it out again is energy from nothing.
+    distance leads there, and what lifts it out again is energy from nothing. Half as many as a grid has at most need no
+    others between them.
     """
     from scipy.spatial import KDTree
 
+    if len(nodes) >= 0.5 * DENSEST_ON_GRID:
+        return nodes[:0]
     while len(kept := one_per_voxel(samples, spacing)) > DENSEST_ON_GRID:
         spacing *= 1.25
     return kept[KDTree(nodes).query(kept)[0] > 0.5 * spacing] if len(nodes) else kept
