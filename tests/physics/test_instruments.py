@@ -265,6 +265,19 @@ def test_a_body_held_with_nothing_near_is_told():
     assert "nothing is near" in verdict.broken[0]
 
 
+@pytest.mark.parametrize(("hits", "told"), [(True, False), (False, True)])
+def test_gravity_may_act_for_longer_only_after_a_touch(hits, told):
+    """The velocity of a body that has just been touched may be half an inner step old."""
+    scene, longer = above(SLAB, 0.0), 9.81 * DT * np.array([0.0, 1.4, 1.0, 1.0])
+    speed = (0.8 if hits else 0.0) - np.cumsum(longer)
+    speeds = np.concatenate([[-1.0], speed]) if hits else np.concatenate([[0.0], speed])
+    heights = 0.35 + (np.array([0.001, 0.006, 0.01, 0.014, 0.017]) if hits else np.full(5, 1.0))
+    place, velocity = np.zeros((5, 2, 3)), np.zeros((5, 2, 3))
+    place[:, 1], velocity[:, 1, 2] = [0.3, 0.2, 0.0], speeds
+    place[:, 1, 2] = heights
+    assert (judged(scene, motion(scene, place, velocity)).floating is not None) == told
+
+
 def test_what_falls_or_bounces_is_not_held():
     """A ball in free flight that bounces with e = 0.8 within steps: its parabolas are exact."""
     scene, speed, height = above(SLAB, 0.3), 0.0, 0.3
