@@ -13,7 +13,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from pipeline.clearing import Cleared, cleared
 from pipeline.materials import SCENERY, Choice
+from pipeline.mesh.bodies import LAYER
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held, scene_keys
 from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
@@ -141,6 +143,7 @@ def write_scene(
         if slab.slope > LEVEL:
             notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
     origins = {name: origin_of(mesh) for name, mesh in solids.items()}
+    closed = {name: replace(mesh, vertices=mesh.vertices - origins[name]) for name, mesh in solids.items()}
     materials = materials or {}
     floor = floor_height(load_mesh(mesh_folder / "shown.ply")) if parts["scenery"] else 0.0
     held = load_held(mesh_folder / JOINT)
@@ -151,9 +154,18 @@ def write_scene(
             raise SdfsimError(f"{message}; {held.line()}", "photograph it from more sides", exit_code=EXIT_QUALITY)
         others = {SCENERY: load_mesh(mesh_folder / "solid.ply")} if parts["scenery"] else {}
         holder = holder_of(solids[PART], others | {name: mesh for name, mesh in solids.items() if name != PART})
-    text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials, seed=seed,
-                      floor=floor, held=held, holder=holder)  # fmt: skip
+
+    def text_of(moved: dict[str, Cleared]) -> str:
+        return scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials,
+                          seed=seed, floor=floor, held=held, holder=holder, moved=moved)  # fmt: skip
+
+    text = text_of({})
     scene = load_scene(scene_file, text=text, allow_outside=True)
+    if parts["scenery"]:
+        closed[SCENERY] = load_mesh(mesh_folder / "solid.ply")
+    if moved := cleared(scene, closed):
+        text = text_of(moved)
+        notes += [moved_line(name, one, LAYER * parts["cell"]) for name, one in moved.items()]
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:
@@ -168,9 +180,25 @@ def write_scene(
     write_text(scene_file, text)
     return {
         "objects": list(solids), "bodies": bodies_of(scene, materials), "size": placement.size_from,
+        "moved": {name: {"by": one.shift.tolist(), "out_of": one.into, "left": one.left}
+                  for name, one in moved.items()},
         "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
         "scene_sha256": made, "joint": None if held is None else held.line(),
     }  # fmt: skip
+
+
+def moved_line(name: str, one: Cleared, unsure: float) -> str:
+    """What the report says of a body that was in others; photos do not tell what touches closer than `unsure` m."""
+    there = " and ".join(one.into)
+    if one.left:
+        if one.held:
+            return f"{name}: is {one.left:.2g} m in {there}, where its joint holds it: these do not touch"
+        return f"{name}: starts {one.left:.2g} m in {there}, as no short way leads out: expect that it is thrown out"
+    away = float(np.linalg.norm(one.shift))
+    line = f"{name}: moved {'up ' if one.shift[2] > 0.99 * away else ''}by {away:.2g} m, out of {there}"
+    if away > unsure:
+        line += f": more than the {unsure:.2g} m that photos leave open where bodies touch, so look at mesh/objects.png"
+    return line
 
 
 def holder_of(part: Mesh, others: dict[str, Mesh]) -> str | None:
@@ -213,14 +241,18 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0,
-               held: HeldPart | None = None, holder: str | None = None) -> str:  # fmt: skip
+               held: HeldPart | None = None, holder: str | None = None,
+               moved: dict[str, Cleared] | None = None) -> str:  # fmt: skip
     """The text of scene.yaml: a floor at a height, m, the scenery, the bodies that were found at their origins [3] m,
     and one dropped from above where there is a slab. What is `held` by a joint starts in its first state, and the body
-    that is its `holder` stands still."""
+    that is its `holder` stands still. Bodies that would be in others are `moved`; what the part is in does not touch
+    it."""
+    moved = moved or {}
     assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
     shapes: list[str] = []
     bodies: list[str] = []
+    everything = ["floor", *([SCENERY] if scenery else []), *origins, *([drop] if slab is not None else [])]
 
     def add(name: str, keys: str, shape: dict | None = None) -> None:
         choice = made.get(name, Choice())
@@ -250,14 +282,21 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
             turned = Rotation.from_matrix(held.turn).as_quat()
             keys = f"position: {_flow(rounded(held.turn @ origin + held.shift).tolist())}"
             keys += f", quat_xyzw: {_flow(turned.round(9).tolist())}"
+            if name in moved:
+                bodies.append(f"  # where it starts it is in {' and '.join(moved[name].into)}")
+                keys += f", collides_with: {_flow([n for n in everything if n not in (name, *moved[name].into)])}"
         elif name == holder:
             bodies.append("  # stands still: the photos show no motion of it")
             keys = f"motion: static, {keys}"
+        elif name in moved:
+            keys = f"position: {_flow(rounded(origin + moved[name].shift).tolist())}"
+            bodies.append(f"  # {moved_line(name, moved[name], np.inf).removeprefix(f'{name}: ')}")
         add(name, keys, {"asset": f"assets/{folder_of(name)}"})
     if slab is not None:
         box = {"box": {"size": rounded((slab.side, slab.side, slab.thickness)).tolist()}}
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
-        add(drop, f"position: {_flow(rounded(slab.position).tolist())}", box if drop == "box" else ball)
+        shift = moved[drop].shift if drop in moved else np.zeros(3)
+        add(drop, f"position: {_flow(rounded(slab.position + shift).tolist())}", box if drop == "box" else ball)
     return "\n".join([
         f"# Reconstructed from photos. Up from the {placement.up_from}, within {placement.up_within:.1f} degrees "
         f"(confidence: {placement.up_confidence}).",

@@ -154,7 +154,7 @@ STAGES = {
     "distill": Stage(do_distill, "distill", version=7),
     "mesh": Stage(do_mesh, "mesh", version=12),
     "fit": Stage(do_fit, "assets", version=2),
-    "scene": Stage(do_scene, "scene", version=5),
+    "scene": Stage(do_scene, "scene", version=6),
 }
 
 

@@ -60,9 +60,9 @@ def true_surface(shape: Shape) -> TrueSurface:
     if shape.pieces:
         pieces = [convex_hull(points) for points in shape.pieces]
         if len(pieces) == 1:
-            return _of_mesh(pieces[0])
+            return of_mesh(pieces[0])
         return _of_pieces(PiecesDistance(pieces))
-    return _of_mesh(shape.mesh)
+    return of_mesh(shape.mesh)
 
 
 def _closed_form(sdf: ClosedForm) -> TrueSurface:
@@ -121,7 +121,7 @@ def _closed_form(sdf: ClosedForm) -> TrueSurface:
     return _clustered(triangles[kept], bent[kept], bounds, distance, onto, turns=turns, straight=half)
 
 
-def _of_mesh(mesh: Mesh) -> TrueSurface:
+def of_mesh(mesh: Mesh) -> TrueSurface:
     import igl  # a third of what open3d takes to load, and in double precision
 
     convex, size = _is_convex(mesh), float(np.ptp(mesh.vertices, axis=0).max())

@@ -1,5 +1,6 @@
 """Where a body is dropped, and the scene file that says so."""
 
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 
@@ -90,24 +91,35 @@ def test_bodies_found_can_move():
     assert [body["name"] for body in alone["bodies"]] == ["floor", "object1"]
 
 
-@pytest.fixture
-def meshes(tmp_path):
+def save_meshes(folder):
     """A mesh folder: a floor with a block of 0.6 m, and a cube that was found on the floor."""
     parts = {"scenery": True, "cell": 0.02, "objects": [{"name": "object1"}]}
-    (tmp_path / "objects").mkdir()
+    (folder / "objects").mkdir()
     for name in ("solid.ply", "shown.ply"):
-        (tmp_path / name).write_bytes(write_ply(scenery()))
-    (tmp_path / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1))))
-    PLACEMENT.save(tmp_path)
-    write_json(tmp_path / "parts.json", {"version": 1, **parts})
-    return tmp_path
+        (folder / name).write_bytes(write_ply(scenery()))
+    (folder / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1))))
+    PLACEMENT.save(folder)
+    write_json(folder / "parts.json", {"version": 1, **parts})
+    return folder
 
 
 @pytest.fixture
-def fitted(meshes):
+def meshes(tmp_path):
+    return save_meshes(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory):
+    """The shapes of the fit stage for these."""
+    folder = save_meshes(tmp_path_factory.mktemp("shapes"))
+    fit_parts(folder, folder / "assets", budget=None, sdf="grid")
+    return folder / "assets"
+
+
+@pytest.fixture
+def fitted(meshes, shapes):
     """The same with the shapes of the fit stage beside it."""
-    for name in ("scene", "object1"):
-        analytic_shape("box", size=(0.2, 0.2, 0.2), name=name).save(meshes / "assets" / name)
+    shutil.copytree(shapes, meshes / "assets")
     return meshes
 
 
@@ -127,6 +139,20 @@ def test_bodies_stand_where_they_were_found(fitted):
     write_scene(fitted, fitted / "scene.yaml", drop="none")
     body = yaml.safe_load((fitted / "scene.yaml").read_text())["bodies"][-1]
     np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
+
+
+@pytest.mark.parametrize(("deep", "told"), [(0.0015, "moved up by 0.0015 m, out of scenery"),
+                                            (0.04, "more than the 0.03 m that photos leave open")])  # fmt: skip
+def test_a_body_that_photos_put_into_the_floor_starts_on_it(fitted, deep, told):
+    """A cell is 2 cm wide; surfaces that touch are told apart to one and a half."""
+    (fitted / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1 - deep))))
+    report = write_scene(fitted, fitted / "scene.yaml")
+    text = (fitted / "scene.yaml").read_text()
+    body = next(body for body in yaml.safe_load(text)["bodies"] if body["name"] == "object1")
+    np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
+    assert report["moved"]["object1"]["by"] == pytest.approx([0, 0, deep], abs=1e-4)
+    assert "scenery" in report["moved"]["object1"]["out_of"] and any(told in note for note in report["notes"])
+    assert f"  # moved up by {deep:.2g} m, out of " in text
 
 
 def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_path, monkeypatch):

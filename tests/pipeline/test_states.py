@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import Similarity
+from pipeline.clearing import Cleared
 from pipeline.mesh.bodies import Parts
 from pipeline.mesh.joint import PART, Doubt, HeldPart, load_held
 from pipeline.mesh.meshing import axis_ends
@@ -150,6 +151,24 @@ def test_the_scene_starts_in_the_first_state_and_goes_to_the_second(tmp_path):
         pose = Rotation.from_quat(body.quat_xyzw)
         assert np.allclose(pose.apply(anchor) + body.position, HELD.anchor, atol=1e-5)
         assert np.allclose((pose * Rotation.from_quat(quat)).apply([1, 0, 0]), [0, 0, 1], atol=1e-6)
+
+
+def test_a_part_does_not_touch_what_it_starts_in(tmp_path):
+    """A door that photos put 3 mm into the floor cannot leave its hinge."""
+    from sdfsim.scene.collision_filter import contact_groups
+    from sdfsim.scene.load import load_scene
+
+    placement = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "given")
+    origins = {PART: np.array([0.15, 0.26, -0.003]), "object1": np.array([0.0, -1.0, 0]), "cup": np.array([0, 2.0, 0])}
+    moved = {PART: Cleared(np.zeros(3), ("floor",), 0.003, held=True)}
+    text = scene_text(placement, origins, None, scenery=False, held=HELD, holder="object1", moved=moved)
+    for name in origins:
+        text = text.replace(f"{name}: {{asset: assets/{name}}}", f"{name}: {{box: {{size: [0.1, 0.1, 0.1]}}}}")
+    scene = load_scene(tmp_path / "scene.yaml", text=text)
+    group, allowed = contact_groups(scene.bodies)
+    number = {body.name: group[k] for k, body in enumerate(scene.bodies)}
+    assert not allowed[number[PART], number["floor"]]
+    assert allowed[number[PART], number["cup"]] and allowed[number["cup"], number["floor"]]
 
 
 def test_what_is_beside_the_part_holds_it():
