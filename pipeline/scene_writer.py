@@ -361,7 +361,8 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     unseen = 1 - (visible > top[:, under] - 0.2 * side).mean(1)
     obstacle = (np.nanmax(top, 1) - top[:, under].max(1)) / side
     central = np.linalg.norm((places - (low + high)[:2] / 2) / np.maximum(high - low, 1e-9)[:2], axis=1)
-    good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central - slope / LEVEL - obstacle
+    good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central
+    good = good - slope / LEVEL - bump / BUMP - obstacle
     # Places that are not level, not flat, or not in the photos are taken only where there are no others.
     bad = np.maximum(slope / LEVEL - 1, 0) + 10 * np.maximum(bump - BUMP, 0) + 10 * np.maximum(unseen - UNSEEN, 0)
     best = int((good - 100 * bad).argmax())

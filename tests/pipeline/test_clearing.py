@@ -3,7 +3,9 @@ distances of Open3D, of which `clearing` uses neither."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import open3d as o3d  # noqa: TID253
@@ -26,7 +28,7 @@ FLOOR = ("floor", None, (0.0, 0.0, 0.0))
 Thing = tuple[str, trimesh.Trimesh | None, tuple[float, float, float]]
 
 
-def scene_of(still: list[Thing], free: list[Thing], joints: list[str] | None = None) -> Scene:
+def scene_of(still: Sequence[Thing], free: Sequence[Thing], joints: Sequence[str] = ()) -> Scene:
     """A scene of static and of dynamic things, by their names and places; those that `joints` name hang on a hinge."""
     shapes, bodies = [], []
     for number, (name, made, place) in enumerate([*still, *free]):
@@ -35,7 +37,7 @@ def scene_of(still: list[Thing], free: list[Thing], joints: list[str] | None = N
         motion = {"motion": "static", "mass": 0.0} if number < len(still) else {}
         bodies.append(make_body(name, number, place, **motion))
     index = {body.name: k for k, body in enumerate(bodies)}
-    hinges = tuple(hinge(bodies, index[name]) for name in joints or [])
+    hinges = tuple(hinge(bodies, index[name]) for name in joints)
     return Scene(tuple(shapes), tuple(bodies), np.array([0.0, 0.0, -9.81]), 1.0, joints=hinges)
 
 
@@ -59,7 +61,7 @@ def depth(scene: Scene, one: str, other: str, moved: dict[str, Cleared], count: 
     deepest = 0.0
     for mine, theirs in (placed, placed[::-1]):
         points = np.concatenate([mine.vertices, trimesh.sample.sample_surface(mine, count, seed=0)[0]])
-        rays = o3d.t.geometry.RaycastingScene()
+        rays: Any = o3d.t.geometry.RaycastingScene()
         rays.add_triangles(np.asarray(theirs.vertices, np.float32), np.asarray(theirs.faces, np.uint32))
         deepest = max(
             deepest, -float(rays.compute_signed_distance(points.astype(np.float32), nsamples=9).numpy().min())

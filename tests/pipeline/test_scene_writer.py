@@ -50,6 +50,12 @@ def test_a_level_step_is_preferred_to_a_higher_slope():
     assert drop.slope < LEVEL and 0.1 < drop.position[0] < 0.5
 
 
+def test_a_flat_place_is_preferred_to_a_bumpy_one_in_the_middle():
+    """Bumps of 1.5 mm, on which a slab of 6 cm would rest on its corners."""
+    rough = terrain(lambda x, y: np.where(x < 0.05, 0.0015 * np.sin(300 * x) * np.sin(290 * y), 0.0))
+    assert choose_slab(rough, rough).position[0] > 0.05 + 0.03
+
+
 def test_where_nothing_is_level_the_flattest_place_is_taken():
     dome = terrain(lambda x, y: -2.0 * (x - 0.2) - 1.0 * y)
     drop = choose_slab(dome, dome)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import sdfsim
 from pipeline.cameras import Similarity
 from pipeline.clearing import Cleared
 from pipeline.mesh.bodies import Parts
@@ -49,6 +50,31 @@ def test_what_makes_no_sense_is_one_line(two, tmp_path, given, said):
     run = command("reconstruct", *words, "-o", tmp_path / "out")
     assert run.exit_code in (1, EXIT_USAGE) and said in run.stderr
     assert len([line for line in run.stderr.splitlines() if line.startswith("error:")]) == 1
+
+
+def test_the_function_takes_two_states_as_the_command_does(two, tmp_path, monkeypatch):
+    """Both come to the same call; without `joint` there is one state."""
+    asked = []
+    monkeypatch.setattr(
+        "pipeline.states.reconstruct_states", lambda *given, **more: asked.append((given, more)) or ({}, "")
+    )
+    monkeypatch.setattr("pipeline.stages.reconstruct", lambda *given, **more: asked.append((given, more)) or {})
+    monkeypatch.setattr("pipeline.commands._report_stages", lambda *_: None)
+    shut, opened = two
+    sdfsim.reconstruct(shut, tmp_path / "out", joint=opened, preset="quick", drop="none", until_stage="mesh")
+    sdfsim.reconstruct(shut, tmp_path / "out", preset="quick", until_stage="mesh")
+    words = [shut, opened, "--joint", "-o", tmp_path / "out", "--preset", "quick", "--drop", "none", "--until", "mesh"]
+    assert command("reconstruct", *words).exit_code == 0
+    assert asked[0][0] == asked[2][0] == (shut, opened, tmp_path / "out") and asked[1][0] == (shut, tmp_path / "out")
+    told = [{name: value for name, value in more.items() if name != "progress" and value is not None}
+            for _, more in asked]  # fmt: skip
+    assert told[2].pop("device") == "auto" and not told[2].pop("sdf", None)
+    assert {name: told[2][name] for name in told[0]} == told[0]
+
+
+def test_a_function_that_gets_one_state_twice_says_so(two, tmp_path):
+    with pytest.raises(SdfsimError, match="is the folder of the first state as well"):
+        sdfsim.reconstruct(two[0], tmp_path / "out", joint=two[0])
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path):
