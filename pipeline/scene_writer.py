@@ -252,7 +252,6 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
     made = materials or {}
     shapes: list[str] = []
     bodies: list[str] = []
-    everything = ["floor", *([SCENERY] if scenery else []), *origins, *([drop] if slab is not None else [])]
 
     def add(name: str, keys: str, shape: dict | None = None) -> None:
         choice = made.get(name, Choice())
@@ -284,7 +283,7 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
             keys += f", quat_xyzw: {_flow(turned.round(9).tolist())}"
             if name in moved:
                 bodies.append(f"  # where it starts it is in {' and '.join(moved[name].into)}")
-                keys += f", collides_with: {_flow([n for n in everything if n not in (name, *moved[name].into)])}"
+                keys += f", avoids: {_flow([*moved[name].into])}"
         elif name == holder:
             bodies.append("  # stands still: the photos show no motion of it")
             keys = f"motion: static, {keys}"
