@@ -29,6 +29,7 @@ from sdfsim.geometry.mesh_io import load_mesh, read_glb
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.far_field import BOX
+from sdfsim.sdf.sdf import Sdf
 
 SAMPLES, BLOCK = (65, 161), 4  # fewest and most along a side of a grid; cells a side of what is sampled as a whole
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
@@ -39,6 +40,7 @@ BUMP = 0.06  # how far a level place may stick out of its plane, as a share of t
 BELOW = 0.001  # of the scenery's widest side: so far the added floor lies below the lowest of the scenery's own
 OWN_FLOOR, DENTS = 0.01, 0.02  # of that side: how far a floor is from 0 at most; share of it that may lie lower
 UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
+ONTO, STEPS = 1.0, 4  # of a cell of the field, that a vertex of what is shown is from the fit's surface; steps to it
 TOUCHES = 0.05  # of a part's surface, that is near to what holds it
 GAP = 0.3  # of the fall, as a share of the side
 
@@ -79,12 +81,28 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
         # The folder appears complete or not at all: a run that goes on keeps those that are there.
         shutil.rmtree(partial, ignore_errors=True)
+        if name == SCENERY:
+            shown = onto(shape.sdf, shown, ONTO * parts["cell"])
         replace(shape, mesh=shown, skin=skins.get(name)).save(partial)
         partial.rename(folder)
         certificates[name] = shape.certificate
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+
+
+def onto(sdf: Sdf, mesh: Mesh, reach: float) -> Mesh:
+    """A mesh with its vertices on the surface of a fit, where that is within `reach` m. Photos leave bumps that are
+    finer than the fit of a scenery: bodies would be shown, and judged, to lie in these."""
+    vertices = mesh.vertices.copy()
+    near = np.flatnonzero(np.abs(np.asarray(sdf(vertices)[0])) < reach)
+    for _ in range(STEPS):
+        distance, slope = (np.asarray(part) for part in sdf(vertices[near]))
+        steep = np.maximum((slope**2).sum(1), 0.25)  # where surfaces are near to each other a grid is flat
+        vertices[near] -= (distance / steep)[:, None] * slope
+    # Where the fit has no such surface, as of a thin wall, it is shown all the same, where photos show it.
+    lost = np.linalg.norm(vertices - mesh.vertices, axis=1) > reach
+    return replace(mesh, vertices=np.where(lost[:, None], mesh.vertices, vertices))
 
 
 def samples_of(mesh: Mesh, cell: float) -> int:

@@ -153,7 +153,7 @@ STAGES = {
     "poses": Stage(do_poses, "poses", version=6),
     "distill": Stage(do_distill, "distill", version=7),
     "mesh": Stage(do_mesh, "mesh", version=13),
-    "fit": Stage(do_fit, "assets", version=2),
+    "fit": Stage(do_fit, "assets", version=3),
     "scene": Stage(do_scene, "scene", version=6),
 }
 

@@ -12,7 +12,16 @@ from pipeline.cameras import Similarity
 from pipeline.materials import ASSUMED, MATERIALS, materials_of
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
-from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, floor_height, samples_of, scene_text, write_scene
+from pipeline.scene_writer import (
+    LEVEL,
+    choose_slab,
+    fit_parts,
+    floor_height,
+    onto,
+    samples_of,
+    scene_text,
+    write_scene,
+)
 from sdfsim.base.files import write_json
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import write_ply
@@ -260,6 +269,17 @@ def sheet(height: float, side: float = 1.0) -> Mesh:
     """A level square."""
     corners = np.array([[-side, -side, height], [side, -side, height], [side, side, height], [-side, side, height]])
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_what_is_shown_of_a_scenery_lies_on_what_is_simulated(shapes):
+    """Bumps of 4 mm on a level floor, of which the fit has nothing; a wall of which it has nothing either stays."""
+    rough, fit = terrain(lambda x, y: 0.004 * np.sin(300 * x) * np.sin(290 * y)), load_shape(shapes / "scene").sdf
+    wall = Mesh(np.array([[-0.4, 0.4, 0.1], [-0.3, 0.4, 0.1], [-0.3, 0.4, 0.4]]), np.array([[0, 1, 2]]))
+    place = [0.0, 0.6, 0.0]  # beside the block of `scenery`
+    shown = onto(fit, joined([replace(rough, vertices=0.5 * rough.vertices + place), wall]), 0.02)
+    assert np.abs(shown.vertices[:-3, 2]).max() < 0.05e-3
+    assert (np.abs(shown.vertices[:-3] - 0.5 * rough.vertices - place) < 0.0025).all()
+    np.testing.assert_array_equal(shown.vertices[-3:], wall.vertices)
 
 
 def test_the_added_floor_lies_below_a_level_surface_that_the_photos_show():
