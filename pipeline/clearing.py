@@ -4,7 +4,6 @@ A field does not separate what touches: each surface is off by some share of a c
 deep in its table. A simulation would throw it out at once, with energy from nothing.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -133,9 +132,12 @@ class _Way:
         """What the body is in once it is moved by a shift: by name how deep, m, and which way is out [3]."""
         found = {}
         for pair in self.pairs:
-            deepest = max(pair.hits(shift), key=lambda hit: hit[0], default=(0.0, np.zeros(3)))
-            if deepest[0] > self.touches:
-                found[pair.other.name] = deepest
+            # Where no point tells that a body is in another, two edges may cross: that takes longer to find.
+            for measure in (pair.deepest_point, pair.deepest):
+                depth, normal = measure(shift)
+                if depth > self.touches:
+                    found[pair.other.name] = (depth, normal)
+                    break
         return found
 
     def out(self, up: np.ndarray) -> np.ndarray | None:
@@ -186,14 +188,17 @@ class _Pair:
         self.body, self.other = body, other
         self.mine, self._free = _beside(body.points, other, most)
         self.theirs, self._taken = _beside(other.points, body, most)
-        self.near = bool(len(self.mine) or len(self.theirs))
+        self.near = bool(len(self.mine) or len(self.theirs)) or _meet(body.points, other.points, most)
 
-    def hits(self, shift: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
-        """How deep, m, and which way is out [3], of some places of which one is the deepest."""
+    def deepest(self, shift: np.ndarray) -> tuple[float, np.ndarray]:
+        """How deep, m, and which way is out [3]."""
         solids = [self.body.surface, self.other.surface]
-        nothing = np.zeros(3)
-        gap = gaps(solids, self.body.placed(0, shift), self.other.placed(1, nothing), np.zeros(1))
-        yield -float(gap.apart[0]), gap.sign[0] * gap.normal[0]
+        gap = gaps(solids, self.body.placed(0, shift), self.other.placed(1, np.zeros(3)), np.zeros(1))
+        return -float(gap.apart[0]), gap.sign[0] * gap.normal[0]
+
+    def deepest_point(self, shift: np.ndarray) -> tuple[float, np.ndarray]:
+        """The same of the points of both surfaces alone."""
+        found = (0.0, np.zeros(3))
         length = float(np.linalg.norm(shift))
         for points, away, solid, sense in (
             (self.mine, self._free, self.other, 1.0),
@@ -203,7 +208,15 @@ class _Pair:
             if len(points):
                 distance, slope = solid.ask(points + sense * shift)
                 lowest = int(distance.argmin())
-                yield -float(distance[lowest]), sense * slope[lowest]
+                found = max(found, (-float(distance[lowest]), sense * slope[lowest]), key=lambda hit: hit[0])
+        return found
+
+
+def _meet(one: np.ndarray, other: np.ndarray, most: float) -> bool:
+    """Whether the boxes around points [P, 3] and [Q, 3] come within `most` m of each other."""
+    if not len(one) or not len(other):
+        return False
+    return bool((np.maximum(one.min(0), other.min(0)) - np.minimum(one.max(0), other.max(0)) <= most).all())
 
 
 def _beside(points: np.ndarray, solid: _Solid, most: float) -> tuple[np.ndarray, np.ndarray]:

@@ -135,6 +135,12 @@ def test_of_two_jars_in_each_other_one_goes_aside():
     check(scene_of([("table", TABLE, (0, 0, 0))], jars), {"other": (1, 0, 0)}, within=0.06 * MM)  # 64 sides
 
 
+def test_sticks_that_cross_leave_each_other_though_neither_has_a_corner_in_the_other():
+    lower, upper = trimesh.creation.box((2.0, 0.01, 0.01)), trimesh.creation.box((0.01, 2.0, 0.01))
+    place = (0.013, 0.017, 0.01 - MM)
+    check(scene_of([("lower", lower, (0, 0, 0))], [("upper", upper, place)]), {"upper": (0, 0, 1)})
+
+
 def test_what_stands_on_a_body_follows_it():
     lid = trimesh.creation.box((0.06, 0.06, 0.02))
     things = [("lid", lid, (0.1, 0, 0.02 + 0.12 + 0.01 - 4 * MM)), ("jar", JAR, (0.1, 0, ON_TABLE - 3 * MM))]
