@@ -122,30 +122,6 @@ def write(found, count, side, mine, theirs, normal, gap, key):
 
 
 @njit(**BARE)
-def first_to_touch(rules, found, count):
-    """Of points with one normal only the deepest are kept, and those that are as deep: what an impact meets first.
-
-    The others follow in the next inner steps, when the impact has been answered.
-    """
-    for e in range(count):
-        found[e, VOID] = 0.0
-        for f in range(count):
-            alike = 0.0
-            for x in range(3):
-                alike += found[e, NORMAL + x] * found[f, NORMAL + x]
-            deeper = found[f, GAP] < found[e, GAP] - rules.together
-            if alike > ALIKE and deeper and found[e, KEY] == found[f, KEY]:
-                found[e, VOID] = 1.0
-    kept = 0
-    for e in range(count):
-        if found[e, VOID] == 0.0:
-            for x in range(COLUMNS):
-                found[kept, x] = found[e, x]
-            kept += 1
-    return kept
-
-
-@njit(**BARE)
 def merged(rules, point, p, known, scratch, count, rounded):
     """Old and new points of a pair in one manifold, spread far; of points that nearly coincide the new ones.
 
