@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from sdfsim import Scene, Simulator
 
@@ -13,6 +12,8 @@ G = 9.81
 def tube(tmp_path):
     """A tube of 96 facets whose walls are two and a half cells of its grid: its bore is 49.97 mm from the axis."""
     file = tmp_path / "tube.obj"
+    import trimesh
+
     trimesh.creation.annulus(0.05, 0.06, height=0.5, sections=96).export(file)
     return file
 
@@ -44,6 +45,8 @@ def test_a_cup_stays_on_a_tray_that_is_sped_up():
 
 def test_nodes_between_others_lie_on_the_surface(tube):
     """Judged by the facets themselves; what is next to an edge of the grid may be rounded off with it."""
+    import trimesh
+
     scene = Scene()
     scene.add("tube", mesh=tube, sdf="mesh", motion="static")
     surface = scene.load().shapes[0].contact.surface
