@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sdfsim.apps.run import simulate
     from sdfsim.base.errors import SceneError, SdfsimError
     from sdfsim.physics.bodies import State
+    from sdfsim.physics.instruments import judged
     from sdfsim.physics.rollout import Rollout
     from sdfsim.scene.builder import SceneBuilder as Scene
     from sdfsim.scene.load import load_scene
@@ -46,6 +47,7 @@ __all__ = [
     "State",
     "export",
     "fit",
+    "judged",
     "load_scene",
     "load_shape",
     "reconstruct",
@@ -61,6 +63,7 @@ _HOME = {
     "Shape": "sdfsim.shape.shape",
     "Simulator": "sdfsim.simulate.simulator",
     "State": "sdfsim.physics.bodies",
+    "judged": "sdfsim.physics.instruments",
     "load_scene": "sdfsim.scene.load",
     "load_shape": "sdfsim.shape.shape",
     "export": "sdfsim.apps.export",

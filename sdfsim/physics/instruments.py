@@ -7,6 +7,7 @@ closed forms and meshes.
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from sdfsim.physics import pose
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
+from sdfsim.scene.builder import SceneBuilder, loaded
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Joint, Scene
 from sdfsim.shape.shape import Shape
@@ -94,12 +96,15 @@ class Verdict:
         }
 
 
-def judged(scene: Scene, rollout: Rollout, *, seconds: float = np.inf, every: int = 1) -> Verdict:
+def judged(
+    scene: Scene | SceneBuilder | Path | str, rollout: Rollout, *, seconds: float = np.inf, every: int = 1
+) -> Verdict:
     """What a motion of a scene breaks of the laws that hold of all rigid bodies.
 
     Surfaces are measured in every so many frames; where they would take longer than `seconds`, in fewer, spread evenly,
-    the last always among them.
+    the last always among them. Scenes that are not loaded yet are, as `Simulator` loads them.
     """
+    scene = loaded(scene)
     energy = energy_account(scene, rollout)
     overlap, floating, frames = _surfaces(scene, rollout, seconds, every)
     broken = []

@@ -19,6 +19,7 @@ FINEST = 512  # likewise, where walls are thin
 PADDING = 4.0  # cells around the solid
 WALL = 2.0  # cells that a wall must be thick for a grid to have both of its sides
 CHUNK = 2**18  # points evaluated at once
+BESIDE = 0.1  # cells: what is farther from a surface is not on it
 SPREAD = 512  # places all over a surface
 # Of the largest extent: how near these places are at first, and after so many steps towards the surface.
 CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
@@ -95,7 +96,11 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
 
 
 def surface_samples(grid: BakedGrid) -> np.ndarray:
-    """[P, 3] m, points all over the surface of a grid, about a cell apart."""
+    """[P, 3] m, points all over the surface of a grid, about a cell apart.
+
+    One step from the middle of a cell leads to the surface, but not from beyond the middle of a wall: there the distance
+    has no slope that could be followed. What ends beside the surface is left out.
+    """
     corners = [grid.fine[:, i : i + SIDE, j : j + SIDE, k : k + SIDE] for i, j, k in np.ndindex(2, 2, 2)]
     middle = np.mean(corners, axis=0)
     chosen = np.nonzero(np.abs(middle) < grid.cell)
@@ -104,7 +109,8 @@ def surface_samples(grid: BakedGrid) -> np.ndarray:
     brick = np.argwhere(grid.brick >= 0)[np.argsort(grid.brick[grid.brick >= 0])]
     place = grid.low + grid.cell * (SIDE * brick[chosen[0]] + np.stack(chosen[1:], axis=1) + 0.5)
     square = np.maximum(np.square(slope).sum(1), 0.25)
-    return place - (middle[chosen] / square)[:, None] * slope
+    places = place - (middle[chosen] / square)[:, None] * slope
+    return places[np.abs(interpolated(grid, places)) < BESIDE * grid.cell]
 
 
 def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:

@@ -39,8 +39,8 @@ from sdfsim.physics.solver.vectors import (
 
 
 @njit(**FAST, inline="always")
-def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note):
-    """Advance `motion` by one step, in place, and what is known of the joints that hold bodies; time is that of
+def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, step):
+    """Advance `motion` by one step of a script, in place, and what is known of the joints that hold bodies; time is that of
     the bodies that go, however many others there are.
 
     All structures but `manifolds` and `held` are references. For what may be None see `run_steps`.
@@ -70,10 +70,14 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
         begin_step(world, work, motion, rules, joints)
     for k in range(rules.substeps):
         for b in world.going:
-            if work.gone[b] > work.ways[b] and world.moves[b]:
+            if work.gone[b] > work.ways[b] and (world.moves[b] or world.scripted[b]):
                 left = rules.substep_dt * (rules.substeps - k)
                 manifolds, near = broad_phase(shapes, world, work, motion, rules, left, manifolds, surfaces, threads)
                 break
+        for s in range(len(script.body)):
+            for x in range(3):
+                motion.velocity[script.body[s], x] = script.velocity[step, k, s, x]
+                motion.angular[script.body[s], x] = script.velocity[step, k, s, 3 + x]
         # Both are used again at the end of the step, so that the references hold.
         points, parts = reference(manifolds), reference(near)
         for b in world.going:

@@ -31,6 +31,7 @@ CANDIDATES = 256  # leaves of nodes that may touch, of which
 SIDE = 40  # at most become points
 EACH = 4  # points of a manifold that are of the same two patches
 ALIKE = 0.9  # cosine between normals that are taken for one
+EVEN = 1e-9  # by how much two lengths or their squares differ at least, for one to come before the other
 OUTWARD = 1e-3  # how much deeper another point must be to be preferred to one that is farther out by a length
 
 
@@ -122,30 +123,6 @@ def write(found, count, side, mine, theirs, normal, gap, key):
 
 
 @njit(**BARE)
-def first_to_touch(rules, found, count):
-    """Of points with one normal only the deepest are kept, and those that are as deep: what an impact meets first.
-
-    The others follow in the next inner steps, when the impact has been answered.
-    """
-    for e in range(count):
-        found[e, VOID] = 0.0
-        for f in range(count):
-            alike = 0.0
-            for x in range(3):
-                alike += found[e, NORMAL + x] * found[f, NORMAL + x]
-            deeper = found[f, GAP] < found[e, GAP] - rules.together
-            if alike > ALIKE and deeper and found[e, KEY] == found[f, KEY]:
-                found[e, VOID] = 1.0
-    kept = 0
-    for e in range(count):
-        if found[e, VOID] == 0.0:
-            for x in range(COLUMNS):
-                found[kept, x] = found[e, x]
-            kept += 1
-    return kept
-
-
-@njit(**BARE)
 def merged(rules, point, p, known, scratch, count, rounded):
     """Old and new points of a pair in one manifold, spread far; of points that nearly coincide the new ones.
 
@@ -180,7 +157,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
     chosen, lowest = -1, 1e300
     for e in range(total):
         away[e], alike[e] = 1e300, 0
-        if every[e, GAP] < lowest:
+        if every[e, GAP] < lowest - EVEN:
             chosen, lowest = e, every[e, GAP]
     kept = 0
     while chosen >= 0 and kept < POINTS:
@@ -197,7 +174,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
             if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
                 alike[e] += 1
             away[e] = min(away[e], gone + 0.01 * turned)
-            if away[e] > farthest and alike[e] < EACH:
+            if away[e] > farthest + EVEN and alike[e] < EACH:
                 farthest, following = away[e], e
         chosen = following
     return kept
@@ -245,7 +222,7 @@ def thinned(scratch, count):
         away[e] = 1e300
     kept, chosen = 0, 0
     for e in range(count):
-        if found[e, GAP] < found[chosen, GAP]:
+        if found[e, GAP] < found[chosen, GAP] - EVEN:
             chosen = e
     while kept < POINTS:
         away[chosen], away[kept] = away[kept], away[chosen]
@@ -260,6 +237,6 @@ def thinned(scratch, count):
                 gone += (found[e, FIRST + x] - found[last, FIRST + x]) ** 2
                 gone += 0.01 * (found[e, NORMAL + x] - found[last, NORMAL + x]) ** 2
             away[e] = min(away[e], gone)
-            if away[e] > away[chosen]:
+            if away[e] > away[chosen] + EVEN:
                 chosen = e
     return kept

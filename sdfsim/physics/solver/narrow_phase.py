@@ -28,7 +28,6 @@ from sdfsim.physics.solver.distance import (
 )
 from sdfsim.physics.solver.manifold import (
     FOUND,
-    first_to_touch,
     merged,
     moved,
     renewed,
@@ -319,8 +318,6 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
         for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
             near.held[at] = False
         count = collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p)
-        if known == 0:
-            count = first_to_touch(rules, scratch.found, count)
         manifolds.count[p] = renewed(rules, manifolds.point, p, known, scratch, count)
         return
     if surfaces is not None:
@@ -343,7 +340,6 @@ def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, wen
             return
     for side in range(2):
         count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, since, scratch, count)
-    count = first_to_touch(rules, scratch.found, count)
     manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, none > one)
     _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 

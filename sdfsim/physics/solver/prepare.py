@@ -43,7 +43,7 @@ ROUNDS, TEACHERS = 100, 50  # of sequential impulses in an inner step at most, a
 CROWD = 64  # bodies that move, from which on pairs may be looked at in threads
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
-NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 6)))
+NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 0, 6)))
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
 
 
@@ -148,7 +148,7 @@ class Compiled:
         if options is not self._options:
             self._options, self._rules = options, compiled_rules(options)
         rules, motion = self._rules, self._motion
-        script, time = _script(self.bodies.tracks, state.time, rules.substep_dt * rules.substeps, steps)
+        script, time = _script(self.bodies.tracks, state.time, rules, steps)
         self._latest = None  # where the rest of this does not come to its end
         manifolds, edges, counts, done, body, wrong, before, given, pair, point, kept = self.run(
             motion, self._manifolds, rules, steps, script, most, note=options.record, keep=keep
@@ -215,16 +215,18 @@ class Steps:
     point: np.ndarray  # [C, 3] where they did
 
 
-def _script(tracks: Tracks | None, time: float, dt: float, steps: int) -> tuple[Script, float]:
-    """Where paths lead in so many steps, and the time after them."""
+def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
+    """Where paths lead in so many steps, and the time after them. What stands on a tray that is sped up slips if the
+    tray's velocity jumps once a step and not in each inner step."""
+    inner, count = rules.substep_dt, rules.substeps
     times = [time]
     for _ in range(steps):
-        times.append(times[-1] + dt)  # as single steps add up, to the last bit
+        times.append(times[-1] + inner * count)  # as single steps add up, to the last bit
     if tracks is None:
         return NO_SCRIPT, times[-1]
+    speeds = [[np.concatenate(tracks.velocity(t + inner * k, inner), -1) for k in range(count)] for t in times[:-1]]
     poses = [np.concatenate(tracks.at(t), -1) for t in times[1:]]
-    speeds = [np.concatenate(tracks.velocity(t, dt), -1) for t in times[:-1]]
-    return Script(tracks.body, np.stack(poses), np.stack(speeds)), times[-1]
+    return Script(tracks.body, np.stack(poses), np.array(speeds)), times[-1]
 
 
 def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:

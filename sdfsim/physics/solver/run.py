@@ -25,7 +25,7 @@ class Script(NamedTuple):
 
     body: np.ndarray  # [S] int64
     pose: np.ndarray  # [n, S, 7] position and orientation at the end of a step
-    velocity: np.ndarray  # [n, S, 6] velocity and angular velocity that lead there
+    velocity: np.ndarray  # [n, m, S, 6] velocity and angular velocity that lead there, of each of m inner steps
 
 
 class Kept(NamedTuple):
@@ -72,7 +72,9 @@ def run_steps(
         for s in range(len(script.body)):
             b = script.body[s]
             for x in range(3):
-                motion.velocity[b, x], motion.angular[b, x] = script.velocity[k, s, x], script.velocity[k, s, 3 + x]
+                # The mean says whom a body may reach in the step.
+                motion.velocity[b, x] = script.velocity[k, :, s, x].mean()
+                motion.angular[b, x] = script.velocity[k, :, s, 3 + x].mean()
         for i in range(len(going)):
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
@@ -83,7 +85,7 @@ def run_steps(
                 rest_held(held.each)
         else:
             manifolds, edges, counts = advance(
-                shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note
+                shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, k
             )
         for s in range(len(script.body)):
             b = script.body[s]

@@ -30,6 +30,7 @@ ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they 
 WAYS = 8  # in which the outermost nodes of a face are looked for
 ONTO_IT = 0.05  # cells: so near a surface is a place on it
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
+LONGER = 4.0  # times the last step of it, at most
 SHORTEST, AHEAD = 2.5, 4.0  # the first one again: of the last, and of the way since, at least
 
 
@@ -260,10 +261,12 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
         slope = norm(g)
         if slope < 0.02:
             break
-        # As far as the slope leads if it goes on to change as in the last step (secant), and a little at first.
+        # As far as the slope leads if it goes on to change as in the last step (secant), and a little at first; in powers
+        # of two, or rounding would grow tenfold in each step.
         change = was + dot(way, g)
         if was > 0.0:
-            stride = min(stride * slope / change, 3.0 * stride) if change > 0.0 else 3.0 * stride
+            longer = min(slope / change, LONGER) if change > 0.0 else LONGER
+            stride *= 2.0 ** math.floor(math.log2(longer) + 0.5)
         way, was, better = scale(g, -1.0 / slope), slope, False
         while stride > least:
             q, share = along(p, way, stride), 0.4

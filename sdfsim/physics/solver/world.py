@@ -131,9 +131,8 @@ class Rules(NamedTuple):
     cone: bool = True  # whether friction is bounded by a cone; else along two axes, each by itself
     ahead: float = 0.0  # new points are looked for so much time farther, as fast as two bodies move against each other
     contact_margin: float = 0.02  # contacts are kept up to this distance, and while they have slid by no more
-    search_margin: float = 0.004  # new ones are looked for up to this one and twice the margin
+    search_margin: float = 0.006  # new ones are looked for up to this one and twice the margin
     still: float = 1e-4  # pairs that have moved by less within a step are not looked at again
-    together: float = 1e-4  # points that are deeper than the deepest less this meet in one impact
     erp: float = 0.08  # the share of a penetration that an inner step resolves, through velocity
     slop: float = 5e-4  # penetration that is left as it is
     split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
