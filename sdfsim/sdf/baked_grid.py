@@ -98,8 +98,8 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
 def surface_samples(grid: BakedGrid) -> np.ndarray:
     """[P, 3] m, points all over the surface of a grid, about a cell apart.
 
-    One step from the middle of a cell leads to the surface, but not from beyond the middle of a wall: there the distance
-    has no slope that could be followed. What ends beside the surface is left out.
+    One step from the middle of a cell leads to the surface, but not from beyond the middle of a wall: there the
+    distance has no slope that could be followed. What ends beside the surface is left out.
     """
     corners = [grid.fine[:, i : i + SIDE, j : j + SIDE, k : k + SIDE] for i, j, k in np.ndindex(2, 2, 2)]
     middle = np.mean(corners, axis=0)

@@ -40,8 +40,8 @@ from sdfsim.physics.solver.vectors import (
 
 @njit(**FAST, inline="always")
 def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, step):
-    """Advance `motion` by one step of a script, in place, and what is known of the joints that hold bodies; time is that of
-    the bodies that go, however many others there are.
+    """Advance `motion` by one step of a script, in place, and what is known of the joints that hold bodies; time is
+    that of the bodies that go, however many others there are.
 
     All structures but `manifolds` and `held` are references. For what may be None see `run_steps`.
 

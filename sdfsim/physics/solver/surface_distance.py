@@ -261,8 +261,8 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
         slope = norm(g)
         if slope < 0.02:
             break
-        # As far as the slope leads if it goes on to change as in the last step (secant), and a little at first; in powers
-        # of two, or rounding would grow tenfold in each step.
+        # As far as the slope leads if it goes on to change as in the last step (secant), and a little at first; in
+        # powers of two, or rounding would grow tenfold in each step.
         change = was + dot(way, g)
         if was > 0.0:
             longer = min(slope / change, LONGER) if change > 0.0 else LONGER
