@@ -19,7 +19,7 @@ FINEST = 512  # likewise, where walls are thin
 PADDING = 4.0  # cells around the solid
 WALL = 2.0  # cells that a wall must be thick for a grid to have both of its sides
 CHUNK = 2**18  # points evaluated at once
-BESIDE = 0.1  # cells: what is farther from a surface is not on it
+BESIDE = 0.05  # cells: what is farther from a surface is not on it
 SPREAD = 512  # places all over a surface
 # Of the largest extent: how near these places are at first, and after so many steps towards the surface.
 CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4

@@ -22,7 +22,7 @@ from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
 
-VERSION = 8  # of what is kept on disk, beside that of the grid that surfaces are sampled from
+VERSION = 9  # of what is kept on disk, beside that of the grid that surfaces are sampled from
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
