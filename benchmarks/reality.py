@@ -685,9 +685,9 @@ def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path,
     chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
     text = (
         f"Networks in the scene that was identified: {STEPS} steps of a training where its row does not say how many "
-        f"({SURFACE_STEPS} of networks on surface nodes), of which the best of {LOOKS} states on {chosen} tosses is taken, and judged once on {TEST} "
-        "others. Means over the seeds that are listed, with 95 % intervals over tosses. Less the solve: toss by toss. "
-        "Seconds of one core, for one training.\n\n"
+        f"({SURFACE_STEPS} of networks on surface nodes), of which the best of {LOOKS} states on {chosen} tosses is "
+        f"taken, and judged once on {TEST} others. Means over the seeds that are listed, with 95 % intervals over "
+        "tosses. Less the solve: toss by toss. Seconds of one core, for one training.\n\n"
         f"{markdown(network_table(found))}"
     )
     write_section("reality networks", f"{COMMAND} --networks-only", text)
