@@ -13,7 +13,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from pipeline.clearing import Cleared, cleared
 from pipeline.materials import SCENERY, Choice
+from pipeline.mesh.bodies import LAYER
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held, scene_keys
 from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
@@ -27,6 +29,7 @@ from sdfsim.geometry.mesh_io import load_mesh, read_glb
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.far_field import BOX
+from sdfsim.sdf.sdf import Sdf
 
 SAMPLES, BLOCK = (65, 161), 4  # fewest and most along a side of a grid; cells a side of what is sampled as a whole
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
@@ -37,6 +40,7 @@ BUMP = 0.06  # how far a level place may stick out of its plane, as a share of t
 BELOW = 0.001  # of the scenery's widest side: so far the added floor lies below the lowest of the scenery's own
 OWN_FLOOR, DENTS = 0.01, 0.02  # of that side: how far a floor is from 0 at most; share of it that may lie lower
 UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
+ONTO, STEPS = 1.0, 4  # of a cell of the field, that a vertex of what is shown is from the fit's surface; steps to it
 TOUCHES = 0.05  # of a part's surface, that is near to what holds it
 GAP = 0.3  # of the fall, as a share of the side
 
@@ -77,12 +81,28 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
         # The folder appears complete or not at all: a run that goes on keeps those that are there.
         shutil.rmtree(partial, ignore_errors=True)
+        if name == SCENERY:
+            shown = onto(shape.sdf, shown, ONTO * parts["cell"])
         replace(shape, mesh=shown, skin=skins.get(name)).save(partial)
         partial.rename(folder)
         certificates[name] = shape.certificate
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+
+
+def onto(sdf: Sdf, mesh: Mesh, reach: float) -> Mesh:
+    """A mesh with its vertices on the surface of a fit, where that is within `reach` m. Photos leave bumps that are
+    finer than the fit of a scenery: bodies would be shown, and judged, to lie in these."""
+    vertices = mesh.vertices.copy()
+    near = np.flatnonzero(np.abs(np.asarray(sdf(vertices)[0])) < reach)
+    for _ in range(STEPS):
+        distance, slope = (np.asarray(part) for part in sdf(vertices[near]))
+        steep = np.maximum((slope**2).sum(1), 0.25)  # where surfaces are near to each other a grid is flat
+        vertices[near] -= (distance / steep)[:, None] * slope
+    # Where the fit has no such surface, as of a thin wall, it is shown all the same, where photos show it.
+    lost = np.linalg.norm(vertices - mesh.vertices, axis=1) > reach
+    return replace(mesh, vertices=np.where(lost[:, None], mesh.vertices, vertices))
 
 
 def samples_of(mesh: Mesh, cell: float) -> int:
@@ -141,6 +161,7 @@ def write_scene(
         if slab.slope > LEVEL:
             notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
     origins = {name: origin_of(mesh) for name, mesh in solids.items()}
+    closed = {name: replace(mesh, vertices=mesh.vertices - origins[name]) for name, mesh in solids.items()}
     materials = materials or {}
     floor = floor_height(load_mesh(mesh_folder / "shown.ply")) if parts["scenery"] else 0.0
     held = load_held(mesh_folder / JOINT)
@@ -151,9 +172,18 @@ def write_scene(
             raise SdfsimError(f"{message}; {held.line()}", "photograph it from more sides", exit_code=EXIT_QUALITY)
         others = {SCENERY: load_mesh(mesh_folder / "solid.ply")} if parts["scenery"] else {}
         holder = holder_of(solids[PART], others | {name: mesh for name, mesh in solids.items() if name != PART})
-    text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials, seed=seed,
-                      floor=floor, held=held, holder=holder)  # fmt: skip
+
+    def text_of(moved: dict[str, Cleared]) -> str:
+        return scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials,
+                          seed=seed, floor=floor, held=held, holder=holder, moved=moved)  # fmt: skip
+
+    text = text_of({})
     scene = load_scene(scene_file, text=text, allow_outside=True)
+    if parts["scenery"]:
+        closed[SCENERY] = load_mesh(mesh_folder / "solid.ply")
+    if moved := cleared(scene, closed):
+        text = text_of(moved)
+        notes += [moved_line(name, one, LAYER * parts["cell"]) for name, one in moved.items()]
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:
@@ -168,9 +198,25 @@ def write_scene(
     write_text(scene_file, text)
     return {
         "objects": list(solids), "bodies": bodies_of(scene, materials), "size": placement.size_from,
+        "moved": {name: {"by": one.shift.tolist(), "out_of": one.into, "left": one.left}
+                  for name, one in moved.items()},
         "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
         "scene_sha256": made, "joint": None if held is None else held.line(),
     }  # fmt: skip
+
+
+def moved_line(name: str, one: Cleared, unsure: float) -> str:
+    """What the report says of a body that was in others; photos do not tell what touches closer than `unsure` m."""
+    there = " and ".join(one.into)
+    if one.left:
+        if one.held:
+            return f"{name}: is {one.left:.2g} m in {there}, where its joint holds it: these do not touch"
+        return f"{name}: starts {one.left:.2g} m in {there}, as no short way leads out: expect that it is thrown out"
+    away = float(np.linalg.norm(one.shift))
+    line = f"{name}: moved {'up ' if one.shift[2] > 0.99 * away else ''}by {away:.2g} m, out of {there}"
+    if away > unsure:
+        line += f": more than the {unsure:.2g} m that photos leave open where bodies touch, so look at mesh/objects.png"
+    return line
 
 
 def holder_of(part: Mesh, others: dict[str, Mesh]) -> str | None:
@@ -213,10 +259,13 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0,
-               held: HeldPart | None = None, holder: str | None = None) -> str:  # fmt: skip
+               held: HeldPart | None = None, holder: str | None = None,
+               moved: dict[str, Cleared] | None = None) -> str:  # fmt: skip
     """The text of scene.yaml: a floor at a height, m, the scenery, the bodies that were found at their origins [3] m,
     and one dropped from above where there is a slab. What is `held` by a joint starts in its first state, and the body
-    that is its `holder` stands still."""
+    that is its `holder` stands still. Bodies that would be in others are `moved`; what the part is in does not touch
+    it."""
+    moved = moved or {}
     assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
     shapes: list[str] = []
@@ -250,14 +299,21 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
             turned = Rotation.from_matrix(held.turn).as_quat()
             keys = f"position: {_flow(rounded(held.turn @ origin + held.shift).tolist())}"
             keys += f", quat_xyzw: {_flow(turned.round(9).tolist())}"
+            if name in moved:
+                bodies.append(f"  # where it starts it is in {' and '.join(moved[name].into)}")
+                keys += f", avoids: {_flow([*moved[name].into])}"
         elif name == holder:
             bodies.append("  # stands still: the photos show no motion of it")
             keys = f"motion: static, {keys}"
+        elif name in moved:
+            keys = f"position: {_flow(rounded(origin + moved[name].shift).tolist())}"
+            bodies.append(f"  # {moved_line(name, moved[name], np.inf).removeprefix(f'{name}: ')}")
         add(name, keys, {"asset": f"assets/{folder_of(name)}"})
     if slab is not None:
         box = {"box": {"size": rounded((slab.side, slab.side, slab.thickness)).tolist()}}
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
-        add(drop, f"position: {_flow(rounded(slab.position).tolist())}", box if drop == "box" else ball)
+        shift = moved[drop].shift if drop in moved else np.zeros(3)
+        add(drop, f"position: {_flow(rounded(slab.position + shift).tolist())}", box if drop == "box" else ball)
     return "\n".join([
         f"# Reconstructed from photos. Up from the {placement.up_from}, within {placement.up_within:.1f} degrees "
         f"(confidence: {placement.up_confidence}).",
@@ -322,7 +378,8 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     unseen = 1 - (visible > top[:, under] - 0.2 * side).mean(1)
     obstacle = (np.nanmax(top, 1) - top[:, under].max(1)) / side
     central = np.linalg.norm((places - (low + high)[:2] / 2) / np.maximum(high - low, 1e-9)[:2], axis=1)
-    good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central - slope / LEVEL - obstacle
+    good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central
+    good = good - slope / LEVEL - bump / BUMP - obstacle
     # Places that are not level, not flat, or not in the photos are taken only where there are no others.
     bad = np.maximum(slope / LEVEL - 1, 0) + 10 * np.maximum(bump - BUMP, 0) + 10 * np.maximum(unseen - UNSEEN, 0)
     best = int((good - 100 * bad).argmax())

@@ -152,9 +152,9 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
     "poses": Stage(do_poses, "poses", version=6),
     "distill": Stage(do_distill, "distill", version=7),
-    "mesh": Stage(do_mesh, "mesh", version=12),
-    "fit": Stage(do_fit, "assets", version=2),
-    "scene": Stage(do_scene, "scene", version=5),
+    "mesh": Stage(do_mesh, "mesh", version=13),
+    "fit": Stage(do_fit, "assets", version=3),
+    "scene": Stage(do_scene, "scene", version=6),
 }
 
 
@@ -162,19 +162,7 @@ def reconstruct(
     photos: str | Path, out: str | Path, *, from_stage: str | None = None, until_stage: str | None = None,
     progress: Callable[[str, float, str], None] | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
-    """Photos -> a scene that can be simulated.
-
-        sdfsim.reconstruct("PHOTOS", "room", preset="quick", size=1.8, progress=print)
-
-    `options` are those of `sdfsim reconstruct --help` by the same names, `seed` and `recipe` (see `OptionKeys`);
-    `from_stage` and `until_stage` are its --from and --until. `progress` is called with the stage, its share that is
-    done, and a line.
-
-    Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
-    `out`, and returns the report. Skips a stage whose inputs, options and version are those of its last
-    run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises SdfsimError for bad
-    photos or options (exit code 1), or where poses or surface are not good enough (3).
-    """
+    """Photos -> a scene, by all stages: `pipeline.states.reconstruct` says more."""
     resolved = options_of(photos=str(Path(photos).absolute()), **options)
     names = list(STAGES)
     first = number_of(from_stage) if from_stage else len(names)

@@ -19,11 +19,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from PIL import Image
 
+from pipeline import stages
 from pipeline.cameras import Similarity
 from pipeline.field.training import load_field
 from pipeline.inputs.labels import FOLDER, NAMES, load_names
@@ -31,7 +32,7 @@ from pipeline.inputs.photos import load_photos
 from pipeline.mesh.joint import JOINT, PART, HeldPart, find_joint
 from pipeline.mesh.moving_part import CELLS, alike, label_images, load_state, part_of, tie, which_move
 from pipeline.mesh.placement import check_distance, load_placement
-from pipeline.options import options_of
+from pipeline.options import OptionKeys, options_of
 from pipeline.stages import RECORD, Instead, Project, check_apart, number_of, read_record, run_all
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
 from sdfsim.base.files import write_json
@@ -40,6 +41,33 @@ FIRST, SECOND = "first", "second"
 WITHOUT = ("crop", "body")  # options that say something of one state's meshes
 
 Said = Callable[[str, float, str], None]
+
+
+def reconstruct(
+    photos: str | Path, out: str | Path, *, joint: str | Path | None = None, from_stage: str | None = None,
+    until_stage: str | None = None, progress: Said | None = None, **options: Unpack[OptionKeys],
+) -> dict:  # fmt: skip
+    """Photos -> a scene that can be simulated.
+
+        sdfsim.reconstruct("PHOTOS", "room", preset="quick", size=1.8, progress=print)
+        sdfsim.reconstruct("SHUT", "cupboard", joint="OPEN", preset="quick")
+
+    `joint` are photos of the same thing in another state, such as with its door open: what moves between both is then
+    a body of its own, called `part`, on a hinge or a slider. `options` are those of `sdfsim reconstruct --help` by the
+    same names, `seed` and `recipe` (see `OptionKeys`); `from_stage` and `until_stage` are its --from and --until.
+    `progress` is called with the stage, its share that is done, and a line.
+
+    Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
+    `out` (of two states also a folder each), and returns the report. Skips a stage whose inputs, options and version
+    are those of its last run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises
+    SdfsimError for bad photos or options (exit code 1), or where poses, surface or joint are not good enough (3).
+    """
+    given: Any = {"from_stage": from_stage, "until_stage": until_stage, "progress": progress, **options}
+    return (
+        stages.reconstruct(photos, out, **given)
+        if joint is None
+        else reconstruct_states(photos, joint, out, **given)[0]
+    )
 
 
 def reconstruct_states(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from sdfsim.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from pipeline.stages import reconstruct
+    from pipeline.states import reconstruct
     from sdfsim.apps.export import export
     from sdfsim.apps.fit import fit
     from sdfsim.apps.render import render
@@ -65,7 +65,7 @@ _HOME = {
     "load_shape": "sdfsim.shape.shape",
     "export": "sdfsim.apps.export",
     "fit": "sdfsim.apps.fit",
-    "reconstruct": "pipeline.stages",
+    "reconstruct": "pipeline.states",
     "render": "sdfsim.apps.render",
     "simulate": "sdfsim.apps.run",
 }

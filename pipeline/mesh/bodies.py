@@ -61,6 +61,7 @@ SCRAP = 0.4  # of the length of the first piece of what masks name: a second one
 # body has on so much surface. Bodies of `shelf` had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
 SMALL_NOISE, BARE = 0.15, 0.05
 # In cells of the field's finest grid, which limits what can be separated:
+ON = 1.5  # samples below a plane, that say where it goes on
 LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
 SMALLEST = 4.0  # what rises less stays part of what it stands on
 FINER = 1 / 3  # distance of a body's samples
@@ -324,6 +325,10 @@ def without_bodies(volume: Volume, bodies: list[FoundBody], field: Distance) -> 
         under = np.flatnonzero(own & (height <= 0) & (height > -2 * body.layer))
         foot = under[holds[under] | (sample(field, lifted[under]) < 0.5 * body.layer)] if len(under) else under
         inside[foot] = np.minimum(inside[foot], height[foot])
+        # Between samples the surface is where the two nearest say: deep in what stood there, the lower one would lift
+        # it by up to a sample.
+        near = foot[height[foot] > -ON * volume.cell]
+        inside[near] = height[near]
         values[part] = inside.reshape(body.own.shape)
     return replace(volume, values=values)
 

@@ -47,6 +47,8 @@ def import_robot(
         if fixed or packages:
             raise SdfsimError(f"{source}: --fixed and --packages go with a URDF", "an MJCF file says both itself")
         robot = read_mjcf(source, key=key)
+    if not robot.links:
+        raise SdfsimError(f"{source}: describes no bodies", "give the file that has them: it may include this one")
     check_writable(out.parent)
     files, notes = write_scene(robot, out, floor=floor, on_progress=partial(on_progress, "shapes"))
     counts = {"links": len(robot.links), "joints": len(robot.joints)}

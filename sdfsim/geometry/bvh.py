@@ -53,6 +53,7 @@ class Winding:
         self._size = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
         self._vertices = np.ascontiguousarray((mesh.vertices - self._centre) / self._size)
         self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+        self._tree: Any = None  # made for the first points: of half a million faces it takes a second
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """[P] float64 at `points` [P, 3] m."""
@@ -60,8 +61,11 @@ class Winding:
 
         if len(points) == 0:
             return np.zeros(0)
+        if self._tree is None:
+            self._tree = igl.FastWindingNumberBVH()
+            self._tree.init(self._vertices, self._faces)
         local = np.ascontiguousarray((points - self._centre) / self._size, dtype=np.float64)
-        return np.asarray(igl.fast_winding_number(self._vertices, self._faces, local))
+        return np.asarray(self._tree.winding_number(local))
 
 
 class Crossings:

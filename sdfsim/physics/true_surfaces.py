@@ -26,6 +26,7 @@ ROUNDS = 26  # of cutting
 FINE = 2e-4  # of the smaller thickness: how exact a distance is
 ROUGH = 4e-3  # likewise, from a body that is not convex: there bounds are weaker, and triangles many
 AROUND = 16  # corners of the circles from which round surfaces are cut further
+TURN = 0.05  # winding number of a point that is outside of everything, at most
 FLAT = 1e-9  # of a mesh's size: how far beside a face's plane a convex mesh may have a vertex
 
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -59,9 +60,9 @@ def true_surface(shape: Shape) -> TrueSurface:
     if shape.pieces:
         pieces = [convex_hull(points) for points in shape.pieces]
         if len(pieces) == 1:
-            return _of_mesh(pieces[0])
+            return of_mesh(pieces[0])
         return _of_pieces(PiecesDistance(pieces))
-    return _of_mesh(shape.mesh)
+    return of_mesh(shape.mesh)
 
 
 def _closed_form(sdf: ClosedForm) -> TrueSurface:
@@ -120,7 +121,7 @@ def _closed_form(sdf: ClosedForm) -> TrueSurface:
     return _clustered(triangles[kept], bent[kept], bounds, distance, onto, turns=turns, straight=half)
 
 
-def _of_mesh(mesh: Mesh) -> TrueSurface:
+def of_mesh(mesh: Mesh) -> TrueSurface:
     import igl  # a third of what open3d takes to load, and in double precision
 
     convex, size = _is_convex(mesh), float(np.ptp(mesh.vertices, axis=0).max())
@@ -146,6 +147,11 @@ def _of_mesh(mesh: Mesh) -> TrueSurface:
             unclear = (np.min(parts, axis=0) <= 1e-6 * area[face]) & (length > 0)
             if unclear.any():
                 inside[unclear] = winding(points[unclear]) > 0.5
+            # Where a surface is folded flat, what is nearest may be a layer that faces the other way. Of a surface that
+            # is open, what is behind it has a part of a turn around it.
+            behind = inside & ~unclear
+            if behind.any():
+                inside[behind] = winding(points[behind]) > TURN
         found = np.where(inside, -length, length)
         near = length < 1e-9 * size
         return found, np.where(near[:, None], normal, away / np.where(near, 1.0, found)[:, None])

@@ -59,9 +59,10 @@ class SimulationError(SdfsimError):
     """The state broke: the message names the step and the body, `rollout` has everything up to the last good state."""
 
     def __init__(self, message: str, rollout: Rollout) -> None:
-        super().__init__(
-            message, "try another model, or look for bodies that overlap at the start", exit_code=EXIT_QUALITY
-        )
+        hint = "try another model, or look for bodies that overlap at the start"
+        if rollout.joint_names:
+            hint += "; light bodies that joints hold to heavy ones may need some damping in their joints"
+        super().__init__(message, hint, exit_code=EXIT_QUALITY)
         self.rollout = rollout
 
 

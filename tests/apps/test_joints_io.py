@@ -358,6 +358,14 @@ def start_positions(scene: Scene) -> dict[str, float]:
     return {"shoulder": math.radians(20), "elbow": math.radians(-15), "track": 0.1}
 
 
+def test_a_file_without_bodies_is_told_and_leaves_nothing(tmp_path: Path) -> None:
+    """As files are that other ones include: with defaults, assets or actuators alone."""
+    (tmp_path / "assets.xml").write_text('<mujoco><default><geom friction="1"/></default></mujoco>')
+    with pytest.raises(SdfsimError, match=r"assets\.xml: describes no bodies"):
+        import_robot(tmp_path / "assets.xml", tmp_path / "scene.yaml")
+    assert [path.name for path in tmp_path.iterdir()] == ["assets.xml"]
+
+
 def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
     scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
     report = export(tmp_path / "scene.yaml", tmp_path / "out.xml")

@@ -169,6 +169,23 @@ def test_a_torus_and_a_ball_are_measured_in_the_hole_too():
             assert found.surely[0] <= found.apart[0]
 
 
+@pytest.mark.parametrize("first", [[0, 1, 2], [0, 2, 1]])
+@pytest.mark.parametrize("below", [False, True])
+def test_what_is_beside_a_seam_folded_flat_is_not_in_the_body(first, below):
+    """A cube with a hem of no thickness around its foot, as reconstructed bodies have: of its two layers, equally near,
+    one faces the other way."""
+    cube = primitives.box((0.2, 0.2, 0.2))
+    hem = np.array([[-0.5, -0.4, -0.1], [0.5, -0.4, -0.1], [0.0, 0.6, -0.1]])
+    layers = np.array([first, first[::-1]]) + len(cube.vertices)
+    hemmed = replace(mesh(cube), mesh=Mesh(np.concatenate([cube.vertices, hem]), np.concatenate([cube.faces, layers])))
+    ball = analytic_shape("sphere", radius=0.02)
+    side = -1 if below else 1
+    found = between(hemmed, ball, [0.0, 0.3, -0.1 + 0.023 * side], Rotation.identity())
+    assert found.apart[0] == pytest.approx(0.003, abs=1e-5)
+    inside = between(hemmed, ball, [0.0, 0.0, 0.115], Rotation.identity())
+    assert inside.apart[0] == pytest.approx(-0.005, abs=1e-4)
+
+
 def test_a_body_swallowed_by_another_is_deep_in_it():
     found = between(BALL, CUBE, [0.0, 0.0, 0.1], Rotation.identity(), scale=(4.0, 1.0))
     # The cube's point that is nearest to the centre of the ball of 1 m lies at z = 0.05.

@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from sdfsim import Rollout, Scene, SdfsimError, Simulator
 from sdfsim.physics.instruments import judged
 from sdfsim.physics.motion import MOTION
+from sdfsim.simulate.simulator import SimulationError
 
 G = 9.81
 
@@ -170,6 +171,43 @@ def test_masses_of_one_to_a_hundred_hang_on_each_other(ratio: float):
     assert not [law for law in judged(simulator.scene, rollout).broken if "joint" in law]
     energy = energy_of(rollout) - rollout.counters["energy_given"].cumsum()
     assert energy == pytest.approx(energy[0], abs=1e-3 * (5 + ratio) * G * 0.1)
+
+
+@pytest.mark.parametrize("ratio", [100.0, 1000.0])
+def test_a_load_swings_on_a_taut_rope_of_light_links(ratio: float):
+    """As one pendulum, which has turned by as much on the way back when a period is over."""
+    built = scene()
+    way = np.array([math.sin(0.5), 0.0, -math.cos(0.5)])
+    for k in range(20):
+        turn = (0, -math.degrees(0.5), 0)
+        built.add(f"link{k}", capsule={"radius": 0.01, "height": 0.1}, position=(0.1 * k + 0.05) * way,
+                  euler_xyz_deg=turn, mass=0.1)  # fmt: skip
+        built.join(f"joint{k}", "ball", f"link{k}", f"link{k - 1}" if k else "world", anchor=0.1 * k * way)
+    built.add("load", sphere={"radius": 0.1}, position=2.1 * way, mass=0.1 * ratio)
+    built.join("hook", "ball", "load", "link19", anchor=2.0 * way)
+    simulator = Simulator(built)
+    rollout = simulator.run(6.0)
+    assert not judged(simulator.scene, rollout, every=50).broken
+    energy = energy_of(rollout)
+    assert energy == pytest.approx(energy[0], abs=1e-4 * 0.1 * ratio * G * 2.1 * (1.0 - math.cos(0.5)))
+
+
+def test_a_light_rope_that_goes_taut_under_a_heavy_load_holds_with_some_damping():
+    """The load falls beside the rope's end and jerks it straight."""
+    built = scene()
+    for k in range(20):
+        built.add(f"link{k}", capsule={"radius": 0.01, "height": 0.1}, position=(0.1 * k + 0.05, 0, 0),
+                  euler_xyz_deg=(0, 90, 0), mass=0.1)  # fmt: skip
+        other = f"link{k - 1}" if k else "world"
+        built.join(f"joint{k}", "ball", f"link{k}", other, anchor=(0.1 * k, 0, 0), damping=0.02)
+    built.add("load", sphere={"radius": 0.1}, position=(1.0, 0, -0.3), mass=10.0)
+    built.join("hook", "distance", "link10", "load", anchor=(1.0, 0, 0), to=(1.0, 0, -0.3), rope=0.3)
+    rollout = Simulator(built).run(1.5)
+    energy = energy_of(rollout)
+    assert energy.max() <= energy[0] + 1e-3 * 10.0 * G * 0.3
+    assert "damping" in str(SimulationError("step 2: too fast", rollout).hint)
+    loose = Scene(model="solver").add("ball", sphere={"radius": 0.1})
+    assert "damping" not in str(SimulationError("step 2: too fast", Simulator(loose).run(0.01)).hint)
 
 
 def test_a_joint_breaks_at_its_load_and_not_before():

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import PosedPhotos
 from pipeline.mesh.bodies import Parts, find_level_planes, split
@@ -75,6 +76,29 @@ def test_where_the_cup_stood_the_table_is_whole():
         near = mesh.vertices[(np.hypot(mesh.vertices[:, 0] - 0.1, mesh.vertices[:, 1] + 0.05) < 0.2)]
         near = near[near[:, 2] > TOP - TABLE[2]]
         assert len(near) > 50 and np.abs(near[:, 2] - TOP).max() < 0.2 * FINEST
+
+
+@pytest.mark.parametrize("tilt", [0.0, 2.0, 5.0])
+def test_where_a_solid_body_stood_the_table_is_level(tilt):
+    """Photos show no border between both: in there a field is as deep as the nearest surface that they do show."""
+
+    def field(points: np.ndarray) -> np.ndarray:
+        away = np.hypot(points[:, 0] - 0.1, points[:, 1] + 0.05) - 0.12  # from the side of a can of 0.3 m
+        found = np.minimum(table(points), np.maximum(away, np.abs(points[:, 2] - TOP - 0.15) - 0.15))
+        within, height = away < 0, points[:, 2] - TOP
+        in_can = within & (height >= 0) & (height < 0.3)
+        found[in_can] = -np.minimum(-away, 0.3 - height)[in_can]
+        in_table = within & (height < 0) & (height > -2 * TABLE[2])
+        found[in_table] = -np.minimum(np.hypot(away, height), height + 2 * TABLE[2])[in_table]
+        return found
+
+    turn = Rotation.from_euler("xy", [tilt, 0.7 * tilt], degrees=True).as_matrix()
+    parts = parts_of(field, turn)
+    assert list(parts.bodies) == ["object1"] and parts.solid is not None
+    there = parts.solid.vertices @ turn
+    near = there[(np.hypot(there[:, 0] - 0.1, there[:, 1] + 0.05) < 0.1) & (there[:, 2] > TOP - TABLE[2])]
+    assert len(near) > 20 and np.abs(near[:, 2] - TOP).max() < 0.1 * FINEST
+    assert (parts.bodies["object1"].vertices @ turn)[:, 2].min() == pytest.approx(TOP, abs=0.1 * FINEST)
 
 
 def test_a_small_piece_without_sparse_points_is_noise_beside_bodies_that_have_them():

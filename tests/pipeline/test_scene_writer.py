@@ -1,5 +1,6 @@
 """Where a body is dropped, and the scene file that says so."""
 
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,7 +12,16 @@ from pipeline.cameras import Similarity
 from pipeline.materials import ASSUMED, MATERIALS, materials_of
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
-from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, floor_height, samples_of, scene_text, write_scene
+from pipeline.scene_writer import (
+    LEVEL,
+    choose_slab,
+    fit_parts,
+    floor_height,
+    onto,
+    samples_of,
+    scene_text,
+    write_scene,
+)
 from sdfsim.base.files import write_json
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import write_ply
@@ -47,6 +57,12 @@ def test_a_level_step_is_preferred_to_a_higher_slope():
     hill = terrain(lambda x, y: 0.6 * np.maximum(-x, 0) + 0.3 * np.maximum(np.abs(x - 0.3) - 0.15, 0))
     drop = choose_slab(hill, hill)
     assert drop.slope < LEVEL and 0.1 < drop.position[0] < 0.5
+
+
+def test_a_flat_place_is_preferred_to_a_bumpy_one_in_the_middle():
+    """Bumps of 1.5 mm, on which a slab of 6 cm would rest on its corners."""
+    rough = terrain(lambda x, y: np.where(x < 0.05, 0.0015 * np.sin(300 * x) * np.sin(290 * y), 0.0))
+    assert choose_slab(rough, rough).position[0] > 0.05 + 0.03
 
 
 def test_where_nothing_is_level_the_flattest_place_is_taken():
@@ -90,24 +106,35 @@ def test_bodies_found_can_move():
     assert [body["name"] for body in alone["bodies"]] == ["floor", "object1"]
 
 
-@pytest.fixture
-def meshes(tmp_path):
+def save_meshes(folder):
     """A mesh folder: a floor with a block of 0.6 m, and a cube that was found on the floor."""
     parts = {"scenery": True, "cell": 0.02, "objects": [{"name": "object1"}]}
-    (tmp_path / "objects").mkdir()
+    (folder / "objects").mkdir()
     for name in ("solid.ply", "shown.ply"):
-        (tmp_path / name).write_bytes(write_ply(scenery()))
-    (tmp_path / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1))))
-    PLACEMENT.save(tmp_path)
-    write_json(tmp_path / "parts.json", {"version": 1, **parts})
-    return tmp_path
+        (folder / name).write_bytes(write_ply(scenery()))
+    (folder / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1))))
+    PLACEMENT.save(folder)
+    write_json(folder / "parts.json", {"version": 1, **parts})
+    return folder
 
 
 @pytest.fixture
-def fitted(meshes):
+def meshes(tmp_path):
+    return save_meshes(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory):
+    """The shapes of the fit stage for these."""
+    folder = save_meshes(tmp_path_factory.mktemp("shapes"))
+    fit_parts(folder, folder / "assets", budget=None, sdf="grid")
+    return folder / "assets"
+
+
+@pytest.fixture
+def fitted(meshes, shapes):
     """The same with the shapes of the fit stage beside it."""
-    for name in ("scene", "object1"):
-        analytic_shape("box", size=(0.2, 0.2, 0.2), name=name).save(meshes / "assets" / name)
+    shutil.copytree(shapes, meshes / "assets")
     return meshes
 
 
@@ -127,6 +154,20 @@ def test_bodies_stand_where_they_were_found(fitted):
     write_scene(fitted, fitted / "scene.yaml", drop="none")
     body = yaml.safe_load((fitted / "scene.yaml").read_text())["bodies"][-1]
     np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
+
+
+@pytest.mark.parametrize(("deep", "told"), [(0.0015, "moved up by 0.0015 m, out of scenery"),
+                                            (0.04, "more than the 0.03 m that photos leave open")])  # fmt: skip
+def test_a_body_that_photos_put_into_the_floor_starts_on_it(fitted, deep, told):
+    """A cell is 2 cm wide; surfaces that touch are told apart to one and a half."""
+    (fitted / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1 - deep))))
+    report = write_scene(fitted, fitted / "scene.yaml")
+    text = (fitted / "scene.yaml").read_text()
+    body = next(body for body in yaml.safe_load(text)["bodies"] if body["name"] == "object1")
+    np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
+    assert report["moved"]["object1"]["by"] == pytest.approx([0, 0, deep], abs=1e-4)
+    assert "scenery" in report["moved"]["object1"]["out_of"] and any(told in note for note in report["notes"])
+    assert f"  # moved up by {deep:.2g} m, out of " in text
 
 
 def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_path, monkeypatch):
@@ -228,6 +269,17 @@ def sheet(height: float, side: float = 1.0) -> Mesh:
     """A level square."""
     corners = np.array([[-side, -side, height], [side, -side, height], [side, side, height], [-side, side, height]])
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_what_is_shown_of_a_scenery_lies_on_what_is_simulated(shapes):
+    """Bumps of 4 mm on a level floor, of which the fit has nothing; a wall of which it has nothing either stays."""
+    rough, fit = terrain(lambda x, y: 0.004 * np.sin(300 * x) * np.sin(290 * y)), load_shape(shapes / "scene").sdf
+    wall = Mesh(np.array([[-0.4, 0.4, 0.1], [-0.3, 0.4, 0.1], [-0.3, 0.4, 0.4]]), np.array([[0, 1, 2]]))
+    place = [0.0, 0.6, 0.0]  # beside the block of `scenery`
+    shown = onto(fit, joined([replace(rough, vertices=0.5 * rough.vertices + place), wall]), 0.02)
+    assert np.abs(shown.vertices[:-3, 2]).max() < 0.05e-3
+    assert (np.abs(shown.vertices[:-3] - 0.5 * rough.vertices - place) < 0.0025).all()
+    np.testing.assert_array_equal(shown.vertices[-3:], wall.vertices)
 
 
 def test_the_added_floor_lies_below_a_level_surface_that_the_photos_show():

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import sdfsim
 from pipeline.cameras import Similarity
+from pipeline.clearing import Cleared
 from pipeline.mesh.bodies import Parts
 from pipeline.mesh.joint import PART, Doubt, HeldPart, load_held
 from pipeline.mesh.meshing import axis_ends
@@ -48,6 +50,31 @@ def test_what_makes_no_sense_is_one_line(two, tmp_path, given, said):
     run = command("reconstruct", *words, "-o", tmp_path / "out")
     assert run.exit_code in (1, EXIT_USAGE) and said in run.stderr
     assert len([line for line in run.stderr.splitlines() if line.startswith("error:")]) == 1
+
+
+def test_the_function_takes_two_states_as_the_command_does(two, tmp_path, monkeypatch):
+    """Both come to the same call; without `joint` there is one state."""
+    asked = []
+    monkeypatch.setattr(
+        "pipeline.states.reconstruct_states", lambda *given, **more: asked.append((given, more)) or ({}, "")
+    )
+    monkeypatch.setattr("pipeline.stages.reconstruct", lambda *given, **more: asked.append((given, more)) or {})
+    monkeypatch.setattr("pipeline.commands._report_stages", lambda *_: None)
+    shut, opened = two
+    sdfsim.reconstruct(shut, tmp_path / "out", joint=opened, preset="quick", drop="none", until_stage="mesh")
+    sdfsim.reconstruct(shut, tmp_path / "out", preset="quick", until_stage="mesh")
+    words = [shut, opened, "--joint", "-o", tmp_path / "out", "--preset", "quick", "--drop", "none", "--until", "mesh"]
+    assert command("reconstruct", *words).exit_code == 0
+    assert asked[0][0] == asked[2][0] == (shut, opened, tmp_path / "out") and asked[1][0] == (shut, tmp_path / "out")
+    told = [{name: value for name, value in more.items() if name != "progress" and value is not None}
+            for _, more in asked]  # fmt: skip
+    assert told[2].pop("device") == "auto" and not told[2].pop("sdf", None)
+    assert {name: told[2][name] for name in told[0]} == told[0]
+
+
+def test_a_function_that_gets_one_state_twice_says_so(two, tmp_path):
+    with pytest.raises(SdfsimError, match="is the folder of the first state as well"):
+        sdfsim.reconstruct(two[0], tmp_path / "out", joint=two[0])
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path):
@@ -150,6 +177,24 @@ def test_the_scene_starts_in_the_first_state_and_goes_to_the_second(tmp_path):
         pose = Rotation.from_quat(body.quat_xyzw)
         assert np.allclose(pose.apply(anchor) + body.position, HELD.anchor, atol=1e-5)
         assert np.allclose((pose * Rotation.from_quat(quat)).apply([1, 0, 0]), [0, 0, 1], atol=1e-6)
+
+
+def test_a_part_does_not_touch_what_it_starts_in(tmp_path):
+    """A door that photos put 3 mm into the floor cannot leave its hinge."""
+    from sdfsim.scene.collision_filter import contact_groups
+    from sdfsim.scene.load import load_scene
+
+    placement = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "given")
+    origins = {PART: np.array([0.15, 0.26, -0.003]), "object1": np.array([0.0, -1.0, 0]), "cup": np.array([0, 2.0, 0])}
+    moved = {PART: Cleared(np.zeros(3), ("floor",), 0.003, held=True)}
+    text = scene_text(placement, origins, None, scenery=False, held=HELD, holder="object1", moved=moved)
+    for name in origins:
+        text = text.replace(f"{name}: {{asset: assets/{name}}}", f"{name}: {{box: {{size: [0.1, 0.1, 0.1]}}}}")
+    scene = load_scene(tmp_path / "scene.yaml", text=text)
+    group, allowed = contact_groups(scene.bodies)
+    number = {body.name: group[k] for k, body in enumerate(scene.bodies)}
+    assert not allowed[number[PART], number["floor"]]
+    assert allowed[number[PART], number["cup"]] and allowed[number["cup"], number["floor"]]
 
 
 def test_what_is_beside_the_part_holds_it():
