@@ -28,6 +28,7 @@ from sdfsim.physics import pose
 from sdfsim.physics.options import GRAVITY, LENGTH, STEP, SUBSTEPS, Options
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.units import scene_units
+from sdfsim.physics.validity import FARTHEST, unsound
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.batch import placed, side_by_side
 from sdfsim.simulate.steppers import stepper_of
@@ -89,8 +90,9 @@ class Worlds:
     def roll(
         self, network: ImpulseNetwork | None, starts: Starts, steps: int, *, mirrored: bool = False
     ) -> list[Stepped]:
-        """What comes of these starts with a network on the solve, or with the solve alone."""
-        u, found = self.units, []
+        """What comes of these starts with a network on the solve, or with the solve alone. Bodies that a network has
+        thrown to where none can be stay at rest far away, so that errors are large, but numbers."""
+        u, found, lost = self.units, [], np.zeros(self.total, bool)
         state = placed(
             self.start, starts.position / u.length, starts.orientation, starts.velocity / u.velocity,
             starts.angular_velocity * u.time,
@@ -98,6 +100,7 @@ class Worlds:
         for _ in range(steps):
             solved, _ = self.solver.advance(state, self.carry)
             edges, rows, graph = cast("Edges", self.carry.edges), np.zeros(0, np.int64), None
+            before = state
             if len(edges.pair):
                 rows, graph = step_graph(self.bodies, state, solved, edges, self.options, self.dt)
                 graph = in_single(graph)
@@ -106,8 +109,19 @@ class Worlds:
                         made = network(graph, mirrored=mirrored)
                     solved = changed(self.bodies, solved, rows, graph, made, self.options)
             state = solved
+            lost |= unsound(state, self.dt, before)[: self.total]
+            if lost.any():
+                state = state.with_rows(gone := np.flatnonzero(lost), _far_away(gone))
             found.append(Stepped(state.position[: self.total], state.orientation[: self.total], rows, graph))
         return found
+
+
+def _far_away(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Poses and velocities at rest of bodies [K] int64, apart from each other and from all else; model units."""
+    still, count = np.zeros((len(rows), 3)), len(rows)
+    place = np.stack([np.full(count, FARTHEST / 2), 1e3 * rows, np.full(count, FARTHEST / 2)], 1)
+    turn = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+    return {"position": place, "orientation": turn, "velocity": still, "angular_velocity": still.copy()}
 
 
 def inner_steps(dt: float) -> int:

@@ -15,7 +15,7 @@ from sdfsim.learned.impulse import ImpulseNetwork
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
 from sdfsim.simulate.simulator import Simulator
-from sdfsim.training.motion_task import MotionTask
+from sdfsim.training.motion_task import LOST, MotionTask
 from sdfsim.training.presets import PRESETS
 from sdfsim.training.run import Run
 from sdfsim.training.train import train
@@ -94,6 +94,24 @@ def test_what_the_network_is_told_of_its_effect_is_what_it_has(bounces):
 
     assert slope == pytest.approx((off(0.01) - off(-0.01)) / 0.02, rel=1e-3)
     assert slope < -1e-3  # a harder push is nearer to what was recorded
+
+
+def test_a_network_that_drives_bodies_beyond_all_bounds_has_a_loss_and_slopes(bounces):
+    """It pushes the ball into the floor, faster in every step."""
+    recordings, scene = load_recordings([bounces[0]], bounces[1])
+    task = MotionTask(recordings, scene)
+    network = Run(PRESETS["alone"], task, 10, 0, torch.device("cpu")).network
+    assert isinstance(network, ImpulseNetwork)
+    with torch.no_grad():
+        for name, value in network.named_parameters():
+            if name.endswith("impulse.bias"):
+                value -= 1e6
+    hit = [int((np.diff(r.velocity[:, 0, 2]) > 0).argmax()) for r in recordings]
+    loss = task.loss(network, task.starts([(k, t) for k, t in enumerate(hit)], 20))
+    loss.backward()
+    slopes = [value.grad for value in network.parameters() if value.grad is not None]
+    assert slopes and all(bool(slope.isfinite().all()) for slope in slopes)
+    assert float(loss.detach()) == pytest.approx(LOST, rel=1e-3)  # of its place; it is not turned
 
 
 def test_the_same_seed_trains_the_same_network_and_a_stopped_training_goes_on(bounces, tmp_path):
