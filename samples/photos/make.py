@@ -6,8 +6,8 @@
 Ray casting with open3d. Every texture is made here from seeded noise and random cells and never repeats, because
 repeating textures make structure-from-motion converge to wrong cameras. Table and vase are the same in both sets.
 `room` is what one photographs: wood, glaze, tiles, a cloth and a plant in soft light, exposed a little differently from
-photo to photo; 16 of the photos look down into the vase. `patches` has texture everywhere and no gloss: a benchmark
-for the geometry alone.
+photo to photo; 20 of the photos look down into the vase, seven of them from near, on to its floor. `patches` has
+texture everywhere and no gloss: a benchmark for the geometry alone.
 World frame: metres, z up, floor at z = 0.
 """
 
@@ -28,7 +28,8 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
 MIDDLE, MOUTH = (0.02, 0.0, 0.46), (0.10, -0.04, 0.70)
 RINGS = {
     "room": (
-        (9, 3, 1.95, 0.5, MIDDLE), (11, 17, 1.95, 0.0, MIDDLE), (12, 40, 1.9, 0.1, MIDDLE), (16, 66, 1.4, 0.25, MOUTH),
+        (8, 3, 1.95, 0.5, MIDDLE), (9, 17, 1.95, 0.0, MIDDLE), (11, 40, 1.9, 0.1, MIDDLE), (13, 66, 1.4, 0.25, MOUTH),
+        (7, 82, 0.85, 0.0, MOUTH),
     ),
     "patches": (
         (12, 3, 1.95, 0.5, MIDDLE), (14, 17, 1.95, 0.0, MIDDLE), (13, 37, 1.9, 0.1, MIDDLE),
@@ -46,8 +47,9 @@ VASE_AT = (0.12, -0.05)
 BOWL_AT = (0.40, 0.16)
 PLANT_AT = (-0.36, -0.17)
 ROOM = 3.6
-# A lathe's texture: m to the radian, m from the outer side's rows to those of the inner one, m of a pixel.
-AROUND, INSIDE, LATHE_TEXEL = 0.12, 0.36, 0.0008
+# A lathe's texture: m to the radian, m from the outer side's rows to those of the inner one, m of a pixel; and how many
+# m of texture there are inside for one of height and distance from the axis together.
+AROUND, INSIDE, LATHE_TEXEL, DOWN = 0.12, 0.36, 0.0008, 0.8
 LIGHT = np.array([0.45, 0.35, 0.82]) / np.linalg.norm([0.45, 0.35, 0.82])
 SPREAD = 0.3  # of the light's directions in the room, standard deviation over their length
 DIRECTIONS = 160  # from which the room's light comes, and as many more from all around
@@ -77,7 +79,8 @@ class Part:
         vertices: [V, 3] m.
         faces: [F, 3].
         texture: [H, W, 3] float32 RGB in 0..1.
-        mapping: "box" (each side its own part of the texture), "sheet" (x and y), "lathe" (angle and height) or "uv".
+        mapping: "box" (each side its own part of the texture), "sheet" (x and y), "lathe" (angle and height),
+            "turned" (the same; inside and on what faces up, height and distance from the axis together) or "uv".
         texel: metres a texture pixel covers.
         axis: of a lathe, where it meets what it stands on, m.
         uv: [V, 2] m, places on the texture; of "uv" only.
@@ -509,7 +512,7 @@ def build_room() -> list[Part]:
         profiles, at, segments = TURNED[name]
         vertices, faces = turned_solid(*profiles, segments)
         axis = (*at, TABLE_HEIGHT)
-        parts.append(Part(vertices + axis, faces, picture, "lathe", LATHE_TEXEL, axis, gloss=gloss))
+        parts.append(Part(vertices + axis, faces, picture, "turned", LATHE_TEXEL, axis, gloss=gloss))
 
     cream = [(0.62, 0.54, 0.42), (0.80, 0.74, 0.62), (0.90, 0.87, 0.78)]
     teal = [(0.42, 0.30, 0.20), (0.14, 0.36, 0.40), (0.10, 0.30, 0.42), (0.24, 0.52, 0.56), (0.08, 0.20, 0.34)]
@@ -546,11 +549,14 @@ def sample_texture(part: Part, points: np.ndarray, normals: np.ndarray, uv: np.n
         points, normals = part.before(points), normals @ part.moved[0]
     if uv is not None:
         u, v = uv.T
-    elif part.mapping == "lathe":
+    elif part.mapping in ("lathe", "turned"):
         local = points - part.axis
         angle = np.arctan2(local[:, 1], local[:, 0])
-        inside = ((normals[:, :2] * local[:, :2]).sum(1) < 0) * INSIDE
-        u, v = (angle + np.pi) * AROUND, local[:, 2] + inside
+        inside = (normals[:, :2] * local[:, :2]).sum(1) < 0
+        u, v = (angle + np.pi) * AROUND, local[:, 2] + inside * INSIDE
+        if part.mapping == "turned":
+            inside |= normals[:, 2] > 0.5
+            v = np.where(inside, INSIDE + DOWN * (local[:, 2] + np.linalg.norm(local[:, :2], axis=1)), v)
     elif part.mapping == "sheet":
         u, v = (points[:, :2] - vertices[:, :2].min(0)).T
     else:
@@ -725,7 +731,7 @@ def _lit_mesh(part: Part, longest: float) -> tuple[np.ndarray, np.ndarray, np.nd
     """
     import trimesh
 
-    if part.mapping in ("lathe", "uv"):
+    if part.mapping in ("lathe", "turned", "uv"):
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
         normals = mesh.vertex_normals.astype(np.float32)
         return mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), normals, part.uv
