@@ -80,7 +80,7 @@ def test_where_it_happens_does_not_matter(distance):
     scene = gates.mixed()
     far = replace(scene, bodies=tuple(replace(b, position=b.position + shift) for b in scene.bodies))
     one, other = (Simulator(s, "solver").run(steps=25) for s in (scene, far))
-    assert np.abs(other.position - shift - one.position).max() <= 1e-4
+    assert np.abs(other.position - shift - one.position).max() <= 1e-6
 
 
 def test_a_run_is_the_same_again():
