@@ -12,9 +12,8 @@ MODULES = {
 }  # fmt: skip
 # From the ground up. What lies in no folder is a room of its own.
 FLOORS = (
-    ("progress", "materials", "naming", "cameras", "grids"), ("options",), ("inputs",), ("sfm",), ("stereo",),
-    ("field",), ("mesh",), ("scene_writer", "report", "measure"), ("stages",), ("states",),
-    ("commands",),
+    ("progress", "materials", "naming", "cameras", "grids", "clearing"), ("options",), ("inputs",), ("sfm",),
+    ("stereo",), ("field",), ("mesh",), ("scene_writer", "report", "measure"), ("stages",), ("states",), ("commands",),
 )  # fmt: skip
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 
