@@ -27,7 +27,7 @@ DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
 MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
-APART, DENSEST_ON_GRID = 2.0, 4000  # cells between nodes on the surface of a grid at least, and how many it has at most
+APART, DENSEST_ON_GRID = 2.0, 3000  # cells between nodes on the surface of a grid at least, and how many it has at most
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 ROUNDED = 0.1  # cells that the grid of a fit is off on an edge of its mesh that it rounds off
 ALONG_EDGE, MOST_ON_EDGES = 2.0, 4000  # cells between nodes of such an edge, and how many of them a shape has at most
@@ -140,12 +140,12 @@ def between(nodes: np.ndarray, samples: np.ndarray, spacing: float) -> np.ndarra
     """Of samples [P, 3] m of a surface those that lie between its nodes [K, 3], at least `spacing` m apart.
 
     The nodes of a network are few. What rolls from one to the next sinks in between them, until the way down the
-    distance leads there, and what lifts it out again is energy from nothing. Shapes that have half as many as a grid
-    has at most need no others.
+    distance leads there, and what lifts it out again is energy from nothing. Shapes that have as many as a grid has at
+    most need no others.
     """
     from scipy.spatial import KDTree
 
-    if len(nodes) >= 0.5 * DENSEST_ON_GRID:
+    if len(nodes) >= DENSEST_ON_GRID:
         return nodes[:0]
     while len(kept := one_per_voxel(samples, spacing)) > DENSEST_ON_GRID:
         spacing *= 1.25

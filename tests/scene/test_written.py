@@ -7,6 +7,8 @@ import pytest
 
 import sdfsim
 from sdfsim import SceneError
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh_io import wavefront
 from sdfsim.scene.keys import BodyKeys, JointKeys
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.schema import BodyTable, JointTable, ShapeTable
@@ -150,3 +152,17 @@ def test_what_does_not_fit_together_is_reported_with_the_lines_that_print_shows(
     assert len(told) == 3
     for problem, key in zip(told, ("shape: c", "shape: d", "collides_with"), strict=True):
         assert problem.startswith("<scene>:") and key in lines[int(problem.split(":")[1]) - 1]
+
+
+def test_bodies_that_bring_the_same_mesh_have_one_shape(tmp_path):
+    """What is said of it otherwise makes another; what the bodies are stays their own."""
+    file = tmp_path / "tile.obj"
+    file.write_text(wavefront([primitives.box((0.1, 0.1, 0.02))]))
+    scene = sdfsim.Scene()
+    for k in range(5):
+        scene.add(f"tile{k}", mesh=file, sdf="mesh", position=(0.2 * k, 0, 0), scale=1 + k, mass=1)
+    scene.add("small", mesh=file, sdf="mesh", units="cm", mass=1)
+    loaded = scene.load()
+    assert [body.shape for body in loaded.bodies] == [0, 0, 0, 0, 0, 1]
+    assert [np.ptp(shape.sdf.bounds, axis=0)[0] for shape in loaded.shapes] == pytest.approx([0.1, 0.001])
+    assert [body.scale for body in loaded.bodies[:5]] == [1, 2, 3, 4, 5]
