@@ -405,7 +405,9 @@ class BodyTable(Turned):
     motion: Motion | None = key(
         "kinematic bodies follow their `path`, whatever they meet; dynamic without it, planes static", None
     )
-    path: Annotated[list[Waypoint], Field(min_length=1)] | None = key("poses of a kinematic body", None)
+    path: Annotated[list[Waypoint], Field(min_length=1)] | None = key(
+        "poses of a kinematic body, in place of `position` and its turn", None
+    )
     scale: Number = key("factor on the size of the shape", 1.0, gt=0)
     position: Vector = key("of the shape's own origin", _ORIGIN, "m")
     velocity: Vector = key("of the centre of mass", _ORIGIN, "m/s")
@@ -413,8 +415,10 @@ class BodyTable(Turned):
     mass: Number | None = key("without it the density counts", None, "kg", gt=0)
     density: Number = key("not together with mass", 1000.0, "kg/m^3", gt=0)
     inertia_factor: Number = key("on the inertia that this mass has, spread evenly in the shape", 1.0, gt=0, le=100)
-    friction: Number = key("Coulomb coefficient; two bodies' product counts", 0.5, ge=0, le=1000)
-    restitution: Number = key("two bodies' product counts", 0.5, ge=0, le=1)
+    friction: Number = key(
+        "Coulomb coefficient; two bodies' product counts, 0.25 of two that say nothing", 0.5, ge=0, le=1000
+    )
+    restitution: Number = key("two bodies' product counts, 0.25 of two that say nothing", 0.5, ge=0, le=1)
     collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(
         "`all`, or a list of names: two bodies touch where each lists the other", None
     )
