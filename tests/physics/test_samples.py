@@ -28,7 +28,7 @@ def test_a_sample_keeps_the_laws(sample, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("sample", "seconds"), [("knocked_vase", 2.5), ("scan", 4.0)])
 def test_what_rolls_on_a_grid_gains_little_from_any_start(sample, seconds):
-    """Of 12 starts one may gain more than the law allows, and none much more: which does is rounding's choice."""
+    """None of 12 starts gains more than the law allows."""
     scene, draw, gained = load_scene(SAMPLES[0].parent / f"{sample}.yaml"), np.random.default_rng(0), []
     for k in range(12):
         bodies = [replace(b, velocity=b.velocity + 0.05 * draw.normal(size=3)) if k and b.motion == "dynamic" else b
@@ -36,7 +36,7 @@ def test_what_rolls_on_a_grid_gains_little_from_any_start(sample, seconds):
         start = replace(scene, bodies=tuple(bodies))
         energy = energy_account(start, Simulator(start).run(seconds=seconds))
         gained.append(max(energy.climb, energy.worst))
-    assert np.sort(gained)[-2] <= 0.01 and max(gained) <= 0.012, np.round(np.sort(gained), 4)
+    assert max(gained) <= 0.01, np.round(np.sort(gained), 4)
 
 
 def turned(profile: list[tuple[float, float]], around: int, size: float) -> Mesh:
