@@ -224,9 +224,12 @@ def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: in
         times.append(times[-1] + inner * count)  # as single steps add up, to the last bit
     if tracks is None:
         return NO_SCRIPT, times[-1]
-    speeds = [[np.concatenate(tracks.velocity(t + inner * k, inner), -1) for k in range(count)] for t in times[:-1]]
-    poses = [np.concatenate(tracks.at(t), -1) for t in times[1:]]
-    return Script(tracks.body, np.stack(poses), np.array(speeds)), times[-1]
+    instants = [t + inner * k for t in times[:-1] for k in range(count)]
+    place, turn = (np.stack(part) for part in zip(*map(tracks.at, [*instants, times[-1]]), strict=True))
+    spin = pose.to_rotvec(pose.multiply(turn[1:], pose.conjugate(turn[:-1])))
+    speeds = np.concatenate([np.diff(place, axis=0), spin], -1) / inner
+    ends = np.concatenate([place, turn], -1)[count::count]
+    return Script(tracks.body, ends, speeds.reshape(steps, count, len(tracks.body), 6)), times[-1]
 
 
 def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
