@@ -4,20 +4,20 @@
 (up: to the body node). A surface node within the contact radius of another body joins that body's node both ways. No
 surface node is ever joined to another.
 
-**FIGNet** (Allen et al., 2023, arXiv 2212.03574) and **FIGNet*** (Lopez-Guevara et al., 2024, arXiv 2401.11985): nodes are
-the vertices of meshes and one node a body. Edges join neighbours on a mesh, vertices and their body's node, and the
+**FIGNet** (Allen et al., 2023, arXiv 2212.03574) and **FIGNet*** (Lopez-Guevara et al., 2024, arXiv 2401.11985): nodes
+are the vertices of meshes and one node a body. Edges join neighbours on a mesh, vertices and their body's node, and the
 faces of two bodies that are near each other. A face edge knows the closest points of the two faces; its message has a
 part for each of the receiving face's three vertices, in the order of their distance to its closest point. FIGNet* is
 FIGNet without mesh edges.
 
-**MeshGraphNets** (Pfaff et al., 2021, arXiv 2010.03409) for rigid bodies, as SDF-Sim's paper compares it: mesh edges join
-neighbours, world edges join vertices of different bodies within a radius, a small one in *mgn*, a large one in
+**MeshGraphNets** (Pfaff et al., 2021, arXiv 2010.03409) for rigid bodies, as SDF-Sim's paper compares it: mesh edges
+join neighbours, world edges join vertices of different bodies within a radius, a small one in *mgn*, a large one in
 *mgn-large*. There are no body nodes; shape matching makes motions rigid.
 
-**DPI** (Li et al., 2019, arXiv 1810.01566) for rigid bodies: particles are joined to their body's root both ways, and to
-particles of different bodies within a radius. Here they lie on the surface (the paper's fill the body), and all kinds of
-edges pass messages at once in every step, with weights of that step (there one after the other, in every round with the
-same).
+**DPI** (Li et al., 2019, arXiv 1810.01566) for rigid bodies: particles are joined to their body's root both ways, and
+to particles of different bodies within a radius. Here they lie on the surface (the paper's fill the body), and all
+kinds of edges pass messages at once in every step, with weights of that step (there one after the other, in every round
+with the same).
 
 `families.py` lists what else is not as in the networks' own papers.
 """
