@@ -57,7 +57,6 @@ def with_far(count: int) -> Scene:
 
 
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
-    """Milliseconds a step of `Simulator.step`."""
     simulator = Simulator(scene, "solver")
     options = replace(simulator.options, sleep=False)
     simulator.options = replace(options, dt=dt / simulator.units.time) if dt else options

@@ -154,7 +154,6 @@ def is_installed(name: str) -> bool:
 
 
 def held_by(results: Results, row: str, check: str) -> list[str]:
-    """The other engines that hold a check."""
     return [n for n in ENGINES if n != OURS and check in results.get((row, n), {}).get("held", ())]
 
 
@@ -204,7 +203,6 @@ def table(results: Results) -> str:
 
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
-    """Every installed engine's results of rows."""
     content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday)]
     sources = inspect.getsource(engines) + inspect.getsource(sys.modules[drake.__module__])
     how = {name: sources if name != OURS else "" for name in ENGINES}
@@ -218,7 +216,6 @@ def compared(rows: list[str], at: Setting, out: Path) -> Results:
 
 
 def main(*, out: Path, full: bool = False) -> None:
-    """Everyday scenes with every engine that is installed."""
     results = compared(list(ROWS), Setting(full=full), out)
     for name in ENGINES:
         took = sum(found.get("s", 0.0) for (_, other), found in results.items() if other == name)

@@ -39,7 +39,6 @@ RATE, HOPNET = 240, {50: (0.047, None), 75: (0.101, None), 100: (0.176, 17.9)}
 
 
 def main(data: Path, *, contacts: bool = False) -> None:
-    """Write the sections of errors, or the one of contacts."""
     if contacts:
         differing(data)
         return
@@ -153,7 +152,6 @@ def contact_kinds(recorded: Trajectory, ours: Trajectory, shapes: dict[str, Shap
 
 
 def cell(found: dict) -> str:
-    """Metres with their interval, and degrees."""
     metres, low, high = map(number, (found["translation_rmse"], *found["translation_rmse_95"]))
     return f"{metres} m [{low}, {high}], {number(found['rotation_error'])} degrees"
 

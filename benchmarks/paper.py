@@ -154,7 +154,6 @@ def unsigned(data: Path, home: Path) -> Path:
 
 
 def graphs(data: Path, *, out: Path) -> None:
-    """Write graphs.md."""
     jobs = []
     for name in NAMES:
         content = [PRESETS[name], STEPS_SEEN, STEPS_TIMED, PUBLISHED_NODES, read_info(data)]
@@ -170,7 +169,6 @@ def graphs(data: Path, *, out: Path) -> None:
 
 
 def growth(*, out: Path) -> None:
-    """Write growth.md and growth.png."""
     jobs = []
     for count in BOWLS:
         home = out / "scenes" / str(count)
@@ -254,7 +252,6 @@ def refitted(shape: Shape, width: int, folder: Path) -> Shape:
 
 
 def sdf(data: Path, *, out: Path) -> None:
-    """Write sdf.md."""
     ways = {"convex pieces, exactly": None, "64 wide": 64, "32 wide": 32, "128 wide": 128}
     jobs = [
         Job("rollouts", name, [width, read_info(data)], rolled_out, (data, width, out / "shapes" / str(width)))

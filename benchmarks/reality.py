@@ -188,7 +188,6 @@ EVEN = MASS * SIDE**2 / 6.0  # kg m2, a solid cube's inertia
 
 
 def recordings_of(tosses: Sequence[Toss], scene: Scene) -> list[Recording]:
-    """As `sdfsim identify` has them."""
     poses = [np.concatenate([toss.position, toss.quat_xyzw], 1)[:, None] for toss in tosses]
     return with_velocities([cleaned(str(k), tosses[k].dt, one, scene) for k, one in enumerate(poses)], scene)
 
@@ -240,7 +239,6 @@ def drake(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[
 
 
 def rolled(network: ImpulseNetwork, task: MotionTask, starts: Sequence[Start]) -> Motion:
-    """What a network on the solve makes of these starts."""
     worlds = task.worlds(len(starts))
     position, turn, speed, spin = (
         np.array([getattr(start, name) for start in starts])
@@ -596,7 +594,6 @@ def network_table(found: Results) -> list[tuple[str, ...]]:
 
 
 def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> None:
-    """Errors against time, and a toss as seen and as predicted."""
     time, way, turn = (dt * np.arange(1, FRAMES + 1)).tolist(), [], []
     for name, (_, _, found) in moved.items():
         off, angle = apart(found, truth)

@@ -149,7 +149,6 @@ def scan(folder: Path) -> Scene:
 
 
 def written(folder: Path, name: str, count: int | None = None) -> Scene:
-    """One of the large scenes."""
     return load_scene(write_scene(name, folder / f"{name}{count or ''}", count))
 
 
@@ -284,7 +283,6 @@ def lost(case: str, run: Ran, size: float) -> int:
 
 
 def compared(cases: list[str], data: Path | None, out: Path) -> Results:
-    """Every engine's results of some cases."""
     for case in set(cases) & set(LARGE):
         CASES[case](out / "scenes")  # settles it here: a process that is measured has no memory of that
     content = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION]
@@ -297,7 +295,6 @@ def compared(cases: list[str], data: Path | None, out: Path) -> Results:
 
 
 def why_not(result: dict[str, Any]) -> str:
-    """Why a result has no figures at the usual inner step."""
     return result.get("failed") or "; ".join(result["broken"].values())
 
 

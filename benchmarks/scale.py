@@ -145,7 +145,6 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
 
 
 def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None:
-    """Write the section."""
     results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=progress)
     rows = [("case", "with", *COLUMNS.values(), "")]
     rows += [(*key, *cells(found, COLUMNS)) for key, found in results.items()]
@@ -178,7 +177,6 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
 
 
 def large(*, out: Path) -> None:
-    """Write the section and a movie each."""
     jobs = [Job("to the end", name, [name], to_the_end, (name, out)) for name in HEAPS]
     results = measure(jobs, out / "large", where="fresh", on_progress=progress)
     titles = {"bodies": "bodies", "nodes": "nodes", "steps": "steps", "s": "s from command to recording", "mib": "MiB",

@@ -46,7 +46,6 @@ DPI = Layout(NODES, STAR | {"contact": EdgeKind("node", "node", WORLD)})
 
 
 def sdf_sim_graph(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> MultiGraph:
-    """The published graph."""
     features = _contact_features(bodies, state, contacts).float()
     node, body = contacts.node[:, None], contacts.body[:, None]
     edges = {"contact_up": EdgeSet(features, node, body), "contact_down": EdgeSet(features, body, node)}
@@ -66,7 +65,6 @@ def _contact_features(bodies: BodyTensors, state: StateTensors, contacts: Contac
 
 
 def fignet_star_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
-    """Of FIGNet*."""
     p = pairs
     forth = _face_features(p.way, p.from_first, p.from_second, p.normal_first, p.normal_second)
     back = _face_features(-p.way, p.from_second, p.from_first, p.normal_second, p.normal_first)
@@ -75,7 +73,6 @@ def fignet_star_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) ->
 
 
 def fignet_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
-    """Of FIGNet."""
     made = fignet_star_graph(bodies, state, pairs)
     return MultiGraph(made.nodes, made.edges | {"mesh": mesh_edges(bodies, state)})
 
@@ -87,7 +84,6 @@ def _face_features(way: Tensor, sending: Tensor, receiving: Tensor, normal: Tens
 
 
 def mgn_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
-    """Of MeshGraphNets."""
     nodes = {"node": motion_features(bodies, state)["node"]}
     return MultiGraph(nodes, {"mesh": mesh_edges(bodies, state), "world": world_edges(pairs)})
 
@@ -100,5 +96,4 @@ def world_edges(pairs: Pairs) -> EdgeSet:
 
 
 def dpi_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGraph:
-    """Of DPI."""
     return MultiGraph(motion_features(bodies, state), star(bodies, state) | {"contact": world_edges(pairs)})

@@ -131,7 +131,6 @@ def inner_steps(dt: float) -> int:
 
 
 def joined(graphs: Sequence[ContactGraph]) -> ContactGraph:
-    """Graphs side by side as one."""
     whole: dict[str, Any] = {"dt": graphs[0].dt, "pairs": sum(g.pairs for g in graphs)}
     bodies = np.cumsum([0, *(len(g.inverse_mass) for g in graphs)]).tolist()
     pairs = np.cumsum([0, *(g.pairs for g in graphs)]).tolist()
@@ -179,7 +178,6 @@ class MotionTask:
         return begin, weight / weight.sum()
 
     def digest(self) -> str:
-        """Changes with the data."""
         told = hashlib.sha256()
         for r in self.recordings:
             for array in (*r.goal, r.position, r.velocity, r.angular_velocity):
