@@ -261,14 +261,3 @@ def test_presets_and_recipes_in_documents_exist():
                 assert found[2] in known[found[1]], f"{file.name}: {line}"
                 named.add((found[1], found[2]))
     assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick"), ("train", "small")} <= named
-
-
-def test_a_thousandfold_weight_stands_as_long_as_the_table_says():
-    """Three seconds in the table of hard cases, and in the sentence about it; the README points there."""
-    text = page("docs/stability.md")
-    depth, fallen = text[text.index("| 1000 kg on 1 kg") :].splitlines()[:2]
-    assert "| fallen |" in fallen and fallen.split("|")[4].strip() == "0.0 bodies"
-    sunk = round(numbers(depth.split("|")[4])[0])
-    told = " ".join(text.split())
-    assert f"it stands for 3 s, sunk by {sunk} % of its size, but it slides off after" in told
-    assert "creeps, and slides off after seconds" in page("README.md")
