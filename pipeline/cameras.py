@@ -75,13 +75,13 @@ class Similarity:
     translation: np.ndarray  # [3]
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """Points [P, 3], moved."""
+        """Points [P, 3] or a point [3], moved."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def after(self, first: "Similarity") -> "Similarity":
         """What `first` and then this one do together."""
         rotation = self.rotation @ first.rotation
-        return Similarity(self.scale * first.scale, rotation, self.points(first.translation[None])[0])
+        return Similarity(self.scale * first.scale, rotation, self.points(first.translation))
 
     def inverse(self) -> "Similarity":
         """The way back."""

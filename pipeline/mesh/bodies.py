@@ -276,8 +276,7 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     label = standing[wide].astype(np.int8)
     inner = tuple(slice(part.start - low, part.stop - low) for low, part in zip(start, box, strict=True))
     label[inner][mine] = 2
-    away, nearest = np.empty(label.shape), np.empty((3, *label.shape), np.int32)
-    ndimage.distance_transform_edt(label == 0, return_indices=True, distances=away, indices=nearest)
+    away, nearest = ndimage.distance_transform_edt(label == 0, return_indices=True)  # type: ignore[misc]
     own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
     corner = volume.low + volume.cell * np.array(start)
     body = FoundBody("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))
