@@ -112,7 +112,7 @@ def find_joint(
     part, share = _moved(one, on[1], clear[1], near, rng)
     there, their_share = _moved(other, on[0], clear[0], near, rng)
     if empty is None and share > MOST:
-        raise SdfsimError("all moves: the two states have nothing in common", "bring both into one frame first")
+        raise SdfsimError("everything moves: the two states have nothing in common", "bring both into one frame first")
     # What photos see through tells one way alone where the part is hidden in the other state, as a drawer is.
     for some, which in ((share, "first"), (their_share, "second")):
         if some < LEAST and (empty is None or max(share, their_share) < LEAST):

@@ -17,7 +17,7 @@ from pipeline.cameras import PosedPhotos, View, frame_of
 from pipeline.inputs.images import reduced
 from pipeline.inputs.photos import open_photo
 from pipeline.mesh.bodies import LevelPlane, find_level_planes
-from pipeline.mesh.extraction import MIN_SEEN, RIM, FieldSurface, Volume
+from pipeline.mesh.extraction import MIN_SEEN, RIM, FieldSurface, Volume, marked
 from pipeline.mesh.visibility import bilinear, framed
 from sdfsim.geometry.bvh import Caster
 
@@ -54,11 +54,8 @@ class Completed:
 
     def covers(self, points: np.ndarray) -> np.ndarray:
         """Whether points [P, 3] lie in the columns of the squares [P]."""
-        index = np.floor((points @ frame_of(self.level.normal)[:2].T - self.corner) / self.step).astype(int)
-        inside = np.flatnonzero(((index >= 0) & (index < self.squares.shape)).all(1))
-        result = np.zeros(len(points), bool)
-        result[inside] = self.squares[tuple(index[inside].T)]
-        return result
+        flat = points @ frame_of(self.level.normal)[:2].T
+        return marked(self.squares, np.floor((flat - self.corner) / self.step).astype(int))
 
     def on(self, points: np.ndarray, width: float) -> np.ndarray:
         """Whether points [P, 3] are within `width` of what was completed [P]."""

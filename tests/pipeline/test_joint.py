@@ -94,7 +94,7 @@ def test_what_does_not_move_or_has_nothing_in_common_is_told() -> None:
     one = whole([*CABINET, *DOOR])
     with pytest.raises(SdfsimError, match="nothing moves"):
         find_joint(one, one)
-    with pytest.raises(SdfsimError, match="all moves"):
+    with pytest.raises(SdfsimError, match="everything moves"):
         find_joint(one, Mesh(one.vertices + np.array([3.0, 0, 0]), one.faces))
 
 
