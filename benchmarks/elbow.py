@@ -47,6 +47,7 @@ from sdfsim.base.files import read_arrays, write_json, write_text
 from sdfsim.data.public_tosses import ARM, ELBOW, LINK, PIVOT, Links, links_of, lowest, upright
 from sdfsim.evaluation.harness import markdown, one_thread
 from sdfsim.evaluation.metrics import interval
+from sdfsim.physics.motion import MOTION
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 
@@ -108,7 +109,7 @@ def begun(tosses: Sequence[Links], dt: float, scene: Scene) -> list[tuple[Links,
 
 
 def _from(r: Recording, first: int) -> Recording:
-    names = ("position", "orientation", "velocity", "angular_velocity", "known", "flying", "seen")
+    names = (*MOTION, "known", "flying", "seen")
     return replace(r, goal=(r.goal[0][first:], r.goal[1][first:]), **{n: getattr(r, n)[first:] for n in names})
 
 

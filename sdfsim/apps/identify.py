@@ -28,6 +28,7 @@ from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, largest_extent
 from sdfsim.physics.joint_columns import DAMPING, DRAG
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver.world import FIRST
 from sdfsim.physics.units import scene_units
@@ -471,8 +472,7 @@ class _Part:
         copies = Copies(problem.scene, count)
         self.bodies, self.solver = copies.bodies, copies.solver
         first = [
-            np.concatenate([getattr(r, name)[t] for r, (_, t) in zip(some, begin, strict=True)])
-            for name in ("position", "orientation", "velocity", "angular_velocity")
+            np.concatenate([getattr(r, name)[t] for r, (_, t) in zip(some, begin, strict=True)]) for name in MOTION
         ]
         self.start = copies.begun(*first)
         self.options = Options(np.asarray(problem.scene.gravity) / u.acceleration, dt, inner_of_frame(dt))

@@ -17,6 +17,7 @@ from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh, face_normals, sample_surface, vertex_normals
 from sdfsim.geometry.primitives import plane
 from sdfsim.physics import pose
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.scene import Joint, Scene
@@ -220,8 +221,7 @@ class Playback:
         ahead = self._before
         parts = [chunk] if ahead is None else [ahead, chunk]
         time, place, turn, speed, spin = (
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("time", "position", "orientation", "velocity", "angular_velocity")
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("time", *MOTION)
         )
         self._before = chunk.frames(len(chunk.time) - 1, len(chunk.time))
         place, turn, speed, spin = (of[:, rows] for of in (place, turn, speed, spin))

@@ -23,6 +23,7 @@ from sdfsim.learned.contact_graph import ContactGraph, edge_frames, in_single
 from sdfsim.learned.impulse import ImpulseNetwork
 from sdfsim.learned.inference import changed, step_graph
 from sdfsim.physics import pose
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import GRAVITY, LENGTH, Options
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.units import scene_units
@@ -187,10 +188,7 @@ class MotionTask:
     def starts(self, picked: Sequence[tuple[int, int]], steps: int, rng: np.random.Generator | None = None) -> Starts:
         """Windows that begin in these recordings at these frames, disturbed as a tracker does where `rng` is given."""
         some = [(self.recordings[k], t) for k, t in picked]
-        position, turn, speed, spin = (
-            np.concatenate([getattr(r, name)[t] for r, t in some])
-            for name in ("position", "orientation", "velocity", "angular_velocity")
-        )
+        position, turn, speed, spin = (np.concatenate([getattr(r, name)[t] for r, t in some]) for name in MOTION)
         many = some[0][0].seen.shape[1]
         goal = np.full((steps, len(some), many, 7), np.nan)
         for w, (r, t) in enumerate(some):
