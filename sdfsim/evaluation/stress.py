@@ -44,22 +44,16 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Study:
-    """All results of the hard cases.
-
-    Attributes:
-        models: their names.
-        engines: their names; the teacher where PyBullet is installed.
-        results: (case, who) -> figures (name -> a value a repetition); lines of broke, outside and laws (which a motion
-            of ours breaks, by instruments that do not use the solve); recording (a path in the folder, or None). There
-            is no entry where a model or engine does not take part in a case.
-        quick: whether it is the short form.
-    """
+    """All results of the hard cases."""
 
     cases: list[Case]
     models: list[str]
-    engines: list[str]
+    engines: list[str]  # the teacher where PyBullet is installed
+    # (case, who) -> figures (name -> a value a repetition); lines of broke, outside and laws (which a motion of ours
+    # breaks, by instruments that do not use the solve); recording (a path in the folder, or None). There is no entry
+    # where a model or engine does not take part in a case.
     results: Results
-    quick: bool
+    quick: bool  # whether it is the short form
 
     @property
     def who(self) -> list[str]:
