@@ -7,7 +7,6 @@ through what its changes lead to, free motion and contacts that hold. What the s
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor
 
 from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import digest
 from sdfsim.data.dataset import ranges_of
 from sdfsim.learned.contact_graph import ContactGraph, edge_frames, in_single
 from sdfsim.learned.impulse import ImpulseNetwork
@@ -158,13 +158,9 @@ class MotionTask:
         return begin, weight / weight.sum()
 
     def digest(self) -> str:
-        told = hashlib.sha256()
-        for r in self.recordings:
-            for array in (*r.goal, r.position, r.velocity, r.angular_velocity):
-                told.update(np.ascontiguousarray(array).tobytes())
-        for b in self.scene.bodies:
-            told.update(repr((b.name, b.scale, b.mass, b.friction, b.restitution, *b.position, *b.quat_xyzw)).encode())
-        return told.hexdigest()[:16]
+        told = [(r.goal, r.position, r.velocity, r.angular_velocity) for r in self.recordings]
+        of = ("name", "scale", "mass", "friction", "restitution", "position", "quat_xyzw")
+        return digest(told, [[getattr(b, name) for name in of] for b in self.scene.bodies])[:16]
 
     def ranges(self) -> dict[str, list[float]]:
         """What the recordings hold, in the solver's units; see `ranges_of`."""
