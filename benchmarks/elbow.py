@@ -7,8 +7,6 @@ that `sdfsim identify` finds on 60 tosses; other engines' are found on the same 
 `benchmarks/reality.py` does for the cube. All are judged on 100 others, over the first 75 frames, from the same starts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -8,8 +8,6 @@ middle of their bounds, until 60 tosses go as recorded; over so many frames of t
 100 other tosses of that benchmark, over its 75 frames, from the same starts.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import time

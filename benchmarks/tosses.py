@@ -1,8 +1,6 @@
 """What tosses of a cube and of an elbow share: how they are split and compared, and how ours, MuJoCo and PyBullet throw
 a box, or two on a hinge."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Recorded motions of a scene as trackers and runs give them: read, cleaned of what trackers do, and the velocities
 that fits through smooth stretches tell."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Recordings of scenes with joints: poses and velocities that these allow, near those that were seen."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast

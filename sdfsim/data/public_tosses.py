@@ -5,8 +5,6 @@ Both were tossed onto a table and tracked at 148 Hz by the DAIR Lab of the Unive
 `contactnets-elbow`, two printed links on a hinge, with that of dair_pll (Bianchini, Halm and Posa 2023).
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 A network gives every surface node an acceleration; shape matching turns those of a body into its next pose.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What training a network on surface nodes means: recorded steps of whole scenes, and a loss on node accelerations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
