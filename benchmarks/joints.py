@@ -16,7 +16,8 @@ import numpy as np
 from benchmarks.results import ROOT
 from sdfsim import Scene, Simulator, load_scene
 from sdfsim.apps.export import export
-from sdfsim.evaluation.engines import engine_module, timed
+from sdfsim.base.lazy import optional
+from sdfsim.evaluation.engines import timed
 from sdfsim.evaluation.harness import markdown, one_thread
 
 ROWS = {"hinge": 5, "slider": 5, "ball": 3, "fixed": 6, "distance": 1}
@@ -35,7 +36,7 @@ def chain(folder: Path, count: int = 100) -> Path:
 
 def costs(file: Path, folder: Path) -> tuple[float, float, float]:
     """Milliseconds of the processor a simulated second of ours and of MuJoCo's, and the inner step in ms."""
-    engine, scene = engine_module("mujoco", "MuJoCo", "bench"), load_scene(file)
+    engine, scene = optional("mujoco", "MuJoCo", "bench"), load_scene(file)
     simulator = Simulator(scene)
     inner = simulator.dt / simulator.options.substeps
     export(file, folder / "scene.xml")

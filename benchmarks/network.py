@@ -19,9 +19,9 @@ from benchmarks.results import progress
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of, read_info
+from sdfsim.evaluation.engines import timed_rollout
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
-from sdfsim.evaluation.runs import timed_rollout
 from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.impulse import Velocities
 from sdfsim.learned.model import SOLVER, load_model
