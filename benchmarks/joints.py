@@ -1,6 +1,6 @@
 """How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs.
 
-    python benchmarks/joints.py
+    python -m benchmarks joints
 
 Rows are what joints hold: three for a ball, five for a hinge. MuJoCo gets the scenes as `export` writes them: it works
 in the coordinates that joints leave, at the inner step of ours, with its implicit integrator and its Newton solver.
@@ -8,15 +8,12 @@ Both run in turn, and times are medians of the processor's, of one thread.
 """
 
 import math
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import ROOT, script
+from benchmarks.results import ROOT
 from sdfsim import Scene, Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.evaluation.engines import engine_module, timed
@@ -70,7 +67,3 @@ def main() -> None:
             counts = (str(len(joints)), str(held), f"{inner:.2f} ms")
             rows.append((name, *counts, *(f"{took:.0f}" for took in taken), *(f"{us:.2f}" for us in each)))
     print(markdown(rows))
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

@@ -48,7 +48,6 @@ def script(doc: str | None, *functions: Callable[..., None]) -> None:
 
 
 def progress(fraction: float, message: str) -> None:
-    """Progress, a line each."""
     print(f"{fraction:6.1%}  {message}", flush=True)
 
 
