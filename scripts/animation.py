@@ -1,6 +1,7 @@
 """Makes the moving picture of the README: photos of a reconstruction on the left, a run of its scene on the right.
 
-python scripts/animation.py runs/demo/scene runs/demo/rollout -o docs/images/photos-to-motion.webp
+python scripts/animation.py runs/demo/scene runs/demo/rollout -o docs/images/photos-to-motion.webp --until 1.3 \\
+    --camera -1.9 -1.9 1.4 --look-at -0.6 0.35 0.3
 """
 
 import argparse

@@ -14,13 +14,14 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.version import __version__
 from sdfsim.learned.model import model_names
 
+# Whose versions are told; all that are needed are asked for.
 NEEDED = ("torch", "numpy", "scipy", "numba", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk")
 # Packages of extras: the extra, and what is done with it.
 EXTRAS = {
     "usd-core": ("export", "export of .usd"),
     "coacd": ("export", "convex pieces, which .xml and .urdf need of shapes without any"),
     "pybullet": ("data", "data sets of the teacher, and runs beside it"),
-    "mujoco": ("bench", "comparisons with MuJoCo"),
+    "mujoco": ("mjcf", "import of MJCF, and comparisons with MuJoCo"),
     "matplotlib": ("bench", "plots of tradeoff and stress, the picture of identify"),
     "imagecodecs": ("record3d", "depth of Record3D"),
     "OpenEXR": ("record3d", "depth of Record3D, in its other form"),
@@ -38,7 +39,7 @@ def about() -> dict[str, Any]:
     """Versions, devices, models, and in `missing` one line for each thing that is not here."""
     versions = {"sdfsim": __version__, "python": platform.python_version(), "system": platform.platform(terse=True)}
     versions |= {name: _version(name) or "missing" for name in (*NEEDED, *EXTRAS)}
-    missing = [f"{name}: pip install {name}" for name in NEEDED if versions[name] == "missing"]
+    missing = [f"{name}: pip install {name}" for name in _needed() if _version(name) is None]
     devices, threads = ["cpu"], None
     for module in ("torch", "open3d"):
         try:
@@ -73,6 +74,15 @@ def about_lines(report: dict[str, Any]) -> list[str]:
     lines = [f"{name} {version}" for name, version in report["versions"].items() if version != "missing"]
     lines += [f"devices: {', '.join(report['devices'])}", f"models: {', '.join(report['models'])}"]
     return [*lines, *(f"not here: {line}" for line in report["missing"])]
+
+
+def _needed() -> list[str]:
+    """The packages that the project asks for, extras aside."""
+    try:
+        asked = metadata.requires("sdfsim") or []
+    except metadata.PackageNotFoundError:  # a checkout that is not installed
+        return list(NEEDED)
+    return [re.split(r"[^\w.-]", one)[0] for one in asked if "extra ==" not in one]
 
 
 def _version(package: str) -> str | None:

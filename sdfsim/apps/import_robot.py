@@ -38,7 +38,7 @@ def import_robot(
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise SdfsimError(f"{out}: a scene ends in .yaml", "give -o scene.yaml")
     if not source.is_file():
-        raise SdfsimError(f"{source}: no such file")
+        raise SdfsimError(f"{source}: no such file", "give a .urdf, or a .xml or .mjcf of MuJoCo")
     if kind == ".urdf":
         if key is not None:
             raise SdfsimError(f"{source}: a URDF has no keyframes", "leave out --key")

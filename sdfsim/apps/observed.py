@@ -14,7 +14,7 @@ from sdfsim.apps.beside import Beside
 from sdfsim.apps.observed_joints import Swing, flying_trees, held_together, jointed, swung, tree_of
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import read_arrays, visible
+from sdfsim.base.files import not_read, read_arrays, visible
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import from_scene, largest_extent
@@ -160,7 +160,9 @@ def _csv(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
                         raise SdfsimError(f"{where}body: {row['body']!r} has two poses at time {numbers[0]:g}")
                     rows[numbers[0], row["body"]] = numbers[1:]
     except (OSError, csv.Error, UnicodeDecodeError) as error:
-        raise SdfsimError(f"{path}: not a CSV of poses ({error})") from error
+        raise SdfsimError(
+            f"{path}: {not_read(error, 'a CSV of poses')}", "give poses as .csv or .npz, or a run folder"
+        ) from error
     if missing := set(moving) - {name for _, name in rows}:
         raise SdfsimError(f"{path}: body: no pose of {min(missing)!r}, which the scene has")
     times = np.unique([time for time, _ in rows])

@@ -90,7 +90,15 @@ def read_json(path: Path, hint: str = "") -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise SdfsimError(f"{path}: cannot be read: {error}", hint) from error
+        raise SdfsimError(f"{path}: {not_read(error)}", hint) from error
+
+
+def not_read(error: Exception, what: str = "") -> str:
+    """Why a file cannot be read (as `what`), without its name, which the system's own words repeat."""
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    told = error.strerror if isinstance(error, OSError) and error.strerror else error
+    return f"cannot be read{what and ' as '}{what}: {told}"
 
 
 def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True) -> None:
@@ -110,7 +118,7 @@ def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
     except Exception as error:  # readers of damaged files raise errors of many types
-        raise SdfsimError(f"{path}: cannot be read as {what}: {error}", hint) from error
+        raise SdfsimError(f"{path}: {not_read(error, what)}", hint) from error
 
 
 def cached_arrays(path: Path, what: str, make: Callable[[], dict[str, Any]]) -> dict[str, np.ndarray]:

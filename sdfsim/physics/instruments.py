@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sdfsim.base.parallel import Progress, silent
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.rollout import Rollout
@@ -97,16 +98,18 @@ class Verdict:
 
 
 def judged(
-    scene: Scene | SceneBuilder | Path | str, rollout: Rollout, *, seconds: float = np.inf, every: int = 1
-) -> Verdict:
+    scene: Scene | SceneBuilder | Path | str, rollout: Rollout, *, seconds: float = np.inf, every: int = 1,
+    on_progress: Progress = silent,
+) -> Verdict:  # fmt: skip
     """What a motion of a scene breaks of the laws that hold of all rigid bodies.
 
     Surfaces are measured in every so many frames; where they would take longer than `seconds`, in fewer, spread evenly,
-    the last always among them. Scenes that are not loaded yet are, as `Simulator` loads them.
+    the last always among them. `on_progress` is called with the share of these frames that are measured. Scenes that
+    are not loaded yet are, as `Simulator` loads them.
     """
     scene = loaded(scene)
     energy = energy_account(scene, rollout)
-    overlap, floating, frames = _surfaces(scene, rollout, seconds, every)
+    overlap, floating, frames = _surfaces(scene, rollout, seconds, every, on_progress)
     broken = []
     loose = _loosest(scene, rollout)
     if loose is not None and loose.part > LOOSE:
@@ -323,7 +326,9 @@ class _Course:
     pushed: np.ndarray  # [T+1, N] bool: whether something else than gravity acted in the step that led here
 
 
-def _surfaces(scene: Scene, rollout: Rollout, seconds: float, every: int) -> tuple[Near | None, Near | None, int]:
+def _surfaces(
+    scene: Scene, rollout: Rollout, seconds: float, every: int, on_progress: Progress
+) -> tuple[Near | None, Near | None, int]:
     started = time.perf_counter()
     solids = [solid_of(shape) for shape in scene.shapes]
     dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
@@ -341,6 +346,7 @@ def _surfaces(scene: Scene, rollout: Rollout, seconds: float, every: int) -> tup
         before = time.perf_counter()
         deep, wide = _measured(course, some, started + seconds)
         done += len(some)
+        on_progress(done / len(frames), f"{done} of {len(frames)} frames measured")
         if deep and (deepest is None or deep.part > deepest.part):
             deepest = deep
         if wide and (widest is None or wide.part > widest.part):

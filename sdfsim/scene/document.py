@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from sdfsim.base.errors import SceneError
+from sdfsim.base.files import not_read
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 
 MOST_BYTES = 16 * 2**20  # of a file
@@ -97,8 +98,7 @@ def _text_of(path: Path) -> str:
             raise SceneError([f"{path}: too large for a scene (at most {MOST_BYTES // 2**20} MiB)"])
         return path.read_bytes().decode("utf-8")
     except OSError as error:
-        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
-        raise SceneError([f"{path}: {why}"], "give the path of a scene.yaml") from error
+        raise SceneError([f"{path}: {not_read(error)}"], "give the path of a scene.yaml") from error
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise SceneError([f"{path}:{line}: not a text in UTF-8"], "a scene is a YAML text file") from error

@@ -297,18 +297,20 @@ class Simulator(LiveScene):
         ]
 
     def rollouts(
-        self, variants: Sequence[Variant], seconds: float | None = None, steps: int | None = None
-    ) -> list[Rollout]:
+        self, variants: Sequence[Variant], seconds: float | None = None, steps: int | None = None,
+        on_progress: Progress = silent,
+    ) -> list[Rollout]:  # fmt: skip
         """The scene from its start with some values changed, once for each variant, on all cores; the same as `run` of
         a `Simulator` of each changed scene with the model, device, seed, step and free flight of this one.
 
         Variants map names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity, mass, friction,
-        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. Raises SdfsimError for no such body or field,
-        or a value that it cannot have; SimulationError where a state broke.
+        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. `on_progress` is called as some of them have
+        ended. Raises SdfsimError for no such body or field, or a value that it cannot have; SimulationError where a
+        state broke.
         """
         scenes = [varied(self.scene, variant) for variant in variants]
         same = {"device": self.device, "seed": self.seed, **self._asked}
-        return run_all(scenes, self.model, seconds, steps, **same)
+        return run_all(scenes, self.model, seconds, steps, on_progress, **same)
 
     def run(self, seconds: float | None = None, steps: int | None = None, on_progress: Progress = silent) -> Rollout:
         """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
@@ -503,7 +505,7 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
 
 def run_all(
     scenes: Sequence[Scene], model: Model | None = None, seconds: float | None = None, steps: int | None = None,
-    **options: Any,
+    on_progress: Progress = silent, **options: Any,
 ) -> list[Rollout]:  # fmt: skip
     """`run` of a `Simulator` of every scene, made with these options, on all cores: in threads where the steps are
     compiled code that needs nothing of Python and has no threads of its own, else in processes. Raises as these do."""
@@ -515,7 +517,11 @@ def run_all(
     together = few and model.kind == SOLVER
     shared = SharedShapes() if together else None
     jobs = [([scenes[k] for k in piece], model, options, seconds, steps, shared) for piece in pieces]
-    found = dict((threads if together else parallel)(_run_each, jobs))
+    found: dict[int, list[Rollout]] = {}
+    for k, ended in (threads if together else parallel)(_run_each, jobs):
+        found[k] = ended
+        done = sum(map(len, found.values()))
+        on_progress(done / len(scenes), f"{done} of {len(scenes)} scenes")
     return [rollout for k in range(len(jobs)) for rollout in found[k]]
 
 

@@ -30,7 +30,7 @@ def test_what_is_not_installed_is_told_with_what_it_is_for(monkeypatch):
     real = metadata.version
 
     def version(name: str) -> str:
-        if name in ("usd-core", "mujoco"):
+        if name in ("usd-core", "mujoco", "xatlas", "pi-heif"):
             raise metadata.PackageNotFoundError(name)
         return real(name)
 
@@ -39,8 +39,10 @@ def test_what_is_not_installed_is_told_with_what_it_is_for(monkeypatch):
     assert report["versions"]["usd-core"] == "missing" and report["versions"]["torch"] == real("torch")
     told = [line for line in report["missing"] if "pip install" in line]
     assert told == [
+        "pi-heif: pip install pi-heif",
+        "xatlas: pip install xatlas",
         "usd-core, for export of .usd: pip install 'sdfsim[export]'",
-        "mujoco, for comparisons with MuJoCo: pip install 'sdfsim[bench]'",
+        "mujoco, for import of MJCF, and comparisons with MuJoCo: pip install 'sdfsim[mjcf]'",
     ]
     shown = run("info").stdout
     assert all(f"not here: {line}" in shown for line in told) and "usd-core missing" not in shown

@@ -83,3 +83,26 @@ def test_scripts_say_the_same_and_end_with_the_same_codes(capsys):
         assert end.value.code == code
     assert capsys.readouterr().err == "error: what is wrong\nhint: what to try\nerror: no hint\n"
     run_main(lambda: None)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("render", "MISSING", "-o", "x.png"),
+        ("identify", "MISSING.csv", "--scene", "SCENE"),
+        ("train", "--data", "MISSING", "-o", "x"),
+        ("import", "MISSING.urdf", "-o", "x.yaml"),
+        ("simulate", "MISSING.yaml", "-o", "x"),
+        ("export", "MISSING", "-o", "x.glb"),
+        ("view", "MISSING"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_is_not_there_is_told_in_plain_words_with_what_to_give(scene, tmp_path, words):
+    named = {"MISSING": str(tmp_path / "missing"), "SCENE": str(scene)}
+    given = [named.get(word, word.replace("MISSING", named["MISSING"])) for word in words]
+    done = run(*given)
+    told, *rest = done.stderr.strip().splitlines()
+    assert done.exit_code == 1 and told.startswith(f"error: {named['MISSING']}") and told.count(named["MISSING"]) == 1
+    assert "Errno" not in told and " no such " in told
+    assert len(rest) == 1 and rest[0].startswith("hint: ")

@@ -221,7 +221,11 @@ def test_a_stick_that_passes_through_another_is_told_with_few_frames_measured():
     scene = crossing(0.0)
     place = np.broadcast_to(np.stack([b.position for b in scene.bodies]), (41, 2, 3)).copy()
     place[:, 1, 2] -= np.linspace(0, 0.12, 41)
-    told = judged(scene, motion(scene, place, np.zeros_like(place)), every=6)
+    shares: list[float] = []
+    told = judged(
+        scene, motion(scene, place, np.zeros_like(place)), every=6, on_progress=lambda share, line: shares.append(share)
+    )
+    assert shares == sorted(shares) and shares[-1] == 1.0
     assert told.frames < 10 and told.overlap is not None and told.overlap.part > 0.1
 
 

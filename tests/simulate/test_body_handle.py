@@ -173,9 +173,9 @@ def test_scenes_with_some_shapes_in_common_share_them_and_are_what_they_would_be
 def test_variants_are_what_they_would_be_alone_in_their_order():
     scene = small(restitution=0.8)
     changed = [{"box": {"velocity": (k, 0, 0), "mass": 0.1 + k}, "floor": {"friction": 0.1 * k}} for k in range(5)]
-    sim = Simulator(scene)
-    found = sim.rollouts([{}, *changed], steps=30)
-    assert len(found) == 6
+    sim, shares = Simulator(scene), []
+    found = sim.rollouts([{}, *changed], steps=30, on_progress=lambda share, line: shares.append(share))
+    assert len(found) == 6 and shares == sorted(shares) and shares[-1] == 1.0
     np.testing.assert_array_equal(found[0].position, sim.run(steps=30).position)
     for rollout, variant in zip(found[1:], changed, strict=True):
         bodies = (
