@@ -1,4 +1,4 @@
-"""How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs.
+"""How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs: docs/joints.md.
 
     python benchmarks/joints.py
 
@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import ROOT, script
+from benchmarks.results import ROOT, script, write_section
 from sdfsim import Scene, Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.evaluation.engines import engine_module, timed
@@ -69,7 +69,7 @@ def main() -> None:
             each = [1e3 * took / (held * 1e3 / inner) for took in taken]
             counts = (str(len(joints)), str(held), f"{inner:.2f} ms")
             rows.append((name, *counts, *(f"{took:.0f}" for took in taken), *(f"{us:.2f}" for us in each)))
-    print(markdown(rows))
+    write_section("joints", "python benchmarks/joints.py", markdown(rows))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ No number of theirs is written by hand: after any table was measured again, this
 import re
 from collections.abc import Iterator
 
-from benchmarks.results import ROOT, script, section, write_section
+from benchmarks.results import script, section, write_section
 from sdfsim.evaluation.harness import number
 
 OURS, PULLED = "sdfsim", ("PyBullet, pieces", "MuJoCo, pieces")  # engines on convex pieces
@@ -100,9 +100,8 @@ def grown() -> dict[str, list[str]]:
 
 def of_joints() -> tuple[list[str], list[str]]:
     """Scenes with joints in which ours takes longer than MuJoCo, and less."""
-    text = (ROOT / "docs" / "joints.md").read_text(encoding="utf-8").partition("\n## Time")[2].partition("\n## ")[0]
     longer, less = [], []
-    for row in cells_of(text)[1:]:
+    for row in cells_of(section("joints"))[1:]:
         ours, theirs = figures(row[4])[0], figures(row[5])[0]
         (longer if ours > theirs else less).append(f"{row[0]} {number(ours / theirs, 2)}")
     return longer, less
