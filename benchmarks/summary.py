@@ -8,7 +8,7 @@ No number of theirs is written by hand: after any table was measured again, this
 import re
 from collections.abc import Iterator
 
-from benchmarks.results import script, section, write_section
+from benchmarks.results import ROOT, script, section, write_section
 from sdfsim.evaluation.harness import number
 
 OURS, PULLED = "sdfsim", ("PyBullet, pieces", "MuJoCo, pieces")  # engines on convex pieces
@@ -56,6 +56,19 @@ def of_tosses() -> tuple[list[str], list[str]]:
                 nearer.append(told)
         lead.append(-figures(row[3])[0])
     return nearer, [f"{number(min(lead), 2)} to {number(max(lead), 2)} % of its side" if min(lead) > 0 else ""]
+
+
+def of_elbows() -> list[str]:
+    """Engines that are nearer to the real elbow in any of its errors."""
+    text = (ROOT / "docs" / "joints.md").read_text(encoding="utf-8").partition("## Real tosses of an elbow")[2]
+    nearer = []
+    for row in cells_of(text.partition("\n## ")[0])[1:]:
+        whats = ("% of a link", "degrees of turn", "degrees of the hinge")
+        for part, what in zip(row[4].split("/") if row[4] else (), whats, strict=False):
+            less, low, high = figures(part)
+            if less > 0.0:
+                nearer.append(f"{row[0]} by {number(less, 2)} {what} ({number(low, 2)} to {number(high, 2)})")
+    return nearer
 
 
 def deeper() -> Iterator[str]:
@@ -130,7 +143,8 @@ def summary() -> str:
     losses = [
         f"[In turn](#hard-shapes-beside-other-engines) at the same step, longer than an engine: {joined(longer)} time.",
         f"Deeper in each other than bodies of both engines: {joined(list(deeper()))} of the smallest body.",
-        f"[Real tosses](#real-tosses-of-a-cube), nearer than ours: {joined(nearer)}.",
+        f"[Real tosses](#real-tosses-of-a-cube), nearer than ours: {joined(nearer)}. "
+        f"[Elbows](../docs/joints.md#real-tosses-of-an-elbow): {joined(of_elbows())}.",
         f"[MOVi-B](#movi-b), 50 steps: {solver[0]:g} m off, where the engine is {engine[0]:g} m off from itself. The "
         f"graph network on top of the solve has {errors['`small`'][0]:g} m and takes longer.",
         f"[Everyday checks](#everyday-scenes-beside-other-engines): {total[OURS][1] - total[OURS][0]} missed of "

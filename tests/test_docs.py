@@ -223,6 +223,37 @@ def test_errors_on_real_tosses_are_the_same_everywhere():
     assert f"came to {mujoco[0]:g} and {mujoco[1]:g}" in " ".join(identify.split())
 
 
+# What the numbers are, and where on each page they stand; the groups of all pages are alike.
+SAME = {
+    "how deep the demo's vase is hollow": {
+        "README.md": r"32 cm comes out hollow by (\d+) cm",
+        RESULTS: r"a body of its own, hollow by \| (\d+) cm",
+        "docs/photos.md": r"\| vase, hollow below its rim \(the true one: 32 cm\) \| [\d.]+ cm \| (\d+) cm",
+    },
+    "errors of the network that is bundled as sdf-sim": {
+        "docs/paper.md": r"bundled as `sdf-sim`\): (0\.\d+) m \((0\.\d+) to (0\.\d+)\), ([\d.]+)°",
+        "docs/gpu.md": r"(0\.\d+) m \[(0\.\d+), (0\.\d+)\], ([\d.]+)° and 1\.\d+ m",
+        "sdfsim/models/sdf-sim.md": r"\| this model \| (0\.\d+) \((0\.\d+) to (0\.\d+)\) \| ([\d.]+) \|",
+    },
+    "how long seventeen fits take": {
+        RESULTS: r"in (\d+) to (\d+) s on one core, median (\d+) s",
+        "docs/sdf.md": r"(\d+) to (\d+) s each on its core, (\d+) s in the median",
+    },
+    "the paper's errors": {
+        "README.md": r"SDF-Sim, the paper's network, on its own recordings \| (0\.160) m, (18)\.0",
+        "docs/paper.md": r"SDF-Sim (0\.160) m, (18)\.0°",
+        "sdfsim/models/sdf-sim.md": r"published network has (0\.160) m and (18)\.0 degrees",
+    },
+}
+
+
+@pytest.mark.parametrize("places", SAME.values(), ids=list(SAME))
+def test_numbers_are_the_same_on_every_page(places):
+    found = {name: re.search(pattern, " ".join(page(name).split())) for name, pattern in places.items()}
+    assert all(found.values()), found
+    assert len({one.groups() for one in found.values() if one}) == 1, found
+
+
 def test_times_and_errors_of_large_scenes_are_the_same_everywhere():
     paper, tradeoff = page("docs/paper.md"), {row[0].rstrip(" *"): row for row in cells_of(measured("tradeoff"))[1:]}
     seconds = {row[0]: float(numbers(row[4])[0]) for row in cells_of(measured("large scenes"))[1:]}
