@@ -1,7 +1,7 @@
 """The time of a step of the contact solve and of PyBullet on the same scenes, and how it grows.
 
-    python -m benchmarks.contact_step DATA [--repeats 5]
-    python -m benchmarks.contact_step --check
+    python -m benchmarks contact_step DATA [--repeats 5]
+    python -m benchmarks contact_step --check
 
 Writes its section of RESULTS.md, and the ratios into contact_step_ratchet.json. A slow test holds later steps to these:
 it asks for --check, which fails where a ratio has slipped back. DATA is a MOVi-B dataset; without one its row is left
@@ -11,7 +11,6 @@ PyBullet collides convex pieces (a bowl of 144), the solve those or baked distan
 Loading, and what a simulator keeps for its recording, is left out.
 """
 
-import os
 import tempfile
 import time
 from collections import deque
@@ -20,12 +19,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-if __name__ == "__main__":
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # before the first import of numba
-
 import numpy as np
 
-from benchmarks.results import in_turn, script, write_section
+from benchmarks.results import in_turn, write_section
 from benchmarks.scale import apart, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.base.errors import SdfsimError
@@ -61,7 +57,6 @@ def with_far(count: int) -> Scene:
 
 
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
-    """Milliseconds a step of `Simulator.step`."""
     simulator = Simulator(scene, "solver")
     options = replace(simulator.options, sleep=False)
     simulator.options = replace(options, dt=dt / simulator.units.time) if dt else options
@@ -170,13 +165,9 @@ def main(data: Path | None = None, *, check: bool = False, repeats: int = 5) -> 
             ratios[name] = round(float(np.median(times[:, 1] / times[:, 0])), 3)
             rows.append((name, one, number(first), other, number(second), f"{ratios[name]:.2f}"))
     if not check:
-        write_section("contact step", "python -m benchmarks.contact_step DATA", markdown(rows))
+        write_section("contact step", "python -m benchmarks contact_step DATA", markdown(rows))
         write_json(RATCHET, ratios)
         return
     print(markdown(rows))
     if worse := slipped_back(ratios, read_json(RATCHET)):
         raise SdfsimError("slipped back: " + "; ".join(worse))
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

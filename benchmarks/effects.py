@@ -1,24 +1,16 @@
 """The time of a step with each effect on and off: RESULTS.md.
 
-    python benchmarks/effects.py
+    python -m benchmarks effects
 
 Sample scenes with one effect at a time switched off; one thread, processor time, medians of five runs of 300 steps.
 "The same" says whether the bodies end, to a hundredth of their size, where they end with all effects on.
 """
 
-import os
-import sys
 from dataclasses import fields, replace
-from pathlib import Path
-
-if __name__ == "__main__":
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # before the first import of numba
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import ROOT, script, write_section
+from benchmarks.results import ROOT, write_section
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.evaluation.runs import timed_rollout
 from sdfsim.physics.bodies import largest_extent
@@ -54,8 +46,4 @@ def main() -> None:
                 away = float(np.linalg.norm(end - there, axis=1).max()) / size
                 shift = "the same" if away < 0.01 else f"up to {number(away, 2)} sizes away"
                 rows.append((name, effect, number(ms), number(ms / usual, 2), shift))
-    write_section("effects", "python benchmarks/effects.py", markdown(rows))
-
-
-if __name__ == "__main__":
-    script(__doc__, main)
+    write_section("effects", "python -m benchmarks effects", markdown(rows))

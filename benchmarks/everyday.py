@@ -1,6 +1,6 @@
 """Everyday scenes with our solver and with other engines, held to the same checks: RESULTS.md.
 
-    python benchmarks/everyday.py -o DIR [--full]
+    python -m benchmarks everyday -o DIR [--full]
 
 The scenes and checks are those of `python -m sdfsim.evaluation.everyday` at 10 cm, of closed forms where a shape has
 one. Engines take inner steps of 4 ms (of bodies of a metre; smaller ones in proportion to the root of their size), ours
@@ -22,10 +22,8 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks.engines.drake import drake
-from benchmarks.results import progress, script, write_section
+from benchmarks.results import progress, write_section
 from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import SUBSTEPS
@@ -156,7 +154,6 @@ def is_installed(name: str) -> bool:
 
 
 def held_by(results: Results, row: str, check: str) -> list[str]:
-    """The other engines that hold a check."""
     return [n for n in ENGINES if n != OURS and check in results.get((row, n), {}).get("held", ())]
 
 
@@ -206,7 +203,6 @@ def table(results: Results) -> str:
 
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
-    """Every installed engine's results of rows."""
     content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday)]
     sources = inspect.getsource(engines) + inspect.getsource(sys.modules[drake.__module__])
     how = {name: sources if name != OURS else "" for name in ENGINES}
@@ -219,14 +215,9 @@ def compared(rows: list[str], at: Setting, out: Path) -> Results:
     return measure(jobs, out / "results", on_progress=progress)
 
 
-def scenes(*, out: Path, full: bool = False) -> None:
-    """Everyday scenes with every engine that is installed."""
+def main(*, out: Path, full: bool = False) -> None:
     results = compared(list(ROWS), Setting(full=full), out)
     for name in ENGINES:
         took = sum(found.get("s", 0.0) for (_, other), found in results.items() if other == name)
         print(f"{name}: {took:.0f} s of the processor")
-    write_section("everyday", f"python benchmarks/everyday.py -o DIR{' --full' if full else ''}", table(results))
-
-
-if __name__ == "__main__":
-    script(__doc__, scenes)
+    write_section("everyday", f"python -m benchmarks everyday -o DIR{' --full' if full else ''}", table(results))

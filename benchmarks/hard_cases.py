@@ -1,21 +1,18 @@
 """The table and pictures of docs/stability.md, and the ratchet for later models.
 
-    python benchmarks/hard_cases.py -o DIR [--quick]
+    python -m benchmarks hard_cases -o DIR [--quick]
 
 Runs the hard cases in DIR (their short form in DIR/quick), as far as it does not hold their results yet; then writes
 the table and the pictures of docs/stability.md, and benchmarks/hard_cases_ratchet.json from the short form, which is
 what the slow test runs. With --quick the table is that of the short form too.
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks.engines.drake import drake
-from benchmarks.results import ROOT, progress, script, write_section
+from benchmarks.results import ROOT, progress, write_section
 from sdfsim.base.files import read_json, write_json
 from sdfsim.evaluation.engines import mujoco
 from sdfsim.evaluation.hard_cases import GROUPS
@@ -64,7 +61,7 @@ def main(*, out: Path, quick: bool = False) -> None:
     if not quick:
         study = stress(out, engines=ENGINES, on_progress=progress)
         write_report(study, out)
-    command = f"python benchmarks/hard_cases.py -o DIR{' --quick' if quick else ''}"
+    command = f"python -m benchmarks hard_cases -o DIR{' --quick' if quick else ''}"
     pictures = "\n".join(f"![{GROUPS[group].title}](images/{name})" for group, name in PICTURES.items())
     write_section("hard cases", command, f"{table(study)}\n{pictures}", DOCUMENT)
     write_section("hard cases", command, "\n".join(f"- {line}" for line in loss_lines(study)))
@@ -72,7 +69,3 @@ def main(*, out: Path, quick: bool = False) -> None:
     others = replace(study, engines=list(USUAL))
     for group, name in PICTURES.items():
         draw_group(others, group, ROOT / "docs" / "images" / name)
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

@@ -1,6 +1,6 @@
 """How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs: docs/joints.md.
 
-    python benchmarks/joints.py
+    python -m benchmarks joints
 
 Rows are what joints hold: three for a ball, five for a hinge. MuJoCo gets the scenes as `export` writes them: it works
 in the coordinates that joints leave, at the inner step of ours, with its implicit integrator and its Newton solver.
@@ -8,15 +8,12 @@ Both run in turn, and times are medians of the processor's, of one thread.
 """
 
 import math
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import ROOT, script, write_section
+from benchmarks.results import ROOT, write_section
 from sdfsim import Scene, Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.evaluation.engines import engine_module, timed
@@ -69,8 +66,4 @@ def main() -> None:
             each = [1e3 * took / (held * 1e3 / inner) for took in taken]
             counts = (str(len(joints)), str(held), f"{inner:.2f} ms")
             rows.append((name, *counts, *(f"{took:.0f}" for took in taken), *(f"{us:.2f}" for us in each)))
-    write_section("joints", "python benchmarks/joints.py", markdown(rows))
-
-
-if __name__ == "__main__":
-    script(__doc__, main)
+    write_section("joints", "python -m benchmarks joints", markdown(rows))

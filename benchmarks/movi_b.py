@@ -1,7 +1,7 @@
 """Errors on recorded MOVi-B scenes, with what ignoring all contact gives and what chaos allows: RESULTS.md.
 
-    python benchmarks/movi_b.py DATA
-    python benchmarks/movi_b.py DATA --contacts
+    python -m benchmarks movi_b DATA
+    python -m benchmarks movi_b DATA --contacts
 
 DATA is a MOVi-B dataset; its test split is rolled out. Written `error [95 % interval over trajectories]`. Then the
 same at the steps next to the instants of which HOPNet reports errors. Its recordings have 240 frames a second
@@ -11,15 +11,12 @@ same at the steps next to the instants of which HOPNet reports errors. Its recor
 error of one step is handed to the next.
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import script, write_section
+from benchmarks.results import write_section
 from sdfsim.data.batching import roll_out
 from sdfsim.data.dataset import Trajectory, conditions_of, engine_substep
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
@@ -29,7 +26,7 @@ from sdfsim.physics.motion import MOTION
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
-COMMAND = "python benchmarks/movi_b.py DATA"
+COMMAND = "python -m benchmarks movi_b DATA"
 STEPS = ("50", "100")
 FLOWN = 1e-3  # m from free flight: what is farther has met something
 # m/s that contacts give a body in a step: more than the first is an impact, no more than the second is none
@@ -42,7 +39,6 @@ RATE, HOPNET = 240, {50: (0.047, None), 75: (0.101, None), 100: (0.176, 17.9)}
 
 
 def main(data: Path, *, contacts: bool = False) -> None:
-    """Write the sections of errors, or the one of contacts."""
     if contacts:
         differing(data)
         return
@@ -156,7 +152,6 @@ def contact_kinds(recorded: Trajectory, ours: Trajectory, shapes: dict[str, Shap
 
 
 def cell(found: dict) -> str:
-    """Metres with their interval, and degrees."""
     metres, low, high = map(number, (found["translation_rmse"], *found["translation_rmse_95"]))
     return f"{metres} m [{low}, {high}], {number(found['rotation_error'])} degrees"
 
@@ -169,7 +164,3 @@ def flying(recorded: list[Trajectory], step: int) -> float:
         free = t.position[0] + t.velocity[0] * seconds + 0.5 * t.gravity * seconds**2
         away.append(np.linalg.norm(t.position[step] - free, axis=-1)[~t.static])
     return float((np.concatenate(away) < FLOWN).mean())
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

@@ -1,6 +1,6 @@
 """The gain of a network on top of the contact solve: docs/simulator.md.
 
-    python benchmarks/network.py DATA [MORE ...] -o DIR [--seeds 3] [--steps N]
+    python -m benchmarks network DATA [MORE ...] -o DIR [--seeds 3] [--steps N]
 
 Trains the presets *alone* and *small* with every seed on the training trajectories of DATA and MORE, then rolls
 them out beside the solver with as many inner steps, on validation and test trajectories of DATA. Trainings resume, and
@@ -8,7 +8,6 @@ results that DIR holds are kept. Writes DIR/table.md.
 """
 
 import statistics
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import progress, script
+from benchmarks.results import progress
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of, read_info
@@ -158,7 +155,3 @@ def main(data: list[Path], *, out: Path, seeds: int = 3, steps: int | None = Non
     table = markdown(rows) + "\n" + one_step(data, models)
     write_text(out / "table.md", table)
     print(table)
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

@@ -1,12 +1,12 @@
 """SDF-Sim and its baselines, all on one footing: docs/paper.md.
 
-    python benchmarks/paper.py graphs DATA -o DIR
+    python -m benchmarks paper graphs DATA -o DIR
         edges, nodes, memory and time of a step, on recorded steps
-    python benchmarks/paper.py growth -o DIR
+    python -m benchmarks paper growth -o DIR
         the same with 2 to 512 spheres in a bowl, and where memory ends
-    python benchmarks/paper.py accuracy DATA -o DIR [--minutes 5 15 30 60]
+    python -m benchmarks paper accuracy DATA -o DIR [--minutes 5 15 30 60]
         trains all of them on one core for equal times, SDF-Sim also on unsigned distances, then rolls them out
-    python benchmarks/paper.py sdf DATA -o DIR
+    python -m benchmarks paper sdf DATA -o DIR
         rollouts of the solver on networks of distances of several widths
 
 DATA is a MOVi-B dataset with train, validation and test. Graphs have the published number of surface nodes, about 440 a
@@ -17,7 +17,6 @@ are kept. Each command writes a table in Markdown into DIR.
 
 import resource
 import statistics
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +26,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import progress, script
+from benchmarks.results import progress
 from samples.large import write_scene
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import batches, first_frames, roll_out
@@ -157,7 +154,6 @@ def unsigned(data: Path, home: Path) -> Path:
 
 
 def graphs(data: Path, *, out: Path) -> None:
-    """Write graphs.md."""
     jobs = []
     for name in NAMES:
         content = [PRESETS[name], STEPS_SEEN, STEPS_TIMED, PUBLISHED_NODES, read_info(data)]
@@ -173,7 +169,6 @@ def graphs(data: Path, *, out: Path) -> None:
 
 
 def growth(*, out: Path) -> None:
-    """Write growth.md and growth.png."""
     jobs = []
     for count in BOWLS:
         home = out / "scenes" / str(count)
@@ -200,7 +195,7 @@ MINUTES = [5.0, 15.0, 30.0, 60.0]
 
 
 def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
-    """Train everything a little, then a little more, and write accuracy.md and accuracy.png."""
+    """Train everything a little, then a little more, and write accuracy.md."""
     results: dict[tuple[str, str], dict[str, Any]] = {}
     minutes = sorted(minutes)
     for spent in minutes:
@@ -221,15 +216,6 @@ def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
                     jobs.append(Job(f"{split}, {way}", _case(name, spent), content, judged, arguments))
             results |= measure(jobs, out / "accuracy")
         written(out / "accuracy.md", accuracy_table(results, minutes))
-    panels = []
-    for way in ("exact", "learned"):
-        lines = []
-        for name, title in COMPARED.items():
-            found = [{"minutes": m} | results[f"validation, {way}", _case(name, m)] for m in minutes]
-            lines.append(line(title, found, "minutes", "translation_rmse"))
-        label = f"m at {FRAME} steps, validation"
-        panels.append(Panel(f"free flight {way}", "minutes of one core", label, lines, "xy"))
-    draw(panels, out / "accuracy.png")
 
 
 def _case(name: str, minutes: float) -> str:
@@ -266,7 +252,6 @@ def refitted(shape: Shape, width: int, folder: Path) -> Shape:
 
 
 def sdf(data: Path, *, out: Path) -> None:
-    """Write sdf.md."""
     ways = {"convex pieces, exactly": None, "64 wide": 64, "32 wide": 32, "128 wide": 128}
     jobs = [
         Job("rollouts", name, [width, read_info(data)], rolled_out, (data, width, out / "shapes" / str(width)))
@@ -313,5 +298,4 @@ def written(path: Path, table: str) -> None:
     print(table, flush=True)
 
 
-if __name__ == "__main__":
-    script(__doc__, graphs, growth, accuracy, sdf)
+COMMANDS = (graphs, growth, accuracy, sdf)

@@ -1,6 +1,6 @@
 """How far engines are from real tosses of a cube, each with its own best parameters: RESULTS.md.
 
-    python benchmarks/reality.py TOSSES -o DIR
+    python -m benchmarks reality TOSSES -o DIR
 
 TOSSES holds `cube.npz`: tosses of an acrylic cube onto a table, tracked at 148 Hz (ContactNets; Pfrommer, Halm and Posa
 2020). Starts are fitted to the flight before the first impact. Ours are the numbers that `sdfsim identify` finds on 60
@@ -12,30 +12,54 @@ is installed. Five minutes, about forty more for the networks, and ten more with
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
-from scipy.optimize import differential_evolution, least_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import progress, script, write_section
-from sdfsim.apps.identify import identify, repeated, write_scene
+from benchmarks.results import progress, write_section
+from benchmarks.tosses import (
+    BODY,
+    CLEAR,
+    FIT,
+    FLIGHT,
+    FRAMES,
+    INNER,
+    ROUNDS,
+    SEED,
+    SOFT,
+    SOLID,
+    TEST,
+    Bounds,
+    Engine,
+    Motion,
+    Start,
+    Thing,
+    apart,
+    bullet,
+    cost,
+    drawn,
+    half_a_step_ago,
+    mujoco,
+    ours,
+    read_tosses,
+    recorded,
+    searched,
+)  # fmt: skip
+from sdfsim.apps.identify import identify, write_scene
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import read_arrays, write_json, write_text
+from sdfsim.base.files import write_json, write_text
 from sdfsim.data.batching import roll_out
 from sdfsim.data.dataset import Trajectory
-from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.evaluation.engines import NotInstalled, engine_module
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, one_thread
 from sdfsim.evaluation.metrics import interval
@@ -49,18 +73,11 @@ from sdfsim.training.run import Run
 from sdfsim.training.surface_task import SurfaceTask
 
 SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as measured by those who tossed it
+THING = Thing(np.full(3, SIDE), MASS, np.full(3, INERTIA))
 GRAVITY = 9.81  # m/s^2
-FRAMES = 75  # that are compared: half a second
-FIT, TEST, SEED = 60, 100, 0
 FEW = 16  # of the first, that ours is found on too
-CLEAR = 0.005  # m: a cube whose lowest corner is higher than this over z = 0 flies; the table is 1 to 6 mm lower
-FLIGHT = 6  # frames at least, to fit a start to
-INNER = 5  # inner steps of every engine in a frame
-IMPRATIO = 14.0  # MuJoCo: how much stiffer friction is than the normal
 TRAINED, SEEDS = (8, 16, 64, 256), 3  # tosses that networks are trained on, and networks of each
 STEPS, LOOKS = 240, 4  # of a training, and looks at the tosses that choose among its states
-FAR = 30.0  # % and degrees: errors of a toss that are larger count as this in the search for parameters
-CROWD, ROUNDS = 25, 15  # of that search: points (rounded up to a power of two), and how often each is tried anew
 
 
 @dataclass(frozen=True)
@@ -73,24 +90,13 @@ class Toss:
 
 
 @dataclass(frozen=True)
-class Start:
-    """Pose and velocities at a recording's first frame, and how the flight that they were fitted to differs from it."""
+class FittedStart(Start):
+    """A start, and how the flight that it was fitted to differs from it."""
 
-    position: np.ndarray  # [3] m
-    quat_xyzw: np.ndarray  # [4]
-    velocity: np.ndarray  # [3] m/s
-    angular_velocity: np.ndarray  # [3] rad/s, world
     flight: int  # frames before the first impact
     # root mean square over these frames, m and rad
     off: float
     turned_off: float
-
-
-class Motion(NamedTuple):
-    """Poses of B tosses in the frames after their first."""
-
-    position: np.ndarray  # [B, T, 3] m
-    quat_xyzw: np.ndarray  # [B, T, 4]
 
 
 # --- recordings ---
@@ -98,13 +104,8 @@ class Motion(NamedTuple):
 
 def load_tosses(folder: Path) -> list[Toss]:
     """The tosses of `cube.npz`. Raises SdfsimError where it is absent or holds no such recordings."""
-    file = folder / "cube.npz"
-    found = read_arrays(file, "recorded tosses", "give the folder that holds cube.npz")
-    if missing := {"start", "dt", "position", "quat_xyzw"} - set(found):
-        raise SdfsimError(f"{file}: there is no array {min(missing)!r}", f"it has {', '.join(sorted(found))}")
-    rows = [slice(a, b) for a, b in zip(found["start"][:-1], found["start"][1:], strict=True)]
-    dt, position, turn = float(found["dt"]), *(found[name].astype(np.float64) for name in ("position", "quat_xyzw"))
-    return [Toss(dt, position[k], turn[k]) for k in rows]
+    dt, tosses = read_tosses(folder / "cube.npz", "position", "quat_xyzw")
+    return [Toss(dt, **arrays) for arrays in tosses]
 
 
 def flight(toss: Toss) -> int:
@@ -114,7 +115,7 @@ def flight(toss: Toss) -> int:
     return int(near.argmax()) if near.any() else len(near)
 
 
-def fitted_start(toss: Toss, gravity: float = GRAVITY) -> Start:
+def fitted_start(toss: Toss, gravity: float = GRAVITY) -> FittedStart:
     """A parabola and an even turn (a cube's free rotation) through the flight before the first impact. Raises
     SdfsimError for fewer frames than `FLIGHT`."""
     count = flight(toss)
@@ -133,7 +134,7 @@ def fitted_start(toss: Toss, gravity: float = GRAVITY) -> Start:
 
     found = least_squares(apart, np.concatenate([np.zeros(3), rate]), x_scale=[0.01] * 3 + [0.1] * 3)
     off, turned_off = fallen - even @ straight, found.fun.reshape(-1, 3)
-    return Start(
+    return FittedStart(
         position=straight[0],
         quat_xyzw=(Rotation.from_rotvec(found.x[:3]) * turns[0]).as_quat(),
         velocity=straight[1],
@@ -161,30 +162,14 @@ def fall(tosses: Sequence[Toss]) -> tuple[float, float]:
 
 
 def split(tosses: Sequence[Toss]) -> tuple[list[Toss], list[Toss], list[Toss]]:
-    """Tosses to find parameters on, others to judge by, and the rest; such as are long enough, and fly long enough."""
-    usable = [toss for toss in tosses if len(toss.position) > FRAMES and flight(toss) >= FLIGHT]
-    if len(usable) < FIT + TEST:
-        raise SdfsimError(f"{len(usable)} tosses are long enough (at least {FIT + TEST})")
-    order = np.random.default_rng(SEED).permutation(len(usable))
-    fit, test, rest = np.split(order, [FIT, FIT + TEST])
-    return [usable[k] for k in fit], [usable[k] for k in test], [usable[k] for k in rest]
-
-
-def recorded(tosses: Sequence[Toss]) -> Motion:
-    """What is compared of recordings."""
-    frames = slice(1, FRAMES + 1)
-    return Motion(*(np.array([getattr(toss, name)[frames] for toss in tosses]) for name in Motion._fields))
+    """As `drawn` has them, of such as are long enough, and fly long enough."""
+    return drawn([toss for toss in tosses if len(toss.position) > FRAMES and flight(toss) >= FLIGHT])
 
 
 def errors(found: Motion, truth: Motion) -> tuple[np.ndarray, np.ndarray]:
     """[B] root mean square distances over frames in % of the side, and [B] mean angles in degrees."""
-    way = np.linalg.norm(found.position - truth.position, axis=-1)
-    angle = (_turns(found) * _turns(truth).inv()).magnitude().reshape(way.shape)
+    way, angle = apart(found, truth)
     return 100.0 / SIDE * np.sqrt(np.square(way).mean(1)), np.degrees(angle).mean(1)
-
-
-def _turns(motion: Motion) -> Rotation:
-    return Rotation.from_quat(motion.quat_xyzw.reshape(-1, 4))
 
 
 # --- engines ---
@@ -203,104 +188,17 @@ EVEN = MASS * SIDE**2 / 6.0  # kg m2, a solid cube's inertia
 
 
 def recordings_of(tosses: Sequence[Toss], scene: Scene) -> list[Recording]:
-    """As `sdfsim identify` has them."""
     poses = [np.concatenate([toss.position, toss.quat_xyzw], 1)[:, None] for toss in tosses]
     return with_velocities([cleaned(str(k), tosses[k].dt, one, scene) for k, one in enumerate(poses)], scene)
 
 
-def ours(starts: Sequence[Start], dt: float, scene: Scene) -> Motion:
-    """The scene that `sdfsim identify` wrote, from these starts."""
-    none, yes = np.zeros((FRAMES + 1, 1, 3)), np.ones((FRAMES + 1, 1), bool)
-    turns, still = np.tile([0.0, 0.0, 0.0, 1.0], (FRAMES + 1, 1, 1)), ("position", "orientation", "velocity")
-    blank = Recording("", dt, none, turns, none, none, yes[:, 0], yes, yes, (none, turns))
-    begun = []
-    for start in starts:
-        first = (start.position, start.quat_xyzw, start.velocity, start.angular_velocity)
-        given = {
-            name: np.broadcast_to(value, (FRAMES + 1, 1, len(value)))
-            for name, value in zip((*still, "angular_velocity"), first, strict=True)
-        }
-        begun.append(replace(blank, **given))
-    place, turn = repeated(begun, scene, FRAMES)
-    return Motion(place[:, :, 0], turn[:, :, 0])
-
-
-def mujoco(
-    starts: Sequence[Start], dt: float, gravity: float, values: dict[str, float], *, elliptic: bool = True
-) -> Motion:
-    """MuJoCo's contacts are damped springs, of a time constant s and a damping ratio; its cone is elliptic or a
-    pyramid."""
-    engine, rollout = (engine_module(name, "MuJoCo", "bench") for name in ("mujoco", "mujoco.rollout"))
-    spec, step = engine.MjSpec(), dt / INNER
-    spec.option.timestep, spec.option.gravity = step, [0.0, 0.0, -gravity]
-    spec.option.cone = engine.mjtCone.mjCONE_ELLIPTIC if elliptic else engine.mjtCone.mjCONE_PYRAMIDAL
-    spec.option.impratio = IMPRATIO if elliptic else 1.0
-    spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0], pos=[0, 0, values["height"]])
-    body = spec.worldbody.add_body(mass=MASS, inertia=[values["inertia"] * INERTIA] * 3, explicitinertial=True)
-    body.add_freejoint()
-    cube = body.add_geom(type=engine.mjtGeom.mjGEOM_BOX, size=[0.5 * values["side"] * SIDE] * 3)
-    cube.priority, cube.condim, cube.friction[0] = 1, 3, values["friction"]
-    cube.solref = [max(values["softness"], 2.0 * step), values["damping"]]
-    model = spec.compile()
-    state = [
-        [
-            0.0, *start.position, *np.roll(start.quat_xyzw, 1), *_half_a_step_ago(start, step, gravity),
-            *Rotation.from_quat(start.quat_xyzw).inv().apply(start.angular_velocity),
-        ]
-        for start in starts
-    ]  # fmt: skip
-    states = rollout.rollout(model, engine.MjData(model), np.array(state), nstep=FRAMES * INNER)[0]
-    found = states[:, INNER - 1 :: INNER]
-    return Motion(found[..., 1:4], np.roll(found[..., 4:8], -1, axis=-1))
-
-
-def bullet(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, float]) -> Motion:
-    """PyBullet as it is without settings."""
-    engine = import_pybullet()
-    client, step = engine.connect(engine.DIRECT), dt / INNER
-    try:
-        here: dict[str, Any] = {"physicsClientId": client}
-        engine.setGravity(0.0, 0.0, -gravity, **here)
-        engine.setTimeStep(step, **here)
-        plane = engine.createCollisionShape(engine.GEOM_PLANE, **here)
-        table = engine.createMultiBody(0.0, plane, basePosition=[0.0, 0.0, values["height"]], **here)
-        engine.changeDynamics(table, -1, lateralFriction=1.0, restitution=1.0, **here)
-        engine.setCollisionFilterGroupMask(table, -1, 1, 2, **here)
-        box = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[0.5 * values["side"] * SIDE] * 3, **here)
-        cubes = []
-        for start in starts:
-            cube = engine.createMultiBody(MASS, box, -1, start.position, start.quat_xyzw, **here)
-            engine.changeDynamics(
-                cube, -1, localInertiaDiagonal=[values["inertia"] * INERTIA] * 3, lateralFriction=values["friction"],
-                restitution=values["restitution"], linearDamping=0.0, angularDamping=0.0, **here,
-            )  # fmt: skip
-            engine.setCollisionFilterGroupMask(cube, -1, 2, 1, **here)  # they meet the table alone
-            speed = _half_a_step_ago(start, step, gravity), start.angular_velocity
-            engine.resetBaseVelocity(cube, *speed, **here)
-            cubes.append(cube)
-        frames = []
-        for _ in range(FRAMES):
-            for _ in range(INNER):
-                engine.stepSimulation(**here)
-            frames.append([engine.getBasePositionAndOrientation(cube, **here) for cube in cubes])
-    finally:
-        engine.disconnect(client)
-    poses = (np.array([[one[k] for one in frame] for frame in frames]) for k in range(2))
-    return Motion(*(np.swapaxes(pose, 0, 1) for pose in poses))
-
-
-def _half_a_step_ago(start: Start, step: float, gravity: float) -> np.ndarray:
-    """The velocity with which engines that add gravity first, and move by the sum, fly along the exact parabola."""
-    return start.velocity + np.array([0.0, 0.0, 0.5 * step * gravity])
-
-
-def drake(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, float]) -> Motion:
+def drake(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[str, float]) -> Motion:
     """Drake's discrete point contact, the cubes far apart on one half space; its contacts have no rebound, but a
     stiffness and a dissipation."""
     lib: Any = engine_module("pydrake.all", "Drake", "rivals")
     step, apart, cubes = dt / INNER, 20.0, []
     plant, _ = lib.AddMultibodyPlantSceneGraph(builder := lib.DiagramBuilder(), step)
-    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -gravity])
+    plant.mutable_gravity_field().set_gravity_vector(gravity)
     table = lib.ProximityProperties()
     lib.AddContactMaterial(0.0, 1e9, lib.CoulombFriction(1.0, 1.0), table)
     ground = lib.RigidTransform([0.0, 0.0, values["height"]])
@@ -325,7 +223,7 @@ def drake(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, 
         plant.SetFreeBodyPose(context, cube, lib.RigidTransform(turn, start.position + to))
         first = cube.floating_velocities_start_in_v()
         speeds[first : first + 3] = start.angular_velocity
-        speeds[first + 3 : first + 6] = _half_a_step_ago(start, step, gravity)
+        speeds[first + 3 : first + 6] = half_a_step_ago(start, step, gravity)
     plant.SetVelocities(context, speeds)
     place, turns = np.empty((len(starts), FRAMES, 3)), np.empty((len(starts), FRAMES, 4))
     for frame in range(FRAMES):
@@ -341,7 +239,6 @@ def drake(starts: Sequence[Start], dt: float, gravity: float, values: dict[str, 
 
 
 def rolled(network: ImpulseNetwork, task: MotionTask, starts: Sequence[Start]) -> Motion:
-    """What a network on the solve makes of these starts."""
     worlds = task.worlds(len(starts))
     position, turn, speed, spin = (
         np.array([getattr(start, name) for start in starts])
@@ -395,8 +292,8 @@ class Lesson:
     known: list[Recording]  # that may be trained on
     scene: Scene  # as identified
     # starts and what was recorded from there: of the tosses that choose, and of those that judge
-    chooses: tuple[list[Start], Motion]
-    judges: tuple[list[Start], Motion]
+    chooses: tuple[Sequence[Start], Motion]
+    judges: tuple[Sequence[Start], Motion]
 
 
 @dataclass(frozen=True)
@@ -532,33 +429,13 @@ def solved(lesson: Lesson, scene: Scene) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# Where engines look for their parameters: lower and upper bound. Sizes are in sides, heights in m, times in s, inertias
-# in told ones, stiffness in powers of ten of N/m.
-BODY = {"friction": (0.05, 0.4), "height": (-0.006, 0.003), "side": (0.9, 1.02), "inertia": (0.8, 1.4)}
-SOLID = BODY | {"restitution": (0.0, 0.5)}
-SOFT = BODY | {"softness": (0.003, 0.04), "damping": (0.05, 1.2)}
-Engine = Callable[[Sequence[Start], float, float, dict[str, float]], Motion]
-ENGINES: dict[str, tuple[Engine, dict[str, tuple[float, float]]]] = {
-    "MuJoCo, elliptic cone": (mujoco, SOFT),
-    "MuJoCo, pyramidal cone": (partial(mujoco, elliptic=False), SOFT),
-    "PyBullet": (bullet, SOLID),
+ENGINES: dict[str, tuple[Engine, Bounds]] = {
+    "MuJoCo, elliptic cone": (partial(mujoco, THING), SOFT),
+    "MuJoCo, pyramidal cone": (partial(mujoco, THING, elliptic=False), SOFT),
+    "PyBullet": (partial(bullet, THING), SOLID),
+    # stiffness in powers of ten of N/m
     "Drake": (drake, BODY | {"stiffness": (3.5, 6.0), "dissipation": (0.0, 2.0)}),
 }
-
-
-def cost(found: Motion, truth: Motion) -> float:
-    """Position error in % and rotation error in degrees, added up. A cube that comes to lie on another face counts as
-    far off, no more: else the few that do so by chance decide about the fit."""
-    return float(sum(np.minimum(error, FAR).mean() for error in errors(found, truth)))
-
-
-def identified(loss: Callable[[dict[str, float]], float], bounds: dict[str, tuple[float, float]]) -> dict[str, float]:
-    """The values within bounds of the least loss. On sixty tosses it has many dips, so that a simplex gets stuck."""
-    found = differential_evolution(
-        lambda point: loss(dict(zip(bounds, point, strict=True))), list(bounds.values()), maxiter=ROUNDS - 1,
-        popsize=CROWD // len(bounds), init="sobol", tol=0.0, polish=False, rng=SEED,
-    )  # fmt: skip
-    return dict(zip(bounds, found.x.tolist(), strict=True))
 
 
 # --- the table ---
@@ -576,7 +453,7 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bo
     (fit, fit_truth), (test, test_truth) = (
         ([fitted_start(toss, gravity) for toss in group], recorded(group)) for group in groups[:2]
     )
-    dt = known[0].dt
+    dt, down = known[0].dt, np.array([0.0, 0.0, -gravity])
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "scene.yaml", SCENE.format(gravity=-gravity, side=SIDE, mass=MASS, factor=INERTIA / EVEN))
     scene = load_scene(out / "scene.yaml")
@@ -596,11 +473,11 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bo
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
         progress(k / (len(ENGINES) + 1), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
         try:
-            values = identified(lambda values, engine=engine: cost(engine(fit, dt, gravity, values), fit_truth), bounds)
+            values = searched(lambda v, engine=engine: cost(errors(engine(fit, dt, down, v), fit_truth)), bounds)
         except NotInstalled as error:
             progress(k / (len(ENGINES) + 1), f"{name} is left out: {error.message}")
             continue
-        moved[name] = values, engine(fit, dt, gravity, values), engine(test, dt, gravity, values)
+        moved[name] = values, engine(fit, dt, down, values), engine(test, dt, down, values)
     result = {
         name: {"values": values, "fit": errors(fitted, fit_truth), "test": errors(judged, test_truth)}
         for name, (values, fitted, judged) in moved.items()
@@ -624,7 +501,7 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bo
 
 
 OURS, FEWER = "sdfsim", f"sdfsim, found on {FEW} tosses"
-COMMAND = "python benchmarks/reality.py TOSSES -o DIR"
+COMMAND = "python -m benchmarks reality TOSSES -o DIR"
 
 
 def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
@@ -671,8 +548,8 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [head]
     for name in sorted(result, key=lambda name: (lost(name), name != OURS)):
         one = result[name]
-        apart = [ours - its for ours, its in zip(result[OURS]["test"], one["test"], strict=True)]
-        less = "" if name == OURS else " / ".join(_told(change) for change in apart)
+        change = [own - its for own, its in zip(result[OURS]["test"], one["test"], strict=True)]
+        less = "" if name == OURS else " / ".join(map(_told, change))
         found = ", ".join(f"{of} {number(value)}" for of, value in one["values"].items())
         own = " / ".join(number(error.mean()) for error in one["fit"])
         rows.append((name, *map(_told, one["test"]), less, own, found))
@@ -706,23 +583,21 @@ def network_table(found: Results) -> list[tuple[str, ...]]:
             continue
         test = np.array([one["test"] for one in seeds])
         mean = test.mean(0)
-        apart = " / ".join(_told(change) for change in mean - own)
+        less = " / ".join(_told(change) for change in mean - own)
         each = "; ".join(" / ".join(map(number, of)) for of in test.mean(2).tolist())
         on = " / ".join(number(one["chosen"]) for one in seeds)
         taken = number(float(np.mean([one["seconds"] for one in seeds])))
-        rows.append((float((mean - own).sum(0).mean()), (name, *map(_told, mean), apart, each, on, taken)))
+        rows.append((float((mean - own).sum(0).mean()), (name, *map(_told, mean), less, each, on, taken)))
     rows.sort(key=lambda row: -row[0])
     on = f"both errors on the tosses that choose (solve: {number(solve['chosen'])})"
     return [(*head, on, "s"), *(row for _, row in rows), (SOLVE, *map(_told, own), "", "", "", "")]
 
 
 def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> None:
-    """Errors against time, and a toss as seen and as predicted."""
     time, way, turn = (dt * np.arange(1, FRAMES + 1)).tolist(), [], []
     for name, (_, _, found) in moved.items():
-        apart = np.linalg.norm(found.position - truth.position, axis=-1) / SIDE
-        angle = (_turns(found) * _turns(truth).inv()).magnitude().reshape(apart.shape)
-        way.append(Line(name, time, (100.0 * np.median(apart, 0)).tolist()))
+        off, angle = apart(found, truth)
+        way.append(Line(name, time, (100.0 * np.median(off / SIDE, 0)).tolist()))
         turn.append(Line(name, time, np.degrees(np.median(angle, 0)).tolist()))
     draw(
         [Panel("median of 100 tosses", "s", "% of the side", way), Panel("", "s", "degrees", turn)], out / "reality.png"
@@ -747,7 +622,3 @@ def _plain(result: dict[str, Any]) -> dict[str, Any]:
         name: {"values": one["values"], **{of: [error.tolist() for error in one[of]] for of in ("fit", "test")}}
         for name, one in result.items()
     }
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

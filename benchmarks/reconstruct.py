@@ -1,23 +1,23 @@
 """How far from the truth a reconstruction of the rendered photo set is.
 
-    python benchmarks/reconstruct.py -o DIR [--preset quick] [--budget MINUTES]
-    python benchmarks/reconstruct.py -o DIR --capture record3d      # the same photos as a phone with depth exports them
-    python benchmarks/reconstruct.py room -o DIR [--capture record3d]    # or patches
+    python -m benchmarks reconstruct -o DIR [--preset quick] [--budget MINUTES]
+    python -m benchmarks reconstruct -o DIR --capture record3d      # the same photos as a phone with depth exports them
+    python -m benchmarks reconstruct room -o DIR [--capture record3d]    # or patches
 
 Runs the whole chain on samples/photos/table_vase, or on one of the sets that samples/photos/make.py draws, rendered
 into DIR-NAME (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
 prints pose errors, surface errors, how these go with the uncertainty that the run gave, how far a ball falls into the
 vase, and times. A folder of photos without `transforms.json` and `truth.ply` gets the report only.
 
-    python benchmarks/reconstruct.py touching -o DIR
-    python benchmarks/reconstruct.py shelf -o DIR [--kind clicks]
+    python -m benchmarks reconstruct touching -o DIR
+    python -m benchmarks reconstruct shelf -o DIR [--kind clicks]
 
 render a set with truth of tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies, without
 (`plain`) and with one clicked place for each (`clicks`: the middle of where a photo shows most of it), or in one of
 these ways, and print the errors of every body.
 
-    python benchmarks/reconstruct.py hinged -o DIR
-    python benchmarks/reconstruct.py sliding -o DIR
+    python -m benchmarks reconstruct hinged -o DIR
+    python -m benchmarks reconstruct sliding -o DIR
 
 render a cupboard with its door shut and open by 50 degrees, or a chest with its drawer in and out by 20 cm, reconstruct
 both states with `--joint`, and print how far the joint is from the true one.
@@ -33,10 +33,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "samples" / "photos"))
 
-from benchmarks.results import ROOT, script
+from benchmarks.results import ROOT
 from pipeline.cameras import Similarity, View, load_views
 from pipeline.field.training import load_field
 from pipeline.mesh.meshing import read_parts
@@ -431,7 +430,3 @@ def main(
         if (photos / "truth.ply").exists():
             report["truth"] = evaluate(out, photos)
         session.report(report)
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

@@ -49,7 +49,6 @@ def script(doc: str | None, *functions: Callable[..., None]) -> None:
 
 
 def progress(fraction: float, message: str) -> None:
-    """Progress, a line each."""
     print(f"{fraction:6.1%}  {message}", flush=True)
 
 

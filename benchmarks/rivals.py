@@ -1,9 +1,9 @@
 """Our solver and other engines on shapes that are hard for these: RESULTS.md.
 
-    python benchmarks/rivals.py shapes DATA -o DIR
-    python benchmarks/rivals.py turns DATA -o DIR
+    python -m benchmarks rivals shapes DATA -o DIR
+    python -m benchmarks rivals turns DATA -o DIR
         ours and the engines on convex pieces in turn: medians and ranges of 7 rounds at 4 ms
-    python benchmarks/rivals.py large -o DIR
+    python -m benchmarks rivals large -o DIR
         the first 20 steps of large scenes with inner steps of 4 ms: as they fall, and at rest
 
 DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 10, 4, 2 and 1 ms (of bodies of a
@@ -13,7 +13,6 @@ are CoACD's, with one setting for all, where a shape has none of its own. Making
 timed. Restitution is 0, friction the same for all. DIR keeps results.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,11 +23,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks.engines.drake import drake
 from benchmarks.engines.newton import newton
-from benchmarks.results import in_turn, progress, script, spread, write_section
+from benchmarks.results import in_turn, progress, spread, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
 from sdfsim.base.errors import SdfsimError
@@ -152,7 +149,6 @@ def scan(folder: Path) -> Scene:
 
 
 def written(folder: Path, name: str, count: int | None = None) -> Scene:
-    """One of the large scenes."""
     return load_scene(write_scene(name, folder / f"{name}{count or ''}", count))
 
 
@@ -287,7 +283,6 @@ def lost(case: str, run: Ran, size: float) -> int:
 
 
 def compared(cases: list[str], data: Path | None, out: Path) -> Results:
-    """Every engine's results of some cases."""
     for case in set(cases) & set(LARGE):
         CASES[case](out / "scenes")  # settles it here: a process that is measured has no memory of that
     content = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION]
@@ -300,7 +295,6 @@ def compared(cases: list[str], data: Path | None, out: Path) -> Results:
 
 
 def why_not(result: dict[str, Any]) -> str:
-    """Why a result has no figures at the usual inner step."""
     return result.get("failed") or "; ".join(result["broken"].values())
 
 
@@ -321,7 +315,7 @@ def shapes(data: Path, *, out: Path) -> None:
             number(100 * usual.get("away", np.nan), 2), str(usual["lost"]),
             number(min(equal)) if equal else "none", number(result["prepare_s"], 2), number(result["mib"]),
         ))  # fmt: skip
-    write_section("rivals", "python benchmarks/rivals.py shapes DATA -o DIR", markdown(rows))
+    write_section("rivals", "python -m benchmarks rivals shapes DATA -o DIR", markdown(rows))
 
 
 @one_thread()
@@ -337,7 +331,7 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
         taken = in_turn([partial(mean, name) for name in FAST], rounds)
         progress((k + 1) / len(SHAPES), case)
         rows.append((case, *map(spread, [*taken.T, *(taken[:, :1] / taken[:, 1:]).T])))
-    write_section("rivals in turn", "python benchmarks/rivals.py turns DATA -o DIR", markdown(rows))
+    write_section("rivals in turn", "python -m benchmarks rivals turns DATA -o DIR", markdown(rows))
 
 
 def large(*, out: Path) -> None:
@@ -351,8 +345,7 @@ def large(*, out: Path) -> None:
         else:
             rows[case].append(why_not(result))
     table = markdown([("ms a simulated second / MiB / depth, %", *ENGINES), *rows.values()])
-    write_section("large rivals", "python benchmarks/rivals.py large -o DIR", table)
+    write_section("large rivals", "python -m benchmarks rivals large -o DIR", table)
 
 
-if __name__ == "__main__":
-    script(__doc__, shapes, turns, large)
+COMMANDS = (shapes, turns, large)

@@ -1,6 +1,6 @@
 """How many robots of PyBullet's data import, and whether MuJoCo puts their links where the scenes do.
 
-    python benchmarks/robots.py [--files FILE ...]     # else all of pybullet_data but its random solids
+    python -m benchmarks robots [--files FILE ...]     # else all of pybullet_data but its random solids
 
 Of each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
 scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
@@ -8,7 +8,6 @@ scene's links, over the start and 20 random positions of all joints; the largest
 
 import math
 import re
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import progress, script
+from benchmarks.results import progress
 from sdfsim import load_scene
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.base.errors import SdfsimError
@@ -199,7 +196,3 @@ def _all() -> list[Path]:
     data = Path(pybullet_data.getDataPath())
     found = [*data.rglob("*.urdf"), *(data / "mjcf").glob("*.xml")]
     return sorted(file for file in found if "random_urdfs" not in file.parts)
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

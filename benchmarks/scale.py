@@ -1,12 +1,12 @@
 """Time and memory of large scenes, and of many scenes at once: RESULTS.md.
 
-    python benchmarks/scale.py growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
+    python -m benchmarks scale growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
         bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, beside networks and two engines
-    python benchmarks/scale.py large -o DIR
+    python -m benchmarks scale large -o DIR
         heaps, shoes and knots to the end on all cores, each with a movie
-    python benchmarks/scale.py many DATA [--scenes 1000]
+    python -m benchmarks scale many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
-    python benchmarks/scale.py roofline
+    python -m benchmarks scale roofline
         what a distance, a contact and a row of impulses cost, beside what the machine could do: docs/scale.md
 
 Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
@@ -28,9 +28,7 @@ import numpy as np
 import torch
 from numba import njit
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import ROOT, progress, script, write_section
+from benchmarks.results import ROOT, progress, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
@@ -38,7 +36,7 @@ from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Engine, bullet, mujoco, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
-from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
+from sdfsim.evaluation.harness import Job, cells, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
 from sdfsim.evaluation.runs import Ran, scene_rollout
 from sdfsim.learned.model import load_model
@@ -147,20 +145,10 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
 
 
 def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None:
-    """Write the section and scale.png."""
     results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=progress)
-    bowls = {key: found for key, found in results.items() if "bowl" in key[0]}
-    panels = []
-    for name in ("ms", "peak_mib"):
-        lines = []
-        for method in dict.fromkeys(method for _, method in bowls):
-            mine = [found for (_, one), found in bowls.items() if one == method]
-            lines.append(line(method, mine, "bodies", name))
-        panels.append(Panel("spheres in a bowl", "spheres", COLUMNS[name], lines, "xy"))
-    draw(panels, out / "scale.png")
     rows = [("case", "with", *COLUMNS.values(), "")]
     rows += [(*key, *cells(found, COLUMNS)) for key, found in results.items()]
-    write_section("growth", "python benchmarks/scale.py growth -o DIR", markdown(rows))
+    write_section("growth", "python -m benchmarks scale growth -o DIR", markdown(rows))
 
 
 def to_the_end(name: str, home: Path) -> dict[str, Any]:
@@ -189,14 +177,13 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
 
 
 def large(*, out: Path) -> None:
-    """Write the section and a movie each."""
     jobs = [Job("to the end", name, [name], to_the_end, (name, out)) for name in HEAPS]
     results = measure(jobs, out / "large", where="fresh", on_progress=progress)
     titles = {"bodies": "bodies", "nodes": "nodes", "steps": "steps", "s": "s from command to recording", "mib": "MiB",
               "worst": "deepest, mm", "lost": "below the floor"}  # fmt: skip
     rows = [("", *titles.values())]
     rows += [(name, *(number(results["to the end", name][k]) for k in titles)) for name in HEAPS]
-    write_section("large scenes", "python benchmarks/scale.py large -o DIR", markdown(rows))
+    write_section("large scenes", "python -m benchmarks scale large -o DIR", markdown(rows))
 
 
 def simulated(scenes: list[Scene], steps: int) -> None:
@@ -223,7 +210,7 @@ def many(data: Path, *, scenes: int = 1000) -> None:
                 rate = scenes / (time.perf_counter() - began)
         first = first or rate
         rows.append((str(workers), number(rate), f"{rate / first:.2f}"))
-    write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {scenes}", markdown(rows))
+    write_section("many scenes", f"python -m benchmarks scale many DATA --scenes {scenes}", markdown(rows))
 
 
 # Operations (a product, a sum, a comparison or a root each) and bytes of one distance, one contact and one row, counted
@@ -255,7 +242,7 @@ def roofline() -> None:
         told = ((operations, rate / 1e9, rate / flops), (moved, speed / 1e9, speed / bandwidth))
         first, second = ([number(v) for v in some] if some[0] else ["-"] * 3 for some in told)
         rows.append((name, first[0], second[0], number(1e9 * seconds), first[1], second[1], first[2], second[2]))
-    write_section("roofline", "python benchmarks/scale.py roofline", markdown(rows), ROOT / "docs" / "scale.md")
+    write_section("roofline", "python -m benchmarks scale roofline", markdown(rows), ROOT / "docs" / "scale.md")
 
 
 def best(call: Callable[[], object], rounds: int = 7) -> float:
@@ -349,5 +336,4 @@ def row_time() -> float:
     return best(lambda: _swept(np.ones(bodies), rules, system, change, len(start) - 1)) / (ROWS * SWEEPS)
 
 
-if __name__ == "__main__":
-    script(__doc__, growth, large, many, roofline)
+COMMANDS = (growth, large, many, roofline)

@@ -1,13 +1,12 @@
 """How good, how fast and how large our SDF networks are, beside the paper's recipe and other representations.
 
-    python benchmarks/sdf.py MESH_FOLDER -o DIR [--seconds 60]
+    python -m benchmarks sdf MESH_FOLDER -o DIR [--seconds 60]
 
 MESH_FOLDER holds NAME/visual_geometry.obj for each shape; `kubasic` downloads Kubric's. Each is fitted with our recipe
 and the paper's at equal time, with other widths of the network, and with smaller budgets; then queries of one shape are
 timed. Fits that DIR holds are not made again. Writes DIR/table.md and DIR/sdf.png.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,9 +17,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import in_turn, progress, script
+from benchmarks.results import in_turn, progress
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
 from sdfsim.data.public_shapes import public_folder
@@ -126,7 +123,3 @@ def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
     text = f"{markdown(table)}\n{markdown(rows)}"
     write_text(out / "table.md", text)
     print(text)
-
-
-if __name__ == "__main__":
-    script(__doc__, main)

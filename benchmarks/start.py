@@ -1,6 +1,6 @@
 """How long a command takes from nothing to its end, and how much memory, and a box that falls: RESULTS.md.
 
-    python -m benchmarks.start [--rounds 7]
+    python -m benchmarks start [--rounds 7]
 
 Every case is a process of its own, all of them in turn; medians. Compiled code and what else is kept on disk is there
 from a first round, which is left out. Processor time says what a free machine would take where this one was not free.
@@ -13,7 +13,7 @@ import tempfile
 
 import numpy as np
 
-from benchmarks.results import ROOT, in_turn, script, write_section
+from benchmarks.results import ROOT, in_turn, write_section
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation.harness import markdown, number
 
@@ -68,8 +68,4 @@ def main(*, rounds: int = 7) -> None:
         found = np.median(in_turn([lambda some=some: ended(some) for some in cases.values()], rounds), axis=0)
     rows = [("from nothing", "s", "s of the processor", "MiB")]
     rows += [(name, *map(number, values)) for name, values in zip(cases, found, strict=True)]
-    write_section("start", "python -m benchmarks.start", markdown(rows))
-
-
-if __name__ == "__main__":
-    script(__doc__, main)
+    write_section("start", "python -m benchmarks start", markdown(rows))

@@ -1,6 +1,6 @@
 """What becomes of photos, meshes and recordings that nobody tuned anything on: a line each.
 
-    python benchmarks/strangers.py FOLDER -o DIR [--preset quick] [--longest 1800] [--page]
+    python -m benchmarks strangers FOLDER -o DIR [--preset quick] [--longest 1800] [--page]
 
 Takes what it finds below FOLDER for what it is: folders of three photos or more (with none of a mesh beside them, whose
 textures they would be), COLMAP models' folders of photos, videos and captures of phones; mesh files; run folders, and
@@ -24,9 +24,7 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import ROOT, script, write_section
+from benchmarks.results import ROOT, write_section
 from pipeline.inputs.captures import ARCHIVES
 from pipeline.inputs.sources import MIN_PHOTOS, VIDEOS, photos_in
 from sdfsim import Scene, load_shape
@@ -251,8 +249,4 @@ def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 180
         write_json(out / "table.json", [asdict(row) for row in rows])  # as far as it got
     write_text(out / "table.md", table(rows))
     if page:
-        write_section("strangers", "python benchmarks/strangers.py FOLDER -o DIR --page", table(rows), PAGE)
-
-
-if __name__ == "__main__":
-    script(__doc__, main)
+        write_section("strangers", "python -m benchmarks strangers FOLDER -o DIR --page", table(rows), PAGE)

@@ -1,6 +1,6 @@
 """The first lists of RESULTS.md, from the tables of its pages: what is lost, then what is won.
 
-    python -m benchmarks.summary
+    python -m benchmarks summary
 
 No number of theirs is written by hand: after any table was measured again, this command makes them agree.
 """
@@ -8,7 +8,7 @@ No number of theirs is written by hand: after any table was measured again, this
 import re
 from collections.abc import Iterator
 
-from benchmarks.results import ROOT, script, section, write_section
+from benchmarks.results import ROOT, section, write_section
 from sdfsim.evaluation.harness import number
 
 OURS, PULLED = "sdfsim", ("PyBullet, pieces", "MuJoCo, pieces")  # engines on convex pieces
@@ -175,8 +175,4 @@ def summary() -> str:
 
 
 def main() -> None:
-    write_section("summary", "python -m benchmarks.summary", summary())
-
-
-if __name__ == "__main__":
-    script(__doc__, main)
+    write_section("summary", "python -m benchmarks summary", summary())

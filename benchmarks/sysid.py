@@ -1,7 +1,7 @@
 """MuJoCo's own system identification on the recorded tosses of a cube, beside `sdfsim identify`: docs/identify.md.
 
     pip install 'mujoco[sysid]'
-    python benchmarks/sysid.py TOSSES [--frames N ...]
+    python -m benchmarks sysid TOSSES [--frames N ...]
 
 MuJoCo's least squares (`mujoco.sysid.optimize`) move the parameters that benchmarks/reality.py searches for, from the
 middle of their bounds, until 60 tosses go as recorded; over so many frames of them as are given. All is judged on the
@@ -10,55 +10,52 @@ middle of their bounds, until 60 tosses go as recorded; over so many frames of t
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
-import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.reality import FRAMES, GRAVITY, SIDE, SOFT, errors, fitted_start, load_tosses, mujoco, recorded, split
-from sdfsim.base.errors import SdfsimError, run_main
+from benchmarks.reality import GRAVITY, SIDE, THING, errors, fitted_start, load_tosses, split
+from benchmarks.tosses import FRAMES, SOFT, mujoco, recorded
+from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation.engines import engine_module
 from sdfsim.evaluation.harness import one_thread
 from sdfsim.evaluation.metrics import interval
 
-SHORT = (25, 40, FRAMES)  # frames that are fitted
+SHORT = [25, 40, FRAMES]
 
 
 @one_thread()
-def main(tosses: Path, horizons: Sequence[int]) -> None:
+def main(tosses: Path, *, frames: list[int] = SHORT) -> None:
+    """Fit over so many `frames`, and print the errors over all that are compared."""
     toolbox: Any = engine_module("mujoco.sysid", "MuJoCo's sysid", "bench")
     if not hasattr(toolbox, "optimize"):  # it swallows what is missing
         raise SdfsimError("MuJoCo's sysid is not installed", "pip install 'mujoco[sysid]'")
     known = load_tosses(tosses)
     groups = split(known)[:2]
-    dt = known[0].dt
+    dt, down = known[0].dt, np.array([0.0, 0.0, -GRAVITY])
     (fit, fit_truth), (test, test_truth) = (
         ([fitted_start(toss, GRAVITY) for toss in group], recorded(group)) for group in groups
     )
     turns = Rotation.from_quat(fit_truth.quat_xyzw.reshape(-1, 4))
-    for frames in horizons:
+    for horizon in frames:
         runs = [0]
 
-        def off(x: np.ndarray, _: Any, frames: int = frames, runs: list[int] = runs) -> tuple[list, None, None]:
+        def off(x: np.ndarray, _: Any, horizon: int = horizon, runs: list[int] = runs) -> tuple[list, None, None]:
             """Places in sides and turns in rad; a column for each of `x` [parameters, columns]."""
             columns = []
             for point in np.atleast_2d(x.T):
                 runs[0] += 1
-                found = mujoco(fit, dt, GRAVITY, dict(zip(SOFT, point, strict=True)))
+                found = mujoco(THING, fit, dt, down, dict(zip(SOFT, point, strict=True)))
                 turned = (Rotation.from_quat(found.quat_xyzw.reshape(-1, 4)) * turns.inv()).as_rotvec()
                 away = np.concatenate(
                     [(found.position - fit_truth.position) / SIDE, turned.reshape(found.position.shape)], -1
                 )
-                columns.append(away[:, :frames].ravel())
+                columns.append(away[:, :horizon].ravel())
             return [columns[0] if x.ndim == 1 else np.stack(columns, 1)], None, None
 
         wanted = toolbox.ParameterDict(
@@ -71,17 +68,9 @@ def main(tosses: Path, horizons: Sequence[int]) -> None:
         values = dict(zip(SOFT, made.as_vector().tolist(), strict=True))
         for name, starts, truth in (("the 60", fit, fit_truth), ("100 others", test, test_truth)):
             told = []
-            for error in errors(mujoco(starts, dt, GRAVITY, values), truth):
+            for error in errors(mujoco(THING, starts, dt, down, values), truth):
                 low, high = interval(error)
                 told.append(f"{error.mean():.2f} [{low:.2f}, {high:.2f}]")
-            print(f"{frames} frames, {name}: {told[0]} % of the side, {told[1]} degrees")
+            print(f"{horizon} frames, {name}: {told[0]} % of the side, {told[1]} degrees")
         found = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-        print(f"{frames} frames: {runs[0]} runs of all tosses, {spent:.0f} s of processor time: {found}")
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("tosses", type=Path)
-    parser.add_argument("--frames", type=int, nargs="+", default=list(SHORT), help="that are fitted")
-    args = parser.parse_args()
-    run_main(lambda: main(args.tosses, args.frames))
+        print(f"{horizon} frames: {runs[0]} runs of all tosses, {spent:.0f} s of processor time: {found}")

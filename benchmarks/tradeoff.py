@@ -1,17 +1,14 @@
 """What `sdfsim tradeoff` finds on MOVi-B, with its picture: RESULTS.md.
 
-    python benchmarks/tradeoff.py DATA -o DIR
+    python -m benchmarks tradeoff DATA -o DIR
 
 DATA is a MOVi-B dataset; DIR keeps the results of the command, which this script continues.
 """
 
 import shutil
-import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.results import ROOT, progress, script, write_section
+from benchmarks.results import ROOT, progress, write_section
 from sdfsim.evaluation import tradeoff as study
 from sdfsim.evaluation.harness import markdown
 
@@ -21,8 +18,4 @@ def main(data: Path, *, out: Path) -> None:
     rows, notes = study.report_table(report)
     shutil.copyfile(out / "tradeoff.png", ROOT / "docs" / "images" / "tradeoff.png")
     text = f"{markdown(rows)}\n{notes[0]}.\n\n![Error against time](../images/tradeoff.png)"
-    write_section("tradeoff", "python benchmarks/tradeoff.py DATA -o DIR", text)
-
-
-if __name__ == "__main__":
-    script(__doc__, main)
+    write_section("tradeoff", "python -m benchmarks tradeoff DATA -o DIR", text)

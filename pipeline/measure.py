@@ -4,17 +4,14 @@ import base64
 import io
 import json
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
 
-from pipeline.inputs.captures import spread, unpack
-from pipeline.inputs.photos import pictures
-from pipeline.inputs.sources import find_source
-from pipeline.progress import Progress, quiet
+from pipeline.inputs.photos import opened, pictures
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, write_text
+from sdfsim.base.parallel import Progress, silent
 
 SIDE = 1280  # px, the longer side of a photo on the page
 QUALITY = 82  # of JPEG: 48 photos of the bundled set are 5 MB
@@ -22,7 +19,7 @@ PAGE = Path(__file__).with_name("measure.html")
 MARK = "__PHOTOS__"  # where the page has its photos
 
 
-def measure(given: Path | str, out: Path | str, *, on_progress: Progress = quiet) -> dict:
+def measure(given: Path | str, out: Path | str, *, on_progress: Progress = silent) -> dict:
     """Write one HTML file that holds the photos (what `reconstruct` takes) and needs nothing else, nor a network.
 
     Two clicks in it give `--distance PLACE PLACE METRES`, one gives `--body NAME=PHOTO:X,Y`; pixels count in the
@@ -35,14 +32,8 @@ def measure(given: Path | str, out: Path | str, *, on_progress: Progress = quiet
     if out.is_dir():
         raise SdfsimError(f"{out}: is a folder", "choose another -o")
     check_writable(out.parent)
-    source = find_source(given)
-    with tempfile.TemporaryDirectory() as folder:
-        if source.archive is not None:
-            unpack(source.archive, Path(folder))
-            source = find_source(Path(folder), unpacked=True)
-        if source.capture:
-            source = replace(source, photos=tuple(spread(source.photos, source.frames)))
-        photos = []
+    photos = []
+    with tempfile.TemporaryDirectory() as folder, opened(given, Path(folder)) as source:
         for name, picture, _, fraction in pictures(source):
             image = Image.fromarray(picture.pixels)
             image.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)

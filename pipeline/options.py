@@ -92,35 +92,22 @@ class Options(BaseModel):
             raise SdfsimError(message, exit_code=EXIT_USAGE)
         return corners[0] + corners[1]
 
-    @field_validator("material", mode="before")
+    @field_validator("material", "body", mode="before")
     @classmethod
-    def _read_materials(cls, given: Any) -> Any:
-        """Materials by body from a list of `BODY=MATERIAL`, as they are on the command line."""
+    def _read_by_body(cls, given: Any, info: ValidationInfo) -> Any:
+        """Values by body from a list of `BODY=VALUE`, as they are on the command line; several places of one body."""
         if not isinstance(given, list):
             return given
-        found: dict[str, str] = {}
-        for text in given:
-            body, _, material = text.partition("=")
-            if not body or not material or body in found:
-                message = f"--material takes BODY=MATERIAL once for a body, such as object1=wood (got {text})"
-                raise SdfsimError(message, exit_code=EXIT_USAGE)
-            found[body] = material
-        return found
-
-    @field_validator("body", mode="before")
-    @classmethod
-    def _read_bodies(cls, given: Any) -> Any:
-        """Places by body from a list of `NAME=PHOTO:X,Y`, as they are on the command line."""
-        if not isinstance(given, list):
-            return given
+        once = info.field_name == "material"
         found: dict[str, list[str]] = {}
         for text in given:
-            name, _, spot = text.partition("=")
-            if not name or not spot:
-                message = f"--body takes NAME=PHOTO:X,Y, such as cup=041.jpg:300,200 (got {text})"
-                raise SdfsimError(message, exit_code=EXIT_USAGE)
-            found.setdefault(name, []).append(spot)
-        return found
+            body, _, value = text.partition("=")
+            if not body or not value or (once and body in found):
+                form = "BODY=MATERIAL once for a body, such as object1=wood"
+                form = form if once else "NAME=PHOTO:X,Y, such as cup=041.jpg:300,200"
+                raise SdfsimError(f"--{info.field_name} takes {form} (got {text})", exit_code=EXIT_USAGE)
+            found.setdefault(body, []).append(value)
+        return {body: values[0] for body, values in found.items()} if once else found
 
     @field_validator("size", "distance")
     @classmethod

@@ -20,9 +20,9 @@ from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held, scene_keys
 from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
 from pipeline.mesh.visibility import Above
-from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.files import write_text
+from sdfsim.base.parallel import Progress, share_of, silent
 from sdfsim.geometry.bvh import ClosestPoint
 from sdfsim.geometry.mesh import Mesh, face_normals, joined
 from sdfsim.geometry.mesh_io import load_mesh, read_glb
@@ -47,7 +47,7 @@ GAP = 0.3  # of the fall, as a share of the side
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default",
               sdf: Literal["grid", "mlp"] = "mlp", seed: int = 0, device: str = "cpu",
-              on_progress: Progress = quiet) -> dict:  # fmt: skip
+              on_progress: Progress = silent) -> dict:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body within the budget, s, or samples their distances on a grid;
     each is a Shape folder in `out` that `folder_of` names, and those that are there already are kept. Returns a
     certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them."""

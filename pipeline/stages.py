@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from pipeline.options import COMMAND, OptionKeys, Options, options_of, read_config, write_config
-from pipeline.progress import Progress
 from pipeline.report import write_report
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import CONFIG, check_own, locked, write_json
+from sdfsim.base.parallel import Progress
 
 # In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of one at work: its fingerprint alone.
 RECORD = "stage.json"
@@ -164,14 +164,20 @@ def reconstruct(
 ) -> dict:  # fmt: skip
     """Photos -> a scene, by all stages: `pipeline.states.reconstruct` says more."""
     resolved = options_of(photos=str(Path(photos).absolute()), **options)
-    names = list(STAGES)
-    first = number_of(from_stage) if from_stage else len(names)
-    last = number_of(until_stage) if until_stage else len(names) - 1
-    if from_stage and first > last:
-        raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
+    wanted = wanted_stages(from_stage, until_stage)
     project = Project(Path(out), resolved, progress)
     check_apart(project)
-    return run_all(project, {stage: number >= first for number, stage in enumerate(names[: last + 1])})
+    return run_all(project, wanted)
+
+
+def wanted_stages(from_stage: str | None, until_stage: str | None) -> dict[str, bool]:
+    """The stages up to one, and whether each is to be done even where nothing changed, as those from another one on
+    are. Raises SdfsimError where there is no such stage, or they are in the wrong order."""
+    first, last = number_of(from_stage or "scene"), number_of(until_stage or "scene")
+    if from_stage and first > last:
+        raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
+    names = list(STAGES)[: last + 1]
+    return {name: from_stage is not None and number >= first for number, name in enumerate(names)}
 
 
 def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, float, str], None] | None = None,

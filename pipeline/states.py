@@ -33,7 +33,7 @@ from pipeline.mesh.joint import JOINT, PART, HeldPart, find_joint
 from pipeline.mesh.moving_part import CELLS, alike, label_images, load_state, part_of, tie, which_move
 from pipeline.mesh.placement import check_distance, load_placement
 from pipeline.options import OptionKeys, options_of
-from pipeline.stages import RECORD, Instead, Project, check_apart, number_of, read_record, run_all
+from pipeline.stages import RECORD, Instead, Project, check_apart, read_record, run_all, wanted_stages
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
 from sdfsim.base.files import write_json
 
@@ -88,14 +88,11 @@ def reconstruct_states(
         if getattr(resolved, name):
             message = f"--{name} goes without --joint"
             raise SdfsimError(message, "give it to `sdfsim mesh` afterwards", exit_code=EXIT_USAGE)
-    start = number_of(from_stage) if from_stage else number_of("scene") + 1
-    last = number_of(until_stage or "scene")
-    if from_stage and start > last:
-        raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
+    again = wanted_stages(from_stage, until_stage)
 
     def wanted(*names: str) -> dict[str, bool]:
         """Those of some stages that are to be done, and whether also where nothing changed."""
-        return {name: number_of(name) >= start for name in names if number_of(name) <= last}
+        return {name: again[name] for name in names if name in again}
 
     def project(name: str, **changes: Any) -> Project:
         said = None if progress is None else _named(progress, name or "scene")
@@ -118,7 +115,7 @@ def reconstruct_states(
     for state in states:
         state.started = time.monotonic()
         report = run_all(state, wanted("photos", "poses", "distill", "mesh"))
-    if last < number_of("mesh"):
+    if "mesh" not in again:
         return report, states[1].folder
     final.instead["photos"] = Instead(lambda own, work: label_part(own, states, scaled, work),
                                       [_record(state, "mesh")["made"] for state in states])  # fmt: skip
@@ -128,7 +125,7 @@ def reconstruct_states(
     for stage in ("poses", "distill"):
         record = _record(best, stage)
         final.instead[stage] = Instead(lambda _, work, stage=stage: take(best, stage, work), record["made"])
-    return run_all(final, wanted("photos", "poses", "distill", "mesh", "fit", "scene")), final.folder
+    return run_all(final, again), final.folder
 
 
 def _named(progress: Said, name: str) -> Said:

@@ -13,7 +13,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from sdfsim.apps.recording import framed
-from sdfsim.apps.render import Studio, eye_of, poses_at
+from sdfsim.apps.render import Studio, eye_of
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError, run_main
 from sdfsim.base.files import replacing
@@ -55,7 +55,7 @@ def main() -> None:
     times = np.arange(0.0, end, 1.0 / RATE)
     moving = []
     for time in times:
-        picture = Image.fromarray(studio.picture(*poses_at(rollout, float(time))))
+        picture = Image.fromarray(studio.picture_at(rollout, float(time)))
         moving.append(
             picture.resize((round(picture.width * HEIGHT / picture.height), HEIGHT), Image.Resampling.LANCZOS)
         )

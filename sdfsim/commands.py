@@ -3,7 +3,7 @@ evaluate; tradeoff, stress."""
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -51,21 +51,8 @@ def simulate(
 
         shapes = partial(session.stage_progress, "shapes")
         recorded = load_beside(beside, scene, allow_outside=allow_outside, on_progress=shapes)
-    report = run.simulate(
-        scene,
-        out,
-        model=model,
-        seconds=seconds,
-        seed=seed,
-        viewer=viewer,
-        allow_outside=allow_outside,
-        until_settled=until_settled,
-        resume=resume,
-        beside=recorded,
-        device=device,
-        on_progress=session.stage_progress,
-        say=session.say,
-    )
+    more = {"beside": recorded, "on_progress": session.stage_progress, "say": session.say}
+    report = run.simulate(scene, **session.given("scene", "beside"), **more)
     median = report["step_ms_median"]
     lines = [
         f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
@@ -94,9 +81,7 @@ def plan(
     """Which effects are in play, why, and what a step costs."""
     from sdfsim.apps import plan as room
 
-    report = room.describe(
-        scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
-    )
+    report = room.describe(scene, **session.given("scene"), on_progress=session.stage_progress)
     for note in report["notes"]:
         session.say(note)
     for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
@@ -190,15 +175,7 @@ def export(
     """Shape, scene or run -> a file of other programs (docs/export.md)."""
     from sdfsim.apps import export as room
 
-    report = room.export(
-        source,
-        out,
-        scene_file=scene,
-        fps=fps,
-        collide=collide,
-        allow_outside=allow_outside,
-        on_progress=session.stage_progress,
-    )
+    report = room.export(**session.given("scene"), scene_file=scene, on_progress=session.stage_progress)
     files = report["files"]
     lines = [
         f"bodies {report['bodies']}, frames {report['frames']}",
@@ -228,9 +205,8 @@ def import_(
     """URDF or MJCF -> scene.yaml with joints (docs/import.md)."""
     from sdfsim.apps import import_robot as room
 
-    report = room.import_robot(
-        source, out, packages=packages or [], fixed=fixed, floor=floor, key=key, on_progress=session.stage_progress
-    )
+    given = session.given("packages")
+    report = room.import_robot(**given, packages=packages or [], on_progress=session.stage_progress)
     lines = [
         f"links {report['links']}, joints {report['joints']}",
         f"wrote {report['files'][0]}" + (f" and {n} shapes beside it" if (n := len(report["files"]) - 1) else ""),
@@ -323,18 +299,7 @@ def dataset(
     from sdfsim.data.generate import make_dataset, report_lines
 
     with working_on(cluster):
-        report = make_dataset(
-            recipe,
-            out,
-            trajectories=trajectories,
-            shapes=shapes,
-            random_solids=random_solids,
-            bodies=bodies,
-            fps=int(fps),
-            seed=seed,
-            split=split,
-            on_progress=session.progress,
-        )
+        report = make_dataset(**session.given("cluster", "fps"), fps=int(fps), on_progress=session.progress)
     session.report(report, report_lines(report))
 
 
@@ -374,8 +339,7 @@ def train(
     """Train a model on datasets, or on recordings of real motions."""
     from sdfsim.training.train import train as run_training
 
-    how = {"preset": preset, "resume": resume, "workers": workers, "device": device, "scene": scene, "first": first}
-    session.report(run_training(data, out, **how, on_progress=session.progress))
+    session.report(run_training(**session.given(), on_progress=session.progress))
 
 
 @command
@@ -396,15 +360,7 @@ def evaluate(
     from sdfsim.evaluation.evaluate import evaluate as run_evaluation
     from sdfsim.evaluation.evaluate import report_lines
 
-    report = run_evaluation(
-        data,
-        model=model,
-        steps=steps,
-        device=device,
-        free_flight=free_flight,
-        chaos_floor=chaos_floor,
-        on_progress=session.progress,
-    )
+    report = run_evaluation(**session.given(), on_progress=session.progress)
     session.report(report, report_lines(report))
 
 
@@ -445,8 +401,7 @@ def stress(
     from sdfsim.evaluation.harness import check_matplotlib
 
     check_matplotlib()
-    options: Any = {"models": model or [], "quick": quick, "shapes": shapes, "device": device}
-    found = study.stress(out, **options, on_progress=session.progress)
+    found = study.stress(**session.given("model"), models=model or [], on_progress=session.progress)
     report = study.write_report(found, out)
     tell_failed(session, report)
     table = columns(study.rows(found, {"missed": "!", "behind": "<"}))

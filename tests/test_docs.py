@@ -127,7 +127,7 @@ def test_results_are_short_and_every_table_says_when_and_how():
 
 
 def test_the_first_lists_of_results_are_what_the_tables_say():
-    """Run `python -m benchmarks.summary` after any table was measured again."""
+    """Run `python -m benchmarks summary` after any table was measured again."""
     assert measured("summary").partition("\n\n")[2].strip() == summary().strip()
 
 

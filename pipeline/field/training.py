@@ -41,12 +41,11 @@ from pipeline.field.supervision import (
 )
 from pipeline.inputs.images import BACKDROP, reduced
 from pipeline.inputs.photos import load_photos
-from pipeline.progress import Progress, quiet, share_of
 from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
 from pipeline.stereo.fusion import Fused, behind, fuse
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
-from sdfsim.base.parallel import choose_threads
+from sdfsim.base.parallel import Progress, choose_threads, share_of, silent
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
@@ -506,7 +505,7 @@ class Trained:
 def train(
     poses: PosedPhotos, photos_folder: Path, out: Path, *, settings: Settings,
     budget: float | None = None, seed: int = 0, device: str = "cpu", threads: int | None = None,
-    checkpoint_every: float = 20.0, on_progress: Progress = quiet,
+    checkpoint_every: float = 20.0, on_progress: Progress = silent,
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
@@ -595,7 +594,7 @@ def train(
 
 
 def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
-          on_progress: Progress = quiet) -> dict:  # fmt: skip
+          on_progress: Progress = silent) -> dict:  # fmt: skip
     """PSNR of held-out views, in normalised space, for the report, at the training resolution (`psnr_px` on the long
     side); empty where none shows anything of the unit sphere. Of large photos one pixel of `SCORED` along each side is
     rendered; writes these pictures to `out`/held_out."""

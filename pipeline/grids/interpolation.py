@@ -18,42 +18,34 @@ from sdfsim.physics import solver as kernels
 NEAR = 2.0  # cells from a surface within which all bricks are there
 
 with kernels.kept():
-    from pipeline.grids.trilinear import (
-        BRICK,
-        gather,
-        gather_bricks,
-        gather_bricks_with_threads,
-        gather_with_threads,
-        scatter,
-        scatter_bricks,
-        scatter_bricks_with_threads,
-        scatter_with_threads,
-    )
+    from pipeline.grids.trilinear import BRICK, gather, gather_with_threads, scatter, scatter_with_threads
+
+WHOLE = torch.zeros((0, 0, 0), dtype=torch.int32)  # the bricks of a grid whose rows are all there
 
 
 def interpolate(grid: Tensor, points: Tensor) -> Tensor:
     """Trilinear values [P, C] of a grid [n, n, n, C] (z, y, x order) over [-1, 1]^3 at points [P, 3] (x, y, z), outside
     those of its border. Differentiable in the grid, not in the points."""
-    if grid.is_cuda:
-        return by_rows(grid, points)
-    return _OnCpu.apply(grid, points.detach().contiguous())  # type: ignore[no-any-return]
+    return interpolate_bricks(grid.reshape(-1, grid.shape[3]), WHOLE, grid.shape[0], points)
 
 
 def interpolate_bricks(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
     """The same as `interpolate` for a grid [side, side, side, C] that is there in bricks only: rows of a table [R, C]
     by `bricks` [m, m, m] int32 (z, y, x order), the numbers of those that are there, else -1; elsewhere it is 0."""
     if table.is_cuda:
-        return bricks_by_rows(table, bricks, side, points)
-    return _BricksOnCpu.apply(table, bricks, side, points.detach().contiguous())  # type: ignore[no-any-return]
+        return by_rows(table, bricks, side, points)
+    return _OnCpu.apply(table, bricks, side, points.detach().contiguous())  # type: ignore[no-any-return]
 
 
-def bricks_by_rows(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
+def by_rows(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
     """What `interpolate_bricks` gives, in torch alone, for any device."""
-    place, weights = _corners(side, points)
-    x, y, z = place % side, place // side % side, place // side**2
-    number = bricks[z // BRICK, y // BRICK, x // BRICK].long()
-    rows = number * BRICK**3 + ((z % BRICK) * BRICK + y % BRICK) * BRICK + x % BRICK
-    return _WeightedRows.apply(table, rows.clamp_min(0), weights * (number >= 0))  # type: ignore[no-any-return]
+    rows, weights = _corners(side, points)
+    if len(bricks):
+        x, y, z = rows % side, rows // side % side, rows // side**2
+        number = bricks[z // BRICK, y // BRICK, x // BRICK].long()
+        rows = number * BRICK**3 + ((z % BRICK) * BRICK + y % BRICK) * BRICK + x % BRICK
+        rows, weights = rows.clamp_min(0), weights * (number >= 0)
+    return _WeightedRows.apply(table, rows, weights)  # type: ignore[no-any-return]
 
 
 def near_bricks(distance: np.ndarray, side: int) -> np.ndarray:
@@ -77,34 +69,6 @@ class _OnCpu(torch.autograd.Function):
     """Values of a grid on the CPU, with torch's number of threads."""
 
     @staticmethod
-    def forward(ctx: Any, grid: Tensor, points: Tensor) -> Tensor:
-        """[P, C] from a grid [n, n, n, C] at points [P, 3]."""
-        ctx.save_for_backward(points)
-        ctx.shape = grid.shape
-        found = grid.new_empty(len(points), grid.shape[3])
-        given = grid.detach().contiguous().numpy(), points.numpy(), found.numpy()
-        if torch.get_num_threads() == 1:
-            gather(*given, 0, len(points))
-        else:
-            _with_threads(gather_with_threads, *given)
-        return found
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
-        (points,) = ctx.saved_tensors
-        gradient = grads[0].new_zeros(ctx.shape)
-        given = gradient.numpy(), points.numpy(), grads[0].contiguous().numpy()
-        if torch.get_num_threads() == 1:
-            scatter(*given, 1, 0)
-        else:
-            _with_threads(scatter_with_threads, *given)
-        return gradient, None
-
-
-class _BricksOnCpu(torch.autograd.Function):
-    """The same for a grid in bricks."""
-
-    @staticmethod
     def forward(ctx: Any, table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
         """[P, C] from a table [R, C] at points [P, 3], see `interpolate_bricks`."""
         ctx.save_for_backward(bricks, points)
@@ -112,9 +76,9 @@ class _BricksOnCpu(torch.autograd.Function):
         found = table.new_empty(len(points), table.shape[1])
         given = table.detach().contiguous().numpy(), bricks.numpy(), side, points.numpy(), found.numpy()
         if torch.get_num_threads() == 1:
-            gather_bricks(*given, 0, len(points))
+            gather(*given, 0, len(points))
         else:
-            _with_threads(gather_bricks_with_threads, *given)
+            _with_threads(gather_with_threads, *given)
         return found
 
     @staticmethod
@@ -123,9 +87,9 @@ class _BricksOnCpu(torch.autograd.Function):
         gradient = grads[0].new_zeros(ctx.shape)
         given = gradient.numpy(), bricks.numpy(), ctx.side, points.numpy(), grads[0].contiguous().numpy()
         if torch.get_num_threads() == 1:
-            scatter_bricks(*given, 1, 0)
+            scatter(*given, 1, 0)
         else:
-            _with_threads(scatter_bricks_with_threads, *given)
+            _with_threads(scatter_with_threads, *given)
         return gradient, None, None, None
 
 
@@ -137,12 +101,6 @@ def _with_threads(work: Any, *given: Any) -> None:
     numba.set_num_threads(count)
     work(*given, count)
     numba.set_num_threads(before)
-
-
-def by_rows(grid: Tensor, points: Tensor) -> Tensor:
-    """What `interpolate` gives, in torch alone, for any device."""
-    rows, weights = _corners(grid.shape[0], points)
-    return _WeightedRows.apply(grid.reshape(-1, grid.shape[3]), rows, weights)  # type: ignore[no-any-return]
 
 
 def _corners(side: int, points: Tensor) -> tuple[Tensor, Tensor]:

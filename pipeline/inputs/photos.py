@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -16,9 +17,9 @@ from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, read_ph
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
-from pipeline.progress import Progress, quiet
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json
+from sdfsim.base.parallel import Progress, silent
 
 LONG_SIDE = 1600  # px; what reads the photos takes them as small as it needs
 KNOWN_CAMERAS = "known_cameras.json"  # cameras that came with the photos
@@ -50,7 +51,7 @@ class Photo:
 
 
 def prepare_photos(
-    given: Path, out: Path, *, long_side: int = LONG_SIDE, on_progress: Progress = quiet
+    given: Path, out: Path, *, long_side: int = LONG_SIDE, on_progress: Progress = silent
 ) -> tuple[list[Photo], list[str]]:
     """Reads every photo (see `find_source`) and writes upright copies of at most `long_side` px to `out`.
 
@@ -58,62 +59,64 @@ def prepare_photos(
     `labels/NNNN.jpg.png` with their names, `known_cameras.json` and `capture.json`. Returns the photos in order, and
     notes for the report.
     """
-    source, out = find_source(given), Path(out)
-    if source.archive is None:
-        return _prepare(source, out, long_side, on_progress)
-    unpacked = out / ".capture"
-    unpack(source.archive, unpacked)
+    out = Path(out)
+    with opened(given, out / ".capture") as source:
+        (out / "images").mkdir(parents=True, exist_ok=True)
+        photos: list[Photo] = []
+        views: list[View] = []
+        for origin, picture, known, fraction in pictures(source, long_side):
+            name, lens = f"{len(photos):04d}.jpg", None
+            if known:
+                picture, view, lens = rectified(picture, known, name, origin)
+                views.append(view)
+            Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
+            for folder, shown in (("masks", picture.mask), (FOLDER, picture.labels)):
+                if shown is not None:
+                    (out / folder).mkdir(exist_ok=True)
+                    Image.fromarray(shown).save(out / folder / f"{name}.png")
+            if known and known.depth:
+                depth = read_depth(known.depth)
+                _check_shape(known.depth.path, depth.shape[::-1], known)
+                (out / "depth").mkdir(exist_ok=True)
+                np.save(out / "depth" / f"{name}.npy", depth)
+            height, width = picture.pixels.shape[:2]
+            sharp = round(sharpness(picture.pixels), 4)
+            focal = None if known else picture.focal  # A known camera is no prior.
+            photos.append(
+                Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
+                      picture.mask is not None, sharp, "too dark" if brightness(picture) < DARK else "",
+                      bool(known and known.depth))
+            )  # fmt: skip
+            on_progress(fraction, f"{len(photos)} photos")
+        # Relative to what is typical of the set: a blur that all have in common may be the scene's.
+        least = max(BLURRED, 0.35 * float(np.quantile([p.sharpness for p in photos], 0.75)))
+        photos = [replace(p, fault=p.fault or ("blurred" if p.sharpness < least else "")) for p in photos]
+        if views:
+            save_views(views, out / KNOWN_CAMERAS)
+        if source.capture:
+            write_json(out / CAPTURE, {"version": 1, **asdict(source.capture)})
+        if source.labels.names:
+            write_json(out / FOLDER / NAMES, {"version": 1, "names": list(source.labels.names)})
+        save_photos(photos, out)
+        return photos, [*source.notes, *notes_on(photos, len(source.masks))]
+
+
+@contextmanager
+def opened(given: Path, unpacked: Path) -> Iterator[Source]:
+    """What the user gave (see `find_source`); an archive is in the folder `unpacked` until the block ends, and of a
+    recording there are only the photos that are used. Raises SdfsimError as `find_source` and `unpack` do."""
+    source = find_source(given)
     try:
-        made = _prepare(find_source(unpacked, unpacked=True), out, long_side, on_progress)
-    except SdfsimError as error:  # which names files that nobody knows
-        message, hint = (text.replace(str(unpacked), str(source.archive)) for text in (error.message, error.hint))
+        if source.archive is not None:
+            unpack(source.archive, unpacked)
+            source = find_source(unpacked, unpacked=True)
+        if source.capture:
+            source = replace(source, photos=tuple(spread(source.photos, source.frames)))
+        yield source
+    except SdfsimError as error:  # which may name files that nobody knows
+        message, hint = (text.replace(str(unpacked), str(given)) for text in (error.message, error.hint))
         raise SdfsimError(message, hint, exit_code=error.exit_code) from error
     shutil.rmtree(unpacked, ignore_errors=True)
-    return made
-
-
-def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -> tuple[list[Photo], list[str]]:
-    """What `prepare_photos` does with anything but an archive."""
-    if source.capture:
-        source = replace(source, photos=tuple(spread(source.photos, source.frames)))
-    (out / "images").mkdir(parents=True, exist_ok=True)
-    photos: list[Photo] = []
-    views: list[View] = []
-    for origin, picture, known, fraction in pictures(source, long_side):
-        name, lens = f"{len(photos):04d}.jpg", None
-        if known:
-            picture, view, lens = rectified(picture, known, name, origin)
-            views.append(view)
-        Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
-        for folder, shown in (("masks", picture.mask), (FOLDER, picture.labels)):
-            if shown is not None:
-                (out / folder).mkdir(exist_ok=True)
-                Image.fromarray(shown).save(out / folder / f"{name}.png")
-        if known and known.depth:
-            depth = read_depth(known.depth)
-            _check_shape(known.depth.path, depth.shape[::-1], known)
-            (out / "depth").mkdir(exist_ok=True)
-            np.save(out / "depth" / f"{name}.npy", depth)
-        height, width = picture.pixels.shape[:2]
-        sharp = round(sharpness(picture.pixels), 4)
-        focal = None if known else picture.focal  # A known camera is no prior.
-        photos.append(
-            Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
-                  picture.mask is not None, sharp, "too dark" if brightness(picture) < DARK else "",
-                  bool(known and known.depth))
-        )  # fmt: skip
-        on_progress(fraction, f"{len(photos)} photos")
-    # Relative to what is typical of the set: a blur that all have in common may be the scene's.
-    least = max(BLURRED, 0.35 * float(np.quantile([p.sharpness for p in photos], 0.75)))
-    photos = [replace(p, fault=p.fault or ("blurred" if p.sharpness < least else "")) for p in photos]
-    if views:
-        save_views(views, out / KNOWN_CAMERAS)
-    if source.capture:
-        write_json(out / CAPTURE, {"version": 1, **asdict(source.capture)})
-    if source.labels.names:
-        write_json(out / FOLDER / NAMES, {"version": 1, "names": list(source.labels.names)})
-    save_photos(photos, out)
-    return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
 def pictures(source: Source, long_side: int = LONG_SIDE) -> Iterator[tuple[str, ReadPhoto, KnownCamera | None, float]]:

@@ -2,21 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates, zoom
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from pipeline.cameras import PosedPhotos
 from pipeline.field.grid_field import Field
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
-from pipeline.progress import Progress, quiet
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.sdf.grid import near_samples
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
@@ -89,36 +89,15 @@ def sample(distance: Distance, points: np.ndarray) -> np.ndarray:
 
 
 def sample_volume(
-    distance: Distance, resolution: int, *, extent: float = EXTENT, coarse: int = 4, on_progress: Progress = quiet
+    distance: Distance, resolution: int, *, extent: float = EXTENT, coarse: int = 4, on_progress: Progress = silent
 ) -> Volume:
     """Samples over [-extent, extent]^3, `resolution` a side (rounded up to a multiple of `coarse` plus 1), fine only
-    near the surface of a distance [P] at points [P, 3].
-
-    Evaluates every `coarse`-th point first and all points only in blocks that can hold the surface, since an SDF
-    changes by no more than the distance moved (a factor of 2 is left for fields that are not quite SDFs).
-    """
-    blocks = -(-(resolution - 1) // coarse)
-    n = blocks * coarse + 1
-    line = np.linspace(-extent, extent, n, dtype=np.float32)
-    knots = line[::coarse]
-    values = sample(distance, np.stack(np.meshgrid(knots, knots, knots, indexing="ij"), -1).reshape(-1, 3))
-    values = values.reshape(blocks + 1, blocks + 1, blocks + 1)
-    volume = np.asarray(zoom(values, n / (blocks + 1), order=1, grid_mode=False, mode="nearest"), np.float32)
-    reach = 2.0 * np.sqrt(3) * (knots[1] - knots[0])
-    corners = np.stack(
-        [values[a : a + blocks, b : b + blocks, c : c + blocks] for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-    )
-    low, high = corners.min(0), corners.max(0)
-    near = np.argwhere((np.abs(corners).min(0) < reach) | (low * high < 0))
-    step = np.arange(coarse + 1)
-    local = np.stack(np.meshgrid(step, step, step, indexing="ij"), -1).reshape(1, -1, 3)
-    parts = np.array_split(near, max(1, len(near) * local.shape[1] // BATCH))
-    for number, part in enumerate(parts):
-        index = (part[:, None] * coarse + local).reshape(-1, 3)
-        volume[tuple(index.T)] = distance(line[index])
-        if number % 4 == 0:
-            on_progress((number + 1) / len(parts), f"sampling the field, {number + 1} of {len(parts)} parts")
-    return Volume(volume, np.full(3, -extent), 2 * extent / (n - 1))
+    near the surface of a distance [P] at points [P, 3]: a factor of 2 is left for fields that are not quite SDFs."""
+    count = -(-(resolution - 1) // coarse) * coarse + 1
+    line = np.linspace(-extent, extent, count, dtype=np.float32)
+    reach = 2.0 * np.sqrt(3) * (line[coarse] - line[0])
+    values = near_samples(partial(sample, distance), line, coarse, reach, on_progress)
+    return Volume(values, np.full(3, -extent), 2 * extent / (count - 1))
 
 
 def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: float) -> Volume:
@@ -180,7 +159,7 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
 
 def surface_of(
     volume: Volume, field: Field, poses: PosedPhotos, photos_folder: Path, limit: Distance, *,
-    known: Callable[[np.ndarray], np.ndarray] | None = None, on_progress: Progress = quiet,
+    known: Callable[[np.ndarray], np.ndarray] | None = None, on_progress: Progress = silent,
 ) -> FieldSurface:  # fmt: skip
     """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
     poses are in normalised space. Points [P, 3] that are `known` [P] count as seen, whoever sees them. Raises
@@ -226,10 +205,9 @@ def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
 
 def components(mesh: Mesh) -> np.ndarray:
     """Component number [F] of each face; faces that share a vertex are connected."""
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
-    count = len(mesh.vertices)
-    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    import igl
+
+    return np.asarray(igl.vertex_components(np.ascontiguousarray(mesh.faces, dtype=np.int64)))[mesh.faces[:, 0]]
 
 
 def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float]]:

@@ -381,7 +381,6 @@ class _Rated:
     cost: float  # m, the mean over what moves, the hidden counting a little
     off: float  # m, the mean distance of what moves where it can be seen
     follows: float  # share of what moves that it explains
-    agreed: float  # share of the pairs of places
 
 
 @dataclass(frozen=True)
@@ -427,11 +426,7 @@ class _Surfaces:
             costs.append(float(np.where(hidden, HIDDEN * self.near, away).mean()))
             offs.append(float(away[~hidden].mean()) if (~hidden).mean() > LEAST else FAR * self.near)
             follow, count = follow + float((hidden | (away <= self.near)).sum()), count + len(points)
-        agreed = 0.0
-        if len(by.pairs[0]):
-            apart = by.pairs[0] @ motion[:3, :3].T + motion[:3, 3] - by.pairs[1]
-            agreed = float((np.linalg.norm(apart, axis=1) <= self.near).mean())
-        return _Rated(motion, max(costs), max(offs), follow / max(count, 1), agreed)
+        return _Rated(motion, max(costs), max(offs), follow / max(count, 1))
 
     def laid(self, start: np.ndarray, reaches: Reaches, *, turns: bool = True) -> np.ndarray:
         """[4, 4] by ICP, points to planes: of the part in the first state on the second's surface, and of the part in

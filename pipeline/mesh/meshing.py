@@ -24,9 +24,9 @@ from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
 from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.options import Options
-from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_bytes, write_json
+from sdfsim.base.parallel import Progress, share_of, silent
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
@@ -40,7 +40,7 @@ AXIS = (255, 255, 0)  # colour of a joint's axis there
 
 def make_meshes(
     distill: Path, poses: Path, photos: Path, out: Path, options: Options, *, device: str = "cpu",
-    on_progress: Progress = quiet,
+    on_progress: Progress = silent,
 ) -> dict:  # fmt: skip
     """Writes the files that docs/objects.md lists and returns the stage's report. Vertices in the PLY files have
     `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) where there is hardly any surface, or

@@ -16,9 +16,9 @@ from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
 from pipeline.mesh.extraction import keep_faces
 from pipeline.mesh.visibility import FLATTEST, bilinear, framed, to_bytes
-from pipeline.progress import Progress, quiet, share_of
+from sdfsim.base.parallel import Progress, share_of, silent
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, face_normals, joined, sample_surface, vertex_normals
+from sdfsim.geometry.mesh import Mesh, face_normals, halves, joined, sample_surface, vertex_normals
 
 FACES = 40_000  # of a textured mesh: finer detail is in its texture
 PIECE = 300  # faces that xatlas gets at a time: its time grows with the square of the faces of a chart
@@ -75,7 +75,7 @@ class Texels:
     colors: np.ndarray  # [T, 3] float32 in 0..255, those of the mesh's vertices
 
 
-def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = quiet) -> dict[str, Mesh]:
+def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = silent) -> dict[str, Mesh]:
     """Each mesh with a texture, fewer faces where it has many, and vertices doubled where its charts meet; its vertex
     colours stay wherever no photo shows the surface."""
     made, done, total = {}, 0.0, sum(len(mesh.faces) for mesh in meshes.values())
@@ -86,7 +86,7 @@ def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress =
     return made
 
 
-def textured(mesh: Mesh, shots: Shots, on_progress: Progress = quiet) -> Mesh:
+def textured(mesh: Mesh, shots: Shots, on_progress: Progress = silent) -> Mesh:
     """One mesh with a texture, see `texture_parts`."""
     on_progress(0.0, "unfolding the surface")
     points, normals = sample_surface(mesh, 4000, np.random.default_rng(0))
@@ -118,7 +118,7 @@ def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int
     columns of the texture, multiples of `BLOCK`."""
     import xatlas
 
-    pieces = _pieces(mesh.vertices[mesh.faces].mean(1))
+    pieces = halves(mesh.vertices[mesh.faces].mean(1), PIECE)
     parts = [np.unique(mesh.faces[piece], return_inverse=True) for piece in pieces]
     extent = float(np.ptp(mesh.vertices, axis=0).max())  # xatlas takes faces of a micrometre for none
     density = min(max(density, SMALLEST / extent), LARGEST * np.sqrt(FULL / face_normals(mesh)[1].sum()))
@@ -148,20 +148,6 @@ def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int
     return flat, of, (int(rows), int(columns))
 
 
-def _pieces(places: np.ndarray) -> list[np.ndarray]:
-    """Indices of points [P, 3] that are near each other, at most `PIECE` together: halves of halves."""
-    done, left = [], [np.arange(len(places))]
-    while left:
-        piece = left.pop()
-        if len(piece) <= PIECE:
-            done.append(piece)
-            continue
-        own = places[piece]
-        order = np.argsort(own[:, np.ptp(own, axis=0).argmax()], kind="stable")
-        left += [piece[order[: len(order) // 2]], piece[order[len(order) // 2 :]]]
-    return done
-
-
 def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels:
     """Where the texels of a texture lie on a surface with `uv`, perhaps colours, and vertex normals [V, 3]."""
     assert flat.uv is not None
@@ -189,7 +175,7 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
     return Texels(shape, at, spread(flat.vertices), spread(normals), spread(colors))
 
 
-def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet) -> np.ndarray:
+def bake(texels: Texels, shots: Shots, on_progress: Progress = silent) -> np.ndarray:
     """The texture [H, W, 3] uint8: of each texel the colour in the photos that show it best.
 
     A view counts by its pixels on the surface, by how straight it looks and how sharp its photo is. Within two blocks

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from pipeline.cameras import View
-from pipeline.progress import Progress, quiet
+from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
@@ -81,7 +81,7 @@ def framed(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pixels, (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
 
 
-def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = quiet) -> PhotoColors:
+def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = silent) -> PhotoColors:
     """How many views see each vertex, and its colour in their photos."""
     vertices = sight.vertices
     count = np.zeros(len(vertices), np.int32)

@@ -16,11 +16,11 @@ import numpy as np
 from pipeline.cameras import View, load_views, save_views
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo
-from pipeline.progress import Progress, quiet
 from pipeline.sfm.agreement import unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, views_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import read_json, replacing, write_json
+from sdfsim.base.parallel import Progress, silent
 
 # Each photo is matched with those that look most like it: at least and at most so many, and a share of all between. On
 # the bundled set 14 of 48 gave the poses that all pairs gave, in a third of the time.
@@ -86,7 +86,7 @@ def size_groups(photos: list[Photo]) -> list[dict]:
 
 
 def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0, timeout: float = 1800.0,
-          on_progress: Progress = quiet) -> dict:  # fmt: skip
+          on_progress: Progress = silent) -> dict:  # fmt: skip
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`; returns the checks.
 
     Makes `ATTEMPTS` until poses of all photos can be trusted, for at most `timeout` s each; each has a folder of its

@@ -17,10 +17,9 @@ from scipy import ndimage
 
 from pipeline.cameras import PosedPhotos, View, focus
 from pipeline.inputs.images import reduced
-from pipeline.progress import Progress, quiet
 from pipeline.stereo.compiled import agreeing, sweep
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.parallel import threads
+from sdfsim.base.parallel import Progress, silent, threads
 
 COARSE = 320  # px of the longer side while planes are swept
 LARGER = 1.5  # times, from round to round
@@ -73,7 +72,7 @@ class DepthMap:
 
 
 def stereo(
-    poses: PosedPhotos, photos_folder: Path, long_side: int, *, on_progress: Progress = quiet
+    poses: PosedPhotos, photos_folder: Path, long_side: int, *, on_progress: Progress = silent
 ) -> list[DepthMap]:  # fmt: skip
     """Depth of every photo in the space of the poses, no larger than `long_side` px, for what lies in the unit sphere
     and behind it. Raises SdfsimError where a photo is missing. None where there are fewer than three photos."""

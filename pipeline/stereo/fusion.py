@@ -14,10 +14,9 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.grids.interpolation import near_bricks, places_of
-from pipeline.progress import Progress, quiet
 from pipeline.stereo.compiled import carve, paint
 from pipeline.stereo.depth import BEYOND, DepthMap, stacked, straightened
-from sdfsim.base.parallel import threads
+from sdfsim.base.parallel import Progress, silent, threads
 
 FRONT, BACK = 3.0, 2.0  # cells before and behind a surface within which its distance counts
 SEEN = 0.3  # weight, that of one certain pixel is 1, from which on a place is known
@@ -42,7 +41,7 @@ class Fused:
 
 
 def fuse(
-    maps: Sequence[DepthMap], side: int, photos_folder: Path, *, on_progress: Progress = quiet
+    maps: Sequence[DepthMap], side: int, photos_folder: Path, *, on_progress: Progress = silent
 ) -> Fused | None:  # fmt: skip
     """Fuses depth maps in the space of the unit sphere, `side` samples along each side and twice as many near the
     surface, and the colours of their photos there; None where they show no surface."""
@@ -60,7 +59,7 @@ def fuse(
     bricks = near_bricks(coarse, 2 * side - 1)
     place = places_of(bricks)
     start = ndimage.map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
-    value, weight = _carved(given, (cell / 2 * place[:, ::-1] - 1).astype(np.float32), cell / 2, quiet)
+    value, weight = _carved(given, (cell / 2 * place[:, ::-1] - 1).astype(np.float32), cell / 2, silent)
     # Where less is known than that, the coarse distance goes on.
     share = np.clip(weight / SEEN, 0, 1) * (np.abs(start) < 1.5 * cell)
     fine = np.clip(share * (value - start), -cell, cell)

@@ -70,7 +70,6 @@ def about() -> dict[str, Any]:
 
 
 def about_lines(report: dict[str, Any]) -> list[str]:
-    """`about` for people."""
     lines = [f"{name} {version}" for name, version in report["versions"].items() if version != "missing"]
     lines += [f"devices: {', '.join(report['devices'])}", f"models: {', '.join(report['models'])}"]
     return [*lines, *(f"not here: {line}" for line in report["missing"])]

@@ -65,7 +65,6 @@ class Beside:
         }
 
     def save(self, path: Path) -> None:
-        """Write the file."""
         arrays = {"time": self.time, "position": self.position, "orientation": self.orientation}
         write_arrays(path, arrays | {"name": np.array(self.name), "bodies": np.array(self.bodies, dtype=str)})
 

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps import export_joints as jointed
+from sdfsim.apps.beside import between
 from sdfsim.apps.export_joints import add
 from sdfsim.apps.observed import COLUMNS
 from sdfsim.apps.recording import body_colors, framed, is_infinite, shown, with_normals
@@ -80,7 +81,6 @@ class Take:
 
     @property
     def moving(self) -> bool:
-        """Whether there is motion: more than one time."""
         return len(self.time) > 1
 
     def each(self) -> Iterable[tuple[str, Body, Shape, np.ndarray]]:
@@ -97,12 +97,7 @@ class Take:
         them is not before the end: it has the last pose."""
         count = int(np.ceil((self.time[-1] - self.time[0]) * fps - 1e-3)) + 1
         time = self.time[0] + np.arange(count) / fps
-        after = np.clip(np.searchsorted(self.time, time), min(1, len(self.time) - 1), len(self.time) - 1)
-        before = np.maximum(after - 1, 0)
-        span = np.maximum(self.time[after] - self.time[before], 1e-12)
-        part = np.clip((time - self.time[before]) / span, 0.0, 1.0)[:, None, None]
-        place, turn = ((1.0 - part) * of[before] + part * of[after] for of in (self.position, self.quat_xyzw))
-        turn /= np.linalg.norm(turn, axis=-1, keepdims=True)
+        place, turn = between(self.time, self.position, self.quat_xyzw, time)
         return replace(self, time=time, position=place, quat_xyzw=turn)
 
 

@@ -111,7 +111,6 @@ def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_pr
 
 
 def _kept(folder: Path, request: str) -> Shape | None:
-    """The shape of a folder where it was made for this request."""
     try:
         made_for = read_json(folder / RECORD_FILE)["source"]["request"]
         return load_shape(folder) if made_for == request else None

@@ -107,8 +107,6 @@ class Ground:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the recordings say of one quantity."""
-
     kind: str
     name: str
     unit: str
@@ -143,7 +141,6 @@ class Identified:
     profiles: list[Profile] = field(default_factory=list)  # where they are asked for
 
     def report(self) -> dict[str, Any]:
-        """By kind and name."""
         kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(WIDTH)[2:])
         told: dict[str, Any] = {kind: {} for kind in kinds}
         for e in self.estimates:
@@ -165,7 +162,6 @@ OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/
 
 
 def report_lines(found: Identified) -> list[str]:
-    """What was found, for people."""
     lines = []
     for e in found.estimates:
         digits = 5 if e.kind == "height" or e.kind in OF_JOINTS else 3

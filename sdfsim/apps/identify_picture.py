@@ -50,7 +50,6 @@ def picture(found: Identified, path: Path) -> str:
 
 
 def title(profile: Profile) -> str:
-    """What a panel says of its parameter."""
     head = f"{HEADS[profile.kind]}: {profile.name}"
     if profile.interval is None:
         return f"{head}\nnot shown by these recordings"

@@ -104,8 +104,8 @@ class _Reader:
         joints = [joint for b in range(1, model.nbody) for joint in self._joints(b)]
         motors = self._motors()
         joints = [replace(joint, motor=motors.get(joint.name)) for joint in joints]
-        if rotors := [self._joint_name(j) for j in self._rotors()]:
-            self.left.append(named("armature of joints", rotors))
+        if rotors := sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(model.dof_armature)}):
+            self.left.append(named("armature of joints", list(map(self._joint_name, rotors))))
         joints += [*self._loops(), *self._ropes()]
         return Robot(
             self.path.stem, tuple(links), tuple(joints), np.array(model.opt.gravity), self._apart(geoms),
@@ -154,12 +154,13 @@ class _Reader:
 
     def _still(self, b: int, pose: np.ndarray, geoms: list[int], solid: list[int]) -> list[tuple[Link, list[int]]]:
         names, found, name = [], [], self._body_name(b)
+        bodies = {self._body_name(k) for k in range(self.model.nbody)}
         for g in geoms:
             part = self._part(g)
             if part is None:
                 continue
             called = name if b and len(geoms) == 1 else self.model.geom(g).name or f"{name}_{g}"
-            while called in names or (called != name and called in self._all_bodies()):
+            while called in names or (called != name and called in bodies):
                 called += "_"
             names.append(called)
             kind: Any = {"solid" if g in solid else "shown": (part,)}
@@ -167,9 +168,6 @@ class _Reader:
             link = Link(called, pose, still=True, where=where, **kind, **self._surface([g], called))
             found.append((link, [g] if g in solid else []))
         return found
-
-    def _all_bodies(self) -> set[str]:
-        return {self._body_name(b) for b in range(self.model.nbody)}
 
     def _surface(self, geoms: list[int], name: str) -> dict[str, Any]:
         """Coefficients of which two alike give MuJoCo's as their product."""
@@ -270,10 +268,6 @@ class _Reader:
             found.append(LinkJoint(kind="hinge" if kind == types.mjJNT_HINGE else "slider", **held))
         return found
 
-    def _rotors(self) -> list[int]:
-        dofs = np.flatnonzero(self.model.dof_armature)
-        return sorted({int(self.model.dof_jntid[dof]) for dof in dofs})
-
     def _motors(self) -> dict[str, dict[str, float]]:
         """Actuators of hinges and slides, by their joints: those that keep a speed or a place, and those that give a
         torque, which do nothing until they are told."""
@@ -363,7 +357,6 @@ class _Reader:
         return found
 
     def _ropes(self) -> list[LinkJoint]:
-        """Tendons between two sites."""
         model, mj = self.model, self.mj
         rods = {
             int(model.eq_obj1id[k])

@@ -55,9 +55,9 @@ def held_together(seen: Frames, scene: Scene) -> Frames:
 
     for k in tree.order:
         if k in tree.above and k in number:
-            made = _allowed(
-                tree.above[k], of(k), of(tree.above[k].parent), _com(scene, k), _com_of(scene, tree.above[k])
-            )
+            one = tree.above[k]
+            com_of_parent = np.zeros(3) if one.parent < 0 else _com(scene, one.parent)
+            made = _allowed(one, of(k), of(one.parent), _com(scene, k), com_of_parent)
             for array, values in zip(arrays, made, strict=True):
                 array[:, number[k]] = values
     place, turn, speed, spin = arrays
@@ -66,10 +66,6 @@ def held_together(seen: Frames, scene: Scene) -> Frames:
 
 def _com(scene: Scene, k: int) -> np.ndarray:
     return scene.bodies[k].scale * scene.shapes[scene.bodies[k].shape].com
-
-
-def _com_of(scene: Scene, one: Held) -> np.ndarray:
-    return np.zeros(3) if one.parent < 0 else _com(scene, one.parent)
 
 
 def _allowed(one: Held, child: Frames, parent: Frames, com: np.ndarray, com_of_parent: np.ndarray) -> Frames:

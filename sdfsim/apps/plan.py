@@ -72,7 +72,6 @@ def _peak_mib() -> float | None:
 
 
 def plan_lines(report: dict[str, Any]) -> list[str]:
-    """`describe`'s report for people."""
     units, pairs, step = report["units"], report["pairs"], report["step"]
     counts = ", ".join(f"{len(report[kind])} {kind}" for kind in ("dynamic", "static", "kinematic"))
     widest = max(len(e["why"]) for e in report["effects"].values())

@@ -443,7 +443,6 @@ def _reduced(image: Image.Image, longest: int) -> np.ndarray:
 
 
 def is_infinite(shape: Shape) -> bool:
-    """Whether it is a plane."""
     return not np.isfinite(shape.sdf.bounds).all()
 
 

@@ -27,7 +27,6 @@ class Mark:
 
 
 def shown_joints(scene: Scene) -> tuple[Joint, ...]:
-    """The joints that are shown."""
     return scene.joints if len(scene.joints) <= MOST_SHOWN else ()
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.beside import COLOR, OPACITY, Beside
+from sdfsim.apps.beside import COLOR, OPACITY, Beside, between
 from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, with_normals
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
@@ -111,19 +111,6 @@ def write_movie(out: Path, pictures: Iterator[np.ndarray]) -> None:
         movie.mux(stream.encode())
 
 
-def poses_at(rollout: Rollout, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [N, 3] m of the centres of mass and orientations [N, 4] xyzw, between frames as if moved evenly."""
-    after = int(np.clip(np.searchsorted(rollout.time, time), min(1, len(rollout)), len(rollout)))
-    before = max(after - 1, 0)
-    span = rollout.time[after] - rollout.time[before]
-    part = float(np.clip((time - rollout.time[before]) / span, 0.0, 1.0)) if span > 0 else 1.0
-    one, other = rollout.orientation[before], rollout.orientation[after]
-    nearer = np.where((one * other).sum(-1, keepdims=True) < 0.0, -other, other)
-    turned = (1.0 - part) * one + part * nearer
-    place = (1.0 - part) * rollout.position[before] + part * rollout.position[after]
-    return place, turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-
-
 class _Cast:
     """The triangles of all bodies, each a mesh about its centre of mass with normals [V, 3], at places [N, 3] m and
     turns [N, 3, 3]; `body` [F] is which one a face is of."""
@@ -183,7 +170,7 @@ class Studio:
 
     def picture_at(self, rollout: Rollout, time: float) -> np.ndarray:
         """[H, W, 3] uint8 of a moment of a run, and of what was recorded then."""
-        place, turn = poses_at(rollout, time)
+        place, turn = (p[0] for p in between(rollout.time, rollout.position, rollout.orientation, np.array([time])))
         if self._beside is None:
             return self.picture(place, turn)
         place_beside, turn_beside = self._beside.at(np.array([time]))

@@ -64,7 +64,6 @@ class Link:
 
     @property
     def whole(self) -> bool:
-        """Whether it has all that a body needs."""
         return bool(self.solid or self.shown) and (self.still or self.mass > 0)
 
 
@@ -89,8 +88,6 @@ class LinkJoint:
 
 @dataclass(frozen=True)
 class Robot:
-    """What a file describes."""
-
     name: str
     links: tuple[Link, ...]
     joints: tuple[LinkJoint, ...]
@@ -262,7 +259,6 @@ def _renamed(links: list[Link], taken: set[str]) -> Iterator[Link]:
 
 
 def _with(keep: Link, gone: Link) -> Link:
-    """A link with all of another that is fixed to it."""
     into = np.linalg.inv(keep.pose) @ gone.pose
 
     def carried(parts: tuple[Part, ...]) -> tuple[Part, ...]:
@@ -338,7 +334,6 @@ def _spread(link: Link) -> np.ndarray:
 
 
 def _mesh(part: Part) -> Mesh:
-    """The surface of a part, in its link."""
     return moved(_primitive(part, "").mesh if part.mesh is None else part.mesh, part.pose)
 
 
@@ -458,12 +453,10 @@ def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> Shape:
 
 
 def _same(part: Part) -> tuple:
+    """What parts that are alike have in common."""
     mesh = None if part.mesh is None else part.mesh.digest()
-    return part.kind, tuple(np.round(part.pose, 9).ravel() + 0.0), str(_sizes(part)), mesh
-
-
-def _sizes(part: Part) -> list:
-    return [(key, np.round(value, 9).tolist()) for key, value in sorted(part.sizes.items())]
+    sizes = [(key, np.round(value, 9).tolist()) for key, value in sorted(part.sizes.items())]
+    return part.kind, tuple(np.round(part.pose, 9).ravel() + 0.0), str(sizes), mesh
 
 
 # --- who touches whom ---
@@ -525,7 +518,6 @@ def _avoided(
 
 
 def _overlap(one: Shape | None, pose: np.ndarray, other: Shape | None, place: np.ndarray) -> bool:
-    """Whether two shapes are in each other."""
     if one is None or other is None:
         return False
     for a, b, into in ((one, other, np.linalg.inv(place) @ pose), (other, one, np.linalg.inv(pose) @ place)):

@@ -274,7 +274,6 @@ def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
 
 
 def ending_lines(report: dict[str, Any]) -> list[str]:
-    """Where bodies ended, and which rest."""
     bodies, lines = report["ended"], []
     if 0 < len(bodies) <= TOLD:
         places = ["({:.3f}, {:.3f}, {:.3f}) m".format(*body["centre_m"]) for body in bodies]

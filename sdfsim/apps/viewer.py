@@ -74,7 +74,6 @@ def check_screen(kind: str) -> None:
 
 
 def has_screen() -> bool:
-    """Whether a window can be shown."""
     return bool(sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 

@@ -49,7 +49,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
                 from sdfsim.base.devices import pick_device
 
                 pick_device(device)
-            work(session, **options, **({"device": device} if "device" in given else {}))
+            session.options = options | ({"device": device} if "device" in given else {})
+            work(session, **session.options)
 
     own = [parameter for name, parameter in given.items() if name not in ("session", "device")]
     shared = (("as_json", Json, False), ("device", Device, "auto"), ("verbose", Verbose, False))

@@ -31,6 +31,7 @@ class Session:
         self.as_json = as_json
         self.verbose = verbose
         self.exit_code = 0
+        self.options: dict[str, Any] = {}  # what the command was given
         self._result: dict[str, Any] | None = None
         self._pressed = False
         self._clean_up = contextlib.ExitStack()
@@ -114,6 +115,10 @@ class Session:
         if not self.as_json:
             self._bar.close()
             self._print("\n".join(_as_lines(plain(result)) if lines is None else lines))
+
+    def given(self, *others: str) -> dict[str, Any]:
+        """What the command was given, but for these options: what it hands on as it is."""
+        return {name: value for name, value in self.options.items() if name not in others}
 
     def hold(self, why: str) -> None:
         """Wait for Ctrl-C, if a person is there to press it."""

@@ -31,6 +31,11 @@ def silent(fraction: float, message: str) -> None:
     """Progress that is not shown: what takes long, and what a command would print, is then warned of."""
 
 
+def share_of(progress: Progress, start: float, share: float) -> Progress:
+    """The progress of a part of some work: a share of it from a start, both 0 to 1."""
+    return lambda fraction, message: progress(start + share * fraction, message)
+
+
 def silent_stages(stage: str, fraction: float, message: str) -> None:
     """The same of several stages."""
 

@@ -168,7 +168,6 @@ def batches(trajectories: list[Trajectory]) -> list[list[Trajectory]]:
 
 
 def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
-    """The first `count` frames."""
     return replace(trajectory, **{name: getattr(trajectory, name)[:count] for name in MOTION})
 
 

@@ -173,7 +173,6 @@ class Conditions:
 
     @property
     def floor(self) -> tuple[float, float]:
-        """Friction and restitution of the floor."""
         return self.friction, self.restitution
 
 
@@ -239,7 +238,6 @@ def shapes_folder(folder: Path) -> Path:
 
 
 def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
-    """Shapes of a dataset, or of a split of it, by name."""
     # Imported here: training from cached contact frames runs where only torch and numpy are installed.
     from sdfsim.shape.shape import load_shape
 

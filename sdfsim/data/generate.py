@@ -92,7 +92,6 @@ def make_dataset(
 
 
 def report_lines(report: dict) -> list[str]:
-    """The report of `make_dataset` as lines."""
     return [
         f"{report['dataset']}: {report['trajectories']} {report['split']} trajectories, {report['made_now']} made now; "
         f"{report['shapes']} shapes to draw from",

@@ -81,8 +81,6 @@ Pose = tuple[np.ndarray, Rotation]  # [3] m of the centre of mass, and the orien
 
 @dataclass(frozen=True)
 class Cast:
-    """What a scene is made of."""
-
     shapes: list[ShapeSource]  # to draw bodies from
     scenery: dict[str, ShapeSource] = field(default_factory=dict)  # the recipe's own shapes, by name
     bodies: int | None = None  # how many bodies move, None for the recipe's own range
@@ -336,7 +334,6 @@ def _body(source: ShapeSource, extent: float, density: float, friction: float, r
 
 
 def _of_material(source: ShapeSource, rng: np.random.Generator, extents: tuple[float, float]) -> TeacherBody:
-    """A body of a random size and one of MOVi-B's materials."""
     return _body(source, rng.uniform(*extents), *MATERIALS[str(rng.choice(list(MATERIALS)))])
 
 

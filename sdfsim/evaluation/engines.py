@@ -45,8 +45,6 @@ class TooSlow(SdfsimError):
 
 @dataclass(frozen=True)
 class Start:
-    """What an engine starts from."""
-
     motion: Trajectory  # its first frame counts
     urdfs: dict[str, Path]  # the engine's file of each shape, by name
     floor: tuple[float, float] | None  # friction and restitution of the floor z = 0, or None for no floor

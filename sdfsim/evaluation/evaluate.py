@@ -286,7 +286,6 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 
 
 def notes(report: dict[str, Any]) -> list[str]:
-    """Notes on the tables, one line each."""
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
     ground, source = report["floor"], "from dataset.json" if report["floor"]["told"] else "that of our recipes"
     how = f"The solve has the teacher's habits: bodies larger by {MARGIN:g} m, pushes that add to rebounds."

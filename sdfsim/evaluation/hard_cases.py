@@ -56,8 +56,6 @@ Measure = Callable[[Sequence[Ran]], dict[str, float]]
 
 @dataclass(frozen=True)
 class Figure:
-    """One number that a case gives."""
-
     name: str
     unit: str
     digits: int = 2  # shown after the point; differences that are not shown do not count
@@ -88,8 +86,6 @@ class Case:
 
 @dataclass(frozen=True)
 class Group:
-    """Cases of one kind."""
-
     title: str
     axis: str = ""  # label of the cases' `x`
     about: str = ""  # the quantity of a model's ranges that they are about: one that never varied was not learned
@@ -122,7 +118,6 @@ def box(*size: float) -> Shape:
 
 @cache
 def ball(diameter: float = 1.0) -> Shape:
-    """A sphere."""
     return analytic_shape("sphere", radius=diameter / 2)
 
 
@@ -165,12 +160,10 @@ def nudged(scene: Scene, repeat: int) -> Scene:
 
 
 def _moved(scene: Scene, change: Callable[[Body], Body]) -> Scene:
-    """The scene with its dynamic bodies changed."""
     return replace(scene, bodies=tuple(change(b) if b.motion == "dynamic" else b for b in scene.bodies))
 
 
 def yawed(scene: Scene, degrees: float) -> Scene:
-    """The whole scene turned about the z axis."""
     turn = Rotation.from_euler("z", degrees, degrees=True)
 
     def turned(b: Body) -> Body:

@@ -137,8 +137,6 @@ def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a panel."""
-
     name: str  # lines of one name have one colour in all panels
     x: Sequence[float]  # [K]
     y: Sequence[float]  # [K]
@@ -153,8 +151,6 @@ def line(name: str, results: Iterable[dict[str, Any]], x: str, y: str) -> Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot of several."""
-
     title: str
     x: str
     y: str

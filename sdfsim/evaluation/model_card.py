@@ -37,7 +37,6 @@ def bundle(model: Path, data: Path, name: Annotated[str, typer.Option()], folder
 
 
 def card_text(model: Model, report: dict) -> str:
-    """The model card as Markdown."""
     card, parameters = model.card, sum(p.numel() for p in model.network.parameters())
     shown = ("recipe", "fps", "seed", "trajectories", "random_solids", "bodies", "engine")
     data = [", ".join(f"{key} {made[key]}" for key in shown if made.get(key)) for made in card["data"]]

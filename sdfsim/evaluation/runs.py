@@ -61,7 +61,6 @@ Runner = Callable[[Scene, float], Ran]  # runs a scene for so many seconds
 
 
 def by_model(scene: Scene, seconds: float, model: str | Model = SOLVER, device: str = "cpu") -> Ran:
-    """Our motion of a scene."""
     try:
         return Ran(scene, Simulator(scene, model, device).run(seconds))
     except SimulationError as error:
@@ -117,7 +116,6 @@ def scene_rollout(scene: Scene, motion: Trajectory, units: Units = SI) -> Rollou
 
 
 def timed_rollout(simulator: Simulator, steps: int) -> tuple[Rollout, Timing]:
-    """Our motion, and its time."""
     frames: list[Rollout] = []
     timing = timed(lambda count: frames.extend(simulator.frames(count)), steps)
     return join(frames), timing

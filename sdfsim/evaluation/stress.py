@@ -244,7 +244,6 @@ def losses(study: Study) -> dict[str, dict[str, int]]:
 
 
 def loss_lines(study: Study) -> list[str]:
-    """`losses`, a line each."""
     return [f"{who}: {', '.join(f'{n} {what}' for what, n in lost.items())}" for who, lost in losses(study).items()]
 
 

@@ -146,7 +146,6 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
 
 
 def _centred(shape: Shape, name: str) -> Shape:
-    """The shape with its origin at its centre of mass."""
     sdf, mesh = shape.sdf, replace(shape.mesh, vertices=shape.mesh.vertices - shape.com)
     if isinstance(sdf, MlpSdf | GridSdf):
         sdf = replace(sdf, frame=replace(sdf.frame, centre=sdf.frame.centre - shape.com), bounds=sdf.bounds - shape.com)

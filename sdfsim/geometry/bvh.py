@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh import Mesh, area_vectors
 
 # A single ray meets edges and vertices of plain cubes; five randomly directed ones outvote that.
 PARITY_RAYS = 5
@@ -14,8 +14,8 @@ DIRECTIONS = np.random.default_rng(0).standard_normal((3, 3))
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
-class ClosestPoint:
-    """Nearest triangle of a mesh, in coordinates moved to the mesh's centre (open3d computes in float32)."""
+class _Centred:
+    """A scene of Open3D's, which computes in float32: its coordinates are moved to the centre of the mesh."""
 
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
@@ -24,8 +24,20 @@ class ClosestPoint:
         self.centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
         self.threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=self.threads)
-        local = np.ascontiguousarray(mesh.vertices - self.centre, dtype=np.float32)
-        self.scene.add_triangles(self.tensor(local), self.tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
+
+    def _add(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        self.scene.add_triangles(self._local(vertices), self.tensor(np.ascontiguousarray(faces, dtype=np.uint32)))
+
+    def _local(self, points: np.ndarray):
+        return self.tensor(np.ascontiguousarray(points - self.centre, dtype=np.float32))
+
+
+class ClosestPoint(_Centred):
+    """Nearest triangle of a mesh."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        super().__init__(mesh)
+        self._add(mesh.vertices, mesh.faces)
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest surface point [P, 3] m and the unit normal [P, 3] of its triangle."""
@@ -37,9 +49,6 @@ class ClosestPoint:
         """[P] bool: rays cross the surface an odd number of times (the majority of `PARITY_RAYS`)."""
         occupancy = self.scene.compute_occupancy(self._local(points), nthreads=self.threads, nsamples=PARITY_RAYS)
         return occupancy.numpy() > 0.5
-
-    def _local(self, points: np.ndarray):
-        return self.tensor(np.ascontiguousarray(points - self.centre, dtype=np.float32))
 
 
 class Winding:
@@ -68,39 +77,30 @@ class Winding:
         return np.asarray(self._tree.winding_number(local))
 
 
-class Crossings:
+class Crossings(_Centred):
     """Winding number of a surface that is closed, by rays: how often they leave it more than they enter it. A hundred
     times faster than `Winding` where faces are long and thin; wrong where a ray meets an edge, goes through an opening,
     or meets two faces at once that the hierarchy takes for one."""
 
     def __init__(self, mesh: Mesh) -> None:
-        import open3d as o3d
-
-        self._tensor: Any = o3d.core.Tensor
-        self._threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
-        self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
-        vertices = np.ascontiguousarray(mesh.vertices - self._centre, dtype=np.float32)
+        super().__init__(mesh)
         # Open3D reports one of two hits at the same distance, unless these are on different geometries. So faces are
         # spread over many geometries, and faces that lie on each other are both hit.
         order = np.random.default_rng(0).permutation(len(mesh.faces))
         groups = np.array_split(order, min(GEOMETRIES, len(order)))
         for group in groups:
             used, faces = np.unique(mesh.faces[group], return_inverse=True)
-            faces = np.ascontiguousarray(faces.reshape(-1, 3), dtype=np.uint32)
-            self._scene.add_triangles(self._tensor(vertices[used]), self._tensor(faces))
+            self._add(mesh.vertices[used], faces.reshape(-1, 3))
         self._start = np.cumsum([0, *(len(group) for group in groups)])
-        corners = mesh.vertices[mesh.faces[order]]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._senses = np.sign(normals @ DIRECTIONS.T)  # [F, D]
+        self._senses = np.sign(area_vectors(mesh.vertices[mesh.faces[order]]) @ DIRECTIONS.T)  # [F, D]
 
     def __call__(self, points: np.ndarray, direction: int) -> np.ndarray:
         """[P] float64 at `points` [P, 3] m, by rays in one of `DIRECTIONS`."""
         if not len(points):
             return np.zeros(0)
-        origins = points - self._centre
+        origins = points - self.centre
         rays = np.concatenate([origins, np.broadcast_to(DIRECTIONS[direction], origins.shape)], 1).astype(np.float32)
-        hits = self._scene.list_intersections(self._tensor(rays), nthreads=self._threads)
+        hits = self.scene.list_intersections(self.tensor(rays), nthreads=self.threads)
         face = self._start[hits["geometry_ids"].numpy()] + hits["primitive_ids"].numpy()
         return np.bincount(hits["ray_ids"].numpy(), self._senses[face, direction], len(points))
 

@@ -16,6 +16,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from sdfsim.geometry.mesh import joined
 from sdfsim.geometry.mesh_formats import FileMesh, looked_up, read_image, side_file, strip
 from sdfsim.geometry.skins import Painted
 
@@ -142,36 +143,26 @@ def read_gltf(path: Path) -> FileMesh:
     nodes where these place them, with their colours. Raises ValueError where it is damaged, or needs an extension that
     is not read."""
     file = _GltfReader(path)
-    parts, painted, count = [], [], 0
-    for node, matrix in file.placed():
-        for primitive in file.header["meshes"][node["mesh"]]["primitives"]:
-            part = file.part(primitive)
-            if part is None:
-                continue
-            for place in file.copies(node, matrix):
-                count += len(part.vertices) + part.faces.size
-                if count > MOST:
-                    raise ValueError(f"with all copies more than {MOST:,} vertices and corners")
-                vertices = part.vertices @ place[:3, :3].T + place[:3, 3]
-                mirrored = np.linalg.det(place[:3, :3]) < 0
-                faces = part.faces[:, ::-1] if mirrored else part.faces
-                moved = part._replace(vertices=vertices @ Z_UP.T, faces=faces)
-                parts.append(moved)
-                paint = part.painted[0]
-                painted.append(paint and paint._replace(vertices=moved.vertices, faces=faces))
+    parts = [part for _, part in file.parts()]
     if not parts:
         return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    colors = None
+    whole, colors = joined(parts), None
     if any(part.colors is not None for part in parts):
         white = [np.full(part.vertices.shape, 255, np.uint8) if part.colors is None else part.colors for part in parts]
         colors = np.concatenate(white)
-    return FileMesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
-        colors,
-        painted=tuple(painted) if file.textured else (),
-    )
+    painted = tuple(part.painted[0] for part in parts) if file.textured else ()
+    return FileMesh(whole.vertices, whole.faces, colors, painted=painted)
+
+
+def read_painted(path: Path) -> dict[str, Painted]:
+    """The parts of a file with a texture each, by the names of their nodes. Raises ValueError where it is damaged, or a
+    part has no texture that is read."""
+    file, found = _GltfReader(path), {}
+    for name, part in file.parts():
+        if not file.textured or part.painted[0] is None:
+            raise ValueError(f"{name} has no texture that is read")
+        found[name], file.textured = part.painted[0], False
+    return found
 
 
 class _GltfReader:
@@ -291,6 +282,22 @@ class _GltfReader:
             raise ValueError(f"the attributes of {INSTANCES} do not have one length")
         for row in zip(*columns.values(), strict=True):
             yield matrix @ _matrix({_OF_NODE[key]: value for key, value in zip(columns, row, strict=True)})
+
+    def parts(self) -> Iterator[tuple[str, FileMesh]]:
+        """The triangles that the scene shows, z up, with the names of their nodes."""
+        count = 0
+        for node, matrix in self.placed():
+            for primitive in self.header["meshes"][node["mesh"]]["primitives"]:
+                if (part := self.part(primitive)) is None:
+                    continue
+                for place in self.copies(node, matrix):
+                    count += len(part.vertices) + part.faces.size
+                    if count > MOST:
+                        raise ValueError(f"with all copies more than {MOST:,} vertices and corners")
+                    vertices = (part.vertices @ place[:3, :3].T + place[:3, 3]) @ Z_UP.T
+                    faces = part.faces[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else part.faces
+                    paint = part.painted[0] and part.painted[0]._replace(vertices=vertices, faces=faces)
+                    yield str(node.get("name")), part._replace(vertices=vertices, faces=faces, painted=(paint,))
 
     def part(self, primitive: dict[str, Any]) -> FileMesh | None:
         """The triangles of a primitive in its own frame; None for points and lines."""

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,6 +53,10 @@ class Frame:
     def outward(self, points: np.ndarray) -> np.ndarray:
         """Normalised -> metres, [P, 3]."""
         return points * self.scale + self.centre
+
+    def scaled(self, factor: float) -> "Frame":
+        """That of the solid `factor` times as large about the origin."""
+        return Frame(self.centre * factor, self.scale * factor)
 
 
 def normal_frame(bounds: np.ndarray) -> Frame:
@@ -122,8 +127,7 @@ def _has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """[F] bool: whether the corners of a face are not in a line, to rounding."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
-    twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return twice > 1e-10 * longest**2
+    return np.linalg.norm(area_vectors(corners), axis=1) > 1e-10 * longest**2
 
 
 def without_doubles(faces: np.ndarray) -> np.ndarray:
@@ -165,14 +169,9 @@ def signed_volume(mesh: Mesh) -> float:
 
 def components(faces: np.ndarray) -> np.ndarray:
     """[F] labels: faces that share an edge belong to one component."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    import igl
 
-    edge, _ = directed_edges(faces)
-    face = np.tile(np.arange(len(faces)), 3)
-    links = coo_matrix((np.ones(len(edge)), (face, len(faces) + edge)), shape=(len(faces) + edge.max() + 1,) * 2)
-    _, label = np.unique(connected_components(links, directed=False)[1][: len(faces)], return_inverse=True)
-    return label
+    return np.asarray(igl.facet_components(np.ascontiguousarray(faces, dtype=np.int64))[1])
 
 
 def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -202,10 +201,16 @@ def convex_hull(points: np.ndarray) -> Mesh:
     return Mesh(np.asarray(points, dtype=np.float64)[used], label.reshape(-1, 3))
 
 
+def area_vectors(corners: np.ndarray) -> np.ndarray:
+    """[F, 3] along the normals of triangles [F, 3, 3 or more], of which the first three columns are places; twice their
+    area long."""
+    points = corners[..., :3]
+    return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+
+
 def face_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals [F, 3] and areas [F]."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
+    cross = area_vectors(mesh.vertices[mesh.faces])
     double = np.linalg.norm(cross, axis=1)
     return cross / np.maximum(double, 1e-30)[:, None], double / 2
 
@@ -219,8 +224,8 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
-def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one, without colours."""
+def joined(meshes: Sequence[Mesh] | Sequence[Any]) -> Mesh:
+    """Several meshes, or whatever has vertices and faces as they do, as one, without colours."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
@@ -229,6 +234,18 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 def lattice(*axes: Sequence[float] | np.ndarray) -> np.ndarray:
     """All places [P, 3] with a coordinate of each of three axes, z running fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def halves(places: np.ndarray, most: int, chosen: np.ndarray | None = None) -> list[np.ndarray]:
+    """Indices of places [P, D], or of those `chosen`, that lie together, at most so many each: halves of halves, along
+    their longest side."""
+    chosen = np.arange(len(places)) if chosen is None else chosen
+    if len(chosen) <= most:
+        return [chosen]
+    some = places[chosen]
+    order = chosen[np.argsort(some[:, np.ptp(some, axis=0).argmax()], kind="stable")]
+    middle = len(order) // 2
+    return halves(places, most, order[:middle]) + halves(places, most, order[middle:])
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

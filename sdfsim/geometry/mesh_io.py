@@ -10,7 +10,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.files import visible
-from sdfsim.geometry.gltf import GltfWriter, read_gltf
+from sdfsim.geometry.gltf import GltfWriter, read_gltf, read_painted
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, require_whole
 from sdfsim.geometry.mesh_formats import (
     TEXTURES,
@@ -199,20 +199,13 @@ def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) ->
 
 def read_glb(path: Path) -> dict[str, Mesh]:
     """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError: not readable."""
-    import trimesh
-
-    found = {}
     with _reading(path):
-        loaded: Any = trimesh.load_scene(path, process=False)
-        for name, drawn in loaded.geometry.items():
-            image = drawn.visual.material.baseColorTexture
-            if image.format != "JPEG":
-                raise ValueError("a texture that is not a JPEG")
-            # trimesh counts up from the lower edge of a texture.
-            uv = np.asarray(drawn.visual.uv) * [1.0, -1.0] + [0.0, 1.0]
-            mesh = Mesh(np.array(drawn.vertices), _faces(drawn), None, uv, np.asarray(image.convert("RGB")))
+        found = {
+            name: Mesh(part.vertices, part.faces, None, part.uv, part.image)
+            for name, part in read_painted(path).items()
+        }
+        for mesh in found.values():
             require_whole(mesh)
-            found[str(name)] = mesh
     return found
 
 

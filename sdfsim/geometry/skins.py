@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
+from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume
 
 LARGEST = 8192  # px, of the longer side of what several images, or repetitions of one, are put into
 SWATCH = 8  # px to each side, of a plain colour beside images
@@ -54,7 +54,7 @@ def one_skin(parts: Sequence[Painted]) -> Mesh | None:
     for key, sheet in sheets.items():
         texture[: sheet.shape[0], left : left + sheet.shape[1]] = sheet
         at[key], left = left, left + sheet.shape[1]
-    whole = np.array(texture.shape[1::-1])
+    extent = np.array(texture.shape[1::-1])
     placed = []
     for part, uv in zip(parts, places, strict=True):
         key = id(part.image)
@@ -62,10 +62,9 @@ def one_skin(parts: Sequence[Painted]) -> Mesh | None:
         pixel = uv / tiles[key] * size
         if len(sheets) > 1:  # no colour of the image beside it
             pixel = np.clip(pixel, 0.5, size - 0.5) + np.array([at[key], 0.0])
-        placed.append(np.clip(pixel / whole, 0.0, 1.0))
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
-    vertices = np.concatenate([part.vertices for part in parts])
-    welded = Mesh(vertices, np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces])
-    solid = is_closed(welded) and signed_volume(Mesh(vertices, faces)) < 0
-    return Mesh(vertices, faces[:, ::-1].copy() if solid else faces, None, np.concatenate(placed), texture)
+        placed.append(np.clip(pixel / extent, 0.0, 1.0))
+    whole = joined(parts)
+    welded = np.unique(whole.vertices, axis=0, return_inverse=True)[1].reshape(-1)[whole.faces]
+    inside_out = is_closed(Mesh(whole.vertices, welded)) and signed_volume(whole) < 0
+    faces = whole.faces[:, ::-1].copy() if inside_out else whole.faces
+    return Mesh(whole.vertices, faces, None, np.concatenate(placed), texture)

@@ -13,7 +13,17 @@ import numpy as np
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import ClosestPoint, Crossings, Winding
 from sdfsim.geometry.mass import integrals
-from sdfsim.geometry.mesh import Frame, Mesh, clean, components, directed_edges, is_closed, lattice, normal_frame
+from sdfsim.geometry.mesh import (
+    Frame,
+    Mesh,
+    area_vectors,
+    clean,
+    components,
+    directed_edges,
+    is_closed,
+    lattice,
+    normal_frame,
+)
 
 # Openings are always closed up to this fraction of the surface, smallest first.
 SMALL = 0.02
@@ -302,18 +312,12 @@ def bodies(faces: np.ndarray, patch: np.ndarray) -> np.ndarray:
 
 def openings(faces: np.ndarray) -> list[np.ndarray]:
     """Loops of vertices [N] around which the surface ends, in the direction of its faces' edges."""
-    edge, sign = directed_edges(faces)
-    net = np.bincount(edge, weights=sign).astype(np.int64)
-    _, first = np.unique(edge, return_index=True)
-    starts = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]])[first]
-    ends = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]])[first]
-    # The direction in which there are too many of them.
-    forward = net * sign[first] > 0
-    starts, ends = np.where(forward, starts, ends), np.where(forward, ends, starts)
+    import igl
+
+    ends: Any = igl.exterior_edges(np.ascontiguousarray(faces, dtype=np.int64))
     leaving: dict[int, list[int]] = {}
-    for start, end, count in zip(starts.tolist(), ends.tolist(), np.abs(net).tolist(), strict=True):
-        if count:
-            leaving.setdefault(start, []).extend([end] * count)
+    for start, end in ends.tolist():
+        leaving.setdefault(start, []).append(end)
     loops = []
     # As many edges come to a vertex as leave it, so a walk can only end where it began.
     for origin in list(leaving):
@@ -335,12 +339,6 @@ def openings(faces: np.ndarray) -> list[np.ndarray]:
 def face_areas(corners: np.ndarray) -> np.ndarray:
     """[F] areas of triangles [F, 3, 3 + K]."""
     return 0.5 * np.linalg.norm(area_vectors(corners), axis=1)
-
-
-def area_vectors(corners: np.ndarray) -> np.ndarray:
-    """[F, 3] along the normals of triangles [F, 3, 3 + K], twice their area long."""
-    points = corners[..., :3]
-    return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
 
 
 def exposed(corners: np.ndarray, side: Side) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,12 @@ from torch import Tensor
 
 REST_SPEED = 0.2  # model units: what gravity adds to a speed in one step of training; slower counts as resting
 EDGE_FEATURES = 30
+# Of a graph's tensors those with a row for each edge, but for its ends; and those with a row for each body.
+OF_EDGES = ("normal", "arm_first", "arm_second", "impulse", "gap", "when", "friction", "restitution")
+OF_BODIES = (
+    "inverse_mass", "inverse_inertia", "velocity", "angular", "free_velocity", "free_angular", "solved_velocity",
+    "solved_angular", "mean_velocity", "mean_angular",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,6 @@ class ContactGraph:
 
 
 def in_single(graph: ContactGraph) -> ContactGraph:
-    """The graph in single precision."""
     tensors = {n: v for n, v in vars(graph).items() if isinstance(v, Tensor) and v.is_floating_point()}
     return replace(graph, **{name: value.float() for name, value in tensors.items()})
 

@@ -16,12 +16,9 @@ import numpy as np
 from torch import device
 
 from sdfsim.geometry.mesh import Mesh, convex_hull, joined
-from sdfsim.learned.baselines.dpi import DPI, dpi_graph
-from sdfsim.learned.baselines.fignet import FIGNET, FIGNET_STAR, fignet_graph, fignet_star_graph
-from sdfsim.learned.baselines.mgn import MGN, mgn_graph
+from sdfsim.learned import graphs
 from sdfsim.learned.message_passing import Layout, MultiGraph
 from sdfsim.learned.near import Contacts, Pairs, face_pairs, find_contacts, no_contacts, no_pairs, node_pairs
-from sdfsim.learned.sdf_sim import SDF_SIM, sdf_sim_graph
 from sdfsim.learned.tensors import BodyTensors, StateTensors
 from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.sdf.closed_forms import PlaneSdf
@@ -91,9 +88,9 @@ class Family:
 _no_faces, _no_nodes = partial(no_pairs, corners=3), partial(no_pairs, corners=1)
 
 FAMILIES = {
-    "sdf-sim": Family(SDF_SIM, points, find_contacts, no_contacts, sdf_sim_graph, distances=True),
-    "fignet": Family(FIGNET, vertices, face_pairs, _no_faces, fignet_graph),
-    "fignet-star": Family(FIGNET_STAR, vertices, face_pairs, _no_faces, fignet_star_graph),
-    "mgn": Family(MGN, vertices, node_pairs, _no_nodes, mgn_graph),
-    "dpi": Family(DPI, particles, node_pairs, _no_nodes, dpi_graph),
+    "sdf-sim": Family(graphs.SDF_SIM, points, find_contacts, no_contacts, graphs.sdf_sim_graph, distances=True),
+    "fignet": Family(graphs.FIGNET, vertices, face_pairs, _no_faces, graphs.fignet_graph),
+    "fignet-star": Family(graphs.FIGNET_STAR, vertices, face_pairs, _no_faces, graphs.fignet_star_graph),
+    "mgn": Family(graphs.MGN, vertices, node_pairs, _no_nodes, graphs.mgn_graph),
+    "dpi": Family(graphs.DPI, particles, node_pairs, _no_nodes, graphs.dpi_graph),
 }

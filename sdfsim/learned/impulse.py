@@ -28,8 +28,6 @@ LEVER = 0.5  # of the way from a centre of mass to a contact: how far off the co
 
 @dataclass(frozen=True)
 class ImpulseConfig:
-    """Sizes of the network."""
-
     width: int = 64  # of every latent and hidden layer
     rounds: int = 6  # of message passing, each with weights of its own
     # 1 for a network that is given where contacts are but not what the solve makes of them, and that nothing bounds:
@@ -58,7 +56,6 @@ class Velocities:
 
 
 def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
-    """Two hidden layers."""
     return nn.Sequential(
         nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, outputs)
     )
@@ -103,7 +100,6 @@ class Round(nn.Module):
     def update(
         self, edge: Tensor, body: Tensor, hidden: Tensor, weight: Tensor, graph: ContactGraph
     ) -> tuple[Tensor, Tensor]:
-        """Latents of edges and bodies for the next round."""
         to_first, to_second = (self.message(hidden) * weight).chunk(2, -1)
         received = torch.zeros_like(body).index_add_(0, graph.first, to_first).index_add_(0, graph.second, to_second)
         body = body + self.body(torch.cat([body, received], -1))

@@ -24,13 +24,14 @@ def doubled(network: ImpulseNetwork) -> ImpulseNetwork:
 
 
 def step_graph(
-    bodies: Bodies, before: State, solved: State, edges: Edges, options: Options, known: float
-) -> tuple[np.ndarray, ContactGraph]:
-    """The bodies [A] int64 that met somebody in a solved step with these `edges`, and their graph in double precision:
-    in units in which the step lasts `known` (a network knows no other) and gravity is what it is, masses relative to
-    the heaviest."""
-    rows, inside = np.unique(edges.pair, return_inverse=True)
-    inside = inside.reshape(edges.pair.shape)
+    bodies: Bodies, before: State, solved: State, edges: Edges, options: Options, known: float,
+    rows: np.ndarray | None = None,
+) -> tuple[np.ndarray, ContactGraph]:  # fmt: skip
+    """The bodies `rows` [A] int64 (None: those that met somebody in a solved step with these `edges`), and their graph
+    in double precision: in units in which the step lasts `known` (a network knows no other) and gravity is what it is,
+    masses relative to the heaviest."""
+    rows = np.unique(edges.pair) if rows is None else rows
+    inside = np.searchsorted(rows, edges.pair)
     time = options.dt / known
     length, moves = time * time, bodies.moves[rows]
     heaviest = float(bodies.mass[rows].max()) or 1.0

@@ -42,8 +42,6 @@ class Layout:
 
 @dataclass(frozen=True)
 class EdgeSet:
-    """E edges of one kind."""
-
     features: Tensor  # [E, F] float32
     # sender, receiver: [E, corners] int64, in the sets that the kind names
     sender: Tensor
@@ -52,13 +50,10 @@ class EdgeSet:
 
 @dataclass(frozen=True)
 class MultiGraph:
-    """A graph of some layout."""
-
     nodes: dict[str, Tensor]  # features [n, F] float32 of each set
     edges: dict[str, EdgeSet]  # of each kind
 
     def __len__(self) -> int:
-        """How many nodes there are."""
         return sum(len(features) for features in self.nodes.values())
 
     @property
@@ -214,11 +209,9 @@ class Normaliser(nn.Module):
         return mean.float(), deviation.float()
 
     def forward(self, values: Tensor) -> Tensor:
-        """Standardised values."""
         mean, deviation = self.moments()
         return (values - mean) / deviation
 
     def undo(self, values: Tensor) -> Tensor:
-        """Back from standardised values."""
         mean, deviation = self.moments()
         return values * deviation + mean

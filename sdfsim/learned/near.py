@@ -43,7 +43,6 @@ class Contacts:
 
 
 def no_contacts(device: torch.device) -> Contacts:
-    """None at all."""
     nobody = torch.zeros(0, dtype=torch.int64, device=device)
     nothing = torch.zeros(0, 3, dtype=torch.float64, device=device)
     return Contacts(nobody, nobody, nobody, nothing, nothing[:, 0], nothing)

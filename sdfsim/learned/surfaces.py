@@ -152,7 +152,6 @@ def advance(bodies: BodyTensors, state: StateTensors, acceleration: Tensor, dt: 
 def predict(
     network: GraphNetwork, graph: MultiGraph, bodies: BodyTensors, state: StateTensors, dt: float
 ) -> StateTensors:
-    """One step of the published simulators."""
     return advance(bodies, state, network.target.undo(network(graph)).double(), dt)
 
 

@@ -55,17 +55,14 @@ class StateTensors:
 
 
 def body_tensors(bodies: Bodies, device: torch.device) -> BodyTensors:
-    """The bodies on `device`."""
     return BodyTensors(**{f.name: torch.from_numpy(getattr(bodies, f.name)).to(device) for f in fields(BodyTensors)})
 
 
 def state_tensors(state: Motion, device: torch.device) -> StateTensors:
-    """The state on `device`."""
     arrays = {f.name: getattr(state, f.name, None) for f in fields(StateTensors)}
     return StateTensors(**{k: torch.from_numpy(v).to(device) for k, v in arrays.items() if v is not None})
 
 
 def state_arrays(state: StateTensors) -> State:
-    """The state as NumPy has it."""
     tensors: dict[str, Any] = {f.name: getattr(state, f.name) for f in fields(state)}
     return State(**{k: v.cpu().numpy() for k, v in tensors.items() if v is not None})

@@ -75,15 +75,6 @@ def first_fault(state: Motion, dt: float, rows: np.ndarray | None = None, before
     return None if row < 0 else replace(fault_of(row, wrong, found, earlier[row], dt), body=int(rows[row]))
 
 
-def unsound(state: Motion, dt: float, before: Motion) -> np.ndarray:
-    """Which bodies [N] bool have a state that cannot be, a step of `dt` after `before`; model units."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        way = (state.position - before.position) / dt
-        sizes = [np.linalg.norm(v, axis=-1) for v in (state.position, state.velocity, state.angular_velocity, way)]
-        off = np.stack([np.abs(np.square(state.orientation).sum(-1) - 1.0), *sizes], 1)
-        return np.logical_not((off <= limits(dt)).all(1))
-
-
 def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
     """Raises SdfsimError where a body that has an end is too large for its surface to keep to where points are placed
     exactly; a model unit is so many `metres`."""

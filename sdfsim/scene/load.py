@@ -48,17 +48,16 @@ def load_scene(
     """
     path = find_scene(path) if text is None else Path(path)
     table, document = read_scene(path, allow_outside=allow_outside, text=text)
-    shapes = _load_shapes(table, document, on_progress)
-    distinct = list({id(shape): shape for shape in shapes.values()}.values())
-    number = {id(shape): i for i, shape in enumerate(distinct)}
+    same, shapes = _load_shapes(table, document, on_progress)
+    number = {key: i for i, key in enumerate(dict.fromkeys(same.values()))}
     groups = {body.name: body.names() for body in table.bodies}
     bodies: list[Body] = []
     for i, entry in enumerate(table.bodies):
-        made = _body(entry, number[id(shapes[entry.shape])], table.motion_of(entry), groups)
+        shape = shapes[same[entry.shape]]
+        made = _body(entry, number[same[entry.shape]], table.motion_of(entry), groups)
         if made.motion == "dynamic":
-            made = replace(made, mass=_mass(entry, shapes[entry.shape], partial(document.wrong, ("bodies", i, "name"))))
+            made = replace(made, mass=_mass(entry, shape, partial(document.wrong, ("bodies", i, "name"))))
             if entry.inertia_factor != 1.0 and made.mass > 0.0:
-                shape = shapes[entry.shape]
                 own = made.mass / shape.volume * shape.inertia * entry.scale**2
                 made = replace(made, inertia=entry.inertia_factor * own)
         for name, offset in zip(entry.names(), entry.offsets(), strict=True):
@@ -66,14 +65,14 @@ def load_scene(
             bodies.append(replace(made, name=name, position=made.position + offset, path=way))
     joints = joints_of(table.joints, bodies, document.wrong)
     document.check()
-    loaded = list({id(shapes[key]): (of, shapes[key]) for key, of in table.shapes.items() if key in shapes}.values())
+    loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
     notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", []))
     if on_progress is silent:
         for note in notes:
             warn_once(note)
     return Scene(
-        shapes=tuple(distinct),
+        shapes=tuple(shapes[key] for key in number),
         bodies=tuple(bodies),
         gravity=np.array(table.gravity),
         duration=table.duration,
@@ -88,17 +87,16 @@ def load_scene(
     )
 
 
-def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -> dict[str | None, Shape]:
-    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. Keys that
-    say the same have one shape, with the name of the first: in Python every body may bring its mesh along. Shapes that
+def _load_shapes(
+    table: SceneTable, document: Document, on_progress: Progress
+) -> tuple[dict[str | None, str | None], dict[str | None, Shape]]:
+    """Of the keys in use, in the order of first use, the first that says the same, and the shapes of these first ones:
+    in Python every body may bring its mesh along. None is the plane that all bodies with a `plane` share. Shapes that
     must be fitted or sampled are made last, when all else is valid: a fit takes a minute."""
-    used = dict.fromkeys(body.shape for body in table.bodies)
     first: dict[str, str] = {}
-    same = {
-        key: first.setdefault(table.shapes[key].model_dump_json(exclude_unset=True), key)
-        for key in used
-        if key is not None
-    }
+    same: dict[str | None, str | None] = {}
+    for key in dict.fromkeys(body.shape for body in table.bodies):
+        same[key] = key and first.setdefault(table.shapes[key].model_dump_json(exclude_unset=True), key)
     shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
     slow = {key: s.kind in FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
     for now in (False, True):
@@ -114,7 +112,7 @@ def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -
                 hint = f" ({error.hint})" if error.hint else ""
                 document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
         document.check()
-    return {key: shapes[key if key is None else same[key]] for key in used}
+    return same, shapes
 
 
 def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:

@@ -79,8 +79,7 @@ class GridSdf:
 
     def scaled(self, factor: float) -> GridSdf:
         """The solid `factor` times as large."""
-        frame = Frame(self.frame.centre * factor, self.frame.scale * factor)
-        return replace(self, frame=frame, bounds=self.bounds * factor)
+        return replace(self, frame=self.frame.scaled(factor), bounds=self.bounds * factor)
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -120,24 +119,40 @@ def _sample_near(
     on_progress: Progress,
 ) -> GridSdf:  # fmt: skip
     """What `sample_grid` does where it samples in full near the surface only."""
-    from scipy.ndimage import zoom
-
     if (resolution - 1) % coarse:
         raise ValueError(f"resolution - 1 must be a multiple of coarse (got {resolution}, {coarse})")
-    rough = sample_grid(distance, bounds, (resolution - 1) // coarse + 1, on_progress)
-    knots, frame = rough.values.numpy(), rough.frame
-    values = np.asarray(zoom(knots, resolution / len(knots), order=1, grid_mode=False, mode="nearest"), np.float32)
-    count = len(knots) - 1
-    corners = [knots[i : i + count, j : j + count, k : k + count] for i, j, k in np.ndindex(2, 2, 2)]
+    frame, axis = normal_frame(bounds), np.linspace(-BOX, BOX, resolution)
+
+    def ask(points: np.ndarray) -> np.ndarray:
+        return np.asarray(distance(frame.outward(points))[0]) / frame.scale
+
     # No place of a block is farther from a corner than half of its diagonal; a quarter of a side more for what is near.
-    reach = (0.5 * np.sqrt(3.0) + 0.25) * 2 * BOX / count
-    blocks = np.argwhere(np.abs(corners).min(0) <= reach)
-    inner = lattice(*[np.arange(coarse + 1)] * 3).astype(int)
-    axis = np.linspace(-BOX, BOX, resolution)
-    parts = np.array_split(blocks, max(1, len(blocks) * len(inner) // CHUNK))
-    for number, part in enumerate(parts):
-        on_progress(number / len(parts), "sampling the distance near the surface")
-        place = (coarse * part[:, None] + inner).reshape(-1, 3)
-        values[tuple(place.T)] = np.asarray(distance(frame.outward(axis[place]))[0]) / frame.scale
-    on_progress(1.0, "sampled")
+    reach = (0.5 * np.sqrt(3.0) + 0.25) * (axis[coarse] - axis[0])
+    values = near_samples(ask, axis, coarse, reach, on_progress)
     return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
+
+
+def near_samples(
+    distance: Callable[[np.ndarray], np.ndarray], axis: np.ndarray, coarse: int, reach: float, on_progress: Progress
+) -> np.ndarray:
+    """Samples [R, R, R] float32 of a distance [P] at points [P, 3], at evenly spaced places [R] along each axis. Blocks
+    of `coarse` cells a side, which divides R - 1, are sampled in full only where a corner is within `reach` of the
+    surface or not all corners are on one side of it; others at their corners, and trilinear between."""
+    from scipy.ndimage import zoom
+
+    knots = axis[::coarse]
+    count, places = len(knots) - 1, lattice(knots, knots, knots)
+    rough = np.concatenate([distance(part) for part in np.array_split(places, len(places) // CHUNK + 1)])
+    rough = rough.reshape((count + 1,) * 3)
+    values = np.asarray(zoom(rough, len(axis) / len(knots), order=1, grid_mode=False, mode="nearest"), np.float32)
+    corners = np.stack([rough[i : i + count, j : j + count, k : k + count] for i, j, k in np.ndindex(2, 2, 2)])
+    crossed = corners.min(0) * corners.max(0) < 0
+    blocks = np.argwhere((np.abs(corners).min(0) <= reach) | crossed)
+    inner = lattice(*[np.arange(coarse + 1)] * 3)
+    parts = np.array_split(blocks, len(blocks) * len(inner) // CHUNK + 1)
+    for number, part in enumerate(parts):
+        on_progress(number / len(parts), f"sampling near the surface, {number + 1} of {len(parts)} parts")
+        place = (coarse * part[:, None] + inner).reshape(-1, 3)
+        values[tuple(place.T)] = distance(axis[place])
+    on_progress(1.0, "sampled")
+    return values

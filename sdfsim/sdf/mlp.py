@@ -55,8 +55,7 @@ class MlpSdf:
 
     def scaled(self, factor: float) -> MlpSdf:
         """The solid `factor` times as large."""
-        frame = Frame(self.frame.centre * factor, self.frame.scale * factor)
-        return replace(self, frame=frame, bounds=self.bounds * factor)
+        return replace(self, frame=self.frame.scaled(factor), bounds=self.bounds * factor)
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import cached_arrays, digest, user_cache
-from sdfsim.geometry.mesh import Mesh, convex_hull, directed_edges, face_normals, lattice
+from sdfsim.geometry.mesh import Mesh, convex_hull, directed_edges, face_normals, halves, lattice
 from sdfsim.sdf.baked_grid import BAKE_VERSION, BakedGrid, baked, interpolated, inwards, surface_samples, unseen_wall
 from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
 from sdfsim.sdf.mlp import MlpSdf
@@ -226,9 +226,9 @@ def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, facing: np
     surface."""
     leaves: list[np.ndarray] = []
     clump_leaf, clump_ball = [0], [np.zeros((0, 4))]
-    for clump in _split(node, np.arange(len(node)), CLUMP) if len(node) else []:
+    for clump in halves(node, CLUMP) if len(node) else []:
         sided = np.column_stack([node, 0.5 * np.ptp(node[clump], axis=0).max() * facing])
-        leaves += [leaf for p in np.unique(patch[clump]) for leaf in _split(sided, clump[patch[clump] == p], LEAF)]
+        leaves += [leaf for p in np.unique(patch[clump]) for leaf in halves(sided, LEAF, clump[patch[clump] == p])]
         clump_leaf.append(len(leaves))
         clump_ball.append(_ball(node[clump], cover[clump]))
     order = np.concatenate([np.zeros(0, np.int64), *leaves])
@@ -244,17 +244,6 @@ def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, facing: np
 NO_SURFACE = ContactSurface(
     **in_leaves(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))), **NO_LABELS
 )
-
-
-def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]:
-    """Rows of [K, D], halved along the longest side until no part has more than `most`."""
-    if len(chosen) <= most:
-        return [chosen]
-    places = nodes[chosen]
-    axis = int(np.argmax(np.ptp(places, axis=0)))
-    order = chosen[np.argsort(places[:, axis], kind="stable")]
-    middle = len(order) // 2
-    return _split(nodes, order[:middle], most) + _split(nodes, order[middle:], most)
 
 
 def _ball(places: np.ndarray, around: np.ndarray) -> np.ndarray:

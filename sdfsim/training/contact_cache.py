@@ -8,14 +8,14 @@ network meets states that differ a little from recorded ones.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import read_arrays, write_arrays
+from sdfsim.base.files import digest, read_arrays, write_arrays
 from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.data.dataset import (
     INFO,
@@ -29,8 +29,8 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import MARGIN
+from sdfsim.learned.contact_graph import OF_BODIES, OF_EDGES
 from sdfsim.physics import pose
-from sdfsim.physics.free_flight import torque_free
 from sdfsim.physics.options import SUBSTEPS
 
 if TYPE_CHECKING:
@@ -39,14 +39,15 @@ if TYPE_CHECKING:
     from sdfsim.physics.solver.record import Edges
 
 STEP = 0.02  # s, the step that networks know
-FRAMES_VERSION = 10  # counts up whenever frames of the same recordings come out differently
+FRAMES_VERSION = 11  # counts up whenever frames of the same recordings come out differently
 TOGETHER = 25  # trajectories that are followed side by side
+ENDS = ("first", "second")
+# What was recorded of a step, and where a graph has it of what a step has led to.
+TOLD = {"velocity": "solved_velocity", "angular": "solved_angular"} | {n: n for n in ("mean_velocity", "mean_angular")}
 
 
 @dataclass(frozen=True)
 class Solved:
-    """How recordings are followed."""
-
     draws: int = 2  # how often every recording is followed: first from the states as they are, then from disturbed ones
     # shift, speed: m and m/s, standard deviations of the disturbance of a body's place and velocity, and by turning and
     # spinning of its surface. Every body's is a part of it, log-uniform from `least` to all.
@@ -63,75 +64,65 @@ class ContactFrames:
     it is that long and gravity is what it is (Froude scaling): to a network, which knows no other step, their bodies
     are larger or smaller.
 
-    A frame holds its trajectory's bodies that move or not, at the start of a step (rows of the body arrays), and
-    its contact edges. `second` = -1 means the floor.
+    A frame holds its trajectory's bodies that move or not (rows of `bodies`, `truth` and what follows these) and its
+    contact edges, each as a `ContactGraph` has them. `second` = -1 means the floor, which is no row.
     """
 
     # body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1]
     body_start: np.ndarray
     edge_start: np.ndarray
-    orientation: np.ndarray  # [B, 4]; velocity, angular: [B, 3] at the start of the step
-    velocity: np.ndarray
-    angular: np.ndarray
-    free_angular: np.ndarray  # [B, 3] rad/s at its end in free flight
-    # solved_velocity, solved_angular, solved_moved, solved_turned: [B, 3] what the solve makes of the step: velocities
-    # at its end, and mean linear and angular velocity over it
-    solved_velocity: np.ndarray
-    solved_angular: np.ndarray
-    solved_moved: np.ndarray
-    solved_turned: np.ndarray
-    # end_velocity, end_angular, moved, turned: [B, 3] the same as recorded
-    end_velocity: np.ndarray
-    end_angular: np.ndarray
-    moved: np.ndarray
-    turned: np.ndarray
-    mass: np.ndarray  # [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B]
-    inertia: np.ndarray
+    bodies: dict[str, np.ndarray]  # of `OF_BODIES`, [B, ...]; masses are relative to one that changes from step to step
+    edges: dict[str, np.ndarray]  # of `OF_EDGES`, [E, ...]; `first` and `second`: [E] int16, bodies within the frame
+    truth: dict[str, np.ndarray]  # of `Velocities`, [B, 3]: what was recorded
+    mass: np.ndarray  # [B] kg, 0 for static bodies; friction, restitution, size: [B]
     friction: np.ndarray
     restitution: np.ndarray
     size: np.ndarray
     floor: np.ndarray  # [F, 2] friction and restitution of each frame's floor
-    # first, second: [E] int16, bodies within the frame
-    first: np.ndarray
-    second: np.ndarray
-    # arm_first, arm_second: [E, 3] m, from the centres of mass (the floor's: its origin) to the contact
-    arm_first: np.ndarray
-    arm_second: np.ndarray
-    normal: np.ndarray  # [E, 3] from the second to the first
-    impulse: np.ndarray  # [E, 3] kg m/s, of the solve on the first body
-    gap: np.ndarray  # [E] m; when: [E] part of the step that was over when it was met
-    when: np.ndarray
-    dt: float  # s, `STEP`; gravity: [3] m/s^2
-    gravity: np.ndarray
+    gravity: np.ndarray  # [3] m/s^2
     trajectories: np.ndarray  # [K] int64, how many were followed, of each of the K sets that were joined
 
     def __len__(self) -> int:
         return len(self.edge_start) - 1
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it, by names in which a stroke leads to what a field holds."""
+        told: dict[str, np.ndarray] = {}
+        for name, value in vars(self).items():
+            told |= {f"{name}/{of}": v for of, v in value.items()} if isinstance(value, dict) else {name: value}
+        return told
+
+    @classmethod
+    def of_arrays(cls, arrays: dict[str, np.ndarray]) -> ContactFrames:
+        """The reverse. Raises TypeError where a field is missing or unknown."""
+        told: dict[str, Any] = {}
+        for name, value in arrays.items():
+            of, _, inside = name.partition("/")
+            if inside:
+                told.setdefault(of, {})[inside] = value
+            else:
+                told[of] = value
+        return cls(**told)
+
     def save(self, path: Path) -> None:
-        """Write the cache file."""
-        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-        write_arrays(path, arrays | {"version": np.array(FRAMES_VERSION)}, compressed=False)
+        write_arrays(path, self.arrays() | {"version": np.array(FRAMES_VERSION)}, compressed=False)
 
     @classmethod
     def load(cls, path: Path) -> ContactFrames:
         """Read a cache file. Raises SdfsimError: not contact frames, or not of this version."""
-        arrays: dict[str, Any] = read_arrays(path, "contact frames", "delete it to have it made again")
-        if int(arrays.pop("version", 0)) != FRAMES_VERSION or set(arrays) != {f.name for f in fields(cls)}:
-            raise SdfsimError(
-                f"{path}: not contact frames of this version of sdfsim ({FRAMES_VERSION})",
-                "where the trajectories are, delete it and train once: it is made again; then copy it here",
-            )
-        arrays["dt"] = float(arrays["dt"])
-        return cls(**arrays)
+        arrays = read_arrays(path, "contact frames", "delete it to have it made again")
+        try:
+            if int(arrays.pop("version", 0)) == FRAMES_VERSION:
+                return cls.of_arrays(arrays)
+        except TypeError:
+            pass
+        raise SdfsimError(
+            f"{path}: not contact frames of this version of sdfsim ({FRAMES_VERSION})",
+            "where the trajectories are, delete it and train once: it is made again; then copy it here",
+        )
 
     def digest(self) -> str:
-        """Changes with the training data."""
-        digest = hashlib.sha256(f"{self.dt}".encode())
-        for field in fields(self):
-            if field.name not in ("dt", "trajectories"):
-                digest.update(np.ascontiguousarray(getattr(self, field.name)).data)
-        return digest.hexdigest()[:16]
+        return digest({name: array for name, array in self.arrays().items() if name != "trajectories"})[:16]
 
 
 def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress = silent) -> ContactFrames:
@@ -169,16 +160,14 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
     one = sets[0]
     if any(not np.allclose(one.gravity, other.gravity) for other in sets[1:]):
         raise SdfsimError("datasets that are trained on together must share gravity")
-    whole: dict[str, Any] = {"dt": one.dt, "gravity": one.gravity}
-    for field in fields(ContactFrames):
-        if field.name in whole:
-            continue
-        arrays = [getattr(s, field.name) for s in sets]
-        if field.name.endswith("_start"):
+    whole = {"gravity": one.gravity}
+    for name, first in one.arrays().items():
+        arrays = [first, *(other.arrays()[name] for other in sets[1:])]
+        if name.endswith("_start"):
             ends = np.cumsum([0] + [a[-1] for a in arrays[:-1]])
-            arrays = [arrays[0][:1], *(a[1:] + end for a, end in zip(arrays, ends, strict=True))]
-        whole[field.name] = np.concatenate(arrays)
-    return ContactFrames(**whole)
+            arrays = [first[:1], *(a[1:] + end for a, end in zip(arrays, ends, strict=True))]
+        whole.setdefault(name, np.concatenate(arrays))
+    return ContactFrames.of_arrays(whole)
 
 
 def inner_steps(dt: float, substep: float) -> int:
@@ -192,11 +181,11 @@ def inner_steps(dt: float, substep: float) -> int:
 
 def _fingerprint(files: list[Path], how: Solved) -> str:
     """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are solved."""
-    digest = hashlib.sha256(f"{FRAMES_VERSION} {how} {[(f.name, f.stat().st_size) for f in files]}".encode())
+    hashed = hashlib.sha256(f"{FRAMES_VERSION} {how} {[(f.name, f.stat().st_size) for f in files]}".encode())
     info = [home / INFO] if (home := home_of(files[0].parent)) else []
     for record in (*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))):
-        digest.update(record.read_bytes())
-    return digest.hexdigest()[:12]
+        hashed.update(record.read_bytes())
+    return hashed.hexdigest()[:12]
 
 
 def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
@@ -255,68 +244,36 @@ def _of_step(
 ) -> list[ContactFrames]:  # fmt: skip
     """The frames of a step of several trajectories on one floor, of this friction and restitution, in units in which it
     lasts `STEP`; none where nothing touches."""
-    from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
+    from sdfsim.learned.inference import step_graph
 
     if not len(edges.pair):
         return []
-    floor = len(bodies) - 1
-    world = bodies.world
-    of_edge = world[edges.pair[:, 0]]
-    order = np.argsort(of_edge, kind="stable")
-    used, count = np.unique(of_edge, return_counts=True)
-    rows = np.flatnonzero(np.isin(world, used))
-    begins = np.searchsorted(world[:floor], np.arange(world.max() + 1))[of_edge[order]]
-    first, second = edges.pair[order].T
-    time = options.dt / STEP
-    length = time**2
-    speed = length / time
-
-    def body(values: np.ndarray, unit: float = 1.0) -> np.ndarray:
-        return (values[rows] / unit).astype(np.float32)
-
-    def edge(column: int, unit: float = 1.0) -> np.ndarray:
-        return (edges.value[order, column] / unit).astype(np.float32)
-
-    def vector(column: int, unit: float = 1.0) -> np.ndarray:
-        return (edges.value[order, column : column + 3] / unit).astype(np.float32)
-
-    def motion(end: State, names: tuple[str, str, str, str]) -> dict[str, np.ndarray]:
-        """Velocities at the end of the step, and mean ones over it."""
-        turned = pose.to_rotvec(pose.multiply(end.orientation, pose.conjugate(state.orientation)))
-        parts = (
-            body(end.velocity, speed),
-            body(end.angular_velocity, 1.0 / time),
-            body((end.position - state.position) / options.dt, speed),
-            body(turned / options.dt, 1.0 / time),
-        )
-        return dict(zip(names, parts, strict=True))
-
-    free = torque_free(state.orientation, state.angular_velocity, bodies.inertia, options.dt)[1]
+    world, floor = bodies.world, len(bodies) - 1
+    order = np.argsort(world[edges.pair[:, 0]], kind="stable")
+    edges = edges._replace(pair=edges.pair[order], value=edges.value[order])
+    used, frame, count = np.unique(world[edges.pair[:, 0]], return_inverse=True, return_counts=True)
+    rows = np.flatnonzero(np.isin(world[:floor], used))
+    begin = np.concatenate([[0], np.cumsum(np.bincount(world[rows])[used])])
+    # Of the same edges, once with what the solve makes of the step, and once with what was recorded.
+    graph, truth = (
+        vars(step_graph(bodies, state, end, edges, options, STEP, np.append(rows, floor))[1])
+        for end in (after, recorded)
+    )
+    ends = {name: graph[name].numpy() for name in ENDS}
+    ends = {name: np.where(k == len(rows), -1, k - begin[frame]).astype(np.int16) for name, k in ends.items()}
+    length = (options.dt / STEP) ** 2
     return [
         ContactFrames(
-            body_start=np.concatenate([[0], np.cumsum(np.bincount(world[rows])[used])]),
+            body_start=begin,
             edge_start=np.concatenate([[0], np.cumsum(count)]),
-            orientation=body(state.orientation),
-            velocity=body(state.velocity, speed),
-            angular=body(state.angular_velocity, 1.0 / time),
-            free_angular=body(free, 1.0 / time),
-            **motion(after, ("solved_velocity", "solved_angular", "solved_moved", "solved_turned")),
-            **motion(recorded, ("end_velocity", "end_angular", "moved", "turned")),
-            mass=body(bodies.mass),
-            inertia=body(bodies.inertia.diagonal(axis1=-2, axis2=-1), length**2),
-            friction=body(bodies.friction),
-            restitution=body(bodies.restitution),
-            size=body(bodies.size, length),
+            bodies={name: graph[name][:-1].float().numpy() for name in OF_BODIES},
+            edges=ends | {name: graph[name].float().numpy() for name in OF_EDGES},
+            truth={name: truth[of][:-1].float().numpy() for name, of in TOLD.items()},
+            mass=bodies.mass[rows].astype(np.float32),
+            friction=bodies.friction[rows].astype(np.float32),
+            restitution=bodies.restitution[rows].astype(np.float32),
+            size=(bodies.size[rows] / length).astype(np.float32),
             floor=np.tile(np.array(of_floor, np.float32), (len(used), 1)),
-            first=(first - begins).astype(np.int16),
-            second=np.where(second == floor, -1, second - begins).astype(np.int16),
-            arm_first=vector(ARM, length),
-            arm_second=vector(OTHER, length),
-            normal=vector(AXIS),
-            impulse=vector(GIVEN, speed),
-            gap=edge(APART, length),
-            when=edge(WHEN),
-            dt=STEP,
             gravity=options.gravity,
             trajectories=np.zeros(1, dtype=np.int64),
         )

@@ -20,7 +20,6 @@ class Team:
 
     @property
     def leads(self) -> bool:
-        """Whether this is the one that writes files."""
         return self.rank == 0
 
     @contextmanager
@@ -54,7 +53,6 @@ class Team:
         nn.utils.vector_to_parameters(flat, gradients)
 
     def wait(self) -> None:
-        """Wait for all processes."""
         if self.size > 1:
             torch.distributed.barrier()
 

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from sdfsim.data.dataset import ranges_of
-from sdfsim.learned import pose
-from sdfsim.learned.contact_graph import ContactGraph, number_pairs
+from sdfsim.learned.contact_graph import OF_BODIES, OF_EDGES, ContactGraph, number_pairs
 from sdfsim.learned.impulse import ImpulseNetwork, Velocities
-from sdfsim.training.contact_cache import ContactFrames
+from sdfsim.training.contact_cache import ENDS, STEP, ContactFrames
 from sdfsim.training.distributed import ALONE, Team
 
 HUBER = 0.01  # m/s: below it errors count squared, above it by their size; what rests may creep by less than that
@@ -36,11 +35,10 @@ class ImpulseTask:
         self.frames = frames
         self.weight = _importance(frames)
         self.counts = frames.trajectories.tolist()  # trajectories of each set of frames
-        self.dt = frames.dt
+        self.dt = STEP
         self.gravity = float(np.linalg.norm(frames.gravity))
 
     def digest(self) -> str:
-        """Changes with the data."""
         return self.frames.digest()
 
     def ranges(self) -> dict[str, list[float]]:
@@ -49,7 +47,7 @@ class ImpulseTask:
         moving = f.mass > 0
         heaviest = np.maximum.reduceat(f.mass, f.body_start[:-1])
         lightest = np.minimum.reduceat(np.where(moving, f.mass, np.inf), f.body_start[:-1])
-        speed = np.linalg.norm(f.velocity[moving], axis=-1)
+        speed = np.linalg.norm(f.bodies["velocity"][moving], axis=-1)
         ratios = (heaviest / lightest)[heaviest > 0]
         return ranges_of(f.size[moving], speed, ratios, f.friction, f.restitution, f.floor)
 
@@ -63,61 +61,26 @@ class ImpulseTask:
         f = self.frames
         rows, body_of = _ranges(f.body_start, picked)
         edges, edge_of = _ranges(f.edge_start, picked)
-        base = np.concatenate([[0], np.cumsum(np.bincount(body_of, minlength=len(picked)))])
-        floor = len(rows)
-        first = f.first[edges] + base[edge_of]
-        second = np.where(f.second[edges] < 0, floor, f.second[edges] + base[edge_of])
+        base = np.concatenate([[0], np.cumsum(np.bincount(body_of, minlength=len(picked)))])[edge_of]
+        ends = [f.edges[name][edges] for name in ENDS]
+        ends = torch.from_numpy(np.stack([np.where(end < 0, len(rows), end + base) for end in ends]).astype(np.int64))
 
-        def body(array: np.ndarray, fill: float | list[float] = 0.0) -> Tensor:
-            last = np.broadcast_to(np.asarray(fill, dtype=np.float32), array.shape[1:])[None]
-            return torch.from_numpy(np.concatenate([array[rows], last]))
+        def body(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.concatenate([array[rows], np.zeros_like(array[:1])]))
 
-        mass, velocity, angular = body(f.mass), body(f.velocity), body(f.angular)
-        moves = mass > 0
-        rotation = pose.to_matrix(body(f.orientation, [0.0, 0.0, 0.0, 1.0]))
-        inverse_inertia = rotation * (1.0 / body(f.inertia, 1.0))[:, None] @ rotation.mT * moves[:, None, None]
-        fall = torch.as_tensor(f.gravity * f.dt, dtype=torch.float32) * moves[:, None]
-        index = torch.from_numpy(np.stack([first, second]).astype(np.int64))
-
-        def edge(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(array[edges])
-
-        def product(own: np.ndarray, column: int) -> Tensor:
-            """[E] of the coefficients of both bodies; every frame has a floor of its own."""
-            one, other = body(own)[index]
-            floors = torch.from_numpy(f.floor[picked][edge_of, column])
-            return one * torch.where(index[1] == floor, floors, other)
-
-        pair, pairs = number_pairs(index[0], index[1], len(mass))
+        pair, pairs = number_pairs(ends[0], ends[1], len(rows) + 1)
         graph = ContactGraph(
-            inverse_mass=torch.where(moves, 1.0 / mass.clamp_min(1e-9), torch.zeros_like(mass)),
-            inverse_inertia=inverse_inertia,
-            velocity=velocity,
-            angular=angular,
-            free_velocity=velocity + fall,
-            free_angular=body(f.free_angular),
-            solved_velocity=body(f.solved_velocity),
-            solved_angular=body(f.solved_angular),
-            mean_velocity=body(f.solved_moved),
-            mean_angular=body(f.solved_turned),
-            first=index[0],
-            second=index[1],
+            **{name: body(f.bodies[name]) for name in OF_BODIES},
+            **{name: torch.from_numpy(f.edges[name][edges]) for name in OF_EDGES},
+            **dict(zip(ENDS, ends, strict=True)),
             pair=pair,
             pairs=pairs,
-            normal=edge(f.normal),
-            arm_first=edge(f.arm_first),
-            arm_second=edge(f.arm_second),
-            impulse=edge(f.impulse),
-            gap=edge(f.gap),
-            when=edge(f.when),
-            friction=product(f.friction, 0),
-            restitution=product(f.restitution, 1),
-            dt=f.dt,
+            dt=STEP,
         )
-        truth = Velocities(body(f.end_velocity), body(f.end_angular), body(f.moved), body(f.turned))
-        counts = torch.zeros_like(moves)
-        counts[index.flatten()] = True
-        return ContactBatch(graph, truth, body(f.size, 1.0), counts & moves)
+        counts = torch.zeros(len(rows) + 1, dtype=torch.bool)
+        counts[ends.flatten()] = True
+        truth = Velocities(**{name: body(array) for name, array in f.truth.items()})
+        return ContactBatch(graph, truth, body(f.size), counts & (graph.inverse_mass > 0))
 
     def loss(self, network: ImpulseNetwork, batch: ContactBatch, *, mirrored: bool = False) -> Tensor:
         """Mean pseudo-Huber error of end and mean velocities, angular ones times half the body's size."""
@@ -151,9 +114,8 @@ def _ranges(start: np.ndarray, picked: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _importance(f: ContactFrames) -> np.ndarray:
     """[F] sampling weights: up to 1 / CALM_SHARE times more for frames whose bodies leave free flight by 1 m/s."""
-    fall = (f.gravity * f.dt).astype(np.float32)
-    hit = np.linalg.norm(f.end_velocity - f.velocity - fall, axis=-1)
-    hit += 0.5 * f.size * np.linalg.norm(f.end_angular - f.free_angular, axis=-1)
+    hit = np.linalg.norm(f.truth["velocity"] - f.bodies["free_velocity"], axis=-1)
+    hit += 0.5 * f.size * np.linalg.norm(f.truth["angular"] - f.bodies["free_angular"], axis=-1)
     hardest = np.maximum.reduceat(np.where(f.mass > 0, hit, 0.0), f.body_start[:-1])
     weight = CALM_SHARE + (1.0 - CALM_SHARE) * np.clip(hardest, 0.0, 1.0)
     return weight / weight.sum()

@@ -28,7 +28,7 @@ from sdfsim.physics import pose
 from sdfsim.physics.options import GRAVITY, LENGTH, STEP, SUBSTEPS, Options
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.units import scene_units
-from sdfsim.physics.validity import FARTHEST, unsound
+from sdfsim.physics.validity import FARTHEST, first_fault
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.batch import placed, side_by_side
 from sdfsim.simulate.steppers import stepper_of
@@ -109,7 +109,8 @@ class Worlds:
                         made = network(graph, mirrored=mirrored)
                     solved = changed(self.bodies, solved, rows, graph, made, self.options)
             state = solved
-            lost |= unsound(state, self.dt, before)[: self.total]
+            while fault := first_fault(state, self.dt, np.flatnonzero(~lost), before):
+                lost[fault.body] = True
             if lost.any():
                 state = state.with_rows(gone := np.flatnonzero(lost), _far_away(gone))
             found.append(Stepped(state.position[: self.total], state.orientation[: self.total], rows, graph))
@@ -130,7 +131,6 @@ def inner_steps(dt: float) -> int:
 
 
 def joined(graphs: Sequence[ContactGraph]) -> ContactGraph:
-    """Graphs side by side as one."""
     whole: dict[str, Any] = {"dt": graphs[0].dt, "pairs": sum(g.pairs for g in graphs)}
     bodies = np.cumsum([0, *(len(g.inverse_mass) for g in graphs)]).tolist()
     pairs = np.cumsum([0, *(g.pairs for g in graphs)]).tolist()
@@ -178,7 +178,6 @@ class MotionTask:
         return begin, weight / weight.sum()
 
     def digest(self) -> str:
-        """Changes with the data."""
         told = hashlib.sha256()
         for r in self.recordings:
             for array in (*r.goal, r.position, r.velocity, r.angular_velocity):

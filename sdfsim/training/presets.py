@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Preset:
-    """One way to train one network."""
-
     kind: str  # "impulse", or a network on surface nodes: "sdf-sim", "fignet", "fignet-star", "mgn", "dpi"
     config: dict[str, int]  # sizes of the network
     steps: int  # of the optimiser

@@ -95,7 +95,6 @@ class Run:
 
     @cached_property
     def drawn(self) -> Iterator[Drawn]:
-        """What the coming steps train on."""
         return batches(Draws(self.task, self.plan.batch, self.seed, self.team), self.step, self.workers)
 
     def close(self) -> None:
@@ -109,7 +108,6 @@ class Run:
         return warm * (0.01 + 0.99 * fall)
 
     def averaged(self) -> nn.Module:
-        """The network with its averaged weights."""
         network = deepcopy(self.network)
         network.load_state_dict(self.average)
         return network.eval().requires_grad_(False)
@@ -209,7 +207,6 @@ class Optimiser:
             part.zero_grad()
 
     def state(self) -> dict[str, Tensor]:
-        """What it remembers, by name."""
         return {
             f"{which}/{index}/{name}": value
             for which, part in enumerate(self.parts)
@@ -218,7 +215,6 @@ class Optimiser:
         }
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Take up what `state` gave."""
         for which, part in enumerate(self.parts):
             slots: dict[int, dict[str, Tensor]] = {}
             for key, value in state.items():

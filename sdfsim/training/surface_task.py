@@ -66,7 +66,6 @@ class SurfaceTask:
         self.__init__(data, split, plan, noisy=noisy)
 
     def digest(self) -> str:
-        """Changes with the data."""
         digest = hashlib.sha256(f"{self.floor}".encode())
         for t in self.trajectories:
             for field in fields(t):

@@ -117,7 +117,6 @@ def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]
 
 
 def _tasks(plan: Preset, folders: Sequence[Path], tell: Progress):
-    """Training and held-out tasks of a preset."""
     if plan.kind == "impulse":
         from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
         from sdfsim.training.impulse_task import ImpulseTask
@@ -147,7 +146,6 @@ def _check_kind(plan: Preset, scene: Path | None, workers: int) -> None:
 
 
 def _motion_tasks(paths: Sequence[Path], scene: Path, tell: Progress, *, allow_outside: bool):
-    """Training and held-out tasks of recordings of a scene."""
     from sdfsim.apps.observed import load_recordings
     from sdfsim.training.motion_task import HELD, LEAST, MotionTask
 

@@ -8,8 +8,9 @@ import pytest
 
 import sdfsim
 from sdfsim import Simulator
+from sdfsim.apps.beside import between
 from sdfsim.apps.recording import framed
-from sdfsim.apps.render import FRAMES, SIZE, Studio, eye_of, poses_at, render
+from sdfsim.apps.render import FRAMES, SIZE, Studio, eye_of, render
 from sdfsim.apps.run import ending_lines, summary
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
@@ -26,7 +27,7 @@ def falling(**keys) -> tuple[Scene, sdfsim.Rollout]:
 def seen(scene: Scene, rollout: sdfsim.Rollout, camera, look_at, time=0.0) -> np.ndarray:
     """[H, W] bool: pixels that are not sky."""
     studio = Studio(scene, eye_of(scene, None, camera, look_at), framed(scene)[1])
-    return np.abs(studio.picture(*poses_at(rollout, time)).astype(int) - SKY).max(-1) > 8
+    return np.abs(studio.picture_at(rollout, time).astype(int) - SKY).max(-1) > 8
 
 
 def test_a_ball_is_a_disc_of_the_right_size_in_the_middle():
@@ -52,7 +53,7 @@ def test_what_is_between_the_floor_and_the_sun_throws_a_shadow():
     scene = sdfsim.Scene().add("floor", plane={}).add("box", box={"size": (0.4, 0.4, 0.1)}, position=(0, 0, 1.5)).load()
     eye = eye_of(scene, None, (0.0, -4.0, 6.0), (0, 0, 0))
     studio = Studio(scene, eye, 1.0)
-    picture = studio.picture(*poses_at(Simulator(scene).initial_rollout(), 0.0)).astype(int)
+    picture = studio.picture_at(Simulator(scene).initial_rollout(), 0.0).astype(int)
 
     def at(point: np.ndarray) -> int:
         """Brightness of a point of the floor."""
@@ -75,7 +76,7 @@ def test_a_texture_is_seen_where_its_places_are():
     shape = replace(analytic_shape("box", size=(2.0, 0.1, 2.0)), skin=sheet)
     scene, rollout = falling(position=(0, 0, 0))
     scene = replace(scene, shapes=(shape,))
-    picture = Studio(scene, eye_of(scene, None, (0, -6, 0), (0, 0, 0)), 1.0).picture(*poses_at(rollout, 0.0))
+    picture = Studio(scene, eye_of(scene, None, (0, -6, 0), (0, 0, 0)), 1.0).picture_at(rollout, 0.0)
     middle, off = np.array(SIZE[::-1]) // 2, 60
     for (row, column), color in np.ndenumerate(np.array([["r", "g"], ["b", "y"]])):
         seen = picture[middle[0] + off * (2 * row - 1), middle[1] + off * (2 * column - 1)].astype(int)
@@ -86,7 +87,7 @@ def test_a_texture_is_seen_where_its_places_are():
 def test_poses_between_two_frames_are_on_the_way():
     _, rollout = falling(position=(0, 0, 1), velocity=(1, 0, 0), angular_velocity=(0, 0, 3))
     for time in (0.0, 0.123, 0.4, rollout.time[-1], 9.0):
-        place, turn = poses_at(rollout, time)
+        place, turn = (p[0] for p in between(rollout.time, rollout.position, rollout.orientation, np.array([time])))
         time = min(time, rollout.time[-1])
         assert place[0] == pytest.approx((time, 0, 1 - 0.5 * 9.81 * time**2), abs=1e-3)
         assert turn[0] == pytest.approx((0, 0, np.sin(1.5 * time), np.cos(1.5 * time)), abs=1e-4)

@@ -226,7 +226,7 @@ def test_static_scenery_takes_part_in_contacts_but_never_in_what_is_learnt(cast,
     t.save(tmp_path / "train" / "00000.npz")
     frames = contact_frames(tmp_path, "train", Solved(draws=1))
     assert (frames.mass.reshape(-1, 6)[:, 0] == 0).all() and (frames.mass.reshape(-1, 6)[:, 1:] > 0).all()
-    assert (frames.second == 0).any() and not (frames.first == 0).any()  # who is first moves
+    assert (frames.edges["second"] == 0).any() and not (frames.edges["first"] == 0).any()  # who is first moves
     task = ImpulseTask(frames)
     batch = task.batch(np.arange(len(frames)))
     fixed = torch.arange(len(batch.counts)) % 6 == 0

@@ -13,36 +13,28 @@ from scipy.spatial.transform import Rotation
 from benchmarks import reality
 from benchmarks.reality import (
     ENGINES,
-    FIT,
-    FRAMES,
     GRAVITY,
     OURS,
     SCENE,
     SIDE,
-    TEST,
     TRAINED,
     Lesson,
-    Motion,
-    Start,
     Toss,
     Trained,
-    cost,
     dataset_of,
     errors,
     fall,
     fitted_start,
     flight,
-    identified,
     learnt,
     load_tosses,
     network_table,
     networks,
     on_surfaces,
-    ours,
-    recorded,
     recordings_of,
     split,
 )  # fmt: skip
+from benchmarks.tosses import FIT, FRAMES, TEST, Motion, Start, cost, ours, recorded, searched
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import Trajectory
 from sdfsim.scene.load import load_scene
@@ -126,7 +118,7 @@ def test_errors_are_those_of_a_shift_and_a_turn():
 
 def moved(name: str, starts: list[Start], height: float, folder: Path) -> Motion:
     if name != OURS:
-        return ENGINES[name][0](starts, DT, GRAVITY, VALUES | {"height": height})
+        return ENGINES[name][0](starts, DT, np.array([0.0, 0.0, -GRAVITY]), VALUES | {"height": height})
     text = SCENE.format(gravity=-GRAVITY, side=SIDE, mass=0.37, factor=1.0)
     (folder / "scene.yaml").write_text(text.replace("plane: {}", f"plane: {{offset: {height}}}"))
     return ours(starts, DT, load_scene(folder / "scene.yaml"))
@@ -159,9 +151,9 @@ def test_tosses_side_by_side_meet_the_table_alone(name, tmp_path):
 
 def test_the_search_finds_a_minimum_within_bounds():
     bounds = {"friction": (0.0, 1.0), "side": (0.9, 1.1)}
-    found = identified(lambda v: (v["friction"] - 0.3) ** 2 + 100.0 * (v["side"] - 1.02) ** 2, bounds)
+    found = searched(lambda v: (v["friction"] - 0.3) ** 2 + 100.0 * (v["side"] - 1.02) ** 2, bounds)
     assert found == pytest.approx({"friction": 0.3, "side": 1.02}, abs=0.02)
-    found = identified(lambda v: v["friction"] - 5.0 * v["side"], bounds)
+    found = searched(lambda v: v["friction"] - 5.0 * v["side"], bounds)
     assert found == pytest.approx({"friction": 0.0, "side": 1.1}, abs=0.05)
     assert all(low <= found[name] <= high for name, (low, high) in bounds.items())
 
@@ -170,9 +162,9 @@ def test_a_toss_that_ends_on_another_face_counts_as_far():
     truth = Motion(np.zeros((2, FRAMES, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, FRAMES, 1)))
     turned = truth.quat_xyzw.copy()
     turned[1] = Rotation.from_euler("x", 90, degrees=True).as_quat()
-    assert cost(Motion(truth.position, turned), truth) == pytest.approx(15.0)
+    assert cost(errors(Motion(truth.position, turned), truth)) == pytest.approx(15.0)
     turned[1] = Rotation.from_euler("x", 20, degrees=True).as_quat()
-    assert cost(Motion(truth.position, turned), truth) == pytest.approx(10.0)
+    assert cost(errors(Motion(truth.position, turned), truth)) == pytest.approx(10.0)
 
 
 def test_no_recordings_are_told(tmp_path):

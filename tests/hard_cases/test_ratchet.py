@@ -8,5 +8,5 @@ from sdfsim.evaluation.stress import stress
 
 @pytest.mark.slow
 def test_no_bundled_model_is_worse_than_was_accepted(tmp_path):
-    assert RATCHET.exists(), "write it: python benchmarks/hard_cases.py -o DIR --quick"
+    assert RATCHET.exists(), "write it: python -m benchmarks hard_cases -o DIR --quick"
     assert slipped_back(stress(tmp_path, quick=True), RATCHET) == []

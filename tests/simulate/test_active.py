@@ -9,7 +9,7 @@ import torch
 
 from sdfsim.learned import inference, near
 from sdfsim.learned.contact_graph import ContactGraph
-from sdfsim.learned.sdf_sim import sdf_sim_graph
+from sdfsim.learned.graphs import sdf_sim_graph
 from sdfsim.learned.surfaces import compact, node_owner, predict
 from sdfsim.learned.tensors import state_arrays
 from sdfsim.physics import free_flight

@@ -36,13 +36,14 @@ def test_another_step_is_another_size_in_the_same_gravity(tmp_path, dt):
     frames = contact_frames(dataset(tmp_path, recorded), "train", ONCE)
     time = dt / STEP
     length = time**2
-    assert len(frames) > 3 and frames.dt == STEP and np.array_equal(frames.gravity, recorded.gravity)
+    assert len(frames) > 3 and np.array_equal(frames.gravity, recorded.gravity)
     np.testing.assert_allclose(frames.size, 1.0 / length, rtol=1e-6)
     ratio = (recorded.inertia / recorded.mass[:, None])[np.arange(len(frames.mass)) % 2]  # masses are relative
-    np.testing.assert_allclose(frames.inertia / frames.mass[:, None], ratio / length**2, rtol=1e-6)
+    turning = frames.bodies["inverse_inertia"].diagonal(axis1=1, axis2=2)
+    np.testing.assert_allclose(frames.bodies["inverse_mass"][:, None] / turning, ratio / length**2, rtol=1e-6)
     now = recorded.velocity[:-1].reshape(-1, 3) * time / length
     gone = np.diff(recorded.position, axis=0).reshape(-1, 3)
-    for velocity, moved in zip(frames.velocity, frames.moved, strict=True):
+    for velocity, moved in zip(frames.bodies["velocity"], frames.truth["mean_velocity"], strict=True):
         k = np.abs(now - velocity).max(1).argmin()
         np.testing.assert_allclose(velocity, now[k], atol=1e-5)
         np.testing.assert_allclose(moved * STEP * length, gone[k], atol=1e-5)
@@ -50,13 +51,14 @@ def test_another_step_is_another_size_in_the_same_gravity(tmp_path, dt):
 
 def test_a_disturbed_start_still_leads_to_the_recorded_end(tmp_path):
     frames = contact_frames(dataset(tmp_path, bouncing(0)), "train", Solved(draws=2, shift=1e-3, speed=0.0))
-    exact = frames.end_velocity[: len(frames.end_velocity) // 2]
+    ended, moved = (frames.truth[name] for name in ("velocity", "mean_velocity"))
+    exact = ended[: len(ended) // 2]
     found = 0
-    for k in range(len(exact), len(frames.end_velocity)):
-        same = np.abs(exact - frames.end_velocity[k]).max(1) < 1e-7
+    for k in range(len(exact), len(ended)):
+        same = np.abs(exact - ended[k]).max(1) < 1e-7
         if same.sum() == 1:
             j = int(same.argmax())
-            shift = (frames.moved[j] - frames.moved[k]) * STEP  # it has to go so much less
+            shift = (moved[j] - moved[k]) * STEP  # it has to go so much less
             assert np.linalg.norm(shift) < 6e-3
             found += np.linalg.norm(shift) > 2e-5
     assert found > 5
@@ -113,7 +115,8 @@ def test_frames_and_ranges_are_those_of_the_floor_of_dataset_json(tmp_path, floo
     frames = contact_frames(slab_data(tmp_path, "train", sliding(floor[0]), told), "train", ONCE)
     assert len(frames) == 39
     # In the first of five inner steps the slab only comes to bear on the floor.
-    part = (frames.velocity[:, 0] - frames.solved_velocity[:, 0]) / (10.0 * floor[0] * 0.02)
+    slower = frames.bodies["velocity"][:, 0] - frames.bodies["solved_velocity"][:, 0]
+    part = slower / (10.0 * floor[0] * 0.02)
     assert part.min() > 0.7 and part.max() < 1.01
     task = ImpulseTask(frames)
     graph = task.batch(np.arange(5)).graph
@@ -154,5 +157,5 @@ def test_only_recordings_of_the_teacher_are_followed_with_its_habits(tmp_path):
         (tmp_path / name).mkdir()
         told = {"engine": name, "engine_settings": engine}
         frames = contact_frames(slab_data(tmp_path / name, "train", sliding(0.0, **still), told), "train", ONCE)
-        up[name] = frames.solved_moved[0, 2] * STEP
+        up[name] = frames.bodies["mean_velocity"][0, 2] * STEP
     assert up["pybullet"] > 1e-4 and up["mine"] <= 0.0

@@ -1,1 +1,0 @@
-"""The networks that SDF-Sim is compared with: FIGNet, FIGNet*, MeshGraphNets, DPI."""
