@@ -1,4 +1,7 @@
-"""Simulates every sample and takes its picture for docs/samples.md: python scripts/gallery.py [NAME ...]"""
+"""Simulates samples and the large scenes, and takes their pictures for docs/samples.md and docs/scale.md.
+
+python scripts/gallery.py [NAME ...]     # samples, or heaps, knots and shoes, which take minutes and get a movie too
+"""
 
 import sys
 import tempfile
@@ -6,17 +9,25 @@ from pathlib import Path
 
 from PIL import Image
 
-from sdfsim.apps.render import render
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from samples.large import HEAPS, write_scene
+from sdfsim.apps.render import Place, render
 from sdfsim.apps.run import ending_lines, summary
+from sdfsim.base.files import replacing
+from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[1]
+IMAGES = ROOT / "docs" / "images"
+SMALL = (480, 270)  # px, of a sample's picture
 # When, from where and at what, in s and m.
 PICTURES = {
     "bounce": (0.62, (0.0, -1.1, 0.45), (0.0, 0.0, 0.25)),
-    "slope": (0.45, (0.75, -0.8, 0.45), (0.2, 0.05, -0.05)),
-    "marble_run": (1.9, (0.3, -0.85, 0.75), (0.0, 0.0, 0.36)),
+    "slope": (0.45, (0.3, -0.95, 0.2), (0.25, 0.05, -0.05)),
+    "marble_run": (1.9, (0.3, -1.0, 0.8), (0.03, 0.0, 0.4)),
     "dominoes": (0.42, (-0.15, -0.32, 0.2), (0.0, 0.0, 0.02)),
     "spinning_plate": (1.5, (0.1, -0.8, 0.4), (0.05, -0.05, 0.08)),
     "tower": (4.0, (0.5, -0.8, 0.5), (0.0, 0.0, 0.18)),
@@ -24,27 +35,56 @@ PICTURES = {
     "paddle": (0.9, (-0.3, -0.9, 0.7), (0.1, 0.0, 0.0)),
     "scan": (0.25, (0.25, -0.5, 0.35), (0.0, 0.0, 0.12)),
     "knocked_vase": (0.45, (-0.1, -1.4, 0.95), (0.15, 0.0, 0.6)),
-    "pile": (1.0, (-1.0, -1.0, 0.6), (0.0, 0.0, 0.05)),
-    "toss": (0.33, (0.0, -1.1, 0.4), (0.0, 0.0, 0.08)),
-    "door": (1.0, (0.4, -3.4, 2.4), (0.5, 0.0, 0.9)),
-    "cradle": (0.95, (0.5, -1.6, 0.9), (0.0, 0.0, 0.7)),
+    "pile": (1.0, (-1.0, -1.2, 0.7), (0.0, 0.0, 0.02)),
+    "toss": (0.33, (0.05, -0.6, 0.25), (0.05, 0.0, 0.06)),
+    "door": (1.0, (0.4, -4.0, 2.5), (0.55, 0.0, 1.0)),
+    "cradle": (0.95, (0.1, -0.75, 0.62), (0.1, 0.0, 0.53)),
     "ragdoll": (1.1, (3.2, -3.4, 2.4), (1.2, 0.0, 0.8)),
     "spheres_in_bowl": (4.0, (0.5, -0.9, 1.0), (0.0, 0.0, 0.3)),
 }
+# From where and at what, m: the picture of the end, and the movie, which sees all that falls.
+LARGE = {
+    "heaps": ((-4.6, -7.2, 3.9), (0.2, 0.2, 0.3), (-9.5, -14.5, 6.5), (0.0, 0.0, 3.2)),
+    "knots": ((-3.0, -4.6, 2.5), (0.0, 0.0, 0.2), (-4.4, -6.4, 3.2), (0.0, 0.0, 1.1)),
+    "shoes": ((-2.1, -3.3, 1.8), (0.0, 0.0, 0.05), (-3.4, -5.2, 2.6), (0.0, 0.0, 0.9)),
+}
 
 
-def main(names: list[str]) -> None:
-    for name in names or PICTURES:
-        at, camera, look_at = PICTURES[name]
-        scene = load_scene(ROOT / "samples" / f"{name}.yaml")
-        rollout = Simulator(scene).run()
-        print(name, *ending_lines(summary(scene, rollout, 0.0)), sep="\n  ")
-        with tempfile.TemporaryDirectory() as folder:
-            picture = Path(folder) / "picture.png"
-            render(scene, rollout, picture, camera=camera, look_at=look_at, at=min(at, rollout.time[-1]))
-            small = Image.open(picture).convert("RGB").resize((480, 270), Image.Resampling.LANCZOS)
-        small.save(ROOT / "docs" / "images" / f"sample-{name}.jpg", quality=82)
+def picture(
+    scene: Scene, rollout: Rollout, name: str, camera: Place, look_at: Place,
+    at: float | None = None, size: tuple[int, int] | None = None,
+) -> None:  # fmt: skip
+    """Writes NAME.jpg, in the renderer's own size or this one."""
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "picture.png"
+        render(scene, rollout, whole, camera=camera, look_at=look_at, at=at)
+        shown = Image.open(whole).convert("RGB")
+    if size is not None:
+        shown = shown.resize(size, Image.Resampling.LANCZOS)
+    with replacing(IMAGES / f"{name}.jpg") as partial:
+        shown.save(partial, "JPEG", quality=82)
+
+
+def sample(name: str) -> None:
+    """Its picture, and in the console what became of its bodies."""
+    at, camera, look_at = PICTURES[name]
+    scene = load_scene(ROOT / "samples" / f"{name}.yaml")
+    rollout = Simulator(scene).run()
+    print(name, *ending_lines(summary(scene, rollout, 0.0)), sep="\n  ")
+    picture(scene, rollout, f"sample-{name}", camera, look_at, min(at, rollout.time[-1]), SMALL)
+
+
+def large(name: str) -> None:
+    """Its picture and its movie."""
+    camera, look_at, filmed_from, filmed_at = LARGE[name]
+    with tempfile.TemporaryDirectory() as folder:
+        scene = load_scene(write_scene(name, Path(folder)))
+    rollout = Simulator(scene).run(steps=HEAPS[name].steps)
+    print(f"{name}: {len(rollout)} steps")
+    picture(scene, rollout, name, camera, look_at)
+    render(scene, rollout, IMAGES / f"{name}.mp4", camera=filmed_from, look_at=filmed_at)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    for chosen in sys.argv[1:] or [*PICTURES, *LARGE]:
+        (large if chosen in LARGE else sample)(chosen)

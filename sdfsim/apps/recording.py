@@ -381,7 +381,13 @@ def _color(number: int) -> tuple[int, ...]:
 
 
 def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
-    """Centre [3] m and radius m of what the first view has to show.
+    """Centre [3] m and radius m of a ball about `extent`."""
+    low, high = extent(scene, motion)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
+    """[2, 3] m: the lowest and highest coordinates of what the first view has to show.
 
     The bodies at the start, planes left out, and the places on planes that they are over, as what is held up by
     nothing falls there; and, where the motion is known, their way. What flies farther than `FARTHEST` times the size
@@ -398,7 +404,7 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
             corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
             boxes[k] = body.position + _turned(corners, body.quat_xyzw)
     if not boxes:
-        return np.zeros(3), 1.0
+        return np.array([[-1.0] * 3, [1.0] * 3]) / np.sqrt(3.0)
     start = np.concatenate(list(boxes.values()))
     below = [start - ((start - at) @ normal)[:, None] * normal for at, normal in planes]
     shown = np.concatenate([start, *below])
@@ -409,7 +415,7 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
             half = np.linalg.norm(np.ptp(corners, axis=0)) / 2 if scene.bodies[k].motion != "static" else 0.0
             way = np.clip(motion.position[:, k], low - FARTHEST * size, high + FARTHEST * size)
             low, high = np.minimum(low, way.min(0) - half), np.maximum(high, way.max(0) + half)
-    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    return np.stack([low, high])
 
 
 def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:

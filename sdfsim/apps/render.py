@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.beside import COLOR, OPACITY, Beside, between
-from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, with_normals
+from sdfsim.apps.recording import Eye, body_colors, extent, eye_around, framed, is_infinite, shown, with_normals
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
 from sdfsim.base.parallel import Progress, silent
@@ -31,6 +31,7 @@ SIZE = (960, 540)  # px, width and height
 FRAMES = 30  # a second
 FORMATS = (".mp4", ".png")
 _TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at distance 1
+_MARGIN = 0.95  # of the picture is filled, where the camera is chosen here
 _SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
 _SKY = np.array([236.0, 240.0, 245.0], np.float32)  # what nothing is in front of
 _SHADE = 0.45  # light where the sun does not shine
@@ -81,8 +82,11 @@ def eye_of(
     """The camera of a scene. Where its position or target, [3] m each, is not given, one is chosen that has the whole
     scene in sight. Raises SdfsimError where the two are one point, or not finite."""
     centre, radius = framed(scene, motion)
-    given = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
-    eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))
+    eye = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
+    if camera is None:
+        eye = _far_enough(eye, np.stack(np.meshgrid(*extent(scene, motion).T), -1).reshape(-1, 3))
+    else:
+        eye = replace(eye, position=np.array(camera, dtype=float))
     sight = eye.target - eye.position
     if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
         raise SdfsimError("--camera and --look-at: must be two different points")
@@ -91,6 +95,23 @@ def eye_of(
         aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
         eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
     return eye
+
+
+def _far_enough(eye: Eye, points: np.ndarray) -> Eye:
+    """The eye at the least distance from its target, along its line of sight, from which it sees all points [P, 3]."""
+    axes = _axes(eye)
+    right, down, ahead = axes @ (points - eye.target).T
+    aside = np.maximum(np.abs(right) * SIZE[1] / SIZE[0], np.abs(down))
+    distance = float((aside / (_MARGIN * _TALL) - ahead).max())
+    return replace(eye, position=eye.target - distance * axes[2])
+
+
+def _axes(eye: Eye) -> np.ndarray:
+    """[3, 3]: unit vectors right and down in the picture, and into it."""
+    forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
+    right = np.cross(forward, eye.up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
 
 
 def check_format(out: Path) -> None:
@@ -161,10 +182,8 @@ class Studio:
         for k in () if beside is None else beside.rows(scene):
             mesh, normals = self._models[k]
             self._ghosts.append((Mesh(mesh.vertices, mesh.faces, np.broadcast_to(COLOR, mesh.vertices.shape)), normals))
-        forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
-        right = np.cross(forward, eye.up)
-        right /= np.linalg.norm(right)
-        self.axes = np.stack([right, np.cross(forward, right), forward])
+        self.axes = _axes(eye)
+        right = self.axes[0]
         self.sun = _SUN @ np.stack([right, np.cross(eye.up, right), eye.up])
         self._through = self._rays(_GRID)
 

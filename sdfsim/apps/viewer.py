@@ -32,12 +32,9 @@ def stream_to_viewer(playback: Playback, kind: str) -> str:
     port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
     web = ["--serve-web", "--web-viewer-port", str(page_port)]
     viewer = _launch(port, web if kind == "web" else ["--expect-data-soon", "--hide-welcome-screen"])
-    started = time.monotonic()
-    while not _answers(port):
-        if viewer.poll() is not None or time.monotonic() - started > _START_SECONDS:
-            _end(viewer)
-            raise SdfsimError("the rerun viewer does not start", "use --viewer file")
-        time.sleep(0.1)
+    if not _started(viewer, port) or (kind == "web" and not _started(viewer, page_port)):
+        _end(viewer)
+        raise SdfsimError("the rerun viewer does not start", "use --viewer file")
     playback.stream.connect_grpc(_address(port))
     if kind == "native":
         return ""
@@ -46,6 +43,16 @@ def stream_to_viewer(playback: Playback, kind: str) -> str:
     if has_screen():
         webbrowser.open(page)
     return page
+
+
+def _started(viewer: subprocess.Popen, port: int) -> bool:
+    """Waits until a viewer answers at a port: whether it does."""
+    began = time.monotonic()
+    while not _answers(port):
+        if viewer.poll() is not None or time.monotonic() - began > _START_SECONDS:
+            return False
+        time.sleep(0.1)
+    return True
 
 
 def _address(port: int) -> str:
@@ -82,13 +89,18 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
     page in the browser (`web`). Raises SdfsimError for no such recording, no screen for a window, or where it fails."""
     recording = _recording(recording)
     port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
-    if web:
-        say(f"watch it at {_page(page_port, port)}")
-        say("the page stays up until Ctrl-C")
-    else:
+    if not web:
         check_screen("native")
     options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
-    code = subprocess.run(_command(port, [str(recording), *options]), check=False).returncode
+    viewer = subprocess.Popen(_command(port, [str(recording), *options]))
+    try:
+        if web and _started(viewer, page_port):  # before, the address leads nowhere
+            say(f"watch it at {_page(page_port, port)}")
+            say("the page stays up until Ctrl-C")
+        code = viewer.wait()
+    except BaseException:
+        _end(viewer)
+        raise
     if code not in (0, -signal.SIGINT, 130, _WINDOWS_CTRL_C):
         raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")
 

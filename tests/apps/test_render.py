@@ -39,6 +39,30 @@ def test_a_ball_is_a_disc_of_the_right_size_in_the_middle():
     assert (column, row) == pytest.approx((SIZE[0] / 2, SIZE[1] / 2), abs=1.0)
 
 
+HIGH = [(0.0, 0.0, 0.5 * k) for k in range(8)]
+ROW = [(0.5 * k, 0.0, 0.0) for k in range(8)]
+DEEP = [(0.0, 0.5 * k, 0.0) for k in range(8)]
+GRID = [(0.3 * i, 0.3 * j, 0.3 * k) for i in range(2) for j in range(2) for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    "places", [HIGH, ROW, DEEP, GRID, [(1.0, 2.0, 3.0)]], ids=["roof", "row", "deep", "grid", "one"]
+)
+@pytest.mark.parametrize("look_at", [None, (0.2, 0.1, 0.3)], ids=["middle", "aside"])
+def test_all_is_in_sight_of_the_camera_that_is_chosen(places, look_at):
+    """Nothing but sky is at the border of the picture, and what is shown is not small in it."""
+    scene = sdfsim.Scene(gravity=(0, 0, -9.81))
+    for k, place in enumerate(places):
+        scene.add(f"box{k}", box={"size": (0.12, 0.12, 0.12)}, position=place)
+    loaded = scene.load()
+    picture = seen(loaded, Simulator(loaded).initial_rollout(), None, look_at)
+    border = np.concatenate([picture[[0, -1]].ravel(), picture[:, [0, -1]].ravel()])
+    assert picture.any() and not border.any()
+    if look_at is None:
+        rows, columns = np.nonzero(picture)
+        assert max(np.ptp(rows) / SIZE[1], np.ptp(columns) / SIZE[0]) > 0.5
+
+
 @pytest.mark.parametrize(("place", "where"), [((0.3, 0, 0), (1, 0)), ((0, 0, 0.2), (0, -1)), ((-0.3, 0.0, 0), (-1, 0))])
 def test_right_is_right_and_up_is_up(place, where):
     """Seen along y, x goes to the right and z up, which is towards the first rows."""

@@ -1,7 +1,9 @@
-"""Which moment of a recording a picture shows."""
+"""Which moment of a recording a picture shows, and when the address of a page is told."""
 
 from __future__ import annotations
 
+import sys
+import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,12 +55,48 @@ def test_the_time_that_a_run_was_asked_for_is_its_end(tmp_path, monkeypatch, at,
 @pytest.mark.parametrize("name", ["rollout.rrd", "reconstruction.rrd"])
 def test_a_folder_is_shown_by_the_recording_in_it(tmp_path, monkeypatch, name):
     opened: list[list[str]] = []
-    monkeypatch.setattr(
-        viewer.subprocess, "run", lambda command, check: opened.append(command) or SimpleNamespace(returncode=0)
-    )
+    ended = SimpleNamespace(poll=lambda: 0, wait=lambda: 0)
+    monkeypatch.setattr(viewer.subprocess, "Popen", lambda command: opened.append(command) or ended)
     with pytest.raises(SdfsimError, match="no such recording"):
         viewer.show(tmp_path, web=True)
     (tmp_path / name).write_bytes(b"RRF2")
     for place in (tmp_path, tmp_path / name):
         viewer.show(place, web=True)
         assert str(tmp_path / name) in opened.pop()
+
+
+SLOW = """\
+import sys, time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+class Page(BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.send_response(200)
+        self.end_headers()
+
+time.sleep(1.0)
+HTTPServer(("127.0.0.1", int(sys.argv[sys.argv.index("--web-viewer-port") + 1])), Page).serve_forever()
+"""
+
+
+def test_the_address_of_a_page_is_told_once_it_answers(tmp_path, monkeypatch):
+    """A viewer takes a while to start; who opens the address at once sees the page, and Ctrl-C ends both."""
+    (tmp_path / "slow.py").write_text(SLOW)
+    (tmp_path / "a.rrd").write_bytes(b"RRF2")
+    real = viewer.subprocess.Popen
+    started: list[Any] = []
+
+    def popen(command: list[str]) -> Any:
+        started.append(real([sys.executable, str(tmp_path / "slow.py"), *command[1:]]))
+        return started[0]
+
+    def say(line: str) -> None:
+        if line.startswith("watch it at "):
+            with urllib.request.urlopen(line.removeprefix("watch it at ").partition("?")[0], timeout=10) as answer:
+                assert answer.status == 200
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewer.subprocess, "Popen", popen)
+    with pytest.raises(KeyboardInterrupt):
+        viewer.show(tmp_path / "a.rrd", web=True, say=say)
+    assert started[0].poll() is not None

@@ -194,6 +194,16 @@ def test_the_live_viewer_listens_on_this_machine_only(home, monkeypatch):
     assert [listening(port) for port in ports] == [["127.0.0.1"], ["127.0.0.1"]]
 
 
+# Writes what it was told, and answers where a page was wanted, once.
+VIEWER = """\
+import socket, sys
+open("TOLD", "w").write(" ".join(sys.argv[1:]))
+if "--web-viewer-port" in sys.argv:
+    page = socket.create_server(("127.0.0.1", int(sys.argv[sys.argv.index("--web-viewer-port") + 1])))
+    page.accept()
+"""
+
+
 @pytest.mark.parametrize("web", [False, True])
 def test_every_viewer_is_told_where_to_listen(tmp_path, monkeypatch, web):
     from sdfsim.apps import viewer
@@ -201,7 +211,7 @@ def test_every_viewer_is_told_where_to_listen(tmp_path, monkeypatch, web):
     (tmp_path / "a.rrd").write_bytes(b"RRF2")
     told = tmp_path / "told"
     fake = tmp_path / "rerun"
-    fake.write_text(f'#!/bin/sh\necho "$@" > {told}\n')
+    fake.write_text(f"#!{sys.executable}\n{VIEWER.replace('TOLD', str(told))}")
     fake.chmod(0o755)
     monkeypatch.setattr(viewer, "viewer_program", lambda: str(fake))
     monkeypatch.setattr(viewer, "has_screen", lambda: True)

@@ -95,8 +95,13 @@ class Browser:
 
     def click(self, x: float, y: float) -> None:
         """With the mouse, at a place of the window, px."""
-        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+        self.move(x, y)
+        for kind in ("mousePressed", "mouseReleased"):
             self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def move(self, x: float, y: float) -> None:
+        """The mouse to a place of the window, px."""
+        self._call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
     def picture(self, file: Path) -> Path:
         """A PNG of the page."""
