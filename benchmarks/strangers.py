@@ -124,15 +124,14 @@ def command(*arguments: object, longest: float) -> dict[str, Any]:
 def of_mesh(found: Found, row: Row, place: Path, run: Callable[..., dict[str, Any]]) -> None:
     """Fit a mesh, and drop it onto a floor."""
     (mesh,), shape = found.files, place / "shape"
-    row.became = "fitted"
+    capped = ""
     try:
         fit = run("fit", mesh, "-o", shape)
     except Failed as error:
         if "--cap" not in str(error):
-            row.became = "nothing"
             raise
-        fit = run("fit", mesh, "-o", shape, "--cap")
-        row.became = "capped and fitted"
+        fit, capped = run("fit", mesh, "-o", shape, "--cap"), "capped and "
+    row.became = f"{capped}fitted"
     row.exact = f"{number(100 * fit['error_within_0.01'], 2)} % of its size"
     row.notes += fit["notes"]
     row.wrong += [*fit["failed_checks"], *([f"not exact: {fit['caveat']}"] if fit["caveat"] else [])]
@@ -181,6 +180,8 @@ def dropped(place: Path, row: Row, run: Callable[..., dict[str, Any]], scene: Pa
     )  # fmt: skip
     bodies = report["ended"]
     row.rests = f"{sum(body['rests'] for body in bodies)} of {len(bodies)}, {report['simulated_s']:.2g} s"
+    if not report["settled"]:
+        row.wrong.append(f"not at rest after {SECONDS:g} s")
     row.wrong += [f"{body['name']} left the scene" for body in bodies if body["left"]]
     row.wrong += [f"breaks a law: {line}" for line in report["broken_laws"]]
 

@@ -119,6 +119,19 @@ def test_a_folder_of_all_kinds(tmp_path, monkeypatch):
     assert "4 of 5 without a fault" in (tmp_path / "out" / "table.md").read_text()
 
 
+def test_a_mesh_that_no_cap_closes_became_nothing(tmp_path, monkeypatch):
+    """Refused as open, and with --cap for another reason."""
+    asked = []
+
+    def fails(*line, longest):
+        asked.append(line)
+        raise Failed("fit: it encloses nothing" if "--cap" in line else "fit: an opening (--cap closes it)")
+
+    monkeypatch.setattr(strangers, "command", fails)
+    row = strangers.judged(Found("mesh", (tmp_path / "a.obj",)), tmp_path, tmp_path / "out", "quick", 9.0)
+    assert len(asked) == 2 and row.became == "nothing" and row.wrong == ["fit: it encloses nothing"]
+
+
 def test_recordings_of_one_scene_are_one_row(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(strangers, "command", lambda *line, longest: seen.append(line) or {
