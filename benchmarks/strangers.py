@@ -240,12 +240,13 @@ def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 180
     """A line each, the table in DIR, and with `page` in docs/notes."""
     if not folder.is_dir():
         raise SdfsimError(f"{folder}: no such folder", "give the folder that holds photos, meshes or recordings")
+    folder, out = folder.resolve(), out.resolve()  # commands run in another folder
     inputs = list(found_in(folder))
     if not inputs:
         raise SdfsimError(f"{folder}: no photos, meshes or recordings in it or below it")
     rows = []
     for found in inputs:
-        rows.append(judged(found, folder, out.resolve(), preset, longest))
+        rows.append(judged(found, folder, out, preset, longest))
         print(" | ".join(filter(None, rows[-1].cells())), flush=True)
         write_json(out / "table.json", [asdict(row) for row in rows])  # as far as it got
     write_text(out / "table.md", table(rows))
