@@ -352,12 +352,7 @@ def test_presets_and_recipes_in_documents_exist():
     assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick"), ("train", "small")} <= named
 
 
-def test_a_thousandfold_weight_stands_as_long_as_the_table_says():
-    """Three seconds in the table of hard cases, and in the sentence about it; the README points there."""
-    text = page("docs/stability.md")
-    depth, fallen = text[text.index("| 1000 kg on 1 kg") :].splitlines()[:2]
-    assert "| fallen |" in fallen and fallen.split("|")[4].strip() == "0.0 bodies"
-    sunk = round(numbers(depth.split("|")[4])[0])
-    told = " ".join(text.split())
-    assert f"it stands for 3 s, sunk by {sunk} % of its size, but it slides off after" in told
-    assert "creeps, and slides off after seconds" in page("README.md")
+def test_a_thousandfold_weight_stays_on_every_page():
+    """As `tests/physics/test_laws.py` holds it; the table of hard cases may be older, and says so by its day."""
+    assert "A block on another of a thousandth of its mass stays where it is" in page("docs/stability.md")
+    assert "creeps" not in page("README.md")
