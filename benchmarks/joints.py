@@ -1,4 +1,4 @@
-"""How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs.
+"""How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs: docs/joints.md.
 
     python -m benchmarks joints
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.results import ROOT
+from benchmarks.results import ROOT, write_section
 from sdfsim import Scene, Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.base.lazy import optional
@@ -67,4 +67,4 @@ def main() -> None:
             each = [1e3 * took / (held * 1e3 / inner) for took in taken]
             counts = (str(len(joints)), str(held), f"{inner:.2f} ms")
             rows.append((name, *counts, *(f"{took:.0f}" for took in taken), *(f"{us:.2f}" for us in each)))
-    print(markdown(rows))
+    write_section("joints", "python -m benchmarks joints", markdown(rows))
