@@ -11,8 +11,8 @@ from dataclasses import fields, replace
 import numpy as np
 
 from benchmarks.results import ROOT, write_section
+from sdfsim.evaluation.engines import timed_rollout
 from sdfsim.evaluation.harness import markdown, number, one_thread
-from sdfsim.evaluation.runs import timed_rollout
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene

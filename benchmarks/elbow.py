@@ -7,8 +7,6 @@ that `sdfsim identify` finds on 60 tosses; other engines' are found on the same 
 `benchmarks/reality.py` does for the cube. All are judged on 100 others, over the first 75 frames, from the same starts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -47,6 +45,7 @@ from sdfsim.base.files import read_arrays, write_json, write_text
 from sdfsim.data.public_tosses import ARM, ELBOW, LINK, PIVOT, Links, links_of, lowest, upright
 from sdfsim.evaluation.harness import markdown, one_thread
 from sdfsim.evaluation.metrics import interval
+from sdfsim.physics.motion import MOTION
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 
@@ -108,7 +107,7 @@ def begun(tosses: Sequence[Links], dt: float, scene: Scene) -> list[tuple[Links,
 
 
 def _from(r: Recording, first: int) -> Recording:
-    names = ("position", "orientation", "velocity", "angular_velocity", "known", "flying", "seen")
+    names = (*MOTION, "known", "flying", "seen")
     return replace(r, goal=(r.goal[0][first:], r.goal[1][first:]), **{n: getattr(r, n)[first:] for n in names})
 
 

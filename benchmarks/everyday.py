@@ -28,10 +28,9 @@ from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import SUBSTEPS
 from sdfsim.evaluation import engines, everyday
-from sdfsim.evaluation.engines import LONGEST, Engine, TooSlow
+from sdfsim.evaluation.engines import LONGEST, Engine, Ran, Runner, TooSlow, by_engine, by_model, still
 from sdfsim.evaluation.everyday import ROWS, Check, Setting, checks
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
-from sdfsim.evaluation.runs import Ran, Runner, by_engine, by_model, still
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import ClosedForm

@@ -1,4 +1,4 @@
-"""How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs.
+"""How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs: docs/joints.md.
 
     python -m benchmarks joints
 
@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.results import ROOT
+from benchmarks.results import ROOT, write_section
 from sdfsim import Scene, Simulator, load_scene
 from sdfsim.apps.export import export
-from sdfsim.evaluation.engines import engine_module, timed
+from sdfsim.base.lazy import optional
+from sdfsim.evaluation.engines import timed
 from sdfsim.evaluation.harness import markdown, one_thread
 
 ROWS = {"hinge": 5, "slider": 5, "ball": 3, "fixed": 6, "distance": 1}
@@ -35,7 +36,7 @@ def chain(folder: Path, count: int = 100) -> Path:
 
 def costs(file: Path, folder: Path) -> tuple[float, float, float]:
     """Milliseconds of the processor a simulated second of ours and of MuJoCo's, and the inner step in ms."""
-    engine, scene = engine_module("mujoco", "MuJoCo", "bench"), load_scene(file)
+    engine, scene = optional("mujoco", "MuJoCo", "bench"), load_scene(file)
     simulator = Simulator(scene)
     inner = simulator.dt / simulator.options.substeps
     export(file, folder / "scene.xml")
@@ -66,4 +67,4 @@ def main() -> None:
             each = [1e3 * took / (held * 1e3 / inner) for took in taken]
             counts = (str(len(joints)), str(held), f"{inner:.2f} ms")
             rows.append((name, *counts, *(f"{took:.0f}" for took in taken), *(f"{us:.2f}" for us in each)))
-    print(markdown(rows))
+    write_section("joints", "python -m benchmarks joints", markdown(rows))

@@ -58,9 +58,10 @@ from sdfsim.apps.identify import identify, write_scene
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json, write_text
+from sdfsim.base.lazy import NotInstalled, optional
 from sdfsim.data.batching import roll_out
 from sdfsim.data.dataset import Trajectory
-from sdfsim.evaluation.engines import NotInstalled, engine_module
+from sdfsim.data.public_tosses import CUBE
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, one_thread
 from sdfsim.evaluation.metrics import interval
 from sdfsim.learned.impulse import ImpulseNetwork
@@ -175,15 +176,6 @@ def errors(found: Motion, truth: Motion) -> tuple[np.ndarray, np.ndarray]:
 # --- engines ---
 
 
-SCENE = """version: 1
-model: solver
-effects: {{sleep: off}}
-gravity: [0, 0, {gravity}]
-shapes: {{cube: {{box: {{size: [{side}, {side}, {side}]}}}}}}
-bodies:
-  - {{name: table, plane: {{}}, friction: 1, restitution: 1}}
-  - {{name: cube, shape: cube, position: [0, 0, 0.2], mass: {mass}, inertia_factor: {factor}}}
-"""
 EVEN = MASS * SIDE**2 / 6.0  # kg m2, a solid cube's inertia
 
 
@@ -195,7 +187,7 @@ def recordings_of(tosses: Sequence[Toss], scene: Scene) -> list[Recording]:
 def drake(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[str, float]) -> Motion:
     """Drake's discrete point contact, the cubes far apart on one half space; its contacts have no rebound, but a
     stiffness and a dissipation."""
-    lib: Any = engine_module("pydrake.all", "Drake", "rivals")
+    lib: Any = optional("pydrake.all", "Drake", "rivals")
     step, apart, cubes = dt / INNER, 20.0, []
     plant, _ = lib.AddMultibodyPlantSceneGraph(builder := lib.DiagramBuilder(), step)
     plant.mutable_gravity_field().set_gravity_vector(gravity)
@@ -356,7 +348,7 @@ def dataset_of(recordings: Sequence[Recording], lesson: Lesson, folder: Path) ->
     """Recordings as a dataset, whose floor is z = 0: there the table lies."""
     (folder / "train").mkdir()
     shape = lesson.scene.shapes[_table(lesson.scene)[2].shape]
-    shape.save(folder / "shapes" / CUBE)
+    shape.save(folder / "shapes" / "cube")
     for k, r in enumerate(recordings):
         place, turn, speed, spin = r.position[:, 0], r.orientation[:, 0], r.velocity[:, 0], r.angular_velocity[:, 0]
         trajectory_of(place, turn, speed, spin, r.dt, lesson.scene).save(folder / "train" / f"{k:03}.npz")
@@ -371,7 +363,7 @@ def trajectory_of(
     still, inertia = lies.inv(), cube.inertia if cube.inertia is not None else np.eye(3) * EVEN
     return Trajectory(
         position=still.apply(position - at)[:, None], orientation=(still * Rotation.from_quat(turn)).as_quat()[:, None],
-        velocity=still.apply(velocity)[:, None], angular_velocity=still.apply(spin)[:, None], shape=np.array([CUBE]),
+        velocity=still.apply(velocity)[:, None], angular_velocity=still.apply(spin)[:, None], shape=np.array(["cube"]),
         scale=np.array([cube.scale]), mass=np.array([cube.mass]), inertia=np.diag(inertia)[None],
         friction=np.array([cube.friction]), restitution=np.array([cube.restitution]), static=np.zeros(1, bool), dt=dt,
         gravity=still.apply(scene.gravity),
@@ -389,14 +381,11 @@ def on_surfaces(model: Model, lesson: Lesson, starts: Sequence[Start]) -> Motion
         )
         return trajectory_of(place, turn, speed, spin, dt, lesson.scene)
 
-    shapes, floor = {CUBE: lesson.scene.shapes[cube.shape]}, (table.friction, table.restitution)
+    shapes, floor = {"cube": lesson.scene.shapes[cube.shape]}, (table.friction, table.restitution)
     moved = roll_out(model, list(map(begun, starts)), shapes, FRAMES, floor=floor)
     place = np.stack([lies.apply(t.position[1:, 0]) + at for t in moved])
     turn = np.stack([(lies * Rotation.from_quat(t.orientation[1:, 0])).as_quat() for t in moved])
     return Motion(place, turn)
-
-
-CUBE = "cube"
 
 
 def networks(groups: tuple[list[Toss], list[Toss], list[Toss]], scene: Path, gravity: float, out: Path) -> Results:
@@ -455,7 +444,7 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bo
     )
     dt, down = known[0].dt, np.array([0.0, 0.0, -gravity])
     out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "scene.yaml", SCENE.format(gravity=-gravity, side=SIDE, mass=MASS, factor=INERTIA / EVEN))
+    write_text(out / "scene.yaml", CUBE.format(gravity=-gravity, factor=INERTIA / EVEN))
     scene = load_scene(out / "scene.yaml")
     moved = {}
     for name, count, file in ((FEWER, FEW, "identified-few.yaml"), (OURS, FIT, "identified.yaml")):

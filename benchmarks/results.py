@@ -1,10 +1,11 @@
-"""What benchmarks share: their command lines, lines of progress, and RESULTS.md, one section a benchmark."""
+"""What benchmarks share: their command lines, lines of progress, and the pages of results, one section a benchmark."""
 
 import argparse
 import inspect
 import re
 import typing
 from collections.abc import Callable, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -62,15 +63,39 @@ def spread(values: np.ndarray) -> str:
     return f"{number(float(np.median(values)))} ({number(values.min())} to {number(values.max())})"
 
 
-def write_section(name: str, command: str, content: str, page: Path = PAGE) -> None:
-    """Print `content`, and put it between the marks of a section, under the command that repeats it.
+def pages() -> list[Path]:
+    """Those that hold sections of benchmarks: RESULTS.md, and what tells more."""
+    return [PAGE, *sorted((ROOT / "docs" / "notes").glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def page_of(name: str) -> Path:
+    """The page that holds a section. Raises ValueError where none does."""
+    found = [page for page in pages() if f"<!-- {name} -->" in page.read_text(encoding="utf-8")]
+    if not found:
+        raise ValueError(f"no section {name} in RESULTS.md, docs/notes or docs")
+    return found[0]
+
+
+def section(name: str, page: Path | None = None) -> str:
+    """What stands between the marks of a section, its command first."""
+    text = (page or page_of(name)).read_text(encoding="utf-8")
+    return text.partition(f"<!-- {name} -->")[2].partition(f"<!-- end of {name} -->")[0].strip()
+
+
+def write_section(name: str, command: str, content: str, page: Path | None = None) -> None:
+    """Print `content`, and put it between the marks of a section, under the command that repeats it and the day.
+
+    The page is the one of `pages` that has the section.
 
     Raises:
-        ValueError: the page has no such section.
+        ValueError: the page, or every page, has no such section.
     """
     print(content)
+    page = page or page_of(name)
     marks = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    text, shown = page.read_text(encoding="utf-8"), f"{marks[0]}\n\n    {command}\n\n{content.strip()}\n\n{marks[1]}"
+    day = date.today()
+    head = f"    {command}        # {day.day} {day:%B %Y}"
+    text, shown = page.read_text(encoding="utf-8"), f"{marks[0]}\n\n{head}\n\n{content.strip()}\n\n{marks[1]}"
     pattern = re.compile(f"{re.escape(marks[0])}.*?{re.escape(marks[1])}", re.DOTALL)
     if not pattern.search(text):
         raise ValueError(f"{page}: no section {name}")

@@ -33,12 +33,11 @@ from sdfsim.base.files import read_arrays, write_arrays, write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation import engines
-from sdfsim.evaluation.engines import Engine, start_of_scene
+from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
-from sdfsim.evaluation.runs import Ran, scene_rollout, timed_rollout
 from sdfsim.geometry.mesh import Mesh, clean
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
 from sdfsim.physics.bodies import largest_extent
@@ -213,7 +212,7 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
         motion, timing = run(start, steps, inner)
         return Ran(scene, scene_rollout(scene, motion, units)), timing.cpu_ms / (0.02 * units.time), prepared
     simulator = Simulator(scene, "solver")
-    simulator.options = replace(simulator.options, substeps=inner)
+    simulator.options = simulator.options._replace(substeps=inner)
     next(simulator.frames(1))
     prepared = time.perf_counter() - began
     simulator.reset()

@@ -33,12 +33,11 @@ from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation.engines import Engine, bullet, mujoco, start_of_scene
+from sdfsim.evaluation.engines import Engine, Ran, bullet, mujoco, scene_rollout, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, cells, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
-from sdfsim.evaluation.runs import Ran, scene_rollout
 from sdfsim.learned.model import load_model
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout
@@ -318,7 +317,7 @@ def contact_time() -> float:
 @njit(error_model="numpy")
 def _swept(mass: np.ndarray, rules: Rules, system: System, change: np.ndarray, islands: int) -> None:
     for i in range(islands):
-        _balance(mass, rules, system, change, i)
+        _balance(mass, rules, system, change, i, rules.rounds)
 
 
 def row_time() -> float:

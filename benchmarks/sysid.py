@@ -8,8 +8,6 @@ middle of their bounds, until 60 tosses go as recorded; over so many frames of t
 100 other tosses of that benchmark, over its 75 frames, from the same starts.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import time
@@ -22,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.reality import GRAVITY, SIDE, THING, errors, fitted_start, load_tosses, split
 from benchmarks.tosses import FRAMES, SOFT, mujoco, recorded
 from sdfsim.base.errors import SdfsimError
-from sdfsim.evaluation.engines import engine_module
+from sdfsim.base.lazy import optional
 from sdfsim.evaluation.harness import one_thread
 from sdfsim.evaluation.metrics import interval
 
@@ -32,7 +30,7 @@ SHORT = [25, 40, FRAMES]
 @one_thread()
 def main(tosses: Path, *, frames: list[int] = SHORT) -> None:
     """Fit over so many `frames`, and print the errors over all that are compared."""
-    toolbox: Any = engine_module("mujoco.sysid", "MuJoCo's sysid", "bench")
+    toolbox: Any = optional("mujoco.sysid", "MuJoCo's sysid", "bench")
     if not hasattr(toolbox, "optimize"):  # it swallows what is missing
         raise SdfsimError("MuJoCo's sysid is not installed", "pip install 'mujoco[sysid]'")
     known = load_tosses(tosses)

@@ -1,8 +1,6 @@
 """What tosses of a cube and of an elbow share: how they are split and compared, and how ours, MuJoCo and PyBullet throw
 a box, or two on a hinge."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +14,9 @@ from sdfsim.apps.identify import repeated
 from sdfsim.apps.observed import Recording
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays
+from sdfsim.base.lazy import optional
 from sdfsim.data.public_tosses import ARM, PIVOT, links_of
 from sdfsim.data.pybullet_sim import import_pybullet
-from sdfsim.evaluation.engines import engine_module
 from sdfsim.scene.scene import Scene
 
 FRAMES = 75  # that are compared: half a second
@@ -161,7 +159,7 @@ def mujoco(
 ) -> Motion:  # fmt: skip
     """MuJoCo's contacts are damped springs, of a time constant s and a damping ratio; its cone is elliptic or a
     pyramid."""
-    engine, rollout = (engine_module(name, "MuJoCo", "bench") for name in ("mujoco", "mujoco.rollout"))
+    engine, rollout = (optional(name, "MuJoCo", "bench") for name in ("mujoco", "mujoco.rollout"))
     spec, step = engine.MjSpec(), dt / INNER
     spec.option.timestep, spec.option.gravity = step, gravity
     spec.option.cone = engine.mjtCone.mjCONE_ELLIPTIC if elliptic else engine.mjtCone.mjCONE_PYRAMIDAL

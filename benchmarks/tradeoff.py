@@ -17,5 +17,5 @@ def main(data: Path, *, out: Path) -> None:
     report = study.tradeoff(data, out, on_progress=lambda _, fraction, message: progress(fraction, message))
     rows, notes = study.report_table(report)
     shutil.copyfile(out / "tradeoff.png", ROOT / "docs" / "images" / "tradeoff.png")
-    text = f"{markdown(rows)}\n{notes[0]}.\n\n![Error against time](../docs/images/tradeoff.png)"
+    text = f"{markdown(rows)}\n{notes[0]}.\n\n![Error against time](../images/tradeoff.png)"
     write_section("tradeoff", "python -m benchmarks tradeoff DATA -o DIR", text)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sdfsim.base.console import plain
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, read_json, write_json
 
@@ -75,13 +76,13 @@ class Similarity:
     translation: np.ndarray  # [3]
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """Points [P, 3], moved."""
+        """Points [P, 3] or a point [3], moved."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def after(self, first: "Similarity") -> "Similarity":
         """What `first` and then this one do together."""
         rotation = self.rotation @ first.rotation
-        return Similarity(self.scale * first.scale, rotation, self.points(first.translation[None])[0])
+        return Similarity(self.scale * first.scale, rotation, self.points(first.translation))
 
     def inverse(self) -> "Similarity":
         """The way back."""
@@ -134,12 +135,8 @@ class PosedPhotos:
 
 def save_views(views: Sequence[View], path: Path) -> None:
     """Writes `cameras.json`."""
-    entries = [
-        {**asdict(v), "rotation": np.asarray(v.rotation).tolist(), "translation": np.asarray(v.translation).tolist()}
-        for v in views
-    ]
     convention = "world to camera; x right, y down, z forward"
-    write_json(path, {"version": 1, "convention": convention, "views": entries})
+    write_json(path, {"version": 1, "convention": convention, "views": [plain(asdict(view)) for view in views]})
 
 
 def load_views(path: Path) -> list[View]:

@@ -66,64 +66,52 @@ def cleared(scene: Scene, solids: dict[str, Mesh]) -> dict[str, Cleared]:
         if hits := way.hits(np.zeros(3)):
             shift = way.out(up)
             left = 0.0 if shift is not None else max(depth for depth, _ in hits.values())
-            found[scene.bodies[k].name] = Cleared(np.zeros(3) if shift is None else shift, tuple(hits), left)
-            bodies[k].shift = found[scene.bodies[k].name].shift
+            found[scene.bodies[k].name] = one = Cleared(np.zeros(3) if shift is None else shift, tuple(hits), left)
+            bodies[k].move(one.shift)
         settled.append(k)
     return found
 
 
 class _Solid:
-    """A body as it is placed in the scene, moved by a shift."""
+    """A body as it is placed in the scene, and then moved."""
 
     def __init__(self, body: Body, shape: Shape, solid: Mesh | None) -> None:
-        self.name, self._body, self._shape, self._mesh = body.name, body, shape, solid or shape.mesh
+        self.name, self.scale, self._shape, self._mesh = body.name, body.scale, shape, solid or shape.mesh
         self._closed_form = solid is None and isinstance(shape.sdf, ClosedForm)
-        self._turn = to_matrix(body.quat_xyzw)
-        self.shift = np.zeros(3)
+        self._turn, self._place = to_matrix(body.quat_xyzw), body.position
+        # [V, 3] m on its surface, in the world; none of a plane
+        self.points = np.zeros((0, 3))
+        if not isinstance(shape.sdf, PlaneSdf):
+            local = np.concatenate([self._mesh.vertices[np.unique(self._mesh.faces)], shape.nodes])
+            self.points = body.position + body.scale * local @ self._turn.T
 
     @cached_property
     def surface(self) -> TrueSurface:
         return true_surface(self._shape) if self._closed_form else of_mesh(self._mesh)
 
-    @cached_property
-    def _own(self) -> np.ndarray:
-        """[V, 3] m, where it has points of its surface before it is shifted."""
-        if isinstance(self._shape.sdf, PlaneSdf):
-            return np.zeros((0, 3))
-        local = np.concatenate([self._mesh.vertices[np.unique(self._mesh.faces)], self._shape.nodes])
-        return self._body.position + self._body.scale * local @ self._turn.T
-
-    @property
-    def points(self) -> np.ndarray:
-        """[V, 3] m on its surface, in the world; none of a plane."""
-        return self._own + self.shift
-
-    @property
-    def thickness(self) -> float:
-        """m, the smallest side of its box."""
-        return self._body.scale * self.surface.thickness
+    def move(self, shift: np.ndarray) -> None:
+        self._place, self.points = self._place + shift, self.points + shift
 
     def placed(self, number: int, shift: np.ndarray) -> Placed:
         """As `gaps` takes it, farther by a shift."""
-        origin = self._body.position + self.shift + shift
-        return Placed(np.array([number]), np.array([self._body.scale]), origin[None], self._turn[None])
+        return Placed(np.array([number]), np.array([self.scale]), (self._place + shift)[None], self._turn[None])
 
     def ask(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Signed distances [P] m and their gradients [P, 3] at points of the world [P, 3]."""
-        local = (points - self._body.position - self.shift) @ self._turn / self._body.scale
+        local = (points - self._place) @ self._turn / self.scale
         distance, slope = self.surface.distance(local)
         if not self._closed_form:
             simulated, towards = (np.asarray(part) for part in self._shape.sdf(local))
             deeper = simulated < distance
             distance, slope = np.where(deeper, simulated, distance), np.where(deeper[:, None], towards, slope)
-        return distance * self._body.scale, slope @ self._turn.T
+        return distance * self.scale, slope @ self._turn.T
 
 
 class _Way:
     """One body's way out of others."""
 
     def __init__(self, body: _Solid, others: list[_Solid]) -> None:
-        self.body, self.most = body, body.thickness
+        self.body, self.most = body, body.scale * body.surface.thickness
         self.touches = TOUCHES * self.most if np.isfinite(self.most) else 0.0
         self.pairs = [_Pair(body, other, self.most) for other in others]
         self.pairs = [pair for pair in self.pairs if pair.near]

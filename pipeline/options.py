@@ -145,7 +145,7 @@ class Options(BaseModel):
     def of_stage(self, stage: str) -> dict[str, Any]:
         """The values, ready for JSON, on which the result of a stage depends."""
         values = self.model_dump(mode="json") | {"recipe": self.fit_recipe(), "sdf": self.shape_sdf()}
-        return {name: values[name] for name in names_of(stage)}
+        return {name: value for name, value in values.items() if stage in form_of(name)["stages"]}
 
     def longer(self) -> str:
         """What trains for longer than these options."""
@@ -185,11 +185,6 @@ def form_of(name: str) -> dict[str, Any]:
     """What `option` keeps of an option: `stages`, `kind`, `metavar`."""
     extra: Any = Options.model_fields[name].json_schema_extra
     return extra or {"stages": []}
-
-
-def names_of(stage: str) -> list[str]:
-    """Names of the options that change the result of a stage."""
-    return [name for name in Options.model_fields if stage in form_of(name)["stages"]]
 
 
 def options_of(**values: Any) -> Options:

@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import shutil
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,7 @@ from pipeline.mesh.bodies import LAYER
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held, scene_keys
 from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
-from pipeline.mesh.visibility import Above
+from pipeline.mesh.visibility import heights
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.files import write_text
 from sdfsim.base.parallel import Progress, share_of, silent
@@ -151,38 +152,35 @@ def write_scene(
     """
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
     names = [entry["name"] for entry in parts["objects"]]
-    solids = {name: load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in names}
+    solids = everything = {name: load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in names}
+    shown = None
+    if parts["scenery"]:
+        solid, shown = meshes_of(mesh_folder, SCENERY)
+        everything = {SCENERY: solid} | solids
     notes: list[str] = []
     slab = None
     if drop != "none":
-        scenery = [load_mesh(mesh_folder / "solid.ply")] if parts["scenery"] else []
-        shown = load_mesh(mesh_folder / "shown.ply") if parts["scenery"] else joined(list(solids.values()))
-        slab = choose_slab(shown, joined([*scenery, *solids.values()]))
+        whole = joined(list(everything.values()))
+        slab = choose_slab(whole if shown is None else shown, whole)
         if slab.slope > LEVEL:
             notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
     origins = {name: origin_of(mesh) for name, mesh in solids.items()}
-    closed = {name: replace(mesh, vertices=mesh.vertices - origins[name]) for name, mesh in solids.items()}
+    closed = {name: replace(mesh, vertices=mesh.vertices - origins.get(name, 0)) for name, mesh in everything.items()}
     materials = materials or {}
-    floor = floor_height(load_mesh(mesh_folder / "shown.ply")) if parts["scenery"] else 0.0
+    floor = 0.0 if shown is None else floor_height(shown)
     held = load_held(mesh_folder / JOINT)
     holder = None
     if held is not None:
         if PART not in solids:
             message = "joint: the part that moves could not be cut off the rest as a body of its own"
             raise SdfsimError(f"{message}; {held.line()}", "photograph it from more sides", exit_code=EXIT_QUALITY)
-        others = {SCENERY: load_mesh(mesh_folder / "solid.ply")} if parts["scenery"] else {}
-        holder = holder_of(solids[PART], others | {name: mesh for name, mesh in solids.items() if name != PART})
-
-    def text_of(moved: dict[str, Cleared]) -> str:
-        return scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials,
-                          seed=seed, floor=floor, held=held, holder=holder, moved=moved)  # fmt: skip
-
-    text = text_of({})
+        holder = holder_of(solids[PART], {name: mesh for name, mesh in everything.items() if name != PART})
+    text_of = partial(scene_text, placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials,
+                      seed=seed, floor=floor, held=held, holder=holder)  # fmt: skip
+    text = text_of()
     scene = load_scene(scene_file, text=text, allow_outside=True)
-    if parts["scenery"]:
-        closed[SCENERY] = load_mesh(mesh_folder / "solid.ply")
     if moved := cleared(scene, closed):
-        text = text_of(moved)
+        text = text_of(moved=moved)
         notes += [moved_line(name, one, LAYER * parts["cell"]) for name, one in moved.items()]
     names = [body.name for body in scene.bodies]
     for name in materials:
@@ -314,6 +312,11 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
         shift = moved[drop].shift if drop in moved else np.zeros(3)
         add(drop, f"position: {_flow(rounded(slab.position + shift).tolist())}", box if drop == "box" else ball)
+    joint = []
+    if held is not None:
+        keys = {name: np.round(value, 6).tolist() for name, value in scene_keys(held).items()}
+        entry = {"name": PART, "type": held.kind, "bodies": [PART, holder or "world"], **keys}
+        joint = ["joints:", f"  # {held.line()}", f"  - {_flow(entry)}"]
     return "\n".join([
         f"# Reconstructed from photos. Up from the {placement.up_from}, within {placement.up_within:.1f} degrees "
         f"(confidence: {placement.up_confidence}).",
@@ -326,16 +329,9 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
         *shapes,
         "bodies:",
         *bodies,
-        *([] if held is None else joint_lines(held, holder)),
+        *joint,
         "",
     ])  # fmt: skip
-
-
-def joint_lines(held: HeldPart, holder: str | None) -> list[str]:
-    """The lines of scene.yaml for the joint of a part that moves."""
-    keys = {name: np.round(value, 6).tolist() for name, value in scene_keys(held).items()}
-    return ["joints:", f"  # {held.line()}",
-            f"  - {_flow({'name': PART, 'type': held.kind, 'bodies': [PART, holder or 'world'], **keys})}"]  # fmt: skip
 
 
 def _flow(content: dict | list) -> str:
@@ -364,8 +360,8 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     line = np.linspace(-0.75, 0.75, 13) * side
     around = np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
     under = (np.abs(around) <= 0.5 * side + 1e-9).all(1)
-    visible = Above(shown).heights(places[:, None] + around[under])
-    top = Above(solid).heights(places[:, None] + around)
+    visible = heights(shown, places[:, None] + around[under])
+    top = heights(solid, places[:, None] + around)
     top[:, under] = np.fmax(top[:, under], visible)
     whole = np.isfinite(top[:, under]).all(1)
     if not whole.any():

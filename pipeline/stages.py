@@ -17,7 +17,7 @@ from pipeline.options import COMMAND, OptionKeys, Options, options_of, read_conf
 from pipeline.report import write_report
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import CONFIG, check_own, locked, write_json
-from sdfsim.base.parallel import Progress
+from sdfsim.base.parallel import Progress, StageProgress
 
 # In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of one at work: its fingerprint alone.
 RECORD = "stage.json"
@@ -40,7 +40,7 @@ class Project:
 
     folder: Path  # of all stages
     options: Options  # as in its config.yaml
-    progress: Callable[[str, float, str], None] | None = None  # called with (stage, fraction, message)
+    progress: StageProgress | None = None  # called with (stage, fraction, message)
     # s for the one stage that is run; None: it has its share of the budget for everything
     own_budget: float | None = None
     started: float = field(default_factory=time.monotonic)
@@ -160,7 +160,7 @@ STAGES = {
 
 def reconstruct(
     photos: str | Path, out: str | Path, *, from_stage: str | None = None, until_stage: str | None = None,
-    progress: Callable[[str, float, str], None] | None = None, **options: Unpack[OptionKeys],
+    progress: StageProgress | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
     """Photos -> a scene, by all stages: `pipeline.states.reconstruct` says more."""
     resolved = options_of(photos=str(Path(photos).absolute()), **options)
@@ -180,7 +180,7 @@ def wanted_stages(from_stage: str | None, until_stage: str | None) -> dict[str, 
     return {name: from_stage is not None and number >= first for number, name in enumerate(names)}
 
 
-def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, float, str], None] | None = None,
+def find_poses(photos: str | Path, out: str | Path, *, progress: StageProgress | None = None,
                **changes: Any) -> dict:  # fmt: skip
     """Photos -> camera poses: the first two stages, as `reconstruct` does them; options that are not given (None) are
     those of the folder's config.yaml, where there is one."""
@@ -191,7 +191,7 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, 
 
 
 def run_stage(
-    name: str, folder: str | Path, *, progress: Callable[[str, float, str], None] | None = None, **changes: Any
+    name: str, folder: str | Path, *, progress: StageProgress | None = None, **changes: Any
 ) -> dict:  # fmt: skip
     """Runs one stage in a folder that the stages before it have written; returns and raises as `reconstruct` does.
     Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone."""

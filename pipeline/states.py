@@ -16,7 +16,7 @@ import itertools
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -25,27 +25,26 @@ import numpy as np
 from PIL import Image
 
 from pipeline import stages
-from pipeline.cameras import Similarity
+from pipeline.cameras import STILL
 from pipeline.field.training import load_field
 from pipeline.inputs.labels import FOLDER, NAMES, load_names
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.joint import JOINT, PART, HeldPart, find_joint
-from pipeline.mesh.moving_part import CELLS, alike, label_images, load_state, part_of, tie, which_move
+from pipeline.mesh.moving_part import CELLS, alike, label_images, load_state, tie, which_move
 from pipeline.mesh.placement import check_distance, load_placement
 from pipeline.options import OptionKeys, options_of
 from pipeline.stages import RECORD, Instead, Project, check_apart, read_record, run_all, wanted_stages
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
 from sdfsim.base.files import write_json
+from sdfsim.base.parallel import StageProgress
 
 FIRST, SECOND = "first", "second"
 WITHOUT = ("crop", "body")  # options that say something of one state's meshes
 
-Said = Callable[[str, float, str], None]
-
 
 def reconstruct(
     photos: str | Path, out: str | Path, *, joint: str | Path | None = None, from_stage: str | None = None,
-    until_stage: str | None = None, progress: Said | None = None, **options: Unpack[OptionKeys],
+    until_stage: str | None = None, progress: StageProgress | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
     """Photos -> a scene that can be simulated.
 
@@ -72,7 +71,7 @@ def reconstruct(
 
 def reconstruct_states(
     first: str | Path, second: str | Path, out: str | Path, *, from_stage: str | None = None,
-    until_stage: str | None = None, progress: Said | None = None, **options: Any,
+    until_stage: str | None = None, progress: StageProgress | None = None, **options: Any,
 ) -> tuple[dict, Path]:  # fmt: skip
     """Photos of a thing in two states -> a scene in which what moves is a body of its own, on a hinge or a slider.
 
@@ -95,7 +94,10 @@ def reconstruct_states(
         return {name: again[name] for name in names if name in again}
 
     def project(name: str, **changes: Any) -> Project:
-        said = None if progress is None else _named(progress, name or "scene")
+        def said(stage: str, done: float, message: str) -> None:
+            if progress is not None:
+                progress(f"{name or 'scene'}: {stage}", done, message)
+
         return Project(out / name, resolved.changed(changes), said)
 
     share = {} if resolved.budget is None else {"budget": 0.5 * resolved.budget}  # each state has half of the time
@@ -126,10 +128,6 @@ def reconstruct_states(
         record = _record(best, stage)
         final.instead[stage] = Instead(lambda _, work, stage=stage: take(best, stage, work), record["made"])
     return run_all(final, again), final.folder
-
-
-def _named(progress: Said, name: str) -> Said:
-    return lambda stage, done, message: progress(f"{name}: {stage}", done, message)
 
 
 def _record(project: Project, stage: str) -> dict:
@@ -176,35 +174,31 @@ def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path)
     shown = [len(np.unique(np.floor(points / near), axis=0)) for points in found.seen]
     number = int(shown[1] >= shown[0])
     best, rest = (one, other)[number], (one, other)[1 - number]
-    motion, seen = part_of(found, number == 0)
+    motion = found.motion.inverse() if number else found.motion
     on_progress(0.6, "marking what moves in the photos")
-    labels = label_images(best, which_move(best.closed, rest, motion, seen))
+    labels = label_images(best, which_move(best.closed, rest, motion, found.seen[number]))
     source = states[number].place("photos")
     shutil.copytree(source, work, copy_function=_link, ignore=shutil.ignore_patterns(RECORD), dirs_exist_ok=True)
     (work / FOLDER).mkdir()
     for name, image in labels.items():
         Image.fromarray(image).save(work / FOLDER / f"{name}.png")
     write_json(work / FOLDER / NAMES, {"version": 1, "names": [PART]})
-    home = motion if number else np.eye(4)
+    home = motion if number else STILL
     sizes = [load_placement(state.folder / "mesh") for state in states]
     # From metres of the first state's meshes to those that count, and to the world of the chosen state's poses.
     unit = 1.0 if scaled == 0 else 1.0 / onto.scale
     held = HeldPart(
-        found.kind, found.anchor, found.axis, found.travel, home[:3, :3], home[:3, 3], unit,
+        found.kind, found.anchor, found.axis, found.travel, home.rotation, home.translation, unit,
         sizes[scaled].size_from, sizes[scaled].size_assumed, found.off, found.doubt, found.follows,
         float(np.linalg.norm(np.ptp(one.visible.vertices, axis=0))),
     )  # fmt: skip
     # The best state's own metres, moved into the first's if it is the second, came from the world of its poses.
-    to_poses = states_world(states[number]).inverse()
+    state = states[number]
+    to_metres = load_placement(state.folder / "mesh").to_metres.after(load_field(state.place("distill")).to_unit)
+    to_poses = to_metres.inverse()
     held.moved(to_poses.after(onto.inverse()) if number else to_poses).save(work / JOINT)
     before = _record(states[number], "photos")["report"]
     return {**before, "state": number, "shown": shown, "tied": tied}
-
-
-def states_world(state: Project) -> Similarity:
-    """From the world of a state's poses to the metres of its meshes."""
-    place = load_placement(state.folder / "mesh").to_metres
-    return place.after(load_field(state.place("distill")).to_unit)
 
 
 def take(state: Project, stage: str, work: Path) -> dict:

@@ -238,7 +238,6 @@ def identify(
 ) -> None:
     """Recorded motions -> friction, restitution, sizes, masses, the lie of the ground."""
     from sdfsim.apps import identify as room
-    from sdfsim.apps.identify_picture import picture
     from sdfsim.apps.observed import load_recordings
     from sdfsim.base.files import check_writable
     from sdfsim.data.public_tosses import public_tosses
@@ -255,7 +254,7 @@ def identify(
     if out is not None and known.path is not None:
         lines += [*room.write_scene(found, known.path, out), f"wrote {out}"]
         wrote, drawn = {"wrote": out}, out.with_suffix(".png")
-        if missing := picture(found, drawn):
+        if missing := room.picture(found, drawn):
             lines.append(f"no {drawn.name}: {missing}")
         else:
             wrote["picture"] = drawn
@@ -376,10 +375,10 @@ def tradeoff(
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
 ) -> None:
     """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
+    from sdfsim.base.lazy import pyplot
     from sdfsim.evaluation import tradeoff as study
-    from sdfsim.evaluation.harness import check_matplotlib
 
-    check_matplotlib()
+    pyplot()  # before minutes of work
     report = study.tradeoff(source, out, models=model or [], quick=quick, on_progress=session.stage_progress)
     rows, notes = study.report_table(report)
     session.report(report, [*columns(rows), *notes])
@@ -397,10 +396,10 @@ def stress(
     device: str = "auto",
 ) -> None:
     """The hard cases, with every model and the teacher: a table, plots, and recordings of what went wrong."""
+    from sdfsim.base.lazy import pyplot
     from sdfsim.evaluation import stress as study
-    from sdfsim.evaluation.harness import check_matplotlib
 
-    check_matplotlib()
+    pyplot()
     found = study.stress(**session.given("model"), models=model or [], on_progress=session.progress)
     report = study.write_report(found, out)
     tell_failed(session, report)

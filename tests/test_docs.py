@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.results import section as measured
+from benchmarks.summary import cells_of, summary
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import load_shape
@@ -17,8 +19,9 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "benchmarks" / "RESULTS.md",
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
 ]
+RESULTS = "benchmarks/RESULTS.md"
 
 
 OURS = re.compile(r"(?<![\w./-])(?:sdfsim|pipeline|benchmarks|tests|samples)/[\w/]+\.py\b")
@@ -98,10 +101,34 @@ def test_the_files_that_pages_name_exist():
     assert not [pair for pair in sorted(named) if not (ROOT / pair[1]).exists()]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_to_files(page):
-    targets = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8"))
-    assert not [target for target in targets if not (page.parent / target).exists()]
+def anchors(file: Path) -> set[str]:
+    """What its headings are called in links, as GitHub makes them."""
+    heads = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_to_files_and_headings(page):
+    links = re.findall(r"\]\((?!https?:)([^)#]*)(?:#([^)]+))?\)", page.read_text(encoding="utf-8"))
+    targets = [((page.parent / target) if target else page, anchor) for target, anchor in links]
+    assert not [target for target, _ in targets if not target.exists()]
+    assert not [
+        (target.name, to) for target, to in targets if to and target.suffix == ".md" and to not in anchors(target)
+    ]
+
+
+def test_results_are_short_and_every_table_says_when_and_how():
+    text = (ROOT / RESULTS).read_text(encoding="utf-8")
+    assert text.count("\n") <= 250
+    for file in PAGES:
+        for found in re.finditer(r"<!-- (?!end of )(.+) -->\n\n(.*)\n", file.read_text(encoding="utf-8")):
+            known = re.fullmatch(r"    (python .+?)        # (\d+ \w+ 20\d\d)(, .+)?", found[2])
+            assert known, f"{file.name}: {found[1]}: no command and day"
+
+
+def test_the_first_lists_of_results_are_what_the_tables_say():
+    """Run `python -m benchmarks summary` after any table was measured again."""
+    assert measured("summary").partition("\n\n")[2].strip() == summary().strip()
 
 
 def test_the_readme_is_short():
@@ -123,11 +150,6 @@ def cells(text: str, first: str) -> list[str]:
     return [cell.strip() for cell in found[0].strip("|").split("|")[1:]]
 
 
-def section(name: str, text: str) -> str:
-    """What stands between the marks of a section."""
-    return text.partition(f"<!-- {name} -->")[2].partition(f"<!-- end of {name} -->")[0]
-
-
 def numbers(text: str) -> list[float]:
     return [float(found.replace(",", "")) for found in re.findall(r"\d[\d,]*\.?\d*", text)]
 
@@ -139,7 +161,7 @@ def numbers(text: str) -> list[float]:
 def test_the_readmes_errors_are_the_results(row, other):
     """To the digits that the README has; it leaves out the intervals."""
     shown = [numbers(cell) for cell in cells(page("README.md"), row)]
-    told = [numbers(cell)[0] for cell in cells(section("MOVi-B", page("benchmarks/RESULTS.md")), other)]
+    told = [numbers(cell)[0] for cell in cells(measured("MOVi-B"), other)]
     assert len(shown) == 2
     for (metres, degrees), (true_metres, true_degrees) in zip(shown, [told[:2], told[2:]], strict=True):
         assert metres == pytest.approx(true_metres, abs=0.0006)
@@ -148,7 +170,7 @@ def test_the_readmes_errors_are_the_results(row, other):
 
 def test_errors_on_movi_b_are_the_results_on_every_page():
     """Of the solver wherever they stand, of `small` in its card, where those of its training stand beside them."""
-    table = section("MOVi-B", page("benchmarks/RESULTS.md"))
+    table = measured("MOVi-B")
     short, turn, long, further = (numbers(cell)[0] for cell in cells(table, "`solver`"))
     assert f"the contact solve on the convex pieces {short:g} m, {turn:g}°" in page("docs/paper.md")
     assert f"today's has {short:g} m and {turn:g}° on test" in page("docs/simulator.md")
@@ -162,7 +184,7 @@ def test_errors_on_movi_b_are_the_results_on_every_page():
 
 
 def test_errors_beside_hopnet_are_the_results():
-    table = section("instants", page("benchmarks/RESULTS.md"))
+    table = measured("instants")
     text = page("docs/simulator.md").partition("### Beside HOPNet")[2].partition("\n## ")[0]
     for first in ("`solver`", "HOPNet"):
         *_, last = cells(table, first)
@@ -172,7 +194,7 @@ def test_errors_beside_hopnet_are_the_results():
 
 
 def test_what_networks_change_on_real_tosses_is_the_same_everywhere():
-    table = section("reality networks", page("benchmarks/RESULTS.md"))
+    table = measured("reality networks")
     text = page("docs/reality.md").partition("## A network on the solve")[2].partition("\n## ")[0]
     known = [line.strip("|").split("|")[0].strip() for line in table.splitlines() if line.startswith("| ")]
     assert len(known) >= 6 and known[-1] == "the solve alone"
@@ -180,22 +202,87 @@ def test_what_networks_change_on_real_tosses_is_the_same_everywhere():
         assert cells(text, name)[0] == cells(table, name)[2]
 
 
+def test_errors_on_real_tosses_are_the_same_everywhere():
+    """On the page about them to the digits that it has; `identify` found on all of them, and on a few."""
+    rows = {row[0]: row[1:] for row in cells_of(measured("reality"))[1:]}
+    text, identify = page("docs/reality.md").partition("## The table")[2], page("docs/identify.md")
+    for name, row in rows.items():
+        if "found on" in name:
+            few = [numbers(cell)[0] for cell in row[:2]]
+            continue
+        first, second, less, *_ = cells(text, "Drake, point contact" if name == "Drake" else name)
+        for told, true in zip((first, second), row[:2], strict=True):
+            assert numbers(told)[0] == pytest.approx(numbers(true)[0], rel=6e-3)
+        assert numbers(less) == pytest.approx(numbers(row[2]), abs=6e-3)
+    place, turn = (numbers(cell)[0] for cell in rows["sdfsim"][:2])
+    told = [numbers(cell) for cell in cells(identify, "`sdfsim identify`, its own solve")[:2]]
+    assert [one[0] for one in told] == [place, turn]
+    assert f"where those of all 60 come to {place:.2f} and {turn:.2f}" in identify
+    assert f"{few[0]:.2f} % of the side and {few[1]:.2f}" in " ".join(identify.split())
+    mujoco = [numbers(cell)[0] for cell in rows["MuJoCo, elliptic cone"][:2]]
+    assert f"came to {mujoco[0]:g} and {mujoco[1]:g}" in " ".join(identify.split())
+
+
+# What the numbers are, and where on each page they stand; the groups of all pages are alike.
+SAME = {
+    "how deep the demo's vase is hollow": {
+        "README.md": r"32 cm comes out hollow by (\d+) cm",
+        RESULTS: r"a body of its own, hollow by \| (\d+) cm",
+        "docs/photos.md": r"\| vase, hollow below its rim \(the true one: 32 cm\) \| [\d.]+ cm \| (\d+) cm",
+    },
+    "errors of the network that is bundled as sdf-sim": {
+        "docs/paper.md": r"bundled as `sdf-sim`\): (0\.\d+) m \((0\.\d+) to (0\.\d+)\), ([\d.]+)°",
+        "docs/gpu.md": r"(0\.\d+) m \[(0\.\d+), (0\.\d+)\], ([\d.]+)° and 1\.\d+ m",
+        "sdfsim/models/sdf-sim.md": r"\| this model \| (0\.\d+) \((0\.\d+) to (0\.\d+)\) \| ([\d.]+) \|",
+    },
+    "how long seventeen fits take": {
+        RESULTS: r"in (\d+) to (\d+) s on one core, median (\d+) s",
+        "docs/sdf.md": r"(\d+) to (\d+) s each on its core, (\d+) s in the median",
+    },
+    "the paper's errors": {
+        "README.md": r"SDF-Sim, the paper's network, on its own recordings \| (0\.160) m, (18)\.0",
+        "docs/paper.md": r"SDF-Sim (0\.160) m, (18)\.0°",
+        "sdfsim/models/sdf-sim.md": r"published network has (0\.160) m and (18)\.0 degrees",
+    },
+}
+
+
+@pytest.mark.parametrize("places", SAME.values(), ids=list(SAME))
+def test_numbers_are_the_same_on_every_page(places):
+    found = {name: re.search(pattern, " ".join(page(name).split())) for name, pattern in places.items()}
+    assert all(found.values()), found
+    assert len({one.groups() for one in found.values() if one}) == 1, found
+
+
+def test_times_and_errors_of_large_scenes_are_the_same_everywhere():
+    paper, tradeoff = page("docs/paper.md"), {row[0].rstrip(" *"): row for row in cells_of(measured("tradeoff"))[1:]}
+    seconds = {row[0]: float(numbers(row[4])[0]) for row in cells_of(measured("large scenes"))[1:]}
+    told = "{:.0f}, {:.0f} and {:.0f} s from command".format(*(seconds[n] for n in ("shoes", "knots", "heaps")))
+    assert told in paper
+    few, usual = (numbers(tradeoff[name][3])[0] for name in ("solver, nodes grid 7", "solver"))
+    assert f"{few:.3f} m in place of {usual:g} m on 20 test trajectories" in paper
+    steps = {row[0]: numbers(row[5])[0] for row in cells_of(measured("contact step"))[1:]}
+    simulator = page("docs/simulator.md")
+    assert 0.55 < steps["a MOVi-B step"] < 0.78 and "about two thirds of PyBullet's time" in simulator
+    assert 0.8 < steps["16 spheres in a bowl"] < 1.2 and steps["512 spheres in a bowl"] < 0.5
+    assert "spheres in a bowl take about as long in both, 512 less than half of the time in ours" in simulator
+
+
 def test_what_far_scenery_costs_is_the_same_everywhere():
     """Nothing, with the solver and with a network on top of it."""
-    table = section("contact step", page("benchmarks/RESULTS.md"))
+    table = measured("contact step")
     solver, small = (
         numbers(cells(table, f"the same with all of `Simulator`, {model}")[-1])[0] for model in ("solver", "small")
     )
     assert solver <= 1.1 and "costs the same beside 10,000 static bodies as beside 10" in page("docs/scale.md")
-    told = "Static bodies far away cost nothing, with the solver and with the network on top of it."
-    assert small <= 1.1 and told in page("benchmarks/RESULTS.md")
+    assert small <= 1.1 and "with a network static bodies cost nothing" in page("CHANGELOG.md")
 
 
 def test_how_many_everyday_checks_hold_is_the_same_everywhere():
     totals = [sum(count) for count in zip(*COUNTS.values(), strict=True)]
     of = {kind: totals[kind != "analytic"] for kind in MISSED}
     held = {kind: f"{of[kind] - len(missed)} of {of[kind]}" for kind, missed in MISSED.items()}
-    row = cells(section("everyday", page("benchmarks/RESULTS.md")), "all")[0]
+    row = cells(measured("everyday"), "all")[0]
     assert row == held["analytic"].replace("of", "/")
     stability, readme = (" ".join(page(name).split()) for name in ("docs/stability.md", "README.md"))
     assert f"{held['analytic']} checks hold" in stability
@@ -205,11 +292,16 @@ def test_how_many_everyday_checks_hold_is_the_same_everywhere():
 
 
 def test_errors_of_reconstructions_name_one_direction():
-    """*standard* has the same figures, for the same direction, on both pages."""
-    results, photos = page("benchmarks/RESULTS.md"), page("docs/photos.md")
-    assert cells(results, "error, median")[1] == cells(photos, "reconstructed surface to the true one")[2]
-    assert cells(results, "missing, median")[1] == cells(photos, "true surface to the reconstruction")[2] == ""
-    assert cells(results, "share of the true surface")[1] == cells(photos, "share of the true surface")[2]
+    """*quick* has the same figures, for the same direction, on both pages."""
+    results, photos = page(RESULTS), page("docs/photos.md").partition("## Depth from photos alone")[2]
+    for here, there in (
+        ("error, median", "reconstructed surface to the true one"), ("missing, median", "true surface to the"),
+        ("share of the true surface", "share of the true surface"), ("its vase, 32 cm hollow", "vase, hollow below"),
+    ):  # fmt: skip
+        assert cells(results, here)[0] == cells(photos, there)[1]
+    whole = re.search(r"whole in (\d+) s beside another", results)
+    assert whole and f"{whole[1]} s on two cores beside another process" in photos
+    assert "PSNR of 20.8 dB at 480 px" in results and "PSNR of 20.8 dB at 480 px" in photos
 
 
 def test_steps_in_documents_are_those_of_the_presets():
@@ -217,11 +309,10 @@ def test_steps_in_documents_are_those_of_the_presets():
 
     text = page("benchmarks/RESULTS.md").partition("## Reconstruction\n")[2]
     assert f"*quick*, {PRESETS['quick'].iterations:,} steps" in text
-    for name in ("benchmarks/RESULTS.md", "docs/photos.md"):
-        assert f"the preset has {PRESETS['standard'].iterations:,}" in page(name)
+    assert f"the preset has {PRESETS['standard'].iterations:,}" in page("docs/photos.md")
     assert f"now it stops at {PRESETS['quick'].iterations:,}" in page("docs/tradeoff.md")
     sides = [f"{PRESETS[name].long_side // 3} px" for name in ("quick", "standard")]
-    assert all(side in page("docs/tradeoff.md") for side in sides) and sides[0] in text
+    assert all(side in page("docs/tradeoff.md") for side in sides) and sides[0] in page("docs/notes/photos.md")
 
 
 def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
@@ -239,11 +330,9 @@ def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
 
 
 def test_hard_cases_are_summed_up_alike():
-    lines = re.findall(
-        r"^- .* 0 cases.*$|^- \w+: \d+ figures.*$", section("hard cases", page("benchmarks/RESULTS.md")), re.M
-    )
+    lines = re.findall(r"^- .* 0 cases.*$|^- \w+: \d+ figures.*$", measured("hard cases"), re.M)
     assert len(lines) == 5
-    assert all(line in section("hard cases", page("docs/stability.md")) for line in lines)
+    assert all(line in measured("hard cases", ROOT / "docs" / "stability.md") for line in lines)
 
 
 def test_presets_and_recipes_in_documents_exist():
@@ -261,14 +350,3 @@ def test_presets_and_recipes_in_documents_exist():
                 assert found[2] in known[found[1]], f"{file.name}: {line}"
                 named.add((found[1], found[2]))
     assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick"), ("train", "small")} <= named
-
-
-def test_a_thousandfold_weight_stands_as_long_as_the_table_says():
-    """Three seconds in the table of hard cases, and in the sentence about it; the README points there."""
-    text = page("docs/stability.md")
-    depth, fallen = text[text.index("| 1000 kg on 1 kg") :].splitlines()[:2]
-    assert "| fallen |" in fallen and fallen.split("|")[4].strip() == "0.0 bodies"
-    sunk = round(numbers(depth.split("|")[4])[0])
-    told = " ".join(text.split())
-    assert f"it stands for 3 s, sunk by {sunk} % of its size, but it slides off after" in told
-    assert "creeps, and slides off after seconds" in page("README.md")

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from sdfsim.base.files import write_text
+from sdfsim.base.lazy import optional
 from sdfsim.data.dataset import Trajectory
 from sdfsim.data.pybullet_sim import SUBSTEPS
-from sdfsim.evaluation.engines import Start, Timing, engine_module, engine_motion, form_of
+from sdfsim.evaluation.engines import Start, Timing, engine_motion, form_of
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import wavefront
 
@@ -29,7 +30,7 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
     Raises:
         SdfsimError: Drake or fTetWild are not installed, or the motion fails.
     """
-    lib = engine_module("pydrake.all", "Drake", "rivals")
+    lib = optional("pydrake.all", "Drake", "rivals")
     t, builder = start.motion, lib.DiagramBuilder()
     settings = lib.MultibodyPlantConfig(time_step=t.dt / substeps, contact_model="hydroelastic_with_fallback")
     plant, _ = lib.AddMultibodyPlant(settings, builder)
@@ -101,7 +102,7 @@ def _tetrahedra(mesh: Mesh, beside: Path) -> str:
     """A VTK file of tetrahedra that fill a closed mesh, kept beside the shape's URDF."""
     kept = beside.with_suffix(".vtk").resolve()
     if not kept.exists():
-        filler = engine_module("pytetwild", "fTetWild", "rivals")
+        filler = optional("pytetwild", "fTetWild", "rivals")
         with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file where it runs
             points, cells = filler.tetrahedralize(
                 mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA

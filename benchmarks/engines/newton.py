@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from sdfsim.base.lazy import optional
 from sdfsim.data.dataset import Trajectory
 from sdfsim.data.pybullet_sim import SUBSTEPS
-from sdfsim.evaluation.engines import Start, Timing, engine_module, engine_motion, form_of
+from sdfsim.evaluation.engines import Start, Timing, engine_motion, form_of
 
 ITERATIONS = 10  # of XPBD in an inner step
 
@@ -20,7 +21,7 @@ def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
     Raises:
         SdfsimError: Newton is not installed, or the motion fails.
     """
-    warp, lib = (engine_module(name, "Newton", "rivals") for name in ("warp", "newton"))
+    warp, lib = (optional(name, "Newton", "rivals") for name in ("warp", "newton"))
     warp.config.quiet = True
     t, builder = start.motion, lib.ModelBuilder(gravity=tuple(map(float, start.motion.gravity)))
 

@@ -94,13 +94,15 @@ def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
 
 
 def stereo_points(maps: Sequence[DepthMap], poses: PosedPhotos) -> DepthPoints:
-    """At most `STEREO_POINTS` places that each depth map shows. The maps are in the space of the poses, the result is
-    in the world that these were moved from."""
+    """At most `STEREO_POINTS` places that each depth map shows, certain ones rather than others. Maps are in the space
+    of the poses, the result is in the world that these were moved from."""
     names, back = [view.name for view in poses.views], poses.moved_by.inverse()
     rng, xyz, index = np.random.default_rng(0), [np.zeros((0, 3))], [np.zeros(0, np.int32)]
     for one in maps:
-        points = one.points()
-        some = rng.permutation(len(points))[:STEREO_POINTS]
+        points, certain = one.points(), one.certain[one.inverse > 0].astype(float)
+        some = rng.permutation(len(points))
+        if len(points) > STEREO_POINTS:
+            some = rng.choice(len(points), STEREO_POINTS, replace=False, p=certain / certain.sum())
         xyz.append(back.points(points[some]))
         index.append(np.full(len(some), names.index(one.view.name), np.int32))
     found = np.concatenate(xyz)

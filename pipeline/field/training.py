@@ -50,10 +50,12 @@ from sdfsim.base.parallel import Progress, choose_threads, share_of, silent
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
 REFINED = 0.4  # of the training is done when bricks are put wherever the surface is
-# Share of the training by which all levels are in use, from a sphere and from fused depth; and the scale of the density
-# that training from fused depth starts with, in cells of the last level that is everywhere: the surface is there.
-ALL_LEVELS, ALL_LEVELS_FUSED, FUSED_BETA = 0.45, 0.15, 1.5
-HOLLOWS = 0.25  # of the training is done before filled free space is looked for
+# From a sphere: share of the training by which all levels are in use, and that is done before filled free space is
+# looked for. From fused depth neither waits: coarse levels alone would fill the hollows that are there.
+ALL_LEVELS, HOLLOWS = 0.45, 0.25
+# Scale of the density that training from fused depth starts with, in cells of the last level that is everywhere: the
+# surface is there.
+FUSED_BETA = 1.5
 EXPOSURE_RATE = 0.004  # Adam's, of the photos' gains and offsets, at the start
 # Standard deviation of the gains from which on photos that were not trained on are compared at an exposure of their
 # own; in rendered sets of one exposure it was below 0.01.
@@ -272,8 +274,8 @@ class Trainer:
         assert isinstance(self.settings.size, FieldSize)
         # Two levels at first, the others one after the other.
         levels = len(self.settings.size.steps)
-        until = ALL_LEVELS if self.fused is None else ALL_LEVELS_FUSED
-        self.field.active = min(levels, 2 + int((levels - 2) * self.fraction / until + 0.4))
+        used = 1.0 if self.fused is not None else self.fraction / ALL_LEVELS
+        self.field.active = min(levels, 2 + int((levels - 2) * used + 0.4))
         # Colour does not change with direction at first, or a wrong surface is painted right.
         self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
         self.cache = sdf_cache(self.field, self.settings.size.sampling)
@@ -301,7 +303,8 @@ class Trainer:
         """Finds free space that the cached SDF fills, once the field is fine enough to have room for a hollow."""
         # A function of the step at which the cache was made, so that a resumed run finds the same.
         made = self.iteration - self.iteration % self.period
-        if self.cache is not None and made > HOLLOWS * self.iterations and len(self.free):
+        early = self.fused is None and made <= HOLLOWS * self.iterations
+        if self.cache is not None and not early and len(self.free):
             self.free.look(self.cache, torch.Generator().manual_seed((self.seed + 11) * 1_000_003 + made))
 
     def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:

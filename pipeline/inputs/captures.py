@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -160,7 +161,10 @@ def unpack(archive: Path, folder: Path) -> None:
     or has names that lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
-            entries = [entry for entry in file.infolist() if not entry.is_dir() and not _left_by_macos(entry.filename)]
+            entries = [
+                entry for entry in file.infolist() if not entry.is_dir()
+                and not re.search(r"(^|[/\\])(__MACOSX[/\\]|\._)", entry.filename)  # what macOS adds
+            ]  # fmt: skip
             if sum(entry.file_size for entry in entries) > LARGEST:
                 raise SdfsimError(f"{archive}: more than {LARGEST >> 30} GiB unpacked", "export fewer frames")
             for entry in entries:
@@ -173,10 +177,6 @@ def unpack(archive: Path, folder: Path) -> None:
                     shutil.copyfileobj(packed, out)
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise SdfsimError(f"{archive}: cannot be unpacked: {error}", "export the capture again") from error
-
-
-def _left_by_macos(name: str) -> bool:
-    return any(part == "__MACOSX" or part.startswith("._") for part in name.replace("\\", "/").split("/"))
 
 
 def spread(photos: Sequence[Path], cameras: dict[Path, KnownCamera], most: int = MOST) -> list[Path]:

@@ -73,7 +73,7 @@ def read_photo(
     """
     image, original, focal, camera = shown(path, long_side, white)
     turned = ImageOps.exif_transpose(image)
-    if shape is not None and off(turned, shape) > off(image, shape):
+    if shape is not None and misfit(turned, shape) > misfit(image, shape):
         turned = image
     if turned.size != image.size:
         original = original[1], original[0]
@@ -108,7 +108,7 @@ def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image
     """A mask as its photo of this size (width, height) is turned: upright, or as stored. Raises SdfsimError where
     neither is shaped like the photo."""
     for image in (ImageOps.exif_transpose(stored), stored):
-        if off(image, size[0] / size[1]) < 0.02:
+        if misfit(image, size[0] / size[1]) < 0.02:
             return image
     given = f"{stored.width} x {stored.height}"
     raise SdfsimError(f"{path}: a mask of {given} does not fit its photo, shaped {size[0]} x {size[1]}")
@@ -183,7 +183,7 @@ def reduced(size: tuple[int, int], long_side: int) -> tuple[int, int]:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-def off(image: Image.Image, shape: float) -> float:
+def misfit(image: Image.Image, shape: float) -> float:
     """By what share an image is wider or narrower than a shape, width over height."""
     return abs(image.width / image.height / shape - 1)
 

@@ -167,6 +167,12 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
     return notes
 
 
+def open_photo(folder: Path, view: View, mode: str = "RGB") -> Image.Image:
+    """The prepared photo of a view, in a mode of PIL's."""
+    with Image.open(Path(folder) / "images" / view.name) as image:
+        return image.convert(mode)
+
+
 def save_photos(photos: list[Photo], folder: Path) -> None:
     """Writes `photos.json`."""
     write_json(folder / "photos.json", {"version": 1, "photos": [asdict(p) for p in photos]})

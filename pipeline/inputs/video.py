@@ -27,11 +27,8 @@ def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
     rate = float(video.get(cv2.CAP_PROP_FPS)) or 30.0
 
     def read() -> Iterator[np.ndarray]:
-        while True:
-            good, frame = video.read()
-            if not good:
-                return
-            yield frame[..., ::-1]
+        while (found := video.read())[0]:
+            yield found[1][..., ::-1]
 
     return read(), rate
 

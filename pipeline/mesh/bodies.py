@@ -27,6 +27,7 @@ from pipeline.mesh.extraction import (
     components,
     islands,
     keep_faces,
+    marked,
     sample,
     sample_box,
 )
@@ -111,18 +112,12 @@ class FoundBody:
 
     def owns(self, points: np.ndarray) -> np.ndarray:
         """Whether points [P, 3] are nearer to this body than to anything else on the plane."""
-        index = np.round((points - self.low) / self.cell).astype(int)
-        inside = ((index >= 0) & (index < self.own.shape)).all(1)
-        result = np.zeros(len(points), bool)
-        result[inside] = self.own[tuple(index[inside].T)]
-        return result
+        return marked(self.own, np.round((points - self.low) / self.cell).astype(int))
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Whether points [P, 3] are in the contact layer and the body goes around them, as a cup around its floor."""
         index = np.round((points @ frame_of(self.level.normal)[:2].T - self.corner) / (0.5 * self.cell)).astype(int)
-        inside = ((index >= 0) & (index < self.hollow.shape)).all(1) & (self.level.above(points) < self.layer)
-        inside[inside] = self.hollow[tuple(index[inside].T)]
-        return inside
+        return marked(self.hollow, index) & (self.level.above(points) < self.layer)
 
     def distance(self, field: Distance) -> Distance:
         """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane. What
@@ -276,8 +271,7 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     label = standing[wide].astype(np.int8)
     inner = tuple(slice(part.start - low, part.stop - low) for low, part in zip(start, box, strict=True))
     label[inner][mine] = 2
-    away, nearest = np.empty(label.shape), np.empty((3, *label.shape), np.int32)
-    ndimage.distance_transform_edt(label == 0, return_indices=True, distances=away, indices=nearest)
+    away, nearest = ndimage.distance_transform_edt(label == 0, return_indices=True)  # type: ignore[misc]
     own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
     corner = volume.low + volume.cell * np.array(start)
     body = FoundBody("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))

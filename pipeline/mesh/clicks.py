@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import View
 from pipeline.inputs.labels import UNKNOWN
+from pipeline.inputs.photos import open_photo
 from pipeline.mesh.seams import ConnectedSolid, Part, count_votes, cut, grooves, owners, seams, shape_labels, steps
 from pipeline.mesh.visibility import Visibility, framed
 from sdfsim.geometry.bvh import Caster
@@ -162,9 +163,8 @@ def _cut_out(view: View, label: np.ndarray, certain: np.ndarray, scene: Scene) -
     corners = np.where(np.isfinite(hit)[:, None], label[nearest], 0)
     body = corners[:, 0].reshape(height, width)
     sure = (certain[nearest].all(1) & (corners == corners[:, :1]).all(1)).reshape(height, width)
-    with Image.open(scene.photos / "images" / view.name) as image:
-        box = (*low.tolist(), *(low + size).tolist())
-        picture = np.array(image.convert("RGB").crop(box).resize((width, height), Image.Resampling.BOX))
+    shown = open_photo(scene.photos, view).crop((*low.tolist(), *(low + size).tolist()))
+    picture = np.array(shown.resize((width, height), Image.Resampling.BOX))
     picture[body == 0] = OUTSIDE
     return CutOut(view, low, size, picture, body, sure)
 

@@ -82,6 +82,13 @@ class Volume:
         return Mesh(self.low + self.cell * vertices.astype(np.float64), faces.astype(np.int64))
 
 
+def marked(table: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Whether places [P, D] int of a table of D dimensions are set [P] bool; those outside are not."""
+    inside = np.all((index >= 0) & (index < table.shape), axis=1)
+    inside[inside] = table[tuple(index[inside].T)]
+    return inside
+
+
 def sample(distance: Distance, points: np.ndarray) -> np.ndarray:
     """Values [P] float32 of a distance at points [P, 3], in batches."""
     parts = np.array_split(points, max(1, len(points) // BATCH))

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from pipeline.mesh.trust import FEW, Evidence
-from pipeline.mesh.visibility import Above
+from pipeline.mesh.visibility import heights
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
@@ -41,7 +41,7 @@ def hollow(mesh: Mesh, least: float, evidence: Evidence | None = None) -> Hollow
     step = float((high - low)[:2].max()) / PLACES
     axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in range(2)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    height = Above(mesh).heights(places)
+    height = heights(mesh, places)
     through = np.isnan(height)
     height = np.where(through, low[2], height)
     water = reconstruction(np.where(through, height, height.max()), height, method="erosion")

@@ -75,8 +75,7 @@ class FoundJoint:
     anchor: np.ndarray  # [3] m, a point of a hinge's axis, in the middle of the part; of a slider the part's middle
     axis: np.ndarray  # [3] unit vector, along which the second state is at a positive angle or position
     travel: float  # rad or m, from the first state to the second
-    turn: np.ndarray  # [3, 3] and shift [3] m: the motion of the part
-    shift: np.ndarray
+    motion: Similarity  # of the part, at scale 1
     moving: np.ndarray  # [F] bool, the faces of the first state that move
     off: float  # m, mean distance of the part, moved, from the second state
     doubt: Doubt
@@ -113,7 +112,7 @@ def find_joint(
     part, share = _moved(one, on[1], clear[1], near, rng)
     there, their_share = _moved(other, on[0], clear[0], near, rng)
     if empty is None and share > MOST:
-        raise SdfsimError("all moves: the two states have nothing in common", "bring both into one frame first")
+        raise SdfsimError("everything moves: the two states have nothing in common", "bring both into one frame first")
     # What photos see through tells one way alone where the part is hidden in the other state, as a drawer is.
     for some, which in ((share, "first"), (their_share, "second")):
         if some < LEAST and (empty is None or max(share, their_share) < LEAST):
@@ -122,23 +121,22 @@ def find_joint(
     if empty is not None:
         part, there = _patches(part, APART * near), _patches(there, APART * near)
     pairs = (np.zeros((0, 3)), np.zeros((0, 3)))
-    shown: np.ndarray | None = None
+    shown: Similarity | None = None
     if paired is not None:
         shown, pairs = _agreed(paired(part[0], there[0]), near)
     surfaces = _Surfaces(on, clear, part, there, pairs, near, size)
     few, width = surfaces.some(FEW), max(_extent(part[0]), _extent(there[0]))
     mid = part[0].mean(0) if len(part[0]) else pairs[0].mean(0)
 
-    def tried(starts: list[np.ndarray]) -> list[_Rated]:
+    def tried(starts: list[Similarity]) -> list[_Rated]:
         """The best of the motions to which these lead, each once."""
         reach = max(COARSE, WIDE * width / near)
         rough = [surfaces.rated(few.laid(start, (reach, 0.5 * reach, 0.25 * reach)), few) for start in starts]
-        best: list[np.ndarray] = []
+        best: list[Similarity] = []
         for entry in sorted(rough, key=lambda entry: entry.cost):
-            apart = [np.linalg.inv(entry.motion) @ other for other in best]
+            apart = [entry.motion.inverse().after(other) for other in best]
             if len(best) < BEST and not any(
-                _screw(step, mid)[0] < SLIDES and np.linalg.norm(step[:3, :3] @ mid + step[:3, 3] - mid) < near
-                for step in apart
+                _screw(step, mid)[0] < SLIDES and np.linalg.norm(step.points(mid) - mid) < near for step in apart
             ):
                 best.append(entry.motion)
         return [surfaces.rated(surfaces.laid(motion, FINISH), surfaces) for motion in best]
@@ -169,7 +167,7 @@ def find_joint(
     fitting = [entry for entry in found if entry.cost <= ALIKE * lowest and entry.off <= FIT * near]
     chosen = min(fitting or found, key=unlikely)
     # Several starts lead into one dip: the deepest place of it counts.
-    same = [entry for entry in fitting or found if _screw(entry.motion @ np.linalg.inv(chosen.motion), mid)[0] < DIP]
+    same = [entry for entry in fitting or found if _screw(entry.motion.after(chosen.motion.inverse()), mid)[0] < DIP]
     rated = min(same, key=lambda entry: entry.cost)
     if empty is not None and rated.follows < FOLLOWS:
         told = f"more than one thing has moved: {1 - rated.follows:.0%} of what moved does not go with the rest"
@@ -178,18 +176,18 @@ def find_joint(
     if angle > SLIDES and abs(slide) > PITCH * size:
         told = f"turns by {math.degrees(angle):.1f} degrees and slides by {slide:.3g} m along the same axis"
         raise SdfsimError(f"the part is on neither a hinge nor a slider: it {told}")
-    motion = rated.motion if angle > SLIDES else surfaces.laid(_shift_of(rated.motion, mid), FINISH, turns=False)
+    motion = rated.motion
+    if angle <= SLIDES:  # the slide that takes the middle where the motion takes it
+        motion = surfaces.laid(_shift(motion.points(mid) - mid), FINISH, turns=False)
     kind, anchor, axis, travel = _joint_of(motion, mid)
     doubt = _doubt(surfaces, motion, mid, COMMON * rated.off, 0.5 * width, rng)
-    back = np.linalg.inv(motion)
     seen = tuple(
         points[(away <= near) | hidden]
-        for points, way, k in ((part[0], motion, 1), (there[0], back, 0))
+        for points, way, k in ((part[0], motion, 1), (there[0], motion.inverse(), 0))
         for away, hidden in [surfaces.carried(points, way, k)]
     )
     moving = _faces(one, motion, on[1], near)
-    return FoundJoint(kind, anchor, axis, travel, motion[:3, :3], motion[:3, 3], moving, rated.off, doubt,
-                      rated.follows, seen)  # type: ignore[arg-type] # fmt: skip
+    return FoundJoint(kind, anchor, axis, travel, motion, moving, rated.off, doubt, rated.follows, seen)  # type: ignore[arg-type]
 
 
 def scene_keys(found: FoundJoint | HeldPart) -> dict[str, Any]:
@@ -224,13 +222,11 @@ class HeldPart:
 
     def moved(self, move: Similarity) -> HeldPart:
         """The same in another world."""
-        turn = move.rotation @ self.turn @ move.rotation.T
-        start = move.inverse().points(np.zeros((1, 3)))[0]  # what is then at the origin
-        shift = move.points((self.turn @ start + self.shift)[None])[0]
+        home = move.after(Similarity(1.0, self.turn, self.shift)).after(move.inverse())
         long = 1.0 if self.kind == "hinge" else move.scale  # a unit of what the joint measures
         doubt = Doubt(self.doubt.axis, self.doubt.place * move.scale, self.doubt.travel * long)
-        return replace(self, anchor=move.points(self.anchor[None])[0], axis=move.rotation @ self.axis,
-                       travel=self.travel * long, turn=turn, shift=shift, metres=self.metres / move.scale,
+        return replace(self, anchor=move.points(self.anchor), axis=move.rotation @ self.axis, travel=self.travel * long,
+                       turn=home.rotation, shift=home.translation, metres=self.metres / move.scale,
                        off=self.off * move.scale, doubt=doubt, size=self.size * move.scale)  # fmt: skip
 
     def save(self, path: Path) -> None:
@@ -266,14 +262,13 @@ def _told(joint: FoundJoint | HeldPart, size: float) -> str:
     return f"{joint.kind}: a part {way} ({axis}) through ({where}) m; {fit}; {doubt}{rest}"
 
 
-def split(mesh: Mesh, moving: np.ndarray) -> tuple[Mesh, Mesh]:
-    """The part that moves, and the rest."""
-    return tuple(replace(mesh, faces=mesh.faces[rows]) for rows in (moving, ~moving))  # type: ignore[return-value]
+def _shift(way: np.ndarray) -> Similarity:
+    """The slide by a way [3] m."""
+    return Similarity(1.0, np.eye(3), way)
 
 
-def _starts(moving: np.ndarray, moved: np.ndarray) -> list[np.ndarray]:
-    """[4, 4] motions to try: a slide; and turns, about the principal axes of the part, by which it may have gone."""
-    found = []
+def _starts(moving: np.ndarray, moved: np.ndarray) -> list[Similarity]:
+    """Motions to try: a slide; and turns, about the principal axes of the part, by which it may have gone."""
     frames = []
     for points in (moving, moved):
         centred = points - points.mean(0)
@@ -287,17 +282,13 @@ def _starts(moving: np.ndarray, moved: np.ndarray) -> list[np.ndarray]:
     # Principal axes tell little where a part is seen in part: also turns about each by steps of a twelfth.
     for axis in frames[0].T:
         turns += [Rotation.from_rotvec(axis * angle).as_matrix() for angle in np.arange(1, 12) * (math.pi / 6.0)]
-    for turn in turns:
-        start = np.eye(4)
-        start[:3, :3], start[:3, 3] = turn, moved.mean(0) - turn @ moving.mean(0)
-        found.append(start)
+    found = [Similarity(1.0, turn, moved.mean(0) - turn @ moving.mean(0)) for turn in turns]
     # Of a slide the middles tell little either: the one or the other end along each axis may be what both show.
     ends = [[(points @ frames[1]).min(0), (points @ frames[1]).max(0)] for points in (moving, moved)]
-    for which in np.ndindex(2, 2, 2):
-        start = np.eye(4)
-        start[:3, 3] = frames[1] @ [ends[1][end][k] - ends[0][end][k] for k, end in enumerate(which)]
-        found.append(start)
-    return found
+    return found + [
+        _shift(frames[1] @ [ends[1][end][k] - ends[0][end][k] for k, end in enumerate(which)])
+        for which in np.ndindex(2, 2, 2)
+    ]
 
 
 def _away(surface: ClosestPoint, points: np.ndarray) -> np.ndarray:
@@ -350,34 +341,24 @@ def _patches(points: Points, gap: float) -> Points:
     return points[0][kept], points[1][kept]
 
 
-def _agreed(pairs: Pairs, near: float) -> tuple[np.ndarray | None, Pairs]:
-    """The motion [4, 4] that most pairs of places agree on, None where too few do, and these pairs."""
-    import open3d as o3d
+def _agreed(pairs: Pairs, near: float) -> tuple[Similarity | None, Pairs]:
+    """The motion that most pairs of places agree on, None where too few do, and these pairs."""
+    import pycolmap
 
-    nothing = np.zeros((0, 3))
-    if len(pairs[0]) < AGREED:
-        return None, (nothing, nothing)
-    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in pairs]
-    o3d.utility.random.seed(0)
-    register = o3d.pipelines.registration
-    same = o3d.utility.Vector2iVector(np.repeat(np.arange(len(pairs[0]))[:, None], 2, axis=1))
-    found = register.registration_ransac_based_on_correspondence(
-        clouds[0], clouds[1], same, near, register.TransformationEstimationPointToPoint(False), 3,
-        [register.CorrespondenceCheckerBasedOnEdgeLength(0.8)], register.RANSACConvergenceCriteria(100_000, 0.9999),
-    )  # fmt: skip
-    motion = np.asarray(found.transformation)
-    there = pairs[0] @ motion[:3, :3].T + motion[:3, 3]
-    good = np.linalg.norm(there - pairs[1], axis=1) < near
-    if good.sum() < max(AGREED, BY_CHANCE * len(good)):
-        return None, (nothing, nothing)
+    options = pycolmap.RANSACOptions(max_error=near, max_num_trials=100_000, random_seed=0)
+    found: Any = pycolmap.estimate_rigid3d_robust(*pairs, options) if len(pairs[0]) >= AGREED else None
+    if found is None or found["num_inliers"] < max(AGREED, BY_CHANCE * len(pairs[0])):
+        return None, (np.zeros((0, 3)), np.zeros((0, 3)))
+    good, move = np.asarray(found["inlier_mask"], bool), found["tgt_from_src"]
+    motion = Similarity(1.0, move.rotation.matrix(), np.asarray(move.translation))
     return motion, (pairs[0][good], pairs[1][good])
 
 
 @dataclass(frozen=True)
 class _Rated:
-    """A motion [4, 4] of the part from the first state to the second, and how well it fits."""
+    """A motion of the part from the first state to the second, and how well it fits."""
 
-    motion: np.ndarray
+    motion: Similarity
     cost: float  # m, the mean over what moves, the hidden counting a little
     off: float  # m, the mean distance of what moves where it can be seen
     follows: float  # share of what moves that it explains
@@ -406,19 +387,19 @@ class _Surfaces:
         pairs = self.pairs[0][::step], self.pairs[1][::step]
         return replace(self, part=few(self.part), there=few(self.there), pairs=pairs)
 
-    def carried(self, points: np.ndarray, motion: np.ndarray, state: int) -> tuple[np.ndarray, np.ndarray]:
+    def carried(self, points: np.ndarray, motion: Similarity, state: int) -> tuple[np.ndarray, np.ndarray]:
         """[P] m, how far points, moved, are from a state's surface, and whether they are where its photos do not look
         and so may have one."""
-        moved = points @ motion[:3, :3].T + motion[:3, 3]
+        moved = motion.points(points)
         away = _away(self.on[state], moved)
         hidden = away > self.near
         hidden[hidden] = ~self.empty[state](moved[hidden])
         return away, hidden
 
-    def rated(self, motion: np.ndarray, by: _Surfaces) -> _Rated:
+    def rated(self, motion: Similarity, by: _Surfaces) -> _Rated:
         """How well a motion fits, both ways: nothing of either part is to be left over."""
         costs, offs, follow, count = [0.0], [0.0], 0.0, 0
-        for (points, _), way, state in ((by.part, motion, 1), (by.there, np.linalg.inv(motion), 0)):
+        for (points, _), way, state in ((by.part, motion, 1), (by.there, motion.inverse(), 0)):
             if not len(points):
                 continue
             away, hidden = self.carried(points, way, state)
@@ -428,37 +409,36 @@ class _Surfaces:
             follow, count = follow + float((hidden | (away <= self.near)).sum()), count + len(points)
         return _Rated(motion, max(costs), max(offs), follow / max(count, 1))
 
-    def laid(self, start: np.ndarray, reaches: Reaches, *, turns: bool = True) -> np.ndarray:
-        """[4, 4] by ICP, points to planes: of the part in the first state on the second's surface, and of the part in
-        the second state on the first's, looking ever nearer; and of pairs of places on each other. Edges of a part that
-        lies flush in the one state are seen in the other. Without `turns` the part keeps its orientation."""
-        motion = start.copy()
+    def laid(self, motion: Similarity, reaches: Reaches, *, turns: bool = True) -> Similarity:
+        """A motion made better by ICP, points to planes: of the part in the first state on the second's surface, and of
+        the part in the second state on the first's, looking ever nearer; and of pairs of places on each other. Edges of
+        a part that lies flush in the one state are seen in the other. Without `turns` it does not turn."""
         for reach in reaches:
             shown = self._shown(motion)
             for _ in range(ROUNDS):
                 step = shown._step(motion, reach * self.near, turns)
                 if step is None:
                     break
-                motion = step[0] @ motion
+                motion = step[0].after(motion)
                 if step[1] < 1e-6 * self.size:
                     break
         return motion
 
-    def _shown(self, motion: np.ndarray) -> _Surfaces:
+    def _shown(self, motion: Similarity) -> _Surfaces:
         """The same without points that a motion carries to where the other state's photos do not look. There is no
         surface for them, and the nearest one is another's."""
         if self.empty == (_everywhere, _everywhere):
             return self
         some = [
             (points[~hidden], normals[~hidden])
-            for (points, normals), way, state in ((self.part, motion, 1), (self.there, np.linalg.inv(motion), 0))
+            for (points, normals), way, state in ((self.part, motion, 1), (self.there, motion.inverse(), 0))
             for hidden in [self.carried(points, way, state)[1]]
         ]
         return replace(self, part=some[0], there=some[1])
 
-    def _step(self, motion: np.ndarray, reach: float, turns: bool) -> tuple[np.ndarray, float] | None:
-        """A step [4, 4] of ICP and how long it is, m; None where too little has a partner."""
-        turn, shift = motion[:3, :3], motion[:3, 3]
+    def _step(self, motion: Similarity, reach: float, turns: bool) -> tuple[Similarity, float] | None:
+        """A step of ICP and how long it is, m; None where too little has a partner."""
+        turn, shift = motion.rotation, motion.translation
         here, facing = self.part[0] @ turn.T + shift, self.part[1] @ turn.T
         goal, normal = self.on[1](here) if len(here) else (here, facing)
         back, normal_back = self.on[0]((self.there[0] - shift) @ turn) if len(self.there[0]) else self.there
@@ -493,9 +473,8 @@ class _Surfaces:
         step = np.linalg.solve(system, heavy.T @ wanted) / scale
         if not turns:
             step[:3] = 0.0
-        change = np.eye(4)
-        change[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
-        change[:3, 3] = middle + step[3:] - change[:3, :3] @ middle
+        turned = Rotation.from_rotvec(step[:3]).as_matrix()
+        change = Similarity(1.0, turned, middle + step[3:] - turned @ middle)
         return change, float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * self.size)
 
     def drawn(self, rng: np.random.Generator) -> _Surfaces:
@@ -518,7 +497,7 @@ class _Surfaces:
 
 
 def _doubt(
-    surfaces: _Surfaces, motion: np.ndarray, mid: np.ndarray, common: float, lever: float, rng: np.random.Generator
+    surfaces: _Surfaces, motion: Similarity, mid: np.ndarray, common: float, lever: float, rng: np.random.Generator
 ) -> Doubt:  # fmt: skip
     """How far the joint differs, in the mean, when it is found from other draws of what moves (the bootstrap), and by
     what all draws have in `common`, m: an end of the part, `lever` m from its middle, may be off by that."""
@@ -539,31 +518,23 @@ def _doubt(
     return Doubt(float(np.hypot(axis_off, tilt)), float(np.hypot(place, shifted)), float(np.hypot(way_off, tilt)))
 
 
-def _shift_of(motion: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """[4, 4] the slide that takes a point where a motion takes it."""
-    found = np.eye(4)
-    found[:3, 3] = motion[:3, :3] @ middle + motion[:3, 3] - middle
-    return found
-
-
-def _joint_of(motion: np.ndarray, mid: np.ndarray) -> tuple[Literal["hinge", "slider"], np.ndarray, np.ndarray, float]:
-    """Kind, anchor, axis and travel of a motion [4, 4]; the anchor is near `mid`."""
+def _joint_of(motion: Similarity, mid: np.ndarray) -> tuple[Literal["hinge", "slider"], np.ndarray, np.ndarray, float]:
+    """Kind, anchor, axis and travel of a motion; the anchor is near `mid`."""
     angle, axis, point, _ = _screw(motion, mid)
     if angle > SLIDES:
         return "hinge", point, axis, angle
-    way = motion[:3, :3] @ mid + motion[:3, 3] - mid
+    way = motion.points(mid) - mid
     length = float(np.linalg.norm(way))
     return "slider", mid, way / length, length
 
 
-def _screw(motion: np.ndarray, near: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
-    """Angle rad, axis, the point of it that is nearest to `near`, and the slide along it m, of a motion [4, 4]."""
-    turn, shift = motion[:3, :3], motion[:3, 3]
-    vector = Rotation.from_matrix(turn).as_rotvec()
+def _screw(motion: Similarity, near: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Angle rad, axis, the point of it that is nearest to `near`, and the slide along it m, of a motion."""
+    shift, vector = motion.translation, Rotation.from_matrix(motion.rotation).as_rotvec()
     angle = float(np.linalg.norm(vector))
     axis = vector / angle if angle > 1e-9 else np.array([1.0, 0.0, 0.0])
     if angle <= SLIDES:
-        return angle, axis, near, float(np.linalg.norm(turn @ near + shift - near))
+        return angle, axis, near, float(np.linalg.norm(motion.points(near) - near))
     slide = float(axis @ shift)
     across = shift - slide * axis
     # (1 - R) x = t has this solution across the axis; any point along it will do.
@@ -571,8 +542,8 @@ def _screw(motion: np.ndarray, near: np.ndarray) -> tuple[float, np.ndarray, np.
     return angle, axis, point + axis * (axis @ (near - point)), slide
 
 
-def _faces(one: Mesh, motion: np.ndarray, other: ClosestPoint, near: float) -> np.ndarray:
+def _faces(one: Mesh, motion: Similarity, other: ClosestPoint, near: float) -> np.ndarray:
     """[F] bool: faces that are off the second state's surface, and nearer to it once they are moved."""
     middles = one.vertices[one.faces].mean(1)
-    stays, moves = (_away(other, points) for points in (middles, middles @ motion[:3, :3].T + motion[:3, 3]))
+    stays, moves = (_away(other, points) for points in (middles, motion.points(middles)))
     return (stays > 0.25 * near) & (moves < 0.5 * stays)

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from pipeline.cameras import View, load_poses, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
-from pipeline.inputs.photos import load_photos
+from pipeline.inputs.photos import load_photos, open_photo
 from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
@@ -246,8 +246,7 @@ def draw_names(
 def _tile(
     view: View, seen: np.ndarray, names: list[str], photos_folder: Path, axis: np.ndarray | None
 ) -> Image.Image:  # fmt: skip
-    with Image.open(photos_folder / "images" / view.name) as photo:
-        pixels = np.asarray(photo.convert("RGB").resize(seen.shape[::-1]), float)
+    pixels = np.array(open_photo(photos_folder, view).resize(seen.shape[::-1]), float)
     for number in range(len(names)):  # Hues a golden section apart, so that neighbours differ.
         color = 255 * np.array(colorsys.hsv_to_rgb(number * 0.618 % 1, 0.85, 1.0))
         pixels[seen == number] += TINT * (color - pixels[seen == number])

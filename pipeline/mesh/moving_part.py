@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 from scipy.spatial import KDTree
 
 from pipeline.cameras import Similarity, View, load_poses
 from pipeline.field.training import load_field
 from pipeline.inputs.labels import UNKNOWN
-from pipeline.mesh.joint import FoundJoint
+from pipeline.inputs.photos import open_photo
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.visibility import framed
@@ -52,7 +51,7 @@ class State:
         """The same in another frame."""
         visible, closed = (Mesh(move.points(mesh.vertices), mesh.faces) for mesh in (self.visible, self.closed))
         views = [move.view(view) for view in self.views]
-        middle = move.points(self.middle[None])[0]
+        middle = move.points(self.middle)
         return State(visible, closed, views, self.photos, self.cell * move.scale, middle, self.radius * move.scale)
 
     @cached_property
@@ -81,7 +80,7 @@ def load_state(folder: Path) -> State:
     visible = read_mesh(folder / "mesh" / "mesh.ply")
     closed = joined([read_mesh(folder / "mesh" / file) for file in files])
     views = load_poses(folder / "poses").moved(place.after(trained.to_unit)).views
-    middle, radius = place.points(np.zeros((1, 3)))[0], INNER * place.scale
+    middle, radius = place.translation, INNER * place.scale
     return State(visible, closed, views, folder / "photos", known["cell"], middle, radius)
 
 
@@ -106,8 +105,7 @@ def landmarks(state: State, part: np.ndarray | None = None) -> Landmarks:
         chosen = np.argsort([-framed(view, part)[1].sum() for view in state.views])[:ASKED]
     for number in chosen:
         view = state.views[number]
-        with Image.open(state.photos / "images" / view.name) as image:
-            grey = np.asarray(image.convert("L"))
+        grey = np.asarray(open_photo(state.photos, view, "L"))
         keys, found = finder.detectAndCompute(grey, None)  # type: ignore[call-overload]
         if not keys:
             continue
@@ -183,11 +181,11 @@ def tied(here: np.ndarray, there: np.ndarray, near: float, near_there: float) ->
     return Similarity(float(move.scale), move.rotation.matrix(), np.asarray(move.translation)), patches
 
 
-def which_move(mesh: Mesh, other: State, motion: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """[V] uint8, of the vertices of one state's surface: 1 for those that a motion [4, 4] takes to the other state, 0
+def which_move(mesh: Mesh, other: State, motion: Similarity, seen: np.ndarray) -> np.ndarray:
+    """[V] uint8, of the vertices of one state's surface: 1 for those that a motion takes to the other state, 0
     for those that stay, `UNKNOWN` where nothing tells. `seen` [P, 3] are points of the part."""
     near, points = CELLS * other.cell, mesh.vertices
-    moved = points @ motion[:3, :3].T + motion[:3, 3]
+    moved = motion.points(points)
     on = ClosestPoint(other.visible)
     stays, goes = (np.linalg.norm(on(at)[0] - at, axis=1) for at in (points, moved))
     beside = KDTree(seen).query(points)[0]
@@ -216,10 +214,3 @@ def label_images(state: State, number: np.ndarray) -> dict[str, np.ndarray]:
         wide = shown.reshape(row.shape).repeat(EVERY, 0).repeat(EVERY, 1)
         found[view.name] = wide[: view.height, : view.width].astype(np.uint8)
     return found
-
-
-def part_of(found: FoundJoint, first: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The motion [4, 4] to the other state, from the first or from the second, and points [P, 3] of the part there."""
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = found.turn, found.shift
-    return (motion, found.seen[0]) if first else (np.linalg.inv(motion), found.seen[1])

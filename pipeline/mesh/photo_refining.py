@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
+from pipeline.inputs.photos import open_photo
 from pipeline.mesh.visibility import FAIR, Visibility
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
@@ -62,8 +62,7 @@ def load_grey_photos(views: Sequence[View], photos_folder: Path) -> list[GreyPho
 
     found = []
     for view in views:
-        with Image.open(Path(photos_folder) / "images" / view.name) as image:
-            grey = np.asarray(image.convert("L"), np.float32)
+        grey = np.asarray(open_photo(photos_folder, view, "L"), np.float32)
         scale = min(1.0, LONG_SIDE / max(grey.shape))
         size = round(view.width * scale), round(view.height * scale)
         found.append(GreyPhoto(view, scale, cv2.resize(grey, size, interpolation=cv2.INTER_AREA)))

@@ -7,6 +7,7 @@ inside belongs to the part whose surface is nearest.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -252,19 +253,15 @@ def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
 
 
 def grooves(solid: ConnectedSolid) -> np.ndarray:
-    """How deep a groove each vertex [P] lies in: 0 on a plane, 0.25 in a sharp right angle, less on an edge."""
-    return _solid_around(solid) - 0.5
-
-
-def _solid_around(solid: ConnectedSolid) -> np.ndarray:
-    """Share [P] of a ball about each vertex that is solid: a half on a plane, more in a groove."""
+    """How deep a groove each vertex [P] lies in: how much more than half of a ball about it is solid. 0 on a plane,
+    0.25 in a sharp right angle, less on an edge."""
     volume = solid.volume
     axis = np.arange(-BALL, BALL + 1)
     x, y, z = np.meshgrid(axis, axis, axis)
     ball = (x**2 + y**2 + z**2 <= BALL**2).astype(np.float32)
     filled = np.clip(0.5 - volume.values / volume.cell, 0, 1) * ndimage.binary_dilation(solid.inside)
     share = fftconvolve(np.pad(filled, BALL), ball / ball.sum(), mode="same").astype(np.float32)
-    return Volume(share, volume.low - BALL * volume.cell, volume.cell).at(solid.points)
+    return Volume(share, volume.low - BALL * volume.cell, volume.cell).at(solid.points) - 0.5
 
 
 def owners(points: np.ndarray, share: np.ndarray, cell: float) -> np.ndarray:
@@ -373,8 +370,7 @@ def flood(solid: ConnectedSolid, label: np.ndarray, found: list[Seam]) -> np.nda
 
 def _spread(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Values [X, Y, Z], those that are not known [X, Y, Z] bool replaced by the nearest one that is."""
-    nearest = np.empty((3, *values.shape), np.int32)
-    ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True, indices=nearest)
+    nearest: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return values[tuple(nearest)]
 
 

@@ -7,6 +7,7 @@ Everything here is in normalised space.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -14,8 +15,9 @@ from scipy import ndimage
 
 from pipeline.cameras import PosedPhotos, View, frame_of
 from pipeline.inputs.images import reduced
+from pipeline.inputs.photos import open_photo
 from pipeline.mesh.bodies import LevelPlane, find_level_planes
-from pipeline.mesh.extraction import MIN_SEEN, RIM, FieldSurface, Volume
+from pipeline.mesh.extraction import MIN_SEEN, RIM, FieldSurface, Volume, marked
 from pipeline.mesh.visibility import bilinear, framed
 from sdfsim.geometry.bvh import Caster
 
@@ -52,11 +54,8 @@ class Completed:
 
     def covers(self, points: np.ndarray) -> np.ndarray:
         """Whether points [P, 3] lie in the columns of the squares [P]."""
-        index = np.floor((points @ frame_of(self.level.normal)[:2].T - self.corner) / self.step).astype(int)
-        inside = np.flatnonzero(((index >= 0) & (index < self.squares.shape)).all(1))
-        result = np.zeros(len(points), bool)
-        result[inside] = self.squares[tuple(index[inside].T)]
-        return result
+        flat = points @ frame_of(self.level.normal)[:2].T
+        return marked(self.squares, np.floor((flat - self.corner) / self.step).astype(int))
 
     def on(self, points: np.ndarray, width: float) -> np.ndarray:
         """Whether points [P, 3] are within `width` of what was completed [P]."""
@@ -138,8 +137,7 @@ def _complete(surface: FieldSurface, level: LevelPlane, poses: PosedPhotos, pict
         return None
     # A patch reaches past the edge of what is plain: there it is the square alone that has to look the same.
     narrow, own = alike(NARROW)
-    nearest = np.empty((2, count, count), np.int32)
-    ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True, indices=nearest)
+    nearest: Any = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
     same = narrow & (np.abs(own - color[tuple(nearest)]).max(2) < SAME)
     grown = ndimage.binary_dilation(core, iterations=int(PATCH) + 1, mask=core | (same & open_))
     return Completed(level, corner, step, np.asarray(grown, bool))
@@ -160,9 +158,9 @@ def _pictures(poses: PosedPhotos, folder: Path) -> list[tuple[View, np.ndarray]]
     """Photos [H, W, 3] float, with cameras of their size; as bright as the sparse points, which are means of photos."""
     found, sparse = [], poses.sparse
     for number, view in enumerate(poses.views):
-        with Image.open(folder / "images" / view.name) as image:
-            size = reduced(image.size, LONG_SIDE)
-            pixels = np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX), np.float32)
+        image = open_photo(folder, view)
+        size = reduced(image.size, LONG_SIDE)
+        pixels = np.asarray(image.resize(size, Image.Resampling.BOX), np.float32)
         sx, sy = size[0] / view.width, size[1] / view.height
         small = replace(view, width=size[0], height=size[1], focal=view.focal * (sx + sy) / 2, cx=view.cx * sx,
                         cy=view.cy * sy)  # fmt: skip

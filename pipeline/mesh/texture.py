@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from scipy.spatial import KDTree
 
 from pipeline.cameras import View
-from pipeline.inputs.photos import Photo
+from pipeline.inputs.photos import Photo, open_photo
 from pipeline.mesh.extraction import keep_faces
 from pipeline.mesh.visibility import FLATTEST, bilinear, framed, to_bytes
 from sdfsim.base.parallel import Progress, share_of, silent
@@ -46,8 +45,7 @@ class Shots:
 
     def photo(self, view: View) -> np.ndarray:
         """Colours [H, W, 3] uint8."""
-        with Image.open(self.folder / "images" / view.name) as image:
-            return np.asarray(image.convert("RGB"))
+        return np.asarray(open_photo(self.folder, view))
 
     def density(self, points: np.ndarray, normals: np.ndarray) -> float:
         """Photo pixels a metre of the surface has where it is seen best: the median over points [P, 3]."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from pipeline.cameras import View
+from pipeline.inputs.photos import open_photo
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
@@ -30,18 +30,12 @@ class PhotoColors:
     weight: np.ndarray  # [V] behind the colour; 0: no photo shows the point
 
 
-class Above:
-    """Heights of a mesh's topmost surface."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.caster = Caster(mesh)
-        self.top = float(mesh.vertices[:, 2].max() + 0.1 * np.ptp(mesh.vertices, axis=0).max())
-
-    def heights(self, at: np.ndarray) -> np.ndarray:
-        """Heights [...] m over the points `at` [..., 2] m; NaN where there is no surface."""
-        origin = np.insert(at.reshape(-1, 2), 2, self.top, axis=1)
-        distance, _ = self.caster.hits(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
-        return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
+def heights(mesh: Mesh, at: np.ndarray) -> np.ndarray:
+    """Heights [...] m of a mesh's topmost surface over the points `at` [..., 2] m; NaN where there is none."""
+    top = float(mesh.vertices[:, 2].max() + 0.1 * np.ptp(mesh.vertices, axis=0).max())
+    origin = np.insert(at.reshape(-1, 2), 2, top, axis=1)
+    distance, _ = Caster(mesh).hits(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
+    return np.where(np.isfinite(distance), top - distance, np.nan).reshape(at.shape[:-1])
 
 
 class Visibility:
@@ -89,8 +83,7 @@ def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progr
     for number, view in enumerate(views):
         index, pixels, cosine = sight.of_view(view)
         count[index] += 1
-        with Image.open(Path(photos_folder) / "images" / view.name) as image:
-            photo = np.asarray(image.convert("RGB"), np.float32)
+        photo = np.asarray(open_photo(photos_folder, view), np.float32)
         share = cosine**2 / np.linalg.norm(view.center - vertices[index], axis=1) ** 2
         color[index] += share[:, None] * bilinear(photo, pixels - 0.5)
         weight[index] += share

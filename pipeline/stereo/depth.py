@@ -1,8 +1,9 @@
 """Depth from photos alone: for every pixel, how far away what it shows is, by comparing it with neighbouring photos.
 
 Planes are swept through the scene at a small size of the photos. Around what that found, places are tried again at the
-full size, along the surface as it was found; so windows follow slopes, which planes before the camera do not. A pixel
-counts where other photos agree.
+full size, along the surface as it was found; so windows follow slopes, which planes before the camera do not. Beside
+edges the surface behind is tried too, for windows take what is behind an edge for what is before it. A pixel counts
+where other photos agree.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ PLACES = 300  # sparse points by which neighbours are chosen
 PLANES = (48, 128)  # fewest and most
 STEP = 1.25  # px that what a plane shows moves to the next one, in the photo farthest away
 FINER, TRIED = 0.5, 4  # px between the places that are tried again, and how many of them to either side
+AROUND = 9  # px, the width within which the farthest surface found is tried too
 HALF = 3  # px from the middle of a window to its sides
 AGREE = 0.01  # share by which inverse depths differ at most
 FEWEST = 2  # photos that agree, where it is certain enough
@@ -260,17 +262,29 @@ def _search(picture: Pinhole, near: list[Pinhole], limits: tuple[float, float], 
     middle = (limits[0] * limits[1]) ** 0.5 if start is None else float(np.median(start))
     slope = np.linalg.norm(shown(1.01 * middle) - shown(middle), axis=2) / (0.01 * middle)  # px a unit of inverse depth
     fastest = max(float(np.median(slope, axis=1).max()), 1e-9)
+    others, sizes = stacked([other.grey for other in near])
+
+    def best(base: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return sweep(picture.grey, others, sizes, turns.astype(np.float32), shifts.astype(np.float32), base,
+                     offsets.astype(np.float32), HALF)  # fmt: skip
+
     if start is None:
         count = int(np.clip((limits[1] - limits[0]) * fastest / STEP, *PLANES))
-        base, offsets = np.zeros((rows, columns), np.float32), np.linspace(*limits, count)
-    else:
-        base = cv2.resize(start.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
-        offsets = np.arange(-TRIED, TRIED + 1) * FINER / fastest
-    others, sizes = stacked([other.grey for other in near])
-    return sweep(
-        picture.grey, others, sizes, turns.astype(np.float32), shifts.astype(np.float32), base,
-        offsets.astype(np.float32), HALF,
-    )  # fmt: skip
+        return best(np.zeros((rows, columns), np.float32), np.linspace(*limits, count))
+    base, far = (
+        cv2.resize(part.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+        for part in (start, ndimage.minimum_filter(start, AROUND))
+    )
+    offsets = np.arange(-TRIED, TRIED + 1) * FINER / fastest
+    inverse, score = best(base, offsets)
+    # Windows that reach over an edge find what is before it, also where a pixel shows what is behind: in the mouth of
+    # a vase that is all that there is. What is nearer than the places that were tried lies on the same surface.
+    beyond = base - far > offsets[-1]
+    if not beyond.any():
+        return inverse, score
+    other, its_score = best(np.where(beyond, far, base), offsets)
+    better = beyond & (its_score > score)
+    return np.where(better, other, inverse), np.where(better, its_score, score)
 
 
 def _agreement(pictures: list[Pinhole], inverse: list[np.ndarray], number: int, asked: list[int]) -> np.ndarray:

@@ -18,7 +18,10 @@ from pipeline.stereo.compiled import carve, paint
 from pipeline.stereo.depth import BEYOND, DepthMap, stacked, straightened
 from sdfsim.base.parallel import Progress, silent, threads
 
-FRONT, BACK = 3.0, 2.0  # cells before and behind a surface within which its distance counts
+BACK = 2.0  # cells before and behind a surface within which its distance counts
+# A place is empty where photos that see past it have more than this share of the weight of those that see a surface
+# there. Their distances are no part of the mean: few that are wrong would move the surface.
+OUTVOTED = 0.5
 SEEN = 0.3  # weight, that of one certain pixel is 1, from which on a place is known
 DENSE = 0.4  # density, before it is made positive, of what lies behind the sphere
 EDGE = 0.05  # share of inverse depth by which neighbouring pixels on one surface differ at most
@@ -157,13 +160,15 @@ def _slopes(inverse: np.ndarray) -> np.ndarray:
 def _carved(given: tuple[np.ndarray, ...], places: np.ndarray, cell: float, on_progress: Progress
             ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Distances and weights [P] at places [P, 3], for samples `cell` apart."""
-    total, weight = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
+    total, weight, past = np.zeros((3, len(places)), np.float32)
     parts = [slice(start, start + BATCH) for start in range(0, len(places), BATCH)]
-    jobs = [(np.ascontiguousarray(places[part], np.float32), *given, FRONT * cell, BACK * cell, total[part],
-             weight[part]) for part in parts]  # fmt: skip
+    jobs = [(np.ascontiguousarray(places[part], np.float32), *given, BACK * cell, total[part], weight[part], past[part])
+            for part in parts]  # fmt: skip
     for number, _ in enumerate(threads(carve, jobs)):
         on_progress((number + 1) / len(jobs), f"fusing depth, {number + 1} of {len(jobs)} parts")
-    return total / np.maximum(weight, 1e-9), weight
+    mean = total / np.maximum(weight, 1e-9)
+    empty = (mean <= 0) & (past > OUTVOTED * weight)
+    return np.where(empty, BACK * cell, mean), weight + past
 
 
 def _distance(solid: np.ndarray, value: np.ndarray, cell: float) -> np.ndarray:

@@ -205,12 +205,13 @@ def paint(places: Any, colors: Any, inverse: Any, sizes: Any, trust: Any, lines:
 
 @njit(cache=True, nogil=True)
 def carve(places: Any, inverse: Any, sizes: Any, slopes: Any, trust: Any, lines: Any, tilts: Any,
-          front: float, back: float, total: Any, weight: Any) -> None:  # fmt: skip
-    """Adds what depth maps say about places [P, 3] to the sums of distances and weights [P].
+          back: float, total: Any, weight: Any, past: Any) -> None:  # fmt: skip
+    """Adds what depth maps say about places [P, 3] to the sums of distances and weights [P], and to the weights [P] of
+    those that see past a place.
 
     Of the N photos `inverse` [N, h, w] is inverse depth (0: none), `slopes` [N, h, w, 2] how fast it changes from pixel
     to pixel, `tilts` [N, h, w] the distance from the surface's tangent plane by depth, and `trust` [N, h, w] a weight.
-    `lines` [N, 3, 4] lead from places to homogeneous pixels. Distances count up to `front` before a surface, and less
+    `lines` [N, 3, 4] lead from places to homogeneous pixels. Distances count up to `back` before a surface, and less
     and less down to `back` behind it: what lies farther behind is unknown.
     """
     for n in range(len(inverse)):
@@ -231,10 +232,10 @@ def carve(places: Any, inverse: Any, sizes: Any, slopes: Any, trust: Any, lines:
             if there <= 0:
                 continue
             away = (1 / there - depth) * tilts[n, j, i]
-            if away < -back:
-                continue
             share = trust[n, j, i]
-            if away < 0:
-                share *= 1 + away / back
-            total[p] += share * min(away, front)
-            weight[p] += share
+            if away > back:
+                past[p] += share
+            elif away > -back:
+                share *= min(1, 1 + away / back)
+                total[p] += share * away
+                weight[p] += share

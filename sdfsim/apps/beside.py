@@ -1,7 +1,5 @@
 """A recorded motion beside a simulated one: where the run begins, and what recordings and movies show through."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

@@ -5,7 +5,6 @@ docs/export.md says it of each format.
 """
 
 import csv
-import importlib
 import io
 import logging
 import re
@@ -28,6 +27,7 @@ from sdfsim.apps.recording import body_colors, framed, is_infinite, shown, with_
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, write_bytes, write_text
+from sdfsim.base.lazy import optional
 from sdfsim.base.parallel import StageProgress, of_stage, silent_stages
 from sdfsim.geometry.gltf import GltfWriter, light
 from sdfsim.geometry.mesh import Mesh, convex_hull
@@ -138,7 +138,7 @@ def export(
         told = f"--fps {fps:g}: " + ("no motion in it" if 0.0 < fps <= 1e4 else "must be above 0, at most 10,000")
         raise SdfsimError(told, "it goes with " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf)))
     if FORMATS[kind] is _usd:
-        _extra("pxr.Usd")  # before shapes are fitted for minutes
+        _pxr("Usd")  # before shapes are fitted for minutes
     check_writable(out.parent)
     take = replace(_read(source, scene_file, allow_outside, on_progress), collide=collide)
     take = take if fps is None else take.at_rate(fps)
@@ -149,12 +149,8 @@ def export(
     return {"format": kind[1:], **counts, "files": files, "left_out": left_out, "notes": notes}
 
 
-def _extra(module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        package = {"pxr": "usd-core"}.get(module.partition(".")[0], module)
-        raise SdfsimError(f"{package} is not installed", "pip install 'sdfsim[export]'") from error
+def _pxr(name: str) -> Any:
+    return optional(f"pxr.{name}", "usd-core", "export")
 
 
 # --- the source ---
@@ -233,7 +229,7 @@ def convex_pieces(shape: Shape) -> list[Mesh]:
         return own
     import open3d  # noqa: F401  (it cannot be loaded after CoACD)
 
-    coacd = _extra("coacd")
+    coacd = optional("coacd", "coacd", "export")
     coacd.set_log_level("off")
     try:
         found = coacd.run_coacd(coacd.Mesh(shape.mesh.vertices, shape.mesh.faces), **COACD)
@@ -342,7 +338,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
 
 def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
     names = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade")
-    gf, sdf, usd, geom, physics, shade = (_extra(f"pxr.{name}") for name in names)
+    gf, sdf, usd, geom, physics, shade = (_pxr(name) for name in names)
     stage = usd.Stage.CreateInMemory()
     geom.SetStageMetersPerUnit(stage, 1.0)
     geom.SetStageUpAxis(stage, geom.Tokens.z)
@@ -434,7 +430,7 @@ def _usd_apply(prim: Any, schema: str, **values: Any) -> None:
 
 def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
     """Prims below `path` that are seen and collide."""
-    gf, geom = _extra("pxr.Gf"), _extra("pxr.UsdGeom")
+    gf, geom = _pxr("Gf"), _pxr("UsdGeom")
     form, solid = shape.sdf, f"{path}/solid"
     if isinstance(form, ClosedForm):
         if isinstance(form, SphereSdf):
@@ -461,7 +457,7 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
     elif dynamic:
         for schema, cells in USD_GRIDS.items():
             seen.AddAppliedSchema(schema)
-            seen.CreateAttribute(cells, _extra("pxr.Sdf").ValueTypeNames.Int).Set(USD_CELLS)
+            seen.CreateAttribute(cells, _pxr("Sdf").ValueTypeNames.Int).Set(USD_CELLS)
     for collider, approximation in colliders:
         if pieces:
             geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
@@ -470,7 +466,7 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
 
 
 def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
-    geom, vt = _extra("pxr.UsdGeom"), _extra("pxr.Vt")
+    geom, vt = _pxr("UsdGeom"), _pxr("Vt")
     mesh, normals = with_normals(mesh)
     prim = geom.Mesh.Define(stage, path)
     prim.CreatePointsAttr(vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))

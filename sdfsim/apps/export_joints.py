@@ -321,16 +321,12 @@ def usd_joints(
     stage.DefinePrim("/World/joints", "Scope")
     for joint in scene.joints:
         made = made_of[joint.kind].Define(stage, f"/World/joints/{names[joint.name]}")
-        sides = ((0, 1), (1, 0))  # of USD, and of ours: USD's second body moves against its first
-        for theirs, ours in sides:
+        for theirs, ours in ((0, 1), (1, 0)):  # USD's second body moves against its first
             if joint.bodies[ours] >= 0:
-                relation = made.CreateBody0Rel() if theirs == 0 else made.CreateBody1Rel()
-                relation.SetTargets([f"/World/{bodies[joint.bodies[ours]]}"])
+                getattr(made, f"CreateBody{theirs}Rel")().SetTargets([f"/World/{bodies[joint.bodies[ours]]}"])
             x, y, z, w = joint.quat_xyzw[ours].tolist()
-            (made.CreateLocalPos0Attr if theirs == 0 else made.CreateLocalPos1Attr)(
-                gf.Vec3f(*joint.anchor[ours].tolist())
-            )
-            (made.CreateLocalRot0Attr if theirs == 0 else made.CreateLocalRot1Attr)(gf.Quatf(w, x, y, z))
+            getattr(made, f"CreateLocalPos{theirs}Attr")(gf.Vec3f(*joint.anchor[ours].tolist()))
+            getattr(made, f"CreateLocalRot{theirs}Attr")(gf.Quatf(w, x, y, z))
         made.CreateCollisionEnabledAttr(joint.collides)
         if math.isfinite(joint.breaks_force):
             made.CreateBreakForceAttr(joint.breaks_force)

@@ -22,20 +22,20 @@ import yaml
 
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import path_from, write_text
+from sdfsim.base.files import path_from, replacing, write_text
+from sdfsim.base.lazy import NotInstalled, pyplot
 from sdfsim.base.parallel import Progress, silent, threads
-from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, largest_extent
 from sdfsim.physics.joint_columns import DAMPING, DRAG
-from sdfsim.physics.joints import initial
-from sdfsim.physics.options import STEP, SUBSTEPS, Options
+from sdfsim.physics.motion import MOTION
+from sdfsim.physics.options import Options
 from sdfsim.physics.solver.world import FIRST
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import read_scene
 from sdfsim.scene.scene import Joint, Scene
-from sdfsim.simulate.batch import placed, side_by_side
-from sdfsim.simulate.steppers import Frames, stepper_of
+from sdfsim.simulate.batch import Copies, inner_of_frame
+from sdfsim.simulate.steppers import Frames
 
 # Model units of time, about seconds for bodies of a metre: length and spacing of short windows, length of long ones.
 WINDOW, EVERY, LONG = 0.15, 0.06, 1.85
@@ -199,10 +199,6 @@ class Problem:
         if any(r.dt == 0.0 for r in recordings):
             raise SdfsimError("a recording is a single frame")
 
-    def windows(self, length: float, begin: Sequence[tuple[int, int]]) -> Windows:
-        """Windows of `length` model times, which begin in these recordings at these frames."""
-        return Windows(self, length, begin)
-
     def short(self, chosen: Sequence[int]) -> Windows:
         """The short windows of these recordings in which something touches; the parameters are those of their pairs."""
         begin = []
@@ -215,14 +211,14 @@ class Problem:
         if not begin:
             told = "give longer ones, of more frames a second"
             raise SdfsimError("the recordings are too short, or nowhere smooth", told)
-        windows = self.windows(WINDOW, begin[:: -(-len(begin) // (2 * MOST))])
+        windows = Windows(self, WINDOW, begin[:: -(-len(begin) // (2 * MOST))])
         touched = windows.touched()
         if not touched and not self.joints:
             raise SdfsimError("nothing touches in the recordings", "friction and restitution show in contacts only")
         self._choose(touched)
         # Joints act all the time.
         rows = range(len(windows.begin)) if self.joints else sorted({w for w, *_ in touched})
-        return self.windows(WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
+        return Windows(self, WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
 
     def whole(self, chosen: Sequence[int]) -> Windows:
         """Long windows that follow each other through these recordings, from the first frame at which velocities are
@@ -237,7 +233,7 @@ class Problem:
                     break
                 begin.append((k, t))
                 t += max(4, round(frames))
-        return self.windows(LONG, begin)
+        return Windows(self, LONG, begin)
 
     def _choose(self, touched: list[tuple[int, int, int, np.ndarray, bool]]) -> None:
         many = len(self.moving)
@@ -305,14 +301,6 @@ class Problem:
         if joint.kind in ("hinge", "ball"):
             return body.mass * pull * size / rate
         return body.mass * pull / (rate * size if kind == "joint_damping" else 1.0)
-
-    def row(self, body: int, window: int, windows: int) -> int:
-        """Where a body of the scene is in so many windows side by side; -1 for the world."""
-        if body < 0:
-            return -1
-        moves = self.scene.bodies[body].motion == "dynamic"
-        before = sum((b.motion == "dynamic") == moves for b in self.scene.bodies[:body])
-        return window * len(self.moving) + before if moves else windows * len(self.moving) + before
 
     def inertia_factor(self, body: int) -> float:
         """The scene's, of a moving body."""
@@ -405,7 +393,8 @@ def _groups(frames: np.ndarray, every: int) -> list[np.ndarray]:
 
 
 class Windows:
-    """Windows of recordings, side by side as a few sets of bodies, one a core; each window is a world of its own."""
+    """Windows of `length` model times, which begin in these recordings at these frames, side by side as a few sets of
+    bodies, one a core; each window is a world of its own."""
 
     def __init__(self, problem: Problem, length: float, begin: Sequence[tuple[int, int]]) -> None:
         self.problem, parts = problem, []
@@ -480,25 +469,13 @@ class _Part:
         ends = [min(self.length, len(r.known) - 1 - t) for r, (_, t) in zip(some, begin, strict=True)]
         self.length = max(ends)
         many, count = len(problem.moving), len(begin)
-        joints = tuple(
-            replace(j, name=f"{j.name} {w}", bodies=tuple(problem.row(b, w, count) for b in j.bodies))
-            for w in range(count)
-            for j in problem.joints
-        )
-        bodies = tuple([*problem.moving] * count + problem.fixed)
-        whole = replace(problem.scene, bodies=bodies, joints=joints)
-        world = [*np.repeat(np.arange(count), many), *[-1] * len(problem.fixed)]
-        self.bodies, start = side_by_side(whole, world, u)
+        copies = Copies(problem.scene, count)
+        self.bodies, self.solver = copies.bodies, copies.solver
         first = [
-            np.concatenate([getattr(r, name)[t] for r, (_, t) in zip(some, begin, strict=True)])
-            for name in ("position", "orientation", "velocity", "angular_velocity")
+            np.concatenate([getattr(r, name)[t] for r, (_, t) in zip(some, begin, strict=True)]) for name in MOTION
         ]
-        self.start = placed(start, first[0] / u.length, first[1], first[2] / u.velocity, first[3] * u.time)
-        if self.bodies.joints is not None:
-            known = initial(self.bodies.joints, self.start.position, self.start.orientation)
-            self.start = replace(self.start, joints=known)
-        inner = max(1, math.ceil(dt / (STEP / SUBSTEPS) - 0.01))
-        self.options = Options(np.asarray(problem.scene.gravity) / u.acceleration, dt, inner)
+        self.start = copies.begun(*first)
+        self.options = Options(np.asarray(problem.scene.gravity) / u.acceleration, dt, inner_of_frame(dt))
         self.goal = np.full((self.length, count, many, 7), np.nan)
         for w, (r, (_, t), n) in enumerate(zip(some, begin, ends, strict=True)):
             rows = slice(t + 1, t + 1 + n)
@@ -506,7 +483,6 @@ class _Part:
             self.goal[:n, w] = np.where(r.seen[rows][..., None], both, np.nan)
         self.shape = (self.length, count, many, 6)
         self.size = self.bodies.size[:many].copy()
-        self.solver = stepper_of(load_model())
         self.carry = self.solver.init(self.bodies, self.start, self.options)
 
     def frames(self, values: np.ndarray) -> Frames:
@@ -529,7 +505,7 @@ class _Part:
         """See `Windows.touched`. Inner steps one by one: what rebounds is away again at the end of a frame."""
         many, total, inner = self.shape[2], self.shape[1] * self.shape[2], self.options.substeps
         there = np.asarray(~np.isnan(self.goal[..., 0]).all(-1))
-        fine = replace(self.options, dt=self.options.dt / inner, substeps=1)
+        fine = self.options._replace(dt=self.options.dt / inner, substeps=1)
         state, carry = self.start, self.solver.init(self.bodies, self.start, fine)
         pull = self.options.dt * self.options.gravity
         found: dict[tuple[int, int, int], list[np.ndarray]] = {}
@@ -648,7 +624,7 @@ def repeated(recordings: Sequence[Recording], scene: Scene, frames: int) -> tupl
     """How the solve moves a scene from where recordings begin: positions [K, T, D, 3] m of the centres of mass, and
     orientations [K, T, D, 4], in the `frames` T that follow the first of each."""
     problem = Problem(recordings, scene)
-    windows = problem.windows(frames * recordings[0].dt / problem.units.time, [(k, 0) for k in range(len(recordings))])
+    windows = Windows(problem, frames * recordings[0].dt / problem.units.time, [(k, 0) for k in range(len(recordings))])
     found = []
     for part in windows.parts:
         _, count, many, _ = part.shape
@@ -898,3 +874,52 @@ def _set(mapping: Any, key: str, value: Any) -> None:
 
 def _rounded(value: Any) -> Any:
     return [_rounded(v) for v in value] if isinstance(value, list) else float(f"{value:.9g}")
+
+
+# --- the picture beside the scene: the loss against each parameter ---
+
+ACROSS = 4  # panels in a row
+PANEL = (3.0, 2.2)  # inches
+
+
+def picture(found: Identified, path: Path) -> str:
+    """Write a panel for every parameter as a PNG: the loss with the others fitted again, and the interval of 95 %.
+    Returns what to install where matplotlib is not, else nothing."""
+    try:
+        plots = pyplot()
+    except NotInstalled as error:
+        return f"{error.message}: {error.hint}"
+    across = min(ACROSS, max(1, len(found.profiles)))
+    down = max(1, math.ceil(len(found.profiles) / across))
+    figure, axes = plots.subplots(
+        down, across, figsize=(PANEL[0] * across, PANEL[1] * down), layout="constrained", squeeze=False
+    )
+    for axis in axes.flat[len(found.profiles) :]:
+        axis.axis("off")
+    for axis, profile in zip(axes.flat, found.profiles, strict=False):
+        shown = profile.interval is not None
+        if profile.interval is not None:
+            axis.axvspan(*profile.interval, color="tab:blue", alpha=0.15, linewidth=0)
+        axis.plot(profile.x, profile.loss, "o-", markersize=3, linewidth=1.2, color="tab:blue" if shown else "0.6")
+        axis.axvline(profile.value, color="0.4", linewidth=0.8, linestyle=":")
+        # What is flat looks flat: the scale holds a tenth of the loss at least.
+        low, high = axis.get_ylim()
+        axis.set_ylim(min(low, 0.99), max(high, 1.1))
+        axis.set_title(title(profile), fontsize=8, color="black" if shown else "0.4")
+        axis.set_xlabel(profile.unit.strip() or "no unit", fontsize=7)
+        axis.set_ylabel("loss over the best", fontsize=7)
+        axis.tick_params(labelsize=7)
+        axis.grid(alpha=0.3)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=110, format="png")
+    plots.close(figure)
+    return ""
+
+
+def title(profile: Profile) -> str:
+    head = f"{HEADS[profile.kind]}: {profile.name}"
+    if profile.interval is None:
+        return f"{head}\nnot shown by these recordings"
+    digits = 4 if profile.unit == " m" or profile.kind.startswith("joint") else 3
+    low, high = (f"{end:.{digits}f}" for end in profile.interval)
+    return f"{head}\n{profile.value:.{digits}f}{profile.unit} ({low} to {high})"

@@ -1,7 +1,6 @@
 """MJCF -> links and joints, as `robot` turns them into a scene. MuJoCo itself reads the file: its compiler knows all
 defaults, frames, inertias and includes, and what it refuses is no MJCF."""
 
-import importlib
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, named, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
+from sdfsim.base.lazy import optional
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
 
@@ -37,10 +37,7 @@ def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
     """The bodies and joints of an MJCF file, as they are in the keyframe `key`, or else in one called start, or as the
     file draws them. Raises SdfsimError where MuJoCo is not installed or refuses the file, for no such keyframe, or for
     geometry that no body can have."""
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError as error:
-        raise SdfsimError("mujoco is not installed: it reads MJCF", "pip install 'sdfsim[mjcf]'") from error
+    mujoco = optional("mujoco", "mujoco", "mjcf")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, RuntimeError) as error:

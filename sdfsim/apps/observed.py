@@ -1,8 +1,6 @@
 """Recorded motions of a scene as trackers and runs give them: read, cleaned of what trackers do, and the velocities
 that fits through smooth stretches tell."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Sequence
@@ -94,9 +92,7 @@ def load_recordings(
             )
             scene = scene or own
             rows = [k for k, b in enumerate(own.bodies) if b in movers(own)]
-            place, turn, speed, spin = (
-                getattr(rollout, n)[:, rows] for n in ("position", "orientation", "velocity", "angular_velocity")
-            )
+            place, turn, speed, spin = (getattr(rollout, name)[:, rows] for name in MOTION)
             dt, sure = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0, np.ones(place.shape[:2], bool)
             found.append(Recording(str(file), dt, place, turn, speed, spin, sure[:, 0], ~sure, sure, (place, turn)))
         elif scene is None:

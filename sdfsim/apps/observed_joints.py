@@ -1,8 +1,5 @@
 """Recordings of scenes with joints: poses and velocities that these allow, near those that were seen."""
 
-from __future__ import annotations
-
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
@@ -10,15 +7,12 @@ from typing import cast
 import numpy as np
 
 from sdfsim.apps.export_joints import Held, trees
-from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
-from sdfsim.physics.joints import initial
-from sdfsim.physics.options import STEP, SUBSTEPS, Options
+from sdfsim.physics.options import Options
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
-from sdfsim.simulate.batch import placed, side_by_side
+from sdfsim.simulate.batch import Copies, inner_of_frame
 from sdfsim.simulate.steppers import Frames as Moved
-from sdfsim.simulate.steppers import stepper_of
 
 ROUNDS = 5  # of Gauss and Newton, for the flight of a tree
 BEGIN = 8  # frames of a flight that tell where its fit begins
@@ -221,23 +215,12 @@ def _centred(arrays: Sequence[np.ndarray], scene: Scene, share: np.ndarray) -> F
 
 def _flown(begun: tuple[np.ndarray, ...], dt: float, frames: int, scene: Scene) -> list[np.ndarray]:
     """[F, P, T, D, *] poses and velocities of flights [F, P, D, *] from their starts on, these first."""
-    u, shape = scene_units(scene), begun[0].shape[:2]
-    count, many = shape[0] * shape[1], len(scene.bodies)
-    joints = tuple(
-        replace(j, name=f"{j.name} {w}", bodies=(w * many + j.bodies[0], w * many + j.bodies[1]))
-        for w in range(count)
-        for j in scene.joints
-    )
-    whole = replace(scene, bodies=tuple([*scene.bodies] * count), joints=joints)
-    bodies, state = side_by_side(whole, np.repeat(np.arange(count), many).tolist(), u)
-    place, turn, speed, spin = (array.reshape(count * many, -1) for array in begun)
-    state = placed(state, place / u.length, turn, speed / u.velocity, spin * u.time)
-    if bodies.joints is not None:
-        state = replace(state, joints=initial(bodies.joints, state.position, state.orientation))
-    step = dt / u.time
-    options = Options(np.zeros(3), step, max(1, math.ceil(step / (STEP / SUBSTEPS) - 0.01)))
-    solver = stepper_of(load_model())
-    _, carry = solver.advance(state, solver.init(bodies, state, options), frames, keep=True)
+    count, many = begun[0].shape[0] * begun[0].shape[1], len(scene.bodies)
+    copies = Copies(scene, count)
+    u, solver, step = copies.units, copies.solver, dt / copies.units.time
+    state = copies.begun(*(array.reshape(count * many, -1) for array in begun))
+    options = Options(np.zeros(3), step, inner_of_frame(step))
+    _, carry = solver.advance(state, solver.init(copies.bodies, state, options), frames, keep=True)
     moved = cast("Moved", carry.frames)
     kept = (moved.position * u.length, moved.orientation, moved.velocity * u.velocity, moved.angular_velocity / u.time)
     paths = []

@@ -166,14 +166,8 @@ def write_scene(
         quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
         turned = {} if abs(quat[3]) > 1 - 1e-15 else {"quat_xyzw": _round(quat)}
         touched = {} if others is None else {"avoids": others} if others else {"collides_with": []}
-        entry: dict[str, Any] = {
-            **keys,
-            "position": _round(pose[:3, 3] + lift),
-            **turned,
-            **motion,
-            **surface,
-            **touched,
-        }
+        at = _round(pose[:3, 3] + lift)
+        entry: dict[str, Any] = {**keys, "position": at, **turned, **motion, **surface, **touched}
         scene.add(link.name, **entry)
     for joint in whole.joints:
         _join(scene, joint, names, lift)

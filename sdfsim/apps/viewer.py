@@ -1,7 +1,5 @@
 """The rerun viewer: live streams, recordings on disk, and pictures taken without a screen."""
 
-from __future__ import annotations
-
 import atexit
 import os
 import signal

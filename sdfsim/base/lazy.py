@@ -1,7 +1,10 @@
-"""Torch, imported on first use: simulations with the solver alone never import it."""
+"""Packages that are imported on first use: torch, which simulations with the solver alone never need, and those of
+extras."""
 
 import importlib
 from typing import Any
+
+from sdfsim.base.errors import SdfsimError
 
 
 class _Torch:
@@ -12,3 +15,21 @@ class _Torch:
 
 
 torch = _Torch()
+
+
+class NotInstalled(SdfsimError):
+    """A package of an extra is not there."""
+
+
+def optional(module: str, title: str, extra: str) -> Any:
+    """A module of a package that an extra brings. Raises NotInstalled."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise NotInstalled(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
+
+
+def pyplot() -> Any:
+    """That of matplotlib, drawing into files. Raises NotInstalled."""
+    optional("matplotlib", "matplotlib", "bench").use("Agg")
+    return importlib.import_module("matplotlib.pyplot")

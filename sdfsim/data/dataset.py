@@ -166,14 +166,9 @@ def home_of(data: Path) -> Path | None:
 class Conditions:
     """How a dataset was recorded, by its `dataset.json`."""
 
-    friction: float  # friction, restitution: of the floor
-    restitution: float
+    floor: tuple[float, float]  # its friction and restitution
     floor_given: bool  # whether a dataset.json has these; else they are those of the recipes' floor
     by_teacher: bool  # whether a dataset.json names PyBullet as the teacher has it set
-
-    @property
-    def floor(self) -> tuple[float, float]:
-        return self.friction, self.restitution
 
 
 def conditions_of(data: Path) -> Conditions:
@@ -182,7 +177,7 @@ def conditions_of(data: Path) -> Conditions:
     home = home_of(data)
     info = read_info(home) if home else {}
     floor = floor_of(info, home or data)
-    return Conditions(*floor, floor_given=info.get("floor") is not None, by_teacher=set_as_teacher(info))
+    return Conditions(floor, floor_given=info.get("floor") is not None, by_teacher=set_as_teacher(info))
 
 
 def floor_of(info: dict, folder: Path = Path()) -> tuple[float, float]:

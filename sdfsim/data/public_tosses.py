@@ -5,8 +5,6 @@ Both were tossed onto a table and tracked at 148 Hz by the DAIR Lab of the Unive
 `contactnets-elbow`, two printed links on a hinge, with that of dair_pll (Bianchini, Halm and Posa 2023).
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 from collections.abc import Sequence
@@ -54,12 +52,12 @@ SETS = {
 }  # fmt: skip
 CUBE = """version: 1
 model: solver
-effects: {sleep: off}
-gravity: [0, 0, -9.81]
-shapes: {cube: {box: {size: [0.1048, 0.1048, 0.1048]}}}
+effects: {{sleep: off}}
+gravity: [0, 0, {gravity}]
+shapes: {{cube: {{box: {{size: [0.1048, 0.1048, 0.1048]}}}}}}
 bodies:
-  - {name: table, plane: {}, friction: 1, restitution: 1}
-  - {name: cube, shape: cube, position: [0, 0, 0.2], mass: 0.37, inertia_factor: 1.196}
+  - {{name: table, plane: {{}}, friction: 1, restitution: 1}}
+  - {{name: cube, shape: cube, position: [0, 0, 0.2], mass: 0.37, inertia_factor: {factor}}}
 """
 # The gravity is that with which the recorded elbows fall, so that lengths and times agree.
 ELBOW = """version: 1
@@ -107,8 +105,8 @@ def _tensor(content: bytes) -> np.ndarray:
 def _cube(files: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], str]:
     """Of rows [1, T, 19]: place in half sides, quaternion wxyz, velocities."""
     rows = [file.reshape(-1, 19) for file in files]
-    poses = np.concatenate(rows)
-    return _arrays([len(r) for r in rows], UNIT * poses[:, None, :3], poses[:, None, [4, 5, 6, 3]], ["cube"]), CUBE
+    poses, scene = np.concatenate(rows), CUBE.format(gravity=-9.81, factor=1.196)
+    return _arrays([len(r) for r in rows], UNIT * poses[:, None, :3], poses[:, None, [4, 5, 6, 3]], ["cube"]), scene
 
 
 def _elbow(files: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], str]:

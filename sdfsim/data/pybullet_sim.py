@@ -11,6 +11,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
+from sdfsim.base.lazy import optional
 
 TEACHER_VERSION = 2  # written to `dataset.json`; datasets of another version are refused
 RATES = {50: 5, 60: 4}  # recorded frames a second -> inner steps in one
@@ -52,12 +53,8 @@ class TeacherBody:
 
 
 def import_pybullet():
-    """The `pybullet` module. Raises SdfsimError when the `data` extra is not installed."""
-    try:
-        import pybullet
-    except ImportError as error:
-        raise SdfsimError("PyBullet is not installed", "pip install 'sdfsim[data]'") from error
-    return pybullet
+    """The `pybullet` module. Raises NotInstalled."""
+    return optional("pybullet", "PyBullet", "data")
 
 
 def write_urdf(geometry: str, path: Path) -> Path:

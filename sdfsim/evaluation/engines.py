@@ -1,14 +1,14 @@
-"""PyBullet (the teacher) and MuJoCo, run from one start: of a recording, or of a scene.
+"""PyBullet (the teacher) and MuJoCo, run from one start, of a recording or of a scene; and scenes run by them or by us.
 
 Both take convex pieces, MuJoCo also a mesh as an SDF (its own octree). Spheres, boxes, cylinders and capsules are
 exact.
 """
 
-import importlib
 import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +17,26 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
+from sdfsim.base.lazy import NotInstalled, optional
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_urdf
 from sdfsim.data.shape_assets import decompose
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
+from sdfsim.learned.model import SOLVER, Model
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.motion import MOTION
+from sdfsim.physics.rollout import Rollout, join
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape, own_pieces
+from sdfsim.simulate.simulator import SimulationError, Simulator
 
 SAME_INERTIA = 1e-3  # relative
 SOFTEST = 3.0  # MuJoCo: period of a contact's spring over 2 pi, in steps of the engine; stable from 2 on
 LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
 SI = Units(1.0, 1.0, 1.0)
-
-
-class NotInstalled(SdfsimError):
-    """An engine, or a package that it needs for a shape, is not installed."""
 
 
 class TooSlow(SdfsimError):
@@ -177,7 +177,7 @@ def mujoco(
     Raises:
         SdfsimError: MuJoCo is not installed, a shape's engine file cannot be read, or the motion is unstable.
     """
-    engine = engine_module("mujoco", "MuJoCo", "bench")
+    engine = optional("mujoco", "MuJoCo", "bench")
     t, step, spec = start.motion, start.motion.dt / substeps, engine.MjSpec()
     spec.option.timestep, spec.option.gravity = step, t.gravity
     spec.memory = 2**31
@@ -239,14 +239,6 @@ def mujoco(
             raise SdfsimError("MuJoCo found the motion unstable and reset it")
 
     return engine_motion(t, steps, advance, state)
-
-
-def engine_module(module: str, title: str, extra: str) -> Any:
-    """An optional package. Raises NotInstalled."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise NotInstalled(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
 
 
 def engine_motion(
@@ -336,3 +328,96 @@ def form_of(urdf: Path) -> tuple[str, np.ndarray]:
         return "mesh", np.zeros(0)
     sizes = " ".join(re.findall(r'"([^"]*)"', found[2]))
     return found[1], np.array(sizes.split(), dtype=float)
+
+
+# --- runs: a scene by a model of ours or by an engine, with the same record ---
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A motion of a scene, up to its last good state."""
+
+    scene: Scene
+    rollout: Rollout  # SI units; an engine's has no contacts and no counters
+    broke: str = ""  # why it ended early
+
+    @property
+    def time(self) -> np.ndarray:
+        """[T] s."""
+        return self.rollout.time
+
+    @cached_property
+    def motion(self) -> Trajectory:
+        """The bodies that are not planes as a recording; shapes are named by their index in the scene."""
+        solid = solid_bodies(self.scene)
+        frames = {name: getattr(self.rollout, name)[:, solid] for name in MOTION}
+        return replace(start_motion(self.scene), **frames, dt=float(self.rollout.meta["dt"]))
+
+    @property
+    def path(self) -> np.ndarray:
+        """[T, M, 3] m, positions of the dynamic bodies."""
+        return self.motion.position[:, ~self.motion.static]
+
+
+Runner = Callable[[Scene, float], Ran]  # runs a scene for so many seconds
+
+
+def by_model(scene: Scene, seconds: float, model: str | Model = SOLVER, device: str = "cpu") -> Ran:
+    try:
+        return Ran(scene, Simulator(scene, model, device).run(seconds))
+    except SimulationError as error:
+        return Ran(scene, error.rollout, error.message)
+
+
+def by_engine(scene: Scene, seconds: float, engine: Engine, folder: Path, units: Units = SI) -> Ran:
+    """An engine's motion of a scene, which it runs in `units`, with its files in `folder`; its bodies never sleep.
+    Where the motion fails they stay where they started.
+
+    Raises:
+        SdfsimError: see `start_of_scene`. NotInstalled, TooSlow.
+    """
+    start = start_of_scene(scene, folder, units)
+    try:
+        motion, _ = engine(start, max(1, round(seconds / (DT * units.time))))
+    except (NotInstalled, TooSlow):
+        raise
+    except SdfsimError as error:
+        return still(scene, seconds, error.message)
+    if not (np.isfinite(motion.position).all() and np.isfinite(motion.velocity).all()):
+        return still(scene, seconds, "a position is not finite")
+    return Ran(scene, scene_rollout(scene, motion, units))
+
+
+def still(scene: Scene, seconds: float, broke: str = "") -> Ran:
+    """A run in which all bodies stay where they started: what is judged where there is no motion."""
+    first = Simulator(scene, SOLVER).initial_rollout()
+    return Ran(scene, join([first, replace(first, time=first.time + seconds)]), broke)
+
+
+def scene_rollout(scene: Scene, motion: Trajectory, units: Units = SI) -> Rollout:
+    """An engine's motion from a `start_of_scene` in `units` as a rollout of the scene in SI units, without contacts."""
+    steps, solid = len(motion.position), solid_bodies(scene)
+    arrays: dict[str, Any] = {}
+    planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
+    for name, values in units.in_si(motion).items():
+        arrays[name] = np.zeros((steps, len(solid), values.shape[2]))
+        arrays[name][:, solid] = values
+    for k, plane in zip(np.flatnonzero(~solid), planes, strict=True):
+        arrays["position"][:, k], arrays["orientation"][:, k] = plane.position, plane.quat_xyzw
+        arrays["position"][:, solid, 2] += plane.position[2]
+    dt = float(motion.dt) * units.time
+    return Rollout(
+        time=dt * np.arange(steps),
+        **arrays,
+        contact_count=np.zeros(steps, np.int64),
+        contact_point=np.zeros((0, 3)),
+        contact_body=np.zeros((0, 2), np.int64),
+        names=tuple(b.name for b in scene.bodies),
+        meta={"dt": dt},
+    )
+
+
+def timed_rollout(simulator: Simulator, steps: int) -> tuple[Rollout, Timing]:
+    frames: list[Rollout] = []
+    timing = timed(lambda count: frames.extend(simulator.frames(count)), steps)
+    return join(frames), timing

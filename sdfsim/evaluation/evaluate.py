@@ -97,6 +97,7 @@ def evaluate(
         starts = load_recorded(data, split, as_recorded=True)[0]
         again = teacher_again(data, starts, longest)
     substep, conditions = engine_substep(data), conditions_of(data)
+    friction, restitution = conditions.floor
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
     scenes, seconds = [scene_of([t], [0], shapes, conditions.floor)[0] for t in recorded], 0.0
@@ -128,11 +129,7 @@ def evaluate(
         "steps": longest,
         "steps_asked": steps,
         "engine_substep": substep,
-        "floor": {
-            "friction": conditions.friction,
-            "restitution": conditions.restitution,
-            "told": conditions.floor_given,
-        },
+        "floor": {"friction": friction, "restitution": restitution, "told": conditions.floor_given},
         "as_teacher": conditions.by_teacher,
         "inner_steps": used.inner or inner,
         "outside_training": stepper.unknown(scenes, model_units(stepper, recorded[0])),

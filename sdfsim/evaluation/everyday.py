@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.evaluation import runs
-from sdfsim.evaluation.runs import Runner, by_model
+from sdfsim.evaluation import engines
+from sdfsim.evaluation.engines import Runner, by_model
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, convex_hull, joined
 from sdfsim.physics.instruments import DEEP, MADE, Verdict, energies, judged, placed, solid_of
@@ -189,7 +189,7 @@ def floor() -> Put:
 
 
 @dataclass(frozen=True)
-class Ran(runs.Ran):
+class Ran(engines.Ran):
     """A motion, turned back by the setting's yaw, and checks of it."""
 
     at: Setting = Setting()

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import visible
 from sdfsim.data.scenarios import steady_faces
+from sdfsim.evaluation.engines import Ran, by_model
 from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
-from sdfsim.evaluation.runs import Ran, by_model
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 from sdfsim.geometry.primitives import BOWL_WALL, bowl_radii
 from sdfsim.learned.model import Model

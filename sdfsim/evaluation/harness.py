@@ -18,6 +18,7 @@ import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import digest, read_json, replacing, write_json
+from sdfsim.base.lazy import pyplot
 from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.base.version import __version__
 
@@ -160,10 +161,10 @@ class Panel:
 
 
 def draw(panels: Sequence[Panel], path: Path, *, size: tuple[float, float] = (3.3, 2.5)) -> None:
-    """Write panels of `size` inches in a row as a PNG. Raises SdfsimError when matplotlib is not installed."""
-    pyplot = check_matplotlib()
+    """Write panels of `size` inches in a row as a PNG. Raises NotInstalled."""
     across, up = size
-    figure, axes = pyplot.subplots(1, len(panels), figsize=(across * len(panels), up), layout="constrained")
+    plots = pyplot()
+    figure, axes = plots.subplots(1, len(panels), figsize=(across * len(panels), up), layout="constrained")
     names = list(dict.fromkeys(line.name for panel in panels for line in panel.lines))
     for axis, panel in zip(np.atleast_1d(axes), panels, strict=True):
         for line in panel.lines:
@@ -172,7 +173,7 @@ def draw(panels: Sequence[Panel], path: Path, *, size: tuple[float, float] = (3.
             axis.errorbar(line.x, line.y, yerr=line.noise, fmt=marker, capsize=2, **style)
         for letter in panel.log:
             getattr(axis, f"set_{letter}scale")("log")
-            getattr(axis, f"{letter}axis").set_minor_formatter(pyplot.matplotlib.ticker.LogFormatter())
+            getattr(axis, f"{letter}axis").set_minor_formatter(plots.matplotlib.ticker.LogFormatter())
         if panel.limit:
             axis.axhline(panel.limit, color="tab:red", linewidth=0.8, linestyle=":")
         axis.set_title(panel.title, fontsize=8)
@@ -184,19 +185,7 @@ def draw(panels: Sequence[Panel], path: Path, *, size: tuple[float, float] = (3.
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
         figure.savefig(partial, dpi=100, format="png")
-    pyplot.close(figure)
-
-
-def check_matplotlib() -> Any:
-    """matplotlib's pyplot, drawing into files. Raises SdfsimError when it is not installed."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise SdfsimError("the plots need matplotlib", "pip install 'sdfsim[bench]'") from error
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
+    plots.close(figure)
 
 
 @contextmanager

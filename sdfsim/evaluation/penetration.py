@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import Trajectory
-from sdfsim.evaluation.engines import dataset_urdf
-from sdfsim.evaluation.runs import Ran
+from sdfsim.evaluation.engines import Ran, dataset_urdf
 from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.sdf.grid import GridSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf

@@ -17,10 +17,9 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.base.version import __version__
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
-from sdfsim.evaluation.engines import Engine, TooSlow, bullet, shape_urdf
+from sdfsim.evaluation.engines import Engine, Ran, TooSlow, bullet, by_engine, by_model, shape_urdf, still
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
-from sdfsim.evaluation.runs import Ran, by_engine, by_model, still
 from sdfsim.learned.model import Model, load_model, sound_models
 from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.physics.instruments import judged
@@ -45,22 +44,16 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Study:
-    """All results of the hard cases.
-
-    Attributes:
-        models: their names.
-        engines: their names; the teacher where PyBullet is installed.
-        results: (case, who) -> figures (name -> a value a repetition); lines of broke, outside and laws (which a motion
-            of ours breaks, by instruments that do not use the solve); recording (a path in the folder, or None). There
-            is no entry where a model or engine does not take part in a case.
-        quick: whether it is the short form.
-    """
+    """All results of the hard cases."""
 
     cases: list[Case]
     models: list[str]
-    engines: list[str]
+    engines: list[str]  # the teacher where PyBullet is installed
+    # (case, who) -> figures (name -> a value a repetition); lines of broke, outside and laws (which a motion of ours
+    # breaks, by instruments that do not use the solve); recording (a path in the folder, or None). There is no entry
+    # where a model or engine does not take part in a case.
     results: Results
-    quick: bool
+    quick: bool  # whether it is the short form
 
     @property
     def who(self) -> list[str]:

@@ -224,7 +224,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
-def joined(meshes: Sequence[Mesh] | Sequence[Any]) -> Mesh:
+def joined(meshes: Sequence[Any]) -> Mesh:
     """Several meshes, or whatever has vertices and faces as they do, as one, without colours."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]

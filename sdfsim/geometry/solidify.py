@@ -352,7 +352,7 @@ def exposed(corners: np.ndarray, side: Side) -> tuple[np.ndarray, np.ndarray]:
         centres, normals = centres_and_normals(corners)
         verdict = side(centres, normals)
         decided = np.ones(len(corners), dtype=bool)
-        large = np.flatnonzero(_longest(corners) > FINE)
+        large = np.flatnonzero(_sides(corners).max(1) > FINE)
         tests = np.einsum("kc,fci->fki", weights, corners[large, :, :3])
         others = side(tests.reshape(-1, 3), np.repeat(normals[large], len(weights), axis=0))
         decided[large] = (others.reshape(-1, len(weights)) == verdict[large, None]).all(1)
@@ -373,7 +373,7 @@ def no_longer_than(corners: np.ndarray, length: float) -> np.ndarray:
     """The triangles, halved until no edge is longer than `length`."""
     done = []
     while len(corners):
-        short = _longest(corners) <= length
+        short = _sides(corners).max(1) <= length
         done.append(corners[short])
         corners = _cut(corners[~short], length)
     return np.concatenate(done)
@@ -382,7 +382,7 @@ def no_longer_than(corners: np.ndarray, length: float) -> np.ndarray:
 def _cut(corners: np.ndarray, length: float) -> np.ndarray:
     """Smaller triangles. Needles become strips across, as many as halving would make of their long edges in the end:
     halves of halves would be three for each of two strips. Edges are cut at the same places by either way."""
-    sides = np.linalg.norm(np.roll(corners, -1, axis=1)[..., :3] - corners[..., :3], axis=2)
+    sides = _sides(corners)
     # How often an edge must be halved; those of needles all but one more than once, and equally often.
     times = np.ceil(np.log2(np.maximum(sides / length, 1.0))).astype(np.int64)
     foot = times.argmin(1)
@@ -402,14 +402,12 @@ def _cut(corners: np.ndarray, length: float) -> np.ndarray:
 
 def _halved(corners: np.ndarray) -> np.ndarray:
     """Cut triangles [F, 3, 3 + K] across their longest edge, so that slivers do not become many: [2 F, 3, 3 + K]."""
-    lengths = np.linalg.norm(np.roll(corners, -1, axis=1)[..., :3] - corners[..., :3], axis=2)
-    turn = (lengths.argmax(1)[:, None] + np.arange(3)) % 3
+    turn = (_sides(corners).argmax(1)[:, None] + np.arange(3)) % 3
     a, b, c = np.moveaxis(np.take_along_axis(corners, turn[..., None], axis=1), 1, 0)
     middle = (a + b) / 2
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
 
 
-def _longest(corners: np.ndarray) -> np.ndarray:
-    """[F] longest edges of triangles [F, 3, 3 + K]."""
-    points = corners[..., :3]
-    return np.linalg.norm(points - np.roll(points, 1, axis=1), axis=2).max(1)
+def _sides(corners: np.ndarray) -> np.ndarray:
+    """[F, 3] lengths of the edges of triangles [F, 3, 3 + K]."""
+    return np.linalg.norm(np.roll(corners, -1, axis=1)[..., :3] - corners[..., :3], axis=2)

@@ -4,8 +4,6 @@ Everything a network sees is a scalar in an edge's frame, made dimensionless by 
 the prediction turns with the scene and does not depend on the choice of units.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -5,8 +5,6 @@ features of SDF-Sim's nodes, contact edges reach farther by what their ends clos
 floor is one node below whatever is near it. The papers of the baselines do otherwise, or do not say.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -22,8 +22,6 @@ with the same).
 `families.py` lists what else is not as in the networks' own papers.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -9,8 +9,6 @@ The rounds start from what the solve makes of the step, and what they add is hel
 This form is for training and to be read. `kernels.impulse` is the same, compiled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import cast

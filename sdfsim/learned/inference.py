@@ -1,7 +1,5 @@
 """The *impulse* network in a simulation: the graph of a solved step, and the step with what the network adds."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 
 import numpy as np

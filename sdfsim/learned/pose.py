@@ -1,8 +1,6 @@
 """Rotations as unit quaternions (xyzw) in torch, for networks: batched over leading dimensions, in the dtype they are
 given. `sdfsim.physics.pose` is the same in NumPy."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Bodies and their state as torch tensors, on the device of a network on surface nodes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 

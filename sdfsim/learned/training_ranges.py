@@ -1,7 +1,5 @@
 """Where scenes leave what a model has seen in training: its predictions are then extrapolation, and are flagged."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 

@@ -99,26 +99,8 @@ def sample_grid(
     places over a cube 1.4 times as wide as the solid. With `coarse` above 1 (it divides `resolution` - 1) only blocks
     of so many cells a side that the surface may cross are sampled in full, others at their corners and trilinear
     between. Raises SdfsimError for fewer than two samples a side, or bounds without extent or not finite."""
-    if coarse > 1:
-        return _sample_near(distance, bounds, resolution, coarse, on_progress)
     if resolution < 2:
         raise SdfsimError(f"a grid needs at least two samples along each side (got {resolution})")
-    frame = normal_frame(bounds)
-    axis = np.linspace(-BOX, BOX, resolution)
-    values = np.empty((resolution, resolution, resolution), dtype=np.float32)
-    for k, x in enumerate(axis):
-        on_progress(k / resolution, "sampling the distance")
-        found = np.asarray(distance(frame.outward(lattice([x], axis, axis)))[0])
-        values[k] = (found / frame.scale).reshape(resolution, resolution)
-    on_progress(1.0, "sampled")
-    return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
-
-
-def _sample_near(
-    distance: Callable[[np.ndarray], tuple[Any, ...]], bounds: np.ndarray, resolution: int, coarse: int,
-    on_progress: Progress,
-) -> GridSdf:  # fmt: skip
-    """What `sample_grid` does where it samples in full near the surface only."""
     if (resolution - 1) % coarse:
         raise ValueError(f"resolution - 1 must be a multiple of coarse (got {resolution}, {coarse})")
     frame, axis = normal_frame(bounds), np.linspace(-BOX, BOX, resolution)
@@ -126,9 +108,17 @@ def _sample_near(
     def ask(points: np.ndarray) -> np.ndarray:
         return np.asarray(distance(frame.outward(points))[0]) / frame.scale
 
-    # No place of a block is farther from a corner than half of its diagonal; a quarter of a side more for what is near.
-    reach = (0.5 * np.sqrt(3.0) + 0.25) * (axis[coarse] - axis[0])
-    values = near_samples(ask, axis, coarse, reach, on_progress)
+    if coarse > 1:
+        # No place of a block is farther from a corner than half of its diagonal; a quarter of a side more for what is
+        # near.
+        reach = (0.5 * np.sqrt(3.0) + 0.25) * (axis[coarse] - axis[0])
+        values = near_samples(ask, axis, coarse, reach, on_progress)
+    else:
+        values = np.empty((resolution, resolution, resolution), dtype=np.float32)
+        for k, x in enumerate(axis):
+            on_progress(k / resolution, "sampling the distance")
+            values[k] = ask(lattice([x], axis, axis)).reshape(resolution, resolution)
+        on_progress(1.0, "sampled")
     return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
 
 

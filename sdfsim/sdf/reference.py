@@ -110,9 +110,10 @@ class PiecesDistance:
         # Pieces that touch leave seams of no width between them: a hair's breadth outside still counts as inside.
         self._seam = 1e-5 * size
         self._boxes = np.stack([np.stack([piece.vertices.min(0), piece.vertices.max(0)]) for piece in pieces])
-        # [H, 4] outward normals and offsets of each hull; inside is normal . x + offset < 0.
-        hulls = [ConvexHull(piece.vertices) for piece in pieces]
-        self._planes = [unique_planes(hull.equations, size, 9) for hull in hulls]
+        # [H, 4] the outward normals and offsets of each piece's faces, each once; inside is normal . x + offset < 0.
+        unit = np.array([1.0, 1.0, 1.0, size])
+        planes = (ConvexHull(piece.vertices).equations / unit for piece in pieces)
+        self.planes = [np.unique(found.round(9), axis=0) * unit for found in planes]
         self._outside = ClosestPoint(everything)
         self.surface = everything if len(pieces) == 1 else self._boundary(everything, size)
         self._inside = self._outside if len(pieces) == 1 else ClosestPoint(self.surface)
@@ -136,7 +137,7 @@ class PiecesDistance:
             for piece in np.flatnonzero(reach):
                 near = np.flatnonzero(~found & ((block >= low[piece]) & (block <= high[piece])).all(1))
                 if len(near):
-                    planes = self._planes[piece]
+                    planes = self.planes[piece]
                     found[near] = (block[near] @ planes[:, :3].T + planes[:, 3]).max(1) < -margin
             result[some] = found
         return result
@@ -157,13 +158,6 @@ class PiecesDistance:
 
         triangles = exposed(everything.vertices[everything.faces] / size, bare)[0] * size
         return Mesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
-
-
-def unique_planes(equations: np.ndarray, size: float, digits: int) -> np.ndarray:
-    """[H, 4] the different ones of face planes [F, 4], normals and offsets in m, rounded to so many digits; those of
-    the offsets count in the `size` m of the body."""
-    unit = np.array([1.0, 1.0, 1.0, size])
-    return np.unique((equations / unit).round(digits), axis=0) * unit
 
 
 def _in_chunks(ask: Callable[[np.ndarray], Reference], points: np.ndarray) -> Reference:

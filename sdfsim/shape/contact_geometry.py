@@ -17,7 +17,7 @@ from sdfsim.geometry.mesh import Mesh, convex_hull, directed_edges, face_normals
 from sdfsim.sdf.baked_grid import BAKE_VERSION, BakedGrid, baked, interpolated, inwards, surface_samples, unseen_wall
 from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
 from sdfsim.sdf.mlp import MlpSdf
-from sdfsim.sdf.reference import PiecesDistance, unique_planes
+from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
@@ -188,7 +188,7 @@ def patches_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> dic
     low = sdf.bounds[0] - cell
     count = np.ceil((sdf.bounds[1] + cell - low) / cell).astype(int) + 1
     places = lattice(*(low[axis] + cell * np.arange(count[axis]) for axis in range(3)))
-    nearest = _nearest_piece(pieces, np.concatenate([places, nodes]))
+    nearest = _nearest_piece(union, np.concatenate([places, nodes]))
     return {
         "node": np.concatenate([vertices[bare], nodes]),
         "patch": np.concatenate([owner[bare], nearest[len(places) :]]),
@@ -205,15 +205,12 @@ def check_pieces(what: str, pieces: Sequence[np.ndarray]) -> None:
         raise SdfsimError(message, "cut it into fewer ones, or fit its mesh without pieces")
 
 
-def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:
-    """[P] int64: the convex hull whose farthest face plane is least far from a place."""
-    from scipy.spatial import ConvexHull
-
+def _nearest_piece(union: PiecesDistance, places: np.ndarray) -> np.ndarray:
+    """[P] int64: the convex piece whose farthest face plane is least far from a place."""
     least, nearest = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
-    size = float(np.ptp(np.concatenate(pieces), axis=0).max())
-    for k, piece in enumerate(pieces):
+    for k, planes in enumerate(union.planes):
         far = np.full(len(places), -np.inf)
-        for plane in unique_planes(ConvexHull(piece).equations, size, 6):
+        for plane in planes:
             np.maximum(far, places @ plane[:3] + plane[3], out=far)
         nearest[far < least] = k
         np.minimum(least, far, out=least)

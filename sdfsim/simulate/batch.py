@@ -1,12 +1,18 @@
 """Many scenes in one call: each a world of one set of bodies, which never meets the others."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from sdfsim.learned.model import load_model
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
-from sdfsim.scene.scene import Scene
+from sdfsim.physics.joints import initial
+from sdfsim.physics.options import STEP, SUBSTEPS
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.scene import Joint, Scene
+from sdfsim.simulate.steppers import stepper_of
 
 
 def side_by_side(scene: Scene, world: Sequence[int], units: Units) -> tuple[Bodies, State]:
@@ -31,3 +37,37 @@ def placed(
         velocity=of(velocity, state.velocity),
         angular_velocity=of(angular_velocity, state.angular_velocity),
     )
+
+
+class Copies:
+    """`count` copies of the bodies of a scene that move, with their joints, each a world of its own; behind them the
+    static ones, which are in all. `bodies`, as `solver` moves them, are in the scene's `units`."""
+
+    def __init__(self, scene: Scene, count: int) -> None:
+        moving, fixed = ([k for k, b in enumerate(scene.bodies) if b.motion == kind] for kind in ("dynamic", "static"))
+        self.units, self.total = scene_units(scene), count * len(moving)
+
+        def of_world(joint: Joint, w: int) -> Joint:
+            rows = {-1: -1} | {k: w * len(moving) + d for d, k in enumerate(moving)}
+            rows |= {k: self.total + d for d, k in enumerate(fixed)}
+            return replace(joint, name=f"{joint.name} {w}", bodies=(rows[joint.bodies[0]], rows[joint.bodies[1]]))
+
+        held = scene.joints if scene.effects.joints != "off" else ()
+        joints = tuple(of_world(joint, w) for w in range(count) for joint in held)
+        bodies = tuple(scene.bodies[k] for k in [*moving * count, *fixed])
+        world = [*np.repeat(np.arange(count), len(moving)).tolist(), *[-1] * len(fixed)]
+        self.bodies, self.start = side_by_side(replace(scene, bodies=bodies, joints=joints), world, self.units)
+        self.solver = stepper_of(load_model())
+
+    def begun(self, position: np.ndarray, orientation: np.ndarray, velocity: np.ndarray, spin: np.ndarray) -> State:
+        """A start of the bodies that move, [`total`, *] in SI units."""
+        u = self.units
+        state = placed(self.start, position / u.length, orientation, velocity / u.velocity, spin * u.time)
+        if self.bodies.joints is None:
+            return state
+        return replace(state, joints=initial(self.bodies.joints, state.position, state.orientation))
+
+
+def inner_of_frame(dt: float) -> int:
+    """Inner steps of the solve in a recorded step of `dt` model units."""
+    return max(1, math.ceil(dt / (STEP / SUBSTEPS) - 0.01))

@@ -1,7 +1,5 @@
 """The batches of a training run, in the order of its steps: drawn when they are asked for, or ahead by workers."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import time

@@ -181,11 +181,10 @@ def inner_steps(dt: float, substep: float) -> int:
 
 def _fingerprint(files: list[Path], how: Solved) -> str:
     """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are solved."""
-    hashed = hashlib.sha256(f"{FRAMES_VERSION} {how} {[(f.name, f.stat().st_size) for f in files]}".encode())
     info = [home / INFO] if (home := home_of(files[0].parent)) else []
-    for record in (*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))):
-        hashed.update(record.read_bytes())
-    return hashed.hexdigest()[:12]
+    records = [*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))]
+    told = [record.read_text(encoding="utf-8") for record in records]
+    return digest(FRAMES_VERSION, how, [[f.name, f.stat().st_size] for f in files], told)[:12]
 
 
 def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
@@ -203,7 +202,7 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     gravity = np.asarray(group[0].gravity, dtype=np.float64)
     options = Options(gravity, group[0].dt, inner_steps(group[0].dt, substep), record=True)
     if found.by_teacher:
-        options = replace(options, margin=MARGIN, adds=True, cone=False)
+        options = options._replace(margin=MARGIN, adds=True, cone=False)
     solver, moves = stepper_of(load_model()), bodies.moves
     count = min(len(t.position) for t in group)
     parts = []

@@ -1,7 +1,5 @@
 """Several processes or GPUs that train one network, as `torchrun` starts them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

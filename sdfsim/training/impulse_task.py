@@ -1,7 +1,5 @@
 """What training the *impulse* network means: batches of contact frames, and a loss on velocities."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

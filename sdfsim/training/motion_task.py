@@ -7,10 +7,8 @@ through what its changes lead to, free motion and contacts that hold. What the s
 
 from __future__ import annotations
 
-import hashlib
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -19,19 +17,19 @@ import torch
 from torch import Tensor
 
 from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import digest
 from sdfsim.data.dataset import ranges_of
 from sdfsim.learned.contact_graph import ContactGraph, edge_frames, in_single
 from sdfsim.learned.impulse import ImpulseNetwork
 from sdfsim.learned.inference import changed, step_graph
-from sdfsim.learned.model import load_model
 from sdfsim.physics import pose
-from sdfsim.physics.options import GRAVITY, LENGTH, STEP, SUBSTEPS, Options
+from sdfsim.physics.motion import MOTION
+from sdfsim.physics.options import GRAVITY, LENGTH, Options
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.units import scene_units
 from sdfsim.physics.validity import FARTHEST, first_fault
 from sdfsim.scene.scene import Scene
-from sdfsim.simulate.batch import placed, side_by_side
-from sdfsim.simulate.steppers import stepper_of
+from sdfsim.simulate.batch import Copies, inner_of_frame
 from sdfsim.training.distributed import ALONE, Team
 
 if TYPE_CHECKING:
@@ -68,35 +66,22 @@ class Stepped(NamedTuple):
     graph: ContactGraph | None
 
 
-class Worlds:
-    """W copies of the bodies of a scene, each in a world of its own, in the solver's units."""
+class Worlds(Copies):
+    """Copies of the bodies of a scene that steps of a recording, whose frames are `dt` s apart, move."""
 
     def __init__(self, scene: Scene, count: int, dt: float) -> None:
-        """`dt` is the frames' spacing, s."""
-        self.units = scene_units(scene)
-        moving = [b for b in scene.bodies if b.motion == "dynamic"]
-        fixed = [b for b in scene.bodies if b.motion == "static"]
-        whole = replace(scene, bodies=tuple([*moving] * count + fixed))
-        world = [*np.repeat(np.arange(count), len(moving)), *[-1] * len(fixed)]
-        self.bodies, self.start = side_by_side(whole, world, self.units)
-        self.dt = dt / self.units.time
-        self.options = Options(
-            np.asarray(scene.gravity) / self.units.acceleration, self.dt, inner_steps(self.dt), record=True
-        )
-        self.solver = stepper_of(load_model())
+        super().__init__(scene, count)
+        self.dt, pull = dt / self.units.time, np.asarray(scene.gravity) / self.units.acceleration
+        self.options = Options(pull, self.dt, inner_of_frame(self.dt), record=True)
         self.carry = self.solver.init(self.bodies, self.start, self.options)
-        self.total = count * len(moving)
 
     def roll(
         self, network: ImpulseNetwork | None, starts: Starts, steps: int, *, mirrored: bool = False
     ) -> list[Stepped]:
         """What comes of these starts with a network on the solve, or with the solve alone. Bodies that a network has
         thrown to where none can be stay at rest far away, so that errors are large, but numbers."""
-        u, found, lost = self.units, [], np.zeros(self.total, bool)
-        state = placed(
-            self.start, starts.position / u.length, starts.orientation, starts.velocity / u.velocity,
-            starts.angular_velocity * u.time,
-        )  # fmt: skip
+        found, lost = [], np.zeros(self.total, bool)
+        state = self.begun(starts.position, starts.orientation, starts.velocity, starts.angular_velocity)
         for _ in range(steps):
             solved, _ = self.solver.advance(state, self.carry)
             edges, rows, graph = cast("Edges", self.carry.edges), np.zeros(0, np.int64), None
@@ -125,11 +110,6 @@ def _far_away(rows: np.ndarray) -> dict[str, np.ndarray]:
     return {"position": place, "orientation": turn, "velocity": still, "angular_velocity": still.copy()}
 
 
-def inner_steps(dt: float) -> int:
-    """Inner steps of the solve in a recorded one of `dt` model units."""
-    return max(1, math.ceil(dt / (STEP / SUBSTEPS) - 0.01))
-
-
 def joined(graphs: Sequence[ContactGraph]) -> ContactGraph:
     whole: dict[str, Any] = {"dt": graphs[0].dt, "pairs": sum(g.pairs for g in graphs)}
     bodies = np.cumsum([0, *(len(g.inverse_mass) for g in graphs)]).tolist()
@@ -153,7 +133,7 @@ class MotionTask:
         self.worlds = cache(lambda count: Worlds(scene, count, spacing))
         self.units = scene_units(scene)
         self.dt, self.gravity, self.length = spacing / self.units.time, GRAVITY, LENGTH
-        self.inner, self.counts = inner_steps(self.dt), [len(self.recordings)]
+        self.inner, self.counts = inner_of_frame(self.dt), [len(self.recordings)]
         self.begin = {horizon: self._begin(max(2, round(horizon / self.dt))) for horizon in HORIZONS}
 
     def _begin(self, steps: int) -> tuple[list[tuple[int, int]], np.ndarray]:
@@ -178,13 +158,9 @@ class MotionTask:
         return begin, weight / weight.sum()
 
     def digest(self) -> str:
-        told = hashlib.sha256()
-        for r in self.recordings:
-            for array in (*r.goal, r.position, r.velocity, r.angular_velocity):
-                told.update(np.ascontiguousarray(array).tobytes())
-        for b in self.scene.bodies:
-            told.update(repr((b.name, b.scale, b.mass, b.friction, b.restitution, *b.position, *b.quat_xyzw)).encode())
-        return told.hexdigest()[:16]
+        told = [(r.goal, r.position, r.velocity, r.angular_velocity) for r in self.recordings]
+        of = ("name", "scale", "mass", "friction", "restitution", "position", "quat_xyzw")
+        return digest(told, [[getattr(b, name) for name in of] for b in self.scene.bodies])[:16]
 
     def ranges(self) -> dict[str, list[float]]:
         """What the recordings hold, in the solver's units; see `ranges_of`."""
@@ -208,10 +184,7 @@ class MotionTask:
     def starts(self, picked: Sequence[tuple[int, int]], steps: int, rng: np.random.Generator | None = None) -> Starts:
         """Windows that begin in these recordings at these frames, disturbed as a tracker does where `rng` is given."""
         some = [(self.recordings[k], t) for k, t in picked]
-        position, turn, speed, spin = (
-            np.concatenate([getattr(r, name)[t] for r, t in some])
-            for name in ("position", "orientation", "velocity", "angular_velocity")
-        )
+        position, turn, speed, spin = (np.concatenate([getattr(r, name)[t] for r, t in some]) for name in MOTION)
         many = some[0][0].seen.shape[1]
         goal = np.full((steps, len(some), many, 7), np.nan)
         for w, (r, t) in enumerate(some):

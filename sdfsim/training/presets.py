@@ -1,7 +1,5 @@
 """Presets: which network is trained, how large it is and for how long."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,15 +1,13 @@
 """What training a network on surface nodes means: recorded steps of whole scenes, and a loss on node accelerations."""
 
-from __future__ import annotations
-
-import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sdfsim.base.files import digest
 from sdfsim.data.batching import PLANE, centred, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
 from sdfsim.learned.families import FAMILIES
@@ -66,13 +64,7 @@ class SurfaceTask:
         self.__init__(data, split, plan, noisy=noisy)
 
     def digest(self) -> str:
-        digest = hashlib.sha256(f"{self.floor}".encode())
-        for t in self.trajectories:
-            for field in fields(t):
-                digest.update(np.ascontiguousarray(getattr(t, field.name)).tobytes())
-        for name, shape in sorted(self.shapes.items()):
-            digest.update(name.encode() + np.ascontiguousarray(shape.nodes).tobytes())
-        return digest.hexdigest()[:16]
+        return digest(self.floor, self.trajectories, {name: shape.nodes for name, shape in self.shapes.items()})[:16]
 
     def prepare(self, network: GraphNetwork, rng: np.random.Generator, device: torch.device) -> None:
         """Set the feature statistics of a network, which is on a device, from a few batches."""

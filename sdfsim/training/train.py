@@ -1,7 +1,5 @@
 """Training: one loop for all networks, resumable to the step, needing only torch and numpy once frames are cached."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
-from sdfsim.apps.identify import Problem, identify, report_lines, write_scene
-from sdfsim.apps.identify_picture import picture, title
+from sdfsim.apps.identify import Problem, identify, picture, report_lines, title, write_scene
 from sdfsim.apps.observed import COLUMNS, load_recordings
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import import_pybullet
@@ -176,7 +175,7 @@ def test_the_picture_shows_what_the_recordings_tell_and_what_they_do_not(tmp_pat
     assert title(restitution) == "restitution of its own: block\nnot shown by these recordings"
     assert title(friction).startswith("friction of its own: block\n") and " to " in title(friction)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert picture(found, tmp_path / "none.png") == "pictures need matplotlib: pip install 'sdfsim[bench]'"
+    assert picture(found, tmp_path / "none.png") == "matplotlib is not installed: pip install 'sdfsim[bench]'"
     assert not (tmp_path / "none.png").exists()
 
 

@@ -12,8 +12,7 @@ from benchmarks.robots import poses
 from sdfsim import Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
-from sdfsim.apps.recording import save_rollout
-from sdfsim.apps.recording_joints import ends, marks
+from sdfsim.apps.recording import ends, marks, save_rollout
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.identify import Problem
+from sdfsim.apps.identify import Problem, Windows
 from sdfsim.apps.observed import cleaned, with_velocities
 from sdfsim.apps.observed_joints import flying_trees, held_together, jointed
 from sdfsim.scene.builder import SceneBuilder
@@ -118,7 +118,7 @@ def test_friction_and_damping_of_a_pendulum_are_those_that_repeat_it_best() -> N
     assert recordings[0].known.mean() > 0.5 and not recordings[0].flying.any()
     problem = Problem(recordings, scene)
     begin = [(0, int(t)) for t in np.flatnonzero(recordings[0].known[:60])[::20]]
-    windows = problem.windows(0.6, begin)
+    windows = Windows(problem, 0.6, begin)
     for kind in ("joint_friction", "joint_damping"):
         problem._add(kind, "pin", [], 0.0, 0.0, axis=0)
     hefts = np.array([problem.heft(problem.joints[0], kind) for kind in ("joint_friction", "joint_damping")])

@@ -26,8 +26,8 @@ from benchmarks.everyday import (
 )
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import engines, everyday
+from sdfsim.evaluation.engines import by_model, still
 from sdfsim.evaluation.everyday import UNIT, Check, G, Put, Setting, about, fixed, floor, run, solid
-from sdfsim.evaluation.runs import by_model, still
 from sdfsim.scene.scene import Scene
 
 FAST = ["PyBullet", "MuJoCo"]

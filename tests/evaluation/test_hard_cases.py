@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import Simulator
 from sdfsim.evaluation import hard_cases
-from sdfsim.evaluation.engines import start_motion
+from sdfsim.evaluation.engines import Ran, scene_rollout, start_motion
 from sdfsim.evaluation.hard_cases import cases
 from sdfsim.evaluation.penetration import depths
-from sdfsim.evaluation.runs import Ran, scene_rollout
 from sdfsim.scene.scene import Body, Effects, Scene
 
 DT = 0.01

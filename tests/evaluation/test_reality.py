@@ -15,7 +15,6 @@ from benchmarks.reality import (
     ENGINES,
     GRAVITY,
     OURS,
-    SCENE,
     SIDE,
     TRAINED,
     Lesson,
@@ -37,6 +36,7 @@ from benchmarks.reality import (
 from benchmarks.tosses import FIT, FRAMES, TEST, Motion, Start, cost, ours, recorded, searched
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import Trajectory
+from sdfsim.data.public_tosses import CUBE
 from sdfsim.scene.load import load_scene
 from tests.helpers.scenes import surface_model
 
@@ -119,7 +119,7 @@ def test_errors_are_those_of_a_shift_and_a_turn():
 def moved(name: str, starts: list[Start], height: float, folder: Path) -> Motion:
     if name != OURS:
         return ENGINES[name][0](starts, DT, np.array([0.0, 0.0, -GRAVITY]), VALUES | {"height": height})
-    text = SCENE.format(gravity=-GRAVITY, side=SIDE, mass=0.37, factor=1.0)
+    text = CUBE.format(gravity=-GRAVITY, factor=1.0)
     (folder / "scene.yaml").write_text(text.replace("plane: {}", f"plane: {{offset: {height}}}"))
     return ours(starts, DT, load_scene(folder / "scene.yaml"))
 
@@ -222,7 +222,7 @@ def test_tosses_are_split_apart(folder):
 def lesson(tmp_path_factory) -> Lesson:
     """Six tosses onto a table that is tilted and lower, and the scene that knows it."""
     folder = tmp_path_factory.mktemp("lesson")
-    text = SCENE.format(gravity=-GRAVITY, side=SIDE, mass=0.37, factor=1.0)
+    text = CUBE.format(gravity=-GRAVITY, factor=1.0)
     text = text.replace("plane: {}", "plane: {normal: [0.1, -0.05, 1.0], offset: -0.02}")
     (folder / "scene.yaml").write_text(text)
     scene = load_scene(folder / "scene.yaml")
@@ -277,7 +277,7 @@ def test_kept_networks_are_not_trained_again(tmp_path, monkeypatch):
     monkeypatch.setattr(reality, "SEEDS", 2)
     tosses = [thrown(np.array([0.5, 0.0, up]), np.array([1.0, 2.0, 3.0]), frames=90) for up in np.linspace(0.4, 1.2, 9)]
     groups = tosses[:3], tosses[3:5], tosses[5:]
-    (tmp_path / "scene.yaml").write_text(SCENE.format(gravity=-GRAVITY, side=SIDE, mass=0.37, factor=1.0))
+    (tmp_path / "scene.yaml").write_text(CUBE.format(gravity=-GRAVITY, factor=1.0))
     first = networks(groups, tmp_path / "scene.yaml", GRAVITY, tmp_path / "kept")
     assert set(first) == {
         ("-", "the solve alone"),

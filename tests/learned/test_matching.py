@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sdfsim.learned.matching import match_shapes
+from sdfsim.learned.surfaces import match_shapes
 from sdfsim.physics.pose import to_matrix
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])

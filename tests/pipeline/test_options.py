@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from pipeline.options import OptionKeys, Options, names_of, options_of, read_config, write_config
+from pipeline.options import OptionKeys, Options, options_of, read_config, write_config
 from sdfsim.base.errors import SdfsimError
 from tests.helpers.command import run as command
 
@@ -50,7 +50,7 @@ def test_a_body_that_cannot_be_pointed_at_is_one_line(given, says):
 def test_places_of_one_body_are_put_together():
     given = options_of(body=["cup=a.jpg:1,2", "vase=b=c.jpg:3,4.5", "cup=d/e.jpg:5,6"])
     assert given.body == {"cup": ["a.jpg:1,2", "d/e.jpg:5,6"], "vase": ["b=c.jpg:3,4.5"]}
-    assert options_of(**given.model_dump()) == given and "body" in names_of("mesh")
+    assert options_of(**given.model_dump()) == given and "body" in given.of_stage("mesh")
 
 
 def test_an_option_that_does_not_exist_is_named_with_those_that_do():
@@ -95,7 +95,7 @@ def test_what_changes_one_changes_the_other():
 def test_commands_take_what_changes_their_stage():
     for stage in ("mesh", "distill", "fit"):
         shown = command(stage, "--help").stdout
-        options = [name for name in names_of(stage) if name not in ("seed", "budget")]
+        options = [name for name in options_of().of_stage(stage) if name not in ("seed", "budget")]
         assert options and all(f"--{name}" in shown for name in options)
 
 

@@ -1,5 +1,6 @@
 """Where the field is asked: samples of bounded error, free space that photos prove, and the cached SDF."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,11 +18,14 @@ from pipeline.field.supervision import (
     JUST_EMPTY,
     NOISES,
     SLOPE,
+    STEREO_POINTS,
     DepthPoints,
     FreeSpace,
+    stereo_points,
     supervision_of,
 )
 from pipeline.field.training import PRESETS
+from pipeline.stereo.depth import DepthMap
 from tests.helpers.sparse import NOTHING
 from tests.helpers.surfaces import ring
 
@@ -173,6 +177,19 @@ def test_lines_of_sight_of_a_sensor_end_before_its_noise():
     away = np.linalg.norm(sight, axis=1)
     ends = xyz[:50] - ((GAP * CELL + NOISES * 0.01 * away) / away)[:, None] * sight
     assert np.linalg.norm(ends[:, None] - found.sight[:, 3:], axis=2).min(1).max() < 1e-9
+
+
+def test_points_of_stereo_are_those_that_are_certain():
+    """Of a photo with more than are used; a tenth of the certainty makes a tenth of the points."""
+    view = replace(ring(4)[0], width=400, height=400)
+    certain = np.full((400, 400), 0.05, np.float32)
+    certain[:, 200:] = 0.5
+    matrix = np.array([[200.0, 0, 199.5], [0, 200, 199.5], [0, 0, 1]])
+    one = DepthMap(view, matrix, np.full((400, 400), 0.5, np.float32), certain)
+    found = stereo_points([one], PosedPhotos((view,), NOTHING.sparse)).xyz
+    right = (found @ view.rotation.T + view.translation)[:, 0] > 0
+    assert len(found) == STEREO_POINTS and len(np.unique(found, axis=0)) == STEREO_POINTS
+    assert right.mean() == pytest.approx(1 / 1.1, abs=0.03)
 
 
 def crossing(count: int) -> np.ndarray:

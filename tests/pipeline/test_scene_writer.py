@@ -11,7 +11,7 @@ import yaml
 from pipeline.cameras import Similarity
 from pipeline.materials import ASSUMED, MATERIALS, materials_of
 from pipeline.mesh.placement import Placement
-from pipeline.mesh.visibility import Above
+from pipeline.mesh.visibility import heights
 from pipeline.scene_writer import (
     LEVEL,
     choose_slab,
@@ -50,7 +50,7 @@ def test_drop_lands_on_the_block():
     assert abs(x - 0.1) < 0.3 - 0.5 * drop.side and abs(y) < 0.3 - 0.5 * drop.side
     assert drop.slope < 1 and 0.4 < z - 0.5 * drop.thickness < 0.5
     assert drop.side == pytest.approx(0.12, rel=0.01)
-    assert np.isnan(Above(mesh).heights(np.array([[5.0, 5]]))).all()
+    assert np.isnan(heights(mesh, np.array([[5.0, 5]]))).all()
 
 
 def test_a_level_step_is_preferred_to_a_higher_slope():

@@ -16,6 +16,7 @@ from pipeline.field.rendering import sdf_cache
 from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
 from pipeline.inputs.photos import save_photos
 from pipeline.report import notes
+from pipeline.stereo.fusion import Fused
 from tests.helpers.fields import SMALL, posed_noise, toy_rays
 from tests.helpers.photos import photo
 
@@ -263,3 +264,26 @@ def test_a_backdrop_that_masks_put_there_keeps_its_colour():
     rgb, opacity = torch.tensor([[0.5] * 3, [0.3] * 3]), torch.tensor([0.0, 1.0])
     seen = exposure(rgb, opacity, 0.5, torch.tensor([0, 1]))
     torch.testing.assert_close(seen, torch.tensor([[0.5] * 3, [0.5 * 0.3 - 0.1] * 3]))
+
+
+def test_a_hollow_that_is_there_from_fused_depth_is_kept_open_from_the_first_step_on():
+    """Lines of sight cross what fused depth has filled. All levels may empty it at once, where training from a ball has
+    no room for a hollow yet: coarse levels alone would fill what is open."""
+    line = np.linspace(-1, 1, 16)
+    z, y, x = np.meshgrid(line, line, line, indexing="ij")
+    rod = np.maximum(np.hypot(x, y) - 0.4, np.abs(z) - 0.6).astype(np.float32)
+    none = np.zeros((0, 3), np.float32)
+    start = Fused(rod, 31, none.astype(np.int16), none[:, 0], none)
+    sight = np.array([[0.1 * i, 0.1 * j, 0.9, 0.1 * i, 0.1 * j, -0.3] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    down = supervision.Supervision(none, none[:, 0], sight)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=300, surface_points=16)
+    fused, ball = Trainer(settings, toy_rays(64), down, 0, fused=start), Trainer(settings, toy_rays(64), down, 0)
+    at = torch.tensor(sight[:, :3] + 0.5 * (sight[:, 3:] - sight[:, :3]), dtype=torch.float32)
+    before = float(fused.field.sdf(at).max())
+    for trainer in (fused, ball):
+        trainer.step()
+    assert fused.field.active == len(SMALL.steps) > ball.field.active
+    assert len(fused.free.filled) > 0 and not len(ball.free.filled)
+    for _ in range(60):
+        fused.step()
+    assert before < -0.1 and float(fused.field.sdf(at).median()) > 0

@@ -1,0 +1,254 @@
+"""What becomes of photos, meshes and recordings that nobody tuned anything on: a line each.
+
+    python -m benchmarks strangers FOLDER -o DIR [--preset quick] [--longest 1800] [--page]
+
+Takes what it finds below FOLDER for what it is: folders of three photos or more (with none of a mesh beside them, whose
+textures they would be), COLMAP models' folders of photos, videos and captures of phones; mesh files; run folders, and
+CSV or npz files of poses with their scene beside them, `NAME.yaml` of one file or `scene.yaml` of all others. Every
+input is handed to the commands as a user would: photos to `reconstruct` and the scene to `simulate`; a mesh to `fit`
+(with --cap, where it is refused as open) and, 20 cm wide, dropped from half its size onto a floor, with `sdf: grid`
+where the fit misses its certificate; recordings to `identify`. Commands run in processes of their own, none for longer
+than `--longest` seconds, so that nothing that one input does stops the others. Writes DIR/table.md and DIR/table.json,
+what failed first, and with `--page` the table of docs/notes/strangers.md. Times are those of a DIR that was empty.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.results import ROOT, write_section
+from pipeline.inputs.captures import ARCHIVES
+from pipeline.inputs.sources import MIN_PHOTOS, VIDEOS, photos_in
+from sdfsim import Scene, load_shape
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import visible, write_json, write_text
+from sdfsim.evaluation.harness import markdown, number
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES
+
+PAGE = ROOT / "docs" / "notes" / "strangers.md"
+SIZE, SECONDS = 0.2, 5.0  # m, how wide a mesh is made that is dropped; s, that it may take to come to rest
+PROGRAM = "from cli import app; app()"
+HEAD = ("input", "is", "became", "s", "exact to", "rests", "what is wrong")
+
+
+@dataclass(frozen=True)
+class Found:
+    """An input: what it is, and its files. Recordings of one scene are one input."""
+
+    kind: str  # photos, mesh or recordings
+    files: tuple[Path, ...]
+    scene: Path | None = None  # of recordings
+
+
+@dataclass
+class Row:
+    """What is told of an input."""
+
+    name: str
+    kind: str
+    became: str = "nothing"
+    seconds: float = 0.0  # of all commands, by the clock
+    exact: str = ""  # the certificate, the scale, or how far motions are off
+    rests: str = ""
+    wrong: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # only in table.json
+
+    def cells(self) -> tuple[str, ...]:
+        told = "; ".join(self.wrong).replace("|", "/").replace("\n", " ")
+        return (f"`{self.name}`", self.kind, self.became, f"{self.seconds:.0f}", self.exact, self.rests, told)
+
+
+class Failed(Exception):
+    """A command that did not end well; says why in a line."""
+
+
+# --- finding ---
+
+
+def found_in(folder: Path) -> Iterator[Found]:
+    """All inputs in a folder and below it, in name order."""
+    inside = visible(folder)
+    files = [path for path in inside if path.is_file()]
+    if (folder / "rollout.npz").exists():
+        yield Found("recordings", (folder,))
+        return
+    meshes = [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
+    if not meshes and len(photos_in(folder)) >= MIN_PHOTOS:
+        yield Found("photos", (folder,))
+        return
+    yield from (Found("photos", (path,)) for path in files if path.suffix.lower() in VIDEOS | set(ARCHIVES))
+    yield from (Found("mesh", (path,)) for path in meshes)
+    poses = [path for path in files if path.suffix in (".csv", ".npz")]
+    own = [path for path in poses if path.with_suffix(".yaml").exists()]
+    yield from (Found("recordings", (path,), path.with_suffix(".yaml")) for path in own)
+    if others := tuple(path for path in poses if path not in own):
+        scene = folder / "scene.yaml"
+        yield Found("recordings", others, scene if scene.exists() else None)
+    for path in inside:
+        if path.is_dir():
+            yield from found_in(path)
+
+
+# --- judging ---
+
+
+def command(*arguments: object, longest: float) -> dict[str, Any]:
+    """The report of a command of sdfsim. Raises Failed where it ends otherwise, with what it says of that."""
+    line = [sys.executable, "-c", PROGRAM, *map(str, arguments), "--json"]
+    try:
+        done = subprocess.run(
+            line, cwd=ROOT, env=os.environ, capture_output=True, text=True, errors="replace", timeout=longest
+        )
+    except subprocess.TimeoutExpired as error:
+        raise Failed(f"{arguments[0]}: stopped after {longest:.0f} s") from error
+    try:
+        report = json.loads(done.stdout)
+    except ValueError as error:
+        last = (done.stderr.strip() or "no word").splitlines()[-1]
+        how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"ended with {done.returncode}"
+        raise Failed(f"{arguments[0]}: {how}: {last}") from error
+    if "error" in report and "exit_code" in report:
+        hint = f" ({report['hint']})" if report.get("hint") else ""
+        raise Failed(f"{arguments[0]}: {report['error']}{hint}")
+    return report
+
+
+def of_mesh(found: Found, row: Row, place: Path, run: Callable[..., dict[str, Any]]) -> None:
+    """Fit a mesh, and drop it onto a floor."""
+    (mesh,), shape = found.files, place / "shape"
+    capped = ""
+    try:
+        fit = run("fit", mesh, "-o", shape)
+    except Failed as error:
+        if "--cap" not in str(error):
+            raise
+        fit, capped = run("fit", mesh, "-o", shape, "--cap"), "capped and "
+    row.became = f"{capped}fitted"
+    row.exact = f"{number(100 * fit['error_within_0.01'], 2)} % of its size"
+    row.notes += fit["notes"]
+    row.wrong += [*fit["failed_checks"], *([f"not exact: {fit['caveat']}"] if fit["caveat"] else [])]
+    corners = load_shape(shape).mesh.vertices
+    scale = SIZE / float(np.ptp(corners, axis=0).max())
+    made: dict[str, Any] = {"asset": str(shape.resolve())}
+    if not fit["passed"]:
+        row.became = "grid"
+        made = {"mesh": str(mesh.resolve()), "sdf": "grid", "cap": "on"}
+    up = 0.5 * SIZE - scale * corners[:, 2].min()
+    # A floor whose coefficients, with those of what falls, make a friction of 0.4 and a restitution of 0.2.
+    scene = Scene(duration=SECONDS).add("floor", plane={}, friction=0.8, restitution=0.4)
+    scene.add("it", **made, scale=float(scale), position=(0.0, 0.0, float(up)))
+    scene.save(place / "scene.yaml")
+    dropped(place, row, run)
+
+
+def of_photos(found: Found, row: Row, place: Path, run: Callable[..., dict[str, Any]], preset: str) -> None:
+    """Reconstruct a scene, and let what is in it come to rest."""
+    room = place / "room"
+    try:
+        report = run("reconstruct", found.files[0], "-o", room, "--preset", preset)
+    except Failed as error:
+        row.wrong.append(str(error))
+        if not (room / "report.json").exists():
+            return
+        report = json.loads((room / "report.json").read_text(encoding="utf-8"))
+    poses, stages = report["poses"], report["stages"]
+    if poses:
+        row.became = f"{poses['posed']} of {poses['photos']} posed"
+    told = [*(["scale: " + stages["mesh"]["size"]] if "mesh" in stages else [])]
+    if report["psnr"] is not None:
+        told.append(f"PSNR {number(report['psnr'])} dB")
+    row.exact = ", ".join(told)
+    row.notes += report["notes"]
+    row.wrong += [*report["failed_checks"], *poses.get("causes", []), *poses.get("warnings", [])]
+    if (room / "scene.yaml").exists():
+        dropped(place, row, run, room / "scene.yaml")
+
+
+def dropped(place: Path, row: Row, run: Callable[..., dict[str, Any]], scene: Path | None = None) -> None:
+    """Simulate a scene until all in it rests."""
+    report = run(
+        "simulate", scene or place / "scene.yaml", "-o", place / "run", "--viewer", "none",
+        "--until-settled", "--seconds", SECONDS, "--allow-outside",
+    )  # fmt: skip
+    bodies = report["ended"]
+    row.rests = f"{sum(body['rests'] for body in bodies)} of {len(bodies)}, {report['simulated_s']:.2g} s"
+    if not report["settled"]:
+        row.wrong.append(f"not at rest after {SECONDS:g} s")
+    row.wrong += [f"{body['name']} left the scene" for body in bodies if body["left"]]
+    row.wrong += [f"breaks a law: {line}" for line in report["broken_laws"]]
+
+
+def of_recordings(found: Found, row: Row, place: Path, run: Callable[..., dict[str, Any]]) -> None:
+    """Identify the parameters of a scene."""
+    report = run("identify", *found.files, *(["--scene", found.scene, "--allow-outside"] if found.scene else []))
+    held = report["held_out"]
+    after, before = ("{:.2g} % and {:.2g} degrees".format(*held[when]) for when in ("after", "before"))
+    row.became = f"{report['windows']} windows repeated to {1e3 * report['error_m']:.2g} mm"
+    row.exact = f"{after} off; {before} as the scene was"
+    row.notes += report["notes"]
+    if any(now > was for now, was in zip(held["after"], held["before"], strict=True)):
+        row.wrong.append("what was found is farther off than what the scene said")
+
+
+def judged(found: Found, folder: Path, out: Path, preset: str, longest: float) -> Row:
+    """The row of an input; whatever goes wrong is told in it."""
+    name = found.files[0].relative_to(folder).as_posix()
+    row = Row(name if len(found.files) == 1 else f"{name} and {len(found.files) - 1} more", found.kind)
+    place = out / name
+    began = time.monotonic()
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+
+        def run(*arguments: object) -> dict[str, Any]:
+            return command(*arguments, longest=longest)
+
+        if found.kind == "mesh":
+            of_mesh(found, row, place, run)
+        elif found.kind == "photos":
+            of_photos(found, row, place, run, preset)
+        else:
+            of_recordings(found, row, place, run)
+    except Failed as error:
+        row.wrong.append(str(error))
+    except (SdfsimError, OSError, KeyError, ValueError) as error:
+        row.wrong.append(f"{type(error).__name__}: {error}")
+    row.seconds = time.monotonic() - began
+    return row
+
+
+# --- telling ---
+
+
+def table(rows: list[Row]) -> str:
+    """In Markdown: first what became nothing, then what something is wrong with, then the others."""
+    ordered = sorted(rows, key=lambda row: (row.became != "nothing", not row.wrong, row.kind, row.name))
+    good = sum(not row.wrong and row.became != "nothing" for row in rows)
+    count = {kind: sum(row.kind == kind for row in rows) for kind in ("photos", "mesh", "recordings")}
+    told = ", ".join(f"{number} of {kind}" for kind, number in count.items() if number)
+    return f"{markdown([HEAD, *(row.cells() for row in ordered)])}\n{good} of {len(rows)} without a fault; {told}.\n"
+
+
+def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 1800.0, page: bool = False) -> None:
+    """A line each, the table in DIR, and with `page` in docs/notes."""
+    if not folder.is_dir():
+        raise SdfsimError(f"{folder}: no such folder", "give the folder that holds photos, meshes or recordings")
+    folder, out = folder.resolve(), out.resolve()  # commands run in another folder
+    inputs = list(found_in(folder))
+    if not inputs:
+        raise SdfsimError(f"{folder}: no photos, meshes or recordings in it or below it")
+    rows = []
+    for found in inputs:
+        rows.append(judged(found, folder, out, preset, longest))
+        print(" | ".join(filter(None, rows[-1].cells())), flush=True)
+        write_json(out / "table.json", [asdict(row) for row in rows])  # as far as it got
+    write_text(out / "table.md", table(rows))
+    if page:
+        write_section("strangers", "python -m benchmarks strangers FOLDER -o DIR --page", table(rows), PAGE)

@@ -1,0 +1,178 @@
+"""The first lists of RESULTS.md, from the tables of its pages: what is lost, then what is won.
+
+    python -m benchmarks summary
+
+No number of theirs is written by hand: after any table was measured again, this command makes them agree.
+"""
+
+import re
+from collections.abc import Iterator
+
+from benchmarks.results import ROOT, section, write_section
+from sdfsim.evaluation.harness import number
+
+OURS, PULLED = "sdfsim", ("PyBullet, pieces", "MuJoCo, pieces")  # engines on convex pieces
+
+
+def cells_of(text: str) -> list[list[str]]:
+    """The rows of the first table in a text, its head first."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
+    return [row for row in rows if not set("".join(row)) <= set("-: ")]
+
+
+def figures(cell: str) -> list[float]:
+    """All numbers of a cell."""
+    return [float(found.replace(",", "")) for found in re.findall(r"-?\d[\d,]*\.?\d*(?:e-?\d+)?", cell)]
+
+
+def joined(parts: list[str]) -> str:
+    return ", ".join(parts) or "none"
+
+
+def in_turn() -> tuple[list[str], list[str]]:
+    """Cases in which ours takes longer than an engine, and those in which it takes less, as median ratios."""
+    head, *rows = cells_of(section("rivals in turn"))
+    names = [title.removeprefix(f"{OURS} / ") for title in head[4:]]
+    longer, less = [], []
+    for row in rows:
+        ratios = {name.partition(",")[0]: figures(cell)[0] for name, cell in zip(names, row[4:], strict=True)}
+        longer += [f"{row[0]} {ratio:.2f} of {name}'s" for name, ratio in ratios.items() if ratio > 1.0]
+        if all(ratio <= 1.0 for ratio in ratios.values()):
+            less.append(f"{row[0]} " + " and ".join(f"{ratio:.2f}" for ratio in ratios.values()))
+    return longer, less
+
+
+def of_tosses() -> tuple[list[str], list[str]]:
+    """Engines that are nearer to the real cube in place or turn, and by how much ours is nearer in place."""
+    nearer, lead = [], []
+    for row in cells_of(section("reality"))[1:]:
+        if "/" not in row[3] or "tosses" in row[0]:
+            continue
+        for part, what in zip(row[3].split("/"), ("% of its side in position", "degrees in rotation"), strict=True):
+            less, low, high = figures(part)
+            told = f"{row[0]} by {number(abs(less), 2)} {what} ({number(low, 2)} to {number(high, 2)})"
+            if less > 0.0:
+                nearer.append(told)
+        lead.append(-figures(row[3])[0])
+    return nearer, [f"{number(min(lead), 2)} to {number(max(lead), 2)} % of its side" if min(lead) > 0 else ""]
+
+
+def of_elbows() -> list[str]:
+    """Engines that are nearer to the real elbow in any of its errors."""
+    text = (ROOT / "docs" / "joints.md").read_text(encoding="utf-8").partition("## Real tosses of an elbow")[2]
+    nearer = []
+    for row in cells_of(text.partition("\n## ")[0])[1:]:
+        whats = ("% of a link", "degrees of turn", "degrees of the hinge")
+        for part, what in zip(row[4].split("/") if row[4] else (), whats, strict=False):
+            less, low, high = figures(part)
+            if less > 0.0:
+                nearer.append(f"{row[0]} by {number(less, 2)} {what} ({number(low, 2)} to {number(high, 2)})")
+    return nearer
+
+
+def deeper() -> Iterator[str]:
+    """Cases in which our bodies are deeper in each other than those of both engines on convex pieces."""
+    rows = cells_of(section("rivals"))[1:]
+    for case in dict.fromkeys(row[0] for row in rows):
+        depth = {row[1]: figures(row[3]) for row in rows if row[0] == case}
+        if depth[OURS] and all(depth[OURS][0] > depth[name][0] for name in PULLED):
+            others = " and ".join(f"{depth[name][0]:g}" for name in PULLED)
+            yield f"{case} {depth[OURS][0]:g} against {others} %"
+
+
+def without_pieces() -> tuple[float, float, list[str]]:
+    """How many times as long engines take at least and at most that collide meshes as they are, and what they lose."""
+    ratios, lost = [], []
+    rows = cells_of(section("rivals"))[1:]
+    ours = {row[0]: figures(row[2])[0] for row in rows if row[1] == OURS}
+    for row in rows:
+        if row[1] in (OURS, *PULLED):
+            continue
+        if len(row) < 6 or not row[5]:
+            lost.append(f"{row[1].partition(',')[0]} does not end {row[0]}")
+            continue
+        ratios.append(figures(row[2])[0] / ours[row[0]])
+        if int(row[5]):
+            lost.append(f"{row[1]} loses {row[5]} of {row[0]}")
+    return min(ratios), max(ratios), lost
+
+
+def grown() -> dict[str, list[str]]:
+    """By engine, its time over ours (64 nodes) with 1 to 512 spheres."""
+    rows = cells_of(section("growth"))[1:]
+    time = {(row[0], row[1]): figures(row[2]) for row in rows if row[0].endswith("spheres in a bowl")}
+    found: dict[str, list[str]] = {}
+    for name in ("PyBullet", "MuJoCo"):
+        for case, ours in ((case, took[0]) for (case, who), took in time.items() if who == "solver, 64 nodes"):
+            theirs = time[case, name]
+            ratio = number(theirs[0] / ours, 2) if theirs else "not ended"
+            found.setdefault(name, []).append(f"{figures(case)[0]:g}: {ratio}")
+    return found
+
+
+def of_joints() -> tuple[list[str], list[str]]:
+    """Scenes with joints in which ours takes longer than MuJoCo, and less."""
+    longer, less = [], []
+    for row in cells_of(section("joints"))[1:]:
+        ours, theirs = figures(row[4])[0], figures(row[5])[0]
+        (longer if ours > theirs else less).append(f"{row[0]} {number(ours / theirs, 2)}")
+    return longer, less
+
+
+def counts(cell: str) -> tuple[int, int]:
+    """How many checks hold, of how many."""
+    held, run = figures(cell)[:2]
+    return int(held), int(run)
+
+
+def summary() -> str:
+    """Both lists."""
+    longer, less = in_turn()
+    nearer, lead = of_tosses()
+    slow_joints, fast_joints = of_joints()
+    at_least, at_most, lost = without_pieces()
+    errors = {row[0]: [figures(cell)[0] for cell in row[1:]] for row in cells_of(section("MOVi-B"))[1:]}
+    head, *rows = cells_of(section("everyday"))
+    total = dict(zip(head[1:], map(counts, rows[-1][1:]), strict=True))
+    start = {row[0]: row for row in cells_of(section("start"))[1:]}
+    steps = {row[0]: row for row in cells_of(section("contact step"))[1:]}
+    hard = re.findall(r"- (.+): (\d+) figures, (\d+) missed, (\d+) behind", section("hard cases"))
+    solver, engine = errors["`solver`"], errors["the engine again, starts 1e-3 m/s off"]
+    growth = grown()
+    losses = [
+        f"[In turn](#hard-shapes-beside-other-engines) at the same step, longer than an engine: {joined(longer)} time.",
+        f"Deeper in each other than bodies of both engines: {joined(list(deeper()))} of the smallest body.",
+        f"[Real tosses](#real-tosses-of-a-cube), nearer than ours: {joined(nearer)}. "
+        f"[Elbows](../docs/joints.md#real-tosses-of-an-elbow): {joined(of_elbows())}.",
+        f"[MOVi-B](#movi-b), 50 steps: {solver[0]:g} m off, where the engine is {engine[0]:g} m off from itself. The "
+        f"graph network on top of the solve has {errors['`small`'][0]:g} m and takes longer.",
+        f"[Everyday checks](#everyday-scenes-beside-other-engines): {total[OURS][1] - total[OURS][0]} missed of "
+        f"{total[OURS][1]}. [Hard cases](#hard-cases): {hard[0][2]} missed, {hard[0][3]} behind PyBullet.",
+        f"[Joints](../docs/joints.md#time), longer than MuJoCo: {joined(slow_joints)} times its time.",
+        f"[From nothing](#from-nothing) a box that falls takes {start['a box that falls for 0.4 s'][1]} s, "
+        f"in MuJoCo {start['the same in MuJoCo'][1]} s.",
+        f"[Growth](../docs/notes/growth.md), time of PyBullet over ours by spheres: {joined(growth['PyBullet'])}; "
+        f"of MuJoCo {joined(growth['MuJoCo'])}.",
+    ]
+    wins = [
+        f"In turn, of the time of PyBullet and MuJoCo: {joined(less)}. 512 spheres in a bowl take "
+        f"{steps['512 spheres in a bowl'][5]} of PyBullet's.",
+        f"Engines that collide meshes without pieces, as ours does, take {number(at_least, 2)} to {number(at_most, 2)} "
+        f"times as long ([all of them](../docs/notes/hard-shapes.md)). {joined(lost)}.",
+        *([f"Real tosses: nearer in position than every other engine, by {lead[0]}."] if lead[0] else []),
+        "Everyday checks that others miss: "
+        + joined([f"{run - held} of {run} {name}" for name, (held, run) in total.items() if name != OURS])
+        + f". Hard cases: {joined([f'{missed} {who}' for who, _, missed, _ in hard[2:]])}.",
+        f"Joints: {joined(fast_joints)} of MuJoCo's time.",
+    ]
+    return (
+        "**What is lost**\n\n"
+        + "".join(f"- {line}\n" for line in losses)
+        + "\n**What is won**\n\n"
+        + "".join(f"- {line}\n" for line in wins)
+    )
+
+
+def main() -> None:
+    write_section("summary", "python -m benchmarks summary", summary())
