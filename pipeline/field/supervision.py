@@ -24,6 +24,7 @@ FILLED, JUST_EMPTY = -0.254, 0.127
 SLOPE = 0.1
 DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor or of stereo, that are used
 STEREO_POINTS = 20_000  # of a photo
+CERTAIN = 0.3  # Less certain pixels of stereo draw no surface towards them, and prove no free space.
 NOISES = 5.0  # median errors of the depth before which its lines of sight end: a line through the surface erodes it
 APART = 0.2  # A scale that differs by more than this share means other units, or another photo's depth.
 USUAL = 0.01  # share by which a phone's depth is off, where nothing is known better
@@ -94,12 +95,13 @@ def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
 
 
 def stereo_points(maps: Sequence[DepthMap], poses: PosedPhotos) -> DepthPoints:
-    """At most `STEREO_POINTS` places that each depth map shows, certain ones rather than others. Maps are in the space
-    of the poses, the result is in the world that these were moved from."""
+    """At most `STEREO_POINTS` places of which each depth map is `CERTAIN`, rather the surest. Maps are in the space of
+    the poses, the result is in the world that these were moved from."""
     names, back = [view.name for view in poses.views], poses.moved_by.inverse()
     rng, xyz, index = np.random.default_rng(0), [np.zeros((0, 3))], [np.zeros(0, np.int32)]
     for one in maps:
         points, certain = one.points(), one.certain[one.inverse > 0].astype(float)
+        points, certain = points[certain > CERTAIN], certain[certain > CERTAIN]
         some = rng.permutation(len(points))
         if len(points) > STEREO_POINTS:
             some = rng.choice(len(points), STEREO_POINTS, replace=False, p=certain / certain.sum())

@@ -180,16 +180,16 @@ def test_lines_of_sight_of_a_sensor_end_before_its_noise():
 
 
 def test_points_of_stereo_are_those_that_are_certain():
-    """Of a photo with more than are used; a tenth of the certainty makes a tenth of the points."""
+    """Of a photo with more than are used. Half the certainty makes half of the points, less than 0.3 none."""
     view = replace(ring(4)[0], width=400, height=400)
-    certain = np.full((400, 400), 0.05, np.float32)
-    certain[:, 200:] = 0.5
+    certain = np.full((400, 400), 0.4, np.float32)
+    certain[:, 200:], certain[:100] = 0.8, 0.2
     matrix = np.array([[200.0, 0, 199.5], [0, 200, 199.5], [0, 0, 1]])
     one = DepthMap(view, matrix, np.full((400, 400), 0.5, np.float32), certain)
     found = stereo_points([one], PosedPhotos((view,), NOTHING.sparse)).xyz
-    right = (found @ view.rotation.T + view.translation)[:, 0] > 0
+    right, below = (found @ view.rotation.T + view.translation)[:, :2].T > [[0], [-1]]
     assert len(found) == STEREO_POINTS and len(np.unique(found, axis=0)) == STEREO_POINTS
-    assert right.mean() == pytest.approx(1 / 1.1, abs=0.03)
+    assert right.mean() == pytest.approx(2 / 3, abs=0.03) and below.all()
 
 
 def crossing(count: int) -> np.ndarray:
