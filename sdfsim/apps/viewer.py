@@ -90,14 +90,17 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
     if not web:
         check_screen("native")
     options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
-    viewer = subprocess.Popen(_command(port, [str(recording), *options]))
+    viewer, told = subprocess.Popen(_command(port, [str(recording), *options])), False
     try:
         if web and _started(viewer, page_port):  # before, the address leads nowhere
             say(f"watch it at {_page(page_port, port)}")
             say("the page stays up until Ctrl-C")
+            told = True
         code = viewer.wait()
-    except BaseException:
+    except BaseException as error:
         _end(viewer)
+        if told and isinstance(error, KeyboardInterrupt):
+            return
         raise
     if code not in (0, -signal.SIGINT, 130, _WINDOWS_CTRL_C):
         raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")

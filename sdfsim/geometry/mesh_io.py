@@ -33,7 +33,7 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 GLTF = (".glb", ".gltf")
-OTHERS = dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "USD")
+OTHERS: dict[str, str] = dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "USD")
 OTHERS |= {".fbx": "FBX", ".blend": "Blender's own format"}
 OTHERS |= {".dae": "COLLADA", ".3ds": "3DS", ".abc": "Alembic", ".step": "STEP", ".stp": "STEP", ".3mf": "3MF"}
 

@@ -107,7 +107,8 @@ def test_a_recording_is_watched_in_the_browser(tmp_path):
     shown = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
         assert shown.stderr
-        page = shown.stderr.readline().removeprefix("watch it at ").strip()
+        told = next(line for line in shown.stderr if line.startswith("watch it at "))  # the viewer has its own lines
+        page = told.removeprefix("watch it at ").strip()
         assert page.startswith("http://localhost:")
         hue = np.array(body_colors(loaded)[1], dtype=float)
         with Browser(tmp_path / "profile") as browser:
