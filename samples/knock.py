@@ -20,9 +20,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pipeline.materials import SCENERY
 from pipeline.mesh.meshing import rounded
-from pipeline.mesh.visibility import Above
+from pipeline.mesh.visibility import heights
 from sdfsim.base.errors import run_main
 from sdfsim.base.files import write_text
+from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import Shape, load_shape
 
@@ -33,19 +34,18 @@ SLOWEST = 1.5  # m/s
 SECONDS = 2.0  # until all that is knocked off lies on the floor
 
 
-def edge(above: Above, at: np.ndarray, base: float, size: float) -> tuple[np.ndarray, float]:
+def edge(support: Mesh, at: np.ndarray, base: float, size: float) -> tuple[np.ndarray, float]:
     """The direction [2] in which the support ends first, and how far away that is, m."""
     angles = np.arange(32) * 2 * np.pi / 32
     directions = np.stack([np.cos(angles), np.sin(angles)], 1)
     away = np.arange(0.5, 20, 0.1) * size
-    heights = above.heights(at + away[:, None, None] * directions)
-    gone = ~(heights > base - 0.3 * size)
+    gone = ~(heights(support, at + away[:, None, None] * directions) > base - 0.3 * size)
     first = np.where(gone.any(0), away[gone.argmax(0)], np.inf)
     best = int(first.argmin())
     return directions[best], float(min(first[best], away[-1]))
 
 
-def throw(body: dict, mass: float, friction: float, shape: Shape, above: Above) -> tuple[float, dict]:
+def throw(body: dict, mass: float, friction: float, shape: Shape, support: Mesh) -> tuple[float, dict]:
     """Radius m of the ball, and its entry among the bodies.
 
     Args:
@@ -53,12 +53,12 @@ def throw(body: dict, mass: float, friction: float, shape: Shape, above: Above) 
         mass: of it, kg.
         friction: between it and what it stands on.
         shape: of it.
-        above: the heights of what it stands on.
+        support: what it stands on.
     """
     low, high = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)])
     height, wide = float(high[2] - low[2]), float(max(high[:2] - low[:2]))
     base = np.array(body["position"])
-    direction, away = edge(above, base[:2], float(base[2]), max(height, wide))
+    direction, away = edge(support, base[:2], float(base[2]), max(height, wide))
     radius = 0.15 * height
     bounce = float(body["restitution"]) ** 2
     sliding = SPARE * np.sqrt(2 * friction * GRAVITY * away)
@@ -94,7 +94,7 @@ def main() -> None:
     shapes = {name: load_shape(arguments.folder / asset) for name, asset in assets.items()}
     own = loaded[target["name"]]
     friction = own.friction * loaded[SCENERY].friction
-    radius, ball = throw(target, own.mass, friction, shapes[target["shape"]], Above(shapes[SCENERY].mesh))
+    radius, ball = throw(target, own.mass, friction, shapes[target["shape"]], shapes[SCENERY].mesh)
     scene["shapes"] = {name: scene["shapes"][name] for name in assets}
     scene["shapes"]["thrown"] = {"sphere": {"radius": float(rounded(radius))}}
     scene["bodies"] = [*bodies, ball]
