@@ -58,8 +58,8 @@ def with_far(count: int) -> Scene:
 
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
     simulator = Simulator(scene, "solver")
-    options = replace(simulator.options, sleep=False)
-    simulator.options = replace(options, dt=dt / simulator.units.time) if dt else options
+    options = simulator.options._replace(sleep=False)
+    simulator.options = options._replace(dt=dt / simulator.units.time) if dt else options
     return timed(simulator.step, steps + 1).cpu_ms  # without the first, which prepares shapes
 
 
@@ -68,7 +68,7 @@ def asleep(scene: Scene) -> tuple[float, float]:
     taken = []
     for sleep in (False, True):
         simulator = Simulator(scene, "solver")
-        simulator.options = replace(simulator.options, sleep=sleep)
+        simulator.options = simulator.options._replace(sleep=sleep)
         simulator.step(REST)
         taken.append(timed(simulator.step, SLIDE + 1).cpu_ms)
     return taken[0], taken[1]
@@ -114,7 +114,7 @@ def user_steps(model: str) -> tuple[float, float]:
     taken = []
     for count in FAR:
         simulator = Simulator(with_far(count), model)
-        simulator.options = replace(simulator.options, sleep=False)
+        simulator.options = simulator.options._replace(sleep=False)
         simulator.step(2)  # not timed: it prepares shapes
         taken.append(timed(lambda count, of=simulator: deque(of.steps(count), maxlen=0), SLIDE + 1).cpu_ms)
     return taken[0], taken[1]

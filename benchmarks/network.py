@@ -8,7 +8,7 @@ results that DIR holds are kept. Writes DIR/table.md.
 """
 
 import statistics
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
             scene = scene_of([start], [0], shapes, conditions_of(data).floor)[0]
             simulator = Simulator(scene, used, dt=start.dt)
             substeps = method.substeps or used.inner or SUBSTEPS
-            simulator.options = replace(simulator.options, substeps=substeps)
+            simulator.options = simulator.options._replace(substeps=substeps)
             simulator.stepper = stepper_of(used)  # trusted, whatever the scene
             taken.append(1e3 * timed_rollout(simulator, STEPS_TIMED)[1].cpu_ms)
     return {"us": statistics.median(taken)}

@@ -213,7 +213,7 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
         motion, timing = run(start, steps, inner)
         return Ran(scene, scene_rollout(scene, motion, units)), timing.cpu_ms / (0.02 * units.time), prepared
     simulator = Simulator(scene, "solver")
-    simulator.options = replace(simulator.options, substeps=inner)
+    simulator.options = simulator.options._replace(substeps=inner)
     next(simulator.frames(1))
     prepared = time.perf_counter() - began
     simulator.reset()

@@ -318,7 +318,7 @@ def contact_time() -> float:
 @njit(error_model="numpy")
 def _swept(mass: np.ndarray, rules: Rules, system: System, change: np.ndarray, islands: int) -> None:
     for i in range(islands):
-        _balance(mass, rules, system, change, i)
+        _balance(mass, rules, system, change, i, rules.rounds)
 
 
 def row_time() -> float:

@@ -529,7 +529,7 @@ class _Part:
         """See `Windows.touched`. Inner steps one by one: what rebounds is away again at the end of a frame."""
         many, total, inner = self.shape[2], self.shape[1] * self.shape[2], self.options.substeps
         there = np.asarray(~np.isnan(self.goal[..., 0]).all(-1))
-        fine = replace(self.options, dt=self.options.dt / inner, substeps=1)
+        fine = self.options._replace(dt=self.options.dt / inner, substeps=1)
         state, carry = self.start, self.solver.init(self.bodies, self.start, fine)
         pull = self.options.dt * self.options.gravity
         found: dict[tuple[int, int, int], list[np.ndarray]] = {}

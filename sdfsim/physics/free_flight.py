@@ -114,7 +114,7 @@ def fly(bodies: Bodies, state: State, options: Options) -> State:
 def with_history(state: State, bodies: Bodies, options: Options, changed: np.ndarray | None = None) -> State:
     """The state with the two poses that bodies would have come from in free flight: those that were `changed` [N] bool,
     all of them where it has no earlier poses, or None is given."""
-    back = replace(options, dt=-options.dt)
+    back = options._replace(dt=-options.dt)
     one = fly(bodies, replace(state, earlier_position=None, earlier_orientation=None), back)
     two = fly(bodies, one, back)
     position, orientation = (np.stack([getattr(s, name) for s in (two, one)]) for name in MOTION[:2])

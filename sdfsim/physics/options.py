@@ -1,6 +1,6 @@
 """What is in play during a run."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,9 +8,8 @@ STEP, GRAVITY, LENGTH = 0.02, 10.0, 1.4  # the contact solve's step in s, for bo
 SUBSTEPS = 5  # inner steps in one step of the engine that the training data come from; some recordings have fewer
 
 
-@dataclass(frozen=True)
-class Options:
-    """What is in play during a run, in model units."""
+class Options(NamedTuple):
+    """What is in play during a run, in model units; compiled code reads it as it is."""
 
     gravity: np.ndarray  # [3] float64
     dt: float  # the step

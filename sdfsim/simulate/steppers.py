@@ -255,7 +255,7 @@ class OnSolver(Solver):
     def _step(self, state: State, carry: Carry) -> State:
         # No network has seen forces or joints in its training.
         asked = self.trust > 0.0 and state.load is None and state.joints is None
-        carry.options = replace(carry.options, record=asked)
+        carry.options = carry.options._replace(record=asked)
         solved, edges = super()._step(state, carry), cast("Edges", carry.edges)
         if not (asked and len(edges.pair)):
             return solved

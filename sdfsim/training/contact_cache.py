@@ -203,7 +203,7 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     gravity = np.asarray(group[0].gravity, dtype=np.float64)
     options = Options(gravity, group[0].dt, inner_steps(group[0].dt, substep), record=True)
     if found.by_teacher:
-        options = replace(options, margin=MARGIN, adds=True, cone=False)
+        options = options._replace(margin=MARGIN, adds=True, cone=False)
     solver, moves = stepper_of(load_model()), bodies.moves
     count = min(len(t.position) for t in group)
     parts = []

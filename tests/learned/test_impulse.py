@@ -45,7 +45,7 @@ def first_graph(
 ) -> tuple[Simulator, np.ndarray, ContactGraph]:
     """The first step in which contacts act: the simulator before it, the bodies in contact, and their graph."""
     sim = Simulator(scene, model or random_model("impulse"))
-    options, state = replace(sim.options, record=True), sim.state
+    options, state = sim.options._replace(record=True), sim.state
     for _ in range(steps):
         made = sim.carry.scene.advance(state, options, 1, NO_LIMITS)
         solved, edges = made.state, made.edges

@@ -60,7 +60,7 @@ def known(world, work, motion, rules, manifolds) -> tuple[list[impulses.Body], l
             inverse_mass=world.inverse_mass[b], inverse_inertia=work.inverse[b],
             falls=work.free[b, :3], spins=work.free[b, 3:6], turns=work.free[b, 6:],
             restitution=world.restitution[b], thickness=world.thickness[b],
-            margin=rules.margin if np.isfinite(world.radius[b]) else 0.0, moves=bool(world.moves[b]),
+            margin=rules.options.margin if np.isfinite(world.radius[b]) else 0.0,
         )
         for b in range(len(world.shape))
     ]  # fmt: skip
@@ -81,7 +81,7 @@ def known(world, work, motion, rules, manifolds) -> tuple[list[impulses.Body], l
                     ),
                     normal=row[NORMAL:GAP].copy(), gap=row[GAP],
                     push=row[NORMAL_IMPULSE], drag=row[TANGENTIAL : TANGENTIAL + 3].copy(),
-                    void=row[VOID] > 0.0, friction=rules.friction * world.friction[pair].prod(),
+                    void=row[VOID] > 0.0, friction=rules.options.friction * world.friction[pair].prod(),
                 )
             )  # fmt: skip
     return bodies, contacts
@@ -111,7 +111,7 @@ def test_the_compiled_solve_is_the_readable_one(seed):
                 motion.velocity[pair[0]] -= draw.choice([0.0, 0.05, 1.0]) * row[NORMAL:GAP]
         work.matrix[:] = Rotation.from_quat(motion.orientation).as_matrix()
         work.inverse[:] = work.matrix @ world.inverse_inertia @ work.matrix.transpose(0, 2, 1)
-        work.free[:] = moves * np.concatenate([rules.substep_dt * rules.gravity, np.zeros(6)])
+        work.free[:] = moves * np.concatenate([rules.substep_dt * rules.options.gravity, np.zeros(6)])
         work.free[:, 3:] += 0.01 * moves * draw.normal(size=(len(moves), 6))
         work.change[:] = work.shift[:] = 0.0
         bodies, contacts = known(world, work, motion, rules, manifolds)

@@ -130,11 +130,11 @@ def test_effects_that_are_off_do_not_act():
     scene = heap(1)
     base = Simulator(scene, "solver")
     flat = Simulator(scene, "solver")
-    flat.options = replace(base.options, rotation=False, friction=False)
+    flat.options = base.options._replace(rotation=False, friction=False)
     motion = flat.run(1.0)
     assert not motion.angular_velocity[1:, :-1].any()
     sim = Simulator(scene, "solver")
-    sim.options = replace(base.options, restitution=False, sleep=False)
+    sim.options = base.options._replace(restitution=False, sleep=False)
     assert sim.run(steps=5).position.shape == base.run(steps=5).position.shape
 
 

@@ -29,7 +29,6 @@ class Body:
     restitution: float
     thickness: float
     margin: float
-    moves: bool
     change: np.ndarray = field(default_factory=lambda: np.zeros(6))  # what contacts add to both velocities
     shift: np.ndarray = field(default_factory=lambda: np.zeros(6))  # and for this step only, to part the bodies
 
@@ -98,9 +97,8 @@ def relative(bodies: tuple[Body, Body], arms: tuple[np.ndarray, np.ndarray], wha
     """Relative velocity at a contact: "now", "falling" (with what pulls) or "then" (and the gyroscopic torque)."""
     found = []
     for b, arm in zip(bodies, arms, strict=True):
-        v = b.velocity + (what != "now") * b.falls
         w = b.angular + (what != "now") * b.spins + (what == "then") * b.turns
-        found.append(v + np.cross(w, arm))
+        found.append(b.velocity + (what != "now") * b.falls + np.cross(w, arm))
     return found[0] - found[1]
 
 
@@ -111,16 +109,16 @@ def acts(c: Contact, rules) -> bool:
     falling, then = (relative(bodies, arms, what) for what in ("falling", "then"))
     gap = c.gap - bodies[0].margin - bodies[1].margin
     way = -(then @ n) * rules.substep_dt
-    early = not rules.adds and way > EARLY * min(b.thickness for b in bodies)
+    early = not rules.options.adds and way > EARLY * min(b.thickness for b in bodies)
     later = -approach > rules.slow and not early  # it first touches, and rebounds in the inner step after
     if c.void or (gap > TOUCH and (gap > way or later)):
         return False
-    e = bodies[0].restitution * bodies[1].restitution if rules.restitution else 0.0
+    e = bodies[0].restitution * bodies[1].restitution if rules.options.restitution else 0.0
     # Newton's rule, v' = -e v, at each contact of an impact; what rebounds early as fast as it will come back by here.
     target, rebounds = 0.0, False
     if e > 0.0 and abs(approach) > rules.slow:
-        pull = early * (falling @ n - approach) / rules.substep_dt
-        square = (e * approach) ** 2 + 2.0 * pull * max(gap, 0.0) * (1.0 - e * e)
+        pull = early * max(gap, 0.0) * (falling @ n - approach) / rules.substep_dt
+        square = (e * approach) ** 2 + 2.0 * pull * (1.0 - e * e)
         rebounds = square > 0.0
         target = -np.sign(approach) * np.sqrt(max(square, 0.0))
     c.before = (falling if rebounds else then) @ n
@@ -131,7 +129,7 @@ def acts(c: Contact, rules) -> bool:
         c.deep = -gap * rules.erp / rules.substep_dt
     elif gap < -rules.slop:
         c.out = (-gap - rules.slop) * rules.erp / rules.substep_dt
-        target = max(c.out, min(target + c.out, -approach) if rules.adds else target)
+        target = max(c.out, min(target + c.out, -approach) if rules.options.adds else target)
     c.calm = rest - c.before
     c.rows = [Row(bodies, arms, n, target - c.before, c.push)]
     if c.friction == 0.0:
@@ -139,12 +137,11 @@ def acts(c: Contact, rules) -> bool:
     then = relative(bodies, arms := met(bodies, c.rubs), "then")
     slip = then - (then @ n) * n
     if slip @ slip < 1e-9:  # it has no direction
-        slip = rules.gravity - (rules.gravity @ n) * n
-        if slip @ slip < 1e-6 * (rules.gravity @ rules.gravity) + 1e-30:
+        slip = rules.options.gravity - (rules.options.gravity @ n) * n
+        if slip @ slip < 1e-6 * (rules.options.gravity @ rules.options.gravity) + 1e-30:
             slip = np.cross(n, [1.0, 0.0, 0.0] if abs(n[0]) < 0.7 else [0.0, 1.0, 0.0])
     one = slip / np.linalg.norm(slip)
-    for tangent in (one, np.cross(n, one)):
-        c.rows.append(Row(bodies, arms, tangent, -(then @ tangent), c.drag @ tangent))
+    c.rows += [Row(bodies, arms, t, -(then @ t), c.drag @ t) for t in (one, np.cross(n, one))]
     c.rows[1].impulse, c.rows[2].impulse = bounded(c, c.rows[1].impulse, c.rows[2].impulse, rules)
     return True
 
@@ -152,7 +149,7 @@ def acts(c: Contact, rules) -> bool:
 def bounded(c: Contact, one: float, two: float, rules) -> tuple[float, float]:
     """A tangential impulse within the cone of friction, or along two axes each by itself."""
     most = c.friction * c.rows[0].impulse
-    if not rules.cone:
+    if not rules.options.cone:
         return float(np.clip(one, -most, most)), float(np.clip(two, -most, most))
     length = np.hypot(one, two)
     return (one, two) if length <= most else (one * most / length, two * most / length)
@@ -162,15 +159,22 @@ def islands(contacts: list[Contact]) -> list[list[Contact]]:
     """Contacts that share bodies that move, in the order in which they are given."""
     groups: list[list[Contact]] = []
     for c in contacts:
-        near = {id(b) for b in c.bodies if b.moves}
+        near = {id(b) for b in c.bodies if b.inverse_mass > 0.0}
         joined = [g for g in groups if any(id(b) in near for x in g for b in x.bodies)]
         groups = [g for g in groups if not any(g is x for x in joined)] + [[x for g in joined for x in g] + [c]]
     return [[c for c in contacts if any(c is x for x in group)] for group in groups]
 
 
+def sweeps(island: list[Contact], rules) -> range:
+    """As many more as masses are uneven."""
+    masses = [b.inverse_mass for c in island for b in c.bodies if b.inverse_mass > 0.0]
+    more = np.clip(max(masses) / min(masses) / 30.0, 1.0, 30.0)
+    return range(rules.rounds if rules.options.adds else int(rules.rounds * more))
+
+
 def part(island: list[Contact], rules) -> None:
     """Velocities that move deep bodies out of each other once, and are forgotten."""
-    for _ in range(rules.rounds):
+    for _ in sweeps(island, rules):
         worst = 0.0
         for c in (c for c in island if c.deep > 0.0):
             r = c.rows[0]
@@ -183,20 +187,17 @@ def part(island: list[Contact], rules) -> None:
 
 def balance(island: list[Contact], rules) -> None:
     """Sweeps over all normals, then all friction, until none changes a velocity by more than `exact`."""
-    for _ in range(rules.rounds):
-        worst = 0.0
-        for c in island:
-            worst = max(worst, c.rows[0].bring(0.0, np.inf))
-        for c in (c for c in island if len(c.rows) == 3):
-            worst = max(worst, rub(c, rules))
-        if worst <= rules.exact:
+    for _ in sweeps(island, rules):
+        worst = [c.rows[0].bring(0.0, np.inf) for c in island]
+        worst += [rub(c, rules) for c in island if len(c.rows) == 3]
+        if max(worst) <= rules.exact:
             return
 
 
 def rub(c: Contact, rules) -> float:
     """One sweep of friction at a contact; by how much it changed a velocity."""
     one, two = c.rows[1:]
-    if not rules.cone:  # one axis after the other
+    if not rules.options.cone:  # one axis after the other
         most = c.friction * c.rows[0].impulse
         return max(one.bring(-most, most), two.bring(-most, most))
     mass = min(one.mass, two.mass)  # one for both: the impulse is against the slip
@@ -209,11 +210,12 @@ def rub(c: Contact, rules) -> float:
 
 
 def gains(island: list[Contact], rules) -> bool:
-    """Whether contacts did more work than pushing out, rounding and a lift by ten slops account for."""
-    work = spare = 0.0
+    """Whether contacts did more work than pushes, rounding and lifts by ten slops explain, of four points a pair."""
+    work, spare, pairs = 0.0, 0.0, [[*map(id, c.bodies)] for c in island]
     for c in island:
-        lift = 10.0 * rules.slop * float(np.linalg.norm(rules.gravity))
-        spare += c.rows[0].mass * (2.0 * c.out**2 + 0.005 * c.before**2 + lift)
+        share = min(1.0, 4.0 / pairs.count([*map(id, c.bodies)]))
+        lift = 10.0 * rules.slop * float(np.linalg.norm(rules.options.gravity))
+        spare += share * c.rows[0].mass * (2.0 * c.out**2 + 0.005 * c.before**2 + lift)
         work += c.rows[0].impulse * (c.before + 0.5 * c.rows[0].speed())
         work += sum(r.impulse * (0.5 * r.speed() - r.wanted) for r in c.rows[1:])
     return work > spare
@@ -240,8 +242,7 @@ def solve_contacts(contacts: list[Contact], rules) -> None:
                 for r in c.rows:
                     r.impulse = 0.0
                 c.rows[0].wanted = c.calm + share * (c.rows[0].wanted - c.calm)
-                if c.out > 0.0:
-                    c.deep = (1.0 - share) * c.out
+                c.deep = (1.0 - share) * c.out if c.out > 0.0 else c.deep
             part(island, rules)
             balance(island, rules)
         for c in island:

@@ -254,7 +254,7 @@ def test_a_state_that_is_given_unchanged_wakes_nobody():
 
 def test_all_wake_under_another_gravity():
     sim = resting()
-    sim.options = replace(sim.options, gravity=-sim.options.gravity)
+    sim.options = sim.options._replace(gravity=-sim.options.gravity)
     sim.step(5)
     for name in ("box", "other"):
         assert not sim[name].asleep
@@ -264,7 +264,7 @@ def test_all_wake_under_another_gravity():
 def test_effects_may_be_changed_amid_a_run():
     sim = resting()
     before = sim.options
-    sim.options = replace(before, friction=False)
+    sim.options = before._replace(friction=False)
     sim["other"].velocity = (1.0, 0, 0)
     sim.step(10)
     assert sim["other"].velocity[0] == pytest.approx(1.0, abs=1e-9)

@@ -50,7 +50,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
     bodies, state = merged([first], [0], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0))
     options = Options(gravity=first.gravity, dt=first.dt, record=True)
     if teacher:
-        options = replace(options, margin=MARGIN, adds=True, cone=False)
+        options = options._replace(margin=MARGIN, adds=True, cone=False)
     scene, touch, found = Compiled(bodies, state), None, []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0))

@@ -51,12 +51,12 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
     """
     joints = reference(held)
     matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
-    span = rules.substep_dt * rules.substeps
+    span = rules.substep_dt * rules.options.substeps
     for b in world.going:
         to_matrix(motion.orientation, b, matrix)
         work.met[b] = False
     manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
-    stirred = rules.sleep
+    stirred = rules.options.sleep
     while stirred:
         stirred = woken(world, motion, reference(manifolds), reference(near))
         if held is not None:
@@ -68,10 +68,10 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
     _shifted(world, work, motion, rules, -0.5)
     if held is not None:
         begin_step(world, work, motion, rules, joints)
-    for k in range(rules.substeps):
+    for k in range(rules.options.substeps):
         for b in world.going:
             if work.gone[b] > work.ways[b] and (world.moves[b] or world.scripted[b]):
-                left = rules.substep_dt * (rules.substeps - k)
+                left = rules.substep_dt * (rules.options.substeps - k)
                 manifolds, near = broad_phase(shapes, world, work, motion, rules, left, manifolds, surfaces, threads)
                 break
         for s in range(len(script.body)):
@@ -101,7 +101,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
             system = solve_contacts(world, work, motion, rules, points, threads)
         contacts = len(system.where)
         if note is not None:
-            edges = noted(motion, matrix, points, system, k / rules.substeps, edges)
+            edges = noted(motion, matrix, points, system, k / rules.options.substeps, edges)
         time_of_impact(shapes, world, work, motion, rules, points, parts, work.scratch, surfaces)
         if held is not None:
             kept_together(joints, work.part)
@@ -115,12 +115,18 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
                 work.met[b] = work.met[b] or motion.touching[b]
     if note is not None:
         edges = gathered(
-            world, motion, matrix, reference(manifolds), len(near.start), (rules.substeps - 1) / rules.substeps, edges
+            world,
+            motion,
+            matrix,
+            reference(manifolds),
+            len(near.start),
+            (rules.options.substeps - 1) / rules.options.substeps,
+            edges,
         )
     _shifted(world, work, motion, rules, 0.5)
     if held is not None:
         end_step(world, work, motion, rules, joints)
-    if rules.sleep:
+    if rules.options.sleep:
         put_to_sleep(world, motion, rules, reference(manifolds), joints)
     met = 0  # of those that are awake still
     for b in world.going:
@@ -136,7 +142,7 @@ def _shifted(world, work, motion, rules, part):
         if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
             v, w = pull_of(world, work.matrix, work.wrench, rules, part, b)
             put(motion.velocity, b, add(get(motion.velocity, b), v))
-            if rules.rotation:
+            if rules.options.rotation:
                 put(motion.angular, b, add(get(motion.angular, b), w))
 
 
@@ -179,7 +185,7 @@ def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, fram
         v = add(add(v, pulled), (change[b, 0], change[b, 1], change[b, 2]))
         put(motion.velocity, b, v)
         v = add(v, (shift[b, 0], shift[b, 1], shift[b, 2]))
-        if rules.rotation:
+        if rules.options.rotation:
             # What the gyroscopic torque adds comes with the exact motion below, which keeps angular momentum.
             w = add(add(w, spun), (change[b, 3], change[b, 4], change[b, 5]))
             turned = (shift[b, 3], shift[b, 4], shift[b, 5])
@@ -187,7 +193,7 @@ def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, fram
             w = (0.0, 0.0, 0.0)
         put(motion.angular, b, w)
     put(motion.position, b, along(get(motion.position, b), v, span))
-    if world.moves[b] and rules.rotation and not world.isotropic[b]:
+    if world.moves[b] and rules.options.rotation and not world.isotropic[b]:
         torque_free(world, motion.orientation, motion.angular, matrix, span, trial, frame, b)
         way = norm(w) + norm(turned)
     else:

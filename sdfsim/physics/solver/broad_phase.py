@@ -15,7 +15,7 @@ from sdfsim.physics.solver.world import COLUMNS, POINTS, Manifolds
 def swept(world, work, motion, rules, span):
     """How far any point of a body may go, and the box around all that it may reach."""
     ways, low, high, matrix = work.ways, work.low, work.high, work.matrix
-    fall = norm(vector(rules.gravity)) * span
+    fall = norm(vector(rules.options.gravity)) * span
     for b in world.going:
         ways[b], work.gone[b], work.beside[b] = 0.0, 0.0, False
         if world.shape[b] < 0 or not math.isfinite(world.radius[b]):

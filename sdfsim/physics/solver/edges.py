@@ -37,7 +37,7 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
         [E, 3] int64 the owner, its node and the other body; [E, 7] the distance, the other's outward normal there and
         the node seen from the other's centre of mass (world axes).
     """
-    span = rules.substep_dt * rules.substeps
+    span = rules.substep_dt * rules.options.substeps
     for b in world.going:
         to_matrix(motion.orientation, b, work.matrix)
     swept(world, work, motion, rules, span)
@@ -52,7 +52,10 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
             own, k = 1.0 / world.scale[one], world.scale[other]
             apart = sub(get(motion.position, one), get(motion.position, other))
             speed = norm(sub(get(motion.velocity, one), get(motion.velocity, other)))
-            speed += norm(vector(rules.gravity)) * span * abs(fall) + norm(get(motion.angular, one)) * world.radius[one]
+            speed += (
+                norm(vector(rules.options.gravity)) * span * abs(fall)
+                + norm(get(motion.angular, one)) * world.radius[one]
+            )
             if norm(get(motion.angular, other)) > 0.0:
                 speed += norm(get(motion.angular, other)) * world.radius[other]
             most = rules.contact_margin + speed * span
@@ -73,7 +76,7 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
                 velocity = add(get(motion.velocity, one), cross(get(motion.angular, one), arm))
                 back = cross(get(motion.angular, other), along(offset, normal, -d))
                 velocity = sub(velocity, add(get(motion.velocity, other), back))
-                velocity = along(velocity, vector(rules.gravity), fall * span)
+                velocity = along(velocity, vector(rules.options.gravity), fall * span)
                 if d + min(0.0, dot(velocity, normal)) * span > rules.contact_margin:
                     continue
                 if count == len(index):

@@ -29,7 +29,7 @@ MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 def pull_of(world, matrix, wrench, rules, part, b):
     """What gravity and what pulls at a body add to its velocities in a part of an inner step."""
     span = rules.substep_dt * part
-    weight = scale(vector(rules.gravity), span)
+    weight = scale(vector(rules.options.gravity), span)
     pulled = False
     for x in range(6):
         pulled = pulled or wrench[b, x] != 0.0

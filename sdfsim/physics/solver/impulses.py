@@ -45,10 +45,14 @@ TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not dec
 AT_REST = 1e-9  # squared: slower tangential motion has no direction
 # No island may gain more energy than so many times what its pushes out of penetration would give each contact alone,
 # this share of what its contacts bring with them, and what lifts it by so many slops: a stack lifts all that is above.
-SPARE, ROUNDING, LIFT = 4.0, 0.01, 10.0
+# Of two bodies so many contacts count: the many points of a hollow shape may gain no more than the corners of a box.
+SPARE, ROUNDING, LIFT, FEW = 4.0, 0.01, 10.0, 4
 # What comes nearer than this part of a thickness in an inner step bounces before it has touched, else after: thin
 # things would be deep in each other.
 THIN = 0.005
+# Sweeps carry a load to what is lighter the more slowly, the larger the ratio of masses is: an island is swept as many
+# times more often as its ratio is times this one, up to so many times.
+EVEN, OFTEN = 30.0, 30.0
 MANY = 64  # islands of contacts from which on threads are worth their while
 
 
@@ -60,8 +64,9 @@ class System(NamedTuple):
     friction: np.ndarray  # [C] product of friction
     wanted: np.ndarray  # [C] speed that resolves penetration and is then forgotten
     pushed: np.ndarray  # [C] impulse that has given it so far
-    # [C, 3]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
-    # speed along it without contact; and the speed that resolves penetration and stays
+    # [C, 4]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
+    # speed along it without contact; the speed that resolves penetration and stays; and the point's share of what
+    # the points of two bodies may gain
     calm: np.ndarray
     start: np.ndarray  # [I + 1] int64, island i has the contacts order[start[i] : start[i + 1]]
     order: np.ndarray  # [C] int64
@@ -108,17 +113,18 @@ def _equations(world, work, motion, rules, manifolds):
             most += manifolds.count[m]
     where = np.empty((most, 4), np.int64)
     row = np.zeros((most, 3, WIDTH))
-    mu, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
+    mu, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.ones((most, 4))
     count = np.int64(0)  # a literal would be a type of its own, for which all is compiled once more
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         if frozen(world, motion, a, b):
             continue
-        friction = world.friction[a] * world.friction[b] if rules.friction else 0.0
-        bounce = world.restitution[a] * world.restitution[b] if rules.restitution else 0.0
-        margin = rules.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
+        friction = world.friction[a] * world.friction[b] if rules.options.friction else 0.0
+        bounce = world.restitution[a] * world.restitution[b] if rules.options.restitution else 0.0
+        margin = rules.options.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
         between = sub(get(motion.position, a), get(motion.position, b))
         thin = THIN * min(world.thickness[a], world.thickness[b])
+        first_of_pair = count
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
@@ -131,7 +137,7 @@ def _equations(world, work, motion, rules, manifolds):
             approach = dot(now, n)
             gap = point[GAP] - margin
             way = -dot(then, n) * rules.substep_dt
-            early = not rules.adds and way > thin
+            early = not rules.options.adds and way > thin
             if point[VOID] > 0.0 or (gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)):
                 point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
                 continue
@@ -153,7 +159,7 @@ def _equations(world, work, motion, rules, manifolds):
             elif gap > -rules.split:
                 if gap < -rules.slop:
                     push = (-gap - rules.slop) * rules.erp / rules.substep_dt
-                    target = max(push, min(target + push, -approach) if rules.adds else target)
+                    target = max(push, min(target + push, -approach) if rules.options.adds else target)
             else:
                 deep = -gap * rules.erp / rules.substep_dt
             row[count, 0, WANTED] = target - before
@@ -169,7 +175,7 @@ def _equations(world, work, motion, rules, manifolds):
                     )
                     then = add(then, _turning(free, a, b, arm, other))
                 slip = along(then, n, -dot(then, n))
-                one = _tangent(n, slip, vector(rules.gravity))
+                one = _tangent(n, slip, vector(rules.options.gravity))
                 two = cross(n, one)
                 _row(world.inverse_mass, inverse, a, b, arm, other, one, row, count, 1)
                 _row(world.inverse_mass, inverse, a, b, arm, other, two, row, count, 2)
@@ -178,7 +184,7 @@ def _equations(world, work, motion, rules, manifolds):
                 drag = (point[TANGENTIAL], point[TANGENTIAL + 1], point[TANGENTIAL + 2])
                 most_drag = friction * point[NORMAL_IMPULSE]
                 first, second = dot(drag, one), dot(drag, two)
-                if rules.cone:
+                if rules.options.cone:
                     share = _within(first, second, most_drag)
                     row[count, 1, IMPULSE], row[count, 2, IMPULSE] = share * first, share * second
                 else:
@@ -186,6 +192,8 @@ def _equations(world, work, motion, rules, manifolds):
                     row[count, 2, IMPULSE] = min(max(second, -most_drag), most_drag)
             where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
             count += 1
+        for c in range(first_of_pair, count):
+            calm[c, 3] = min(FEW / (count - first_of_pair), 1.0)
     start, order = islands_of(world, work.parent, work.number, where[:count])
     return System(where[:count], row[:count], mu[:count], wanted[:count], pushed[:count], calm[:count], start, order)
 
@@ -280,6 +288,7 @@ def _solve(mass, rules, system, change, shift, island):
     """
     where, row, order = system.where, system.row, system.order
     lively = deep = False
+    rounds = _sweeps(mass, rules, system, island)
     for o in range(system.start[island], system.start[island + 1]):
         c = order[o]
         deep = deep or system.wanted[c] > 0.0
@@ -288,8 +297,8 @@ def _solve(mass, rules, system, change, shift, island):
             if row[c, e, IMPULSE] != 0.0:
                 _apply(where, row, mass, change, c, e, row[c, e, IMPULSE])
     if deep:
-        _resolve_penetration(mass, rules, system, shift, island)
-    _balance(mass, rules, system, change, island)
+        _resolve_penetration(mass, rules, system, shift, island, rounds)
+    _balance(mass, rules, system, change, island, rounds)
     for share in (0.5, 0.0):
         if not lively or not _gains(rules, system, change, island):
             return
@@ -303,8 +312,21 @@ def _solve(mass, rules, system, change, shift, island):
             row[c, 0, WANTED] = system.calm[c, 0] + share * (row[c, 0, WANTED] - system.calm[c, 0])
             if system.calm[c, 2] > 0.0:
                 system.wanted[c] = (1.0 - share) * system.calm[c, 2]
-        _resolve_penetration(mass, rules, system, shift, island)
-        _balance(mass, rules, system, change, island)
+        _resolve_penetration(mass, rules, system, shift, island, rounds)
+        _balance(mass, rules, system, change, island, rounds)
+
+
+@njit(**BARE)
+def _sweeps(mass, rules, system, island):
+    """How often an island is swept at most; the teacher sweeps all alike."""
+    heaviest, lightest = math.inf, 0.0  # inverse masses
+    for o in range(system.start[island], system.start[island + 1]):
+        for x in (2, 3):
+            inverse = mass[system.where[system.order[o], x]]
+            if inverse > 0.0:
+                heaviest, lightest = min(heaviest, inverse), max(lightest, inverse)
+    uneven = 1.0 if rules.options.adds else lightest / (EVEN * heaviest)
+    return np.int64(rules.rounds * min(max(uneven, 1.0), OFTEN))
 
 
 @njit(**BARE)
@@ -312,11 +334,11 @@ def _gains(rules, system, change, island):
     """Whether contacts have given an island more energy than they may: impulses times mean velocities, added up."""
     where, row = system.where, system.row
     work = spare = 0.0
-    lift = 2.0 * norm(vector(rules.gravity)) * LIFT * rules.slop
+    lift = 2.0 * norm(vector(rules.options.gravity)) * LIFT * rules.slop
     for o in range(system.start[island], system.start[island + 1]):
         c = system.order[o]
-        before, push = system.calm[c, 1], system.calm[c, 2]
-        spare += 0.5 * row[c, 0, MASS] * (SPARE * push * push + ROUNDING * before * before + lift)
+        before, push, share = system.calm[c, 1], system.calm[c, 2], system.calm[c, 3]
+        spare += 0.5 * share * row[c, 0, MASS] * (SPARE * push * push + ROUNDING * before * before + lift)
         work += row[c, 0, IMPULSE] * (before + 0.5 * _speed(where, row, change, c, 0))
         for e in range(1, 3 if system.friction[c] > 0.0 else 1):
             work += row[c, e, IMPULSE] * (0.5 * _speed(where, row, change, c, e) - row[c, e, WANTED])
@@ -324,10 +346,10 @@ def _gains(rules, system, change, island):
 
 
 @njit(**BARE)
-def _resolve_penetration(mass, rules, system, shift, island):
+def _resolve_penetration(mass, rules, system, shift, island, rounds):
     """Part what is deep in each other, by velocities that move bodies once and are forgotten."""
     where, row, order = system.where, system.row, system.order
-    for _ in range(rules.rounds):
+    for _ in range(rounds):
         worst = 0.0
         for o in range(system.start[island], system.start[island + 1]):
             c = order[o]
@@ -343,11 +365,11 @@ def _resolve_penetration(mass, rules, system, shift, island):
 
 
 @njit(**BARE)
-def _balance(mass, rules, system, change, island):
+def _balance(mass, rules, system, change, island, rounds):
     """All normals, then all friction, until no impulse changes a velocity by more than `exact`."""
     where, row, order, friction = system.where, system.row, system.order, system.friction
     first, last = system.start[island], system.start[island + 1]
-    for _ in range(rules.rounds):
+    for _ in range(rounds):
         worst = 0.0
         for o in range(first, last):
             c = order[o]
@@ -356,7 +378,7 @@ def _balance(mass, rules, system, change, island):
             c = order[o]
             if friction[c] > 0.0:
                 most = friction[c] * row[c, 0, IMPULSE]
-                if rules.cone:
+                if rules.options.cone:
                     worst = max(worst, _relax_friction(where, row, mass, change, c, most))
                 else:
                     worst = max(worst, _relax(where, row, mass, change, c, 1, 3, -most, most))

@@ -396,7 +396,7 @@ def _eased(world, work, rules, row, a, b, out):
             spin = turn(work.inverse, body, (row[first + 3], row[first + 4], row[first + 5]))
             for x in range(3):
                 out[12 + first + x] = world.inverse_mass[body] * row[first + x]
-                out[15 + first + x] = spin[x] if rules.rotation else 0.0
+                out[15 + first + x] = spin[x] if rules.options.rotation else 0.0
             for x in range(6):
                 total += row[first + x] * out[12 + first + x]
     return total
@@ -483,7 +483,7 @@ def _mend(world, work, motion, rules, graph, factors, lines, c):
         if b >= 0:
             moved, turned = get(factors.x, k), (factors.x[k, 3], factors.x[k, 4], factors.x[k, 5])
             put(motion.position, b, along(get(motion.position, b), moved, share))
-            if rules.rotation:
+            if rules.options.rotation:
                 q = turned_by(scale(turned, share), motion.orientation, b)
                 for x in range(4):
                     motion.orientation[b, x] = q[x]
@@ -534,7 +534,7 @@ def _factor(world, work, motion, rules, graph, factors, each, lines, c):
                 if lines.active[j, e] == 0:
                     continue
                 for x in range(6):
-                    value = -lines.line[j, e, 6 * s + x] if x < 3 or rules.rotation else 0.0
+                    value = -lines.line[j, e, 6 * s + x] if x < 3 or rules.options.rotation else 0.0
                     if lower:
                         factors.block[p, e, x] = value
                     else:
@@ -694,7 +694,7 @@ def _tried(world, work, motion, rules, trial, b):
         v = add(v, add((free[b, 0], free[b, 1], free[b, 2]), (change[b, 0], change[b, 1], change[b, 2])))
         w = add(w, add((free[b, 3], free[b, 4], free[b, 5]), (change[b, 3], change[b, 4], change[b, 5])))
     put(trial.position, b, along(get(motion.position, b), v, h))
-    if not rules.rotation and world.moves[b]:
+    if not rules.options.rotation and world.moves[b]:
         return
     put(trial.angular, b, w)
     if world.moves[b] and not world.isotropic[b]:
@@ -990,7 +990,7 @@ def _hold(world, work, motion, rules, held, comps, lo, hi, rows, count, steady):
                 rows.known[r] = rows.impulse[r]
                 rows.now[r] = _read(rows, r, change)
             for _ in range(rules.rounds):
-                worst = _sweep(world.moves, rules.cone, rows, count, change)
+                worst = _sweep(world.moves, rules.options.cone, rows, count, change)
                 if len(rows.see) == 0:
                     for i in range(lo, hi):
                         _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)
@@ -1061,7 +1061,7 @@ def _solve_island(world, work, motion, rules, system, held, comps, lo, hi, islan
         deep = deep or system.wanted[c] > 0.0
         lively = lively or system.row[c, 0, WANTED] > system.calm[c, 0]
     if deep:
-        _resolve_penetration(world.inverse_mass, rules, system, work.shift, island)
+        _resolve_penetration(world.inverse_mass, rules, system, work.shift, island, rules.rounds)
         for i in range(lo, hi):
             _project(world, work, motion, graph, factors, each, lines, comps[i], work.shift, False)
     room = _room(most)
@@ -1382,7 +1382,7 @@ def _find_first(world, work, motion, rules, held):
     """The impulses of joints that nothing is known of, as if there were no contact."""
     graph, each = held.graph, held.each
     from_contacts = System(
-        np.empty((0, 4), np.int64), np.empty((0, 3, WIDTH)), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)),
+        np.empty((0, 4), np.int64), np.empty((0, 3, WIDTH)), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 4)),
         np.zeros(2, np.int64), np.empty(0, np.int64),
     )  # fmt: skip
     assemble(world, work, motion, rules, held, True)
@@ -1434,7 +1434,7 @@ def end_step(world, work, motion, rules, held):
             if n >= 0:
                 for x in range(3):
                     motion.velocity[n, x] += work.change[n, x]
-                    if rules.rotation:
+                    if rules.options.rotation:
                         motion.angular[n, x] += work.change[n, 3 + x]
             else:
                 j = -1 - n

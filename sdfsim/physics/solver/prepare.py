@@ -218,7 +218,7 @@ class Steps:
 def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
     """Where paths lead in so many steps, and the time after them. What stands on a tray that is sped up slips if the
     tray's velocity jumps once a step and not in each inner step."""
-    inner, count = rules.substep_dt, rules.substeps
+    inner, count = rules.substep_dt, rules.options.substeps
     times = [time]
     for _ in range(steps):
         times.append(times[-1] + inner * count)  # as single steps add up, to the last bit
@@ -293,14 +293,15 @@ def nodes_near(
 
 def compiled_rules(options: Options) -> compiled.Rules:
     """The options of a run as the compiled step wants them."""
-    gravity, inner = options.gravity, options.dt / options.substeps
-    ahead = inner if options.record and inner > COARSE else 0.0
-    rounds = TEACHERS if options.adds else ROUNDS
+    inner = options.dt / options.substeps
     return compiled.Rules(
-        gravity, inner, options.substeps, SLOW * math.hypot(*gravity) * inner, options.friction,
-        options.restitution, options.rotation, options.sleep, options.margin, options.adds, options.cone,
-        ahead=ahead, slop=min(SLOP, SLOP_A_TIME * inner), rounds=rounds,
-    )  # fmt: skip
+        options,
+        inner,
+        SLOW * math.hypot(*options.gravity) * inner,
+        ahead=inner if options.record and inner > COARSE else 0.0,
+        slop=min(SLOP, SLOP_A_TIME * inner),
+        rounds=TEACHERS if options.adds else ROUNDS,
+    )
 
 
 def _manifolds(touch: Touch | None) -> compiled.Manifolds:

@@ -64,7 +64,7 @@ def run_steps(
     """
     shapes, world, work = reference(shapes), reference(world), reference(work)
     motion, rules, told = reference(motion), reference(rules), reference(kept)
-    going, dt = world.going, rules.substep_dt * rules.substeps
+    going, dt = world.going, rules.substep_dt * rules.options.substeps
     place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
     pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
     edges, counts, total = no_edges(), (0, 0, 0), 0.0
@@ -78,7 +78,7 @@ def run_steps(
         for i in range(len(going)):
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
-        if rules.sleep and rests(world, motion):
+        if rules.options.sleep and rests(world, motion):
             edges, counts = no_edges(), (0, 0, 0)
             _rest_on(world, work, motion)
             if held is not None:
@@ -189,7 +189,7 @@ def _energies(world, motion, rules):
         if world.moves[b]:
             mass = 1.0 / world.inverse_mass[b]
             moving, lifted = energy(
-                mass, world.inertia, rules.gravity, motion.position, motion.orientation, motion.velocity,
+                mass, world.inertia, rules.options.gravity, motion.position, motion.orientation, motion.velocity,
                 motion.angular, b,
             )  # fmt: skip
             kinetic, potential = kinetic + moving, potential + lifted

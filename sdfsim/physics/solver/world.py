@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sdfsim.physics.options import Options
+
 POINTS = 24  # of a manifold at most
 # Columns of a contact point: where it is on either body (about its centre of mass, in its axes), the unit normal from
 # the second body to the first (world), the distance, the impulses of the last inner step: along the normal, and the
@@ -115,20 +117,12 @@ class Manifolds(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What is in play. Lengths and speeds are those of model units, in which the smallest bodies are about 1.4 wide."""
+    """How the solve does what is in play. Lengths and speeds are those of model units, in which the smallest bodies are
+    about 1.4 wide."""
 
-    gravity: np.ndarray  # [3]
+    options: Options
     substep_dt: float  # the inner step
-    substeps: int  # of them in a step
     slow: float  # an approach up to this speed ends at the surface without a rebound
-    # friction, restitution, rotation, sleep: whether they are
-    friction: bool = True
-    restitution: bool = True
-    rotation: bool = True
-    sleep: bool = False
-    margin: float = 0.0  # all bodies but planes are larger by this than their distances say
-    adds: bool = False  # whether what is pushed out adds to the speed of a rebound
-    cone: bool = True  # whether friction is bounded by a cone; else along two axes, each by itself
     ahead: float = 0.0  # new points are looked for so much time farther, as fast as two bodies move against each other
     contact_margin: float = 0.02  # contacts are kept up to this distance, and while they have slid by no more
     search_margin: float = 0.006  # new ones are looked for up to this one and twice the margin
