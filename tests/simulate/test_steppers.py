@@ -1,5 +1,6 @@
 """The contract of steppers: steps in one call or one by one, states taken up again, and what is changed in between."""
 
+import time
 from dataclasses import fields, replace
 
 import numpy as np
@@ -272,3 +273,19 @@ def test_effects_may_be_changed_amid_a_run():
     sim.step(10)
     mu = 0.5 * 0.5  # of box and floor
     assert sim["other"].velocity[0] == pytest.approx(1.0 - mu * G * 10 * sim.dt, rel=0.02)
+
+
+def test_what_is_compiled_first_is_no_part_of_the_time_of_a_step(dropped, monkeypatch):
+    sim, called = Simulator(dropped), []
+    kind = type(sim.stepper)
+    advance = kind.advance
+
+    def slow_at_first(self, state, carry, n=1, *, keep=False):
+        if not called:
+            time.sleep(1.0)
+        called.append(n)
+        return advance(self, state, carry, n, keep=keep)
+
+    monkeypatch.setattr(kind, "advance", slow_at_first)
+    assert sim.run(steps=3).counters["step_ms"].max() < 500.0
+    assert sum(called) == 3

@@ -32,6 +32,7 @@ SIDE = 40  # at most become points
 EACH = 4  # points of a manifold that are of the same two patches
 ALIKE = 0.9  # cosine between normals that are taken for one
 EVEN = 1e-9  # by how much two lengths or their squares differ at least, for one to come before the other
+TOUCHES = 1e6  # more than any squared distance between points of a pair
 OUTWARD = 1e-3  # how much deeper another point must be to be preferred to one that is farther out by a length
 
 
@@ -153,7 +154,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
             for x in range(NORMAL_IMPULSE, KEY):
                 every[twin, x] = point[p, k, x]
             every[twin, TORSION] = point[p, k, TORSION]
-    # The deepest first, then always the one that is farthest from those chosen.
+    # The deepest first, then always the one that is farthest from those chosen, of what touches before all others.
     chosen, lowest = -1, 1e300
     for e in range(total):
         away[e], alike[e] = 1e300, 0
@@ -174,8 +175,11 @@ def merged(rules, point, p, known, scratch, count, rounded):
             if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
                 alike[e] += 1
             away[e] = min(away[e], gone + 0.01 * turned)
-            if away[e] > farthest + EVEN and alike[e] < EACH:
-                farthest, following = away[e], e
+            # What touches comes before what may: a corner that is far out and above would take the place of what bears.
+            if away[e] > rules.apart * rules.apart and alike[e] < EACH:
+                far = away[e] + (TOUCHES if every[e, GAP] <= 0.0 else 0.0)
+                if far > farthest + EVEN:
+                    farthest, following = far, e
         chosen = following
     return kept
 
