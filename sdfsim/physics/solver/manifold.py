@@ -175,9 +175,10 @@ def merged(rules, point, p, known, scratch, count, rounded):
             if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
                 alike[e] += 1
             away[e] = min(away[e], gone + 0.01 * turned)
-            # What touches comes before what may: a corner that is far out and above would take the place of what bears.
+            # What touches, or is about to, comes first: a corner that is far out and above would take the place of what
+            # bears. What rolls on would sink in if the node that comes next had to wait until it touches.
             if away[e] > rules.apart * rules.apart and alike[e] < EACH:
-                far = away[e] + (TOUCHES if every[e, GAP] <= 0.0 else 0.0)
+                far = away[e] + (TOUCHES if every[e, GAP] <= rules.slop else 0.0)
                 if far > farthest + EVEN:
                     farthest, following = far, e
         chosen = following
