@@ -104,7 +104,10 @@ def test_a_recording_is_watched_in_the_browser(tmp_path):
     rollout = Simulator(loaded).run()
     save_rollout(loaded, rollout, tmp_path / "rollout.rrd")
     command = [sys.executable, "-m", "cli", "view", str(tmp_path / "rollout.rrd"), "--web"]
+    # A shell that starts the tests in the background has them ignore Ctrl-C, and what they start.
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     shown = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
     try:
         assert shown.stderr
         told = next(line for line in shown.stderr if line.startswith("watch it at "))  # the viewer has its own lines
