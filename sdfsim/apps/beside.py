@@ -82,7 +82,7 @@ def between(
 
 def beside_of(run: Path, scene: Scene) -> Beside | None:
     """What a run, its folder or `rollout.npz`, was simulated beside; None where that was nothing. Raises SdfsimError
-    where the file is unreadable, or of other bodies."""
+    if the file is unreadable, or of other bodies."""
     file = (run if run.is_dir() else run.parent) / FILE
     if not file.exists():
         return None

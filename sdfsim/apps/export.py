@@ -224,7 +224,7 @@ def _inertia(body: Body, shape: Shape) -> np.ndarray:
 
 
 def convex_pieces(shape: Shape) -> list[Mesh]:
-    """Convex pieces [m]: the shape's own, or those of CoACD. Raises SdfsimError where there are none."""
+    """Convex pieces [m]: the shape's own, or those of CoACD. Raises SdfsimError if there are none."""
     if own := own_pieces(shape):
         return own
     import open3d  # noqa: F401  (it cannot be loaded after CoACD)

@@ -55,7 +55,7 @@ def fit(
         units: of the mesh files; None: metres.
         device: "cpu", "cuda" or "auto".
 
-    Returns the report of `fit_file`, or of `fit_many`. Raises SdfsimError where a mesh cannot be used, a folder cannot
+    Returns the report of `fit_file`, or of `fit_many`. Raises SdfsimError if a mesh cannot be used, a folder cannot
     be written, or there are no meshes; several meshes that cannot be used are told of in the report.
     """
     options = Options(recipe, budget, cap, thicken, units)
@@ -76,7 +76,7 @@ def fit(
 def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
     """Fit a mesh file and write the shape folder `out`, unless it is there from the same mesh and options. The report
     has the folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether
-    it was missed. Raises SdfsimError where the mesh cannot be used, the folder cannot be written, or another run is
+    it was missed. Raises SdfsimError if the mesh cannot be used, the folder cannot be written, or another run is
     writing to it."""
     where, loaded = pick_device(device), load_textured(mesh_file)
     mesh = loaded.mesh

@@ -29,7 +29,7 @@ def import_robot(
 
     `packages` are folders of ROS packages, `fixed` holds the root of a URDF, `floor` adds one at z = 0 on which all
     stands, and `key` is the keyframe of an MJCF file that is the start. Returns a report: links, joints, files,
-    left_out and notes. Raises SdfsimError for what cannot be read, or where files cannot be written.
+    left_out and notes. Raises SdfsimError for what cannot be read, or if files cannot be written.
     """
     source, out = Path(source), Path(out)
     kind = source.suffix.lower()

@@ -35,7 +35,7 @@ COUNTED = {
 
 def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
     """The bodies and joints of an MJCF file, as they are in the keyframe `key`, or else in one called start, or as the
-    file draws them. Raises SdfsimError where MuJoCo is not installed or refuses the file, for no such keyframe, or for
+    file draws them. Raises SdfsimError if MuJoCo is not installed or refuses the file, for no such keyframe, or for
     geometry that no body can have."""
     mujoco = optional("mujoco", "mujoco", "mjcf")
     try:

@@ -61,7 +61,7 @@ class Recording:
 
 
 def movers(scene: Scene) -> list[Body]:
-    """The bodies that a recording tells of. Raises SdfsimError where none moves."""
+    """The bodies that a recording tells of. Raises SdfsimError if none moves."""
     found = [b for b in scene.bodies if b.motion == "dynamic"]
     if not found:
         raise SdfsimError(f"{scene.path}: bodies: none moves")

@@ -266,7 +266,7 @@ def _crowds(scene: Scene) -> list[Crowd]:
 
 
 def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Beside | None = None) -> None:
-    """Write `rollout` as a rerun recording, with a recorded motion `beside` it. Raises SdfsimError where the file
+    """Write `rollout` as a rerun recording, with a recorded motion `beside` it. Raises SdfsimError if the file
     cannot be written."""
     playback = Playback(scene, rollout, beside=beside)
     encoded = playback.stream.binary_stream()  # since rerun's own sink only logs a full disk

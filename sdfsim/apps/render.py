@@ -80,7 +80,7 @@ def eye_of(
     scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
 ) -> Eye:
     """The camera of a scene. Where its position or target, [3] m each, is not given, one is chosen that has the whole
-    scene in sight. Raises SdfsimError where the two are one point, or not finite."""
+    scene in sight. Raises SdfsimError if the two are one point, or not finite."""
     centre, radius = framed(scene, motion)
     eye = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
     if camera is None:
@@ -115,7 +115,7 @@ def _axes(eye: Eye) -> np.ndarray:
 
 
 def check_format(out: Path) -> None:
-    """Raises SdfsimError where the ending of a file says neither movie nor picture."""
+    """Raises SdfsimError if the ending of a file says neither movie nor picture."""
     if out.suffix not in FORMATS:
         raise SdfsimError(f"{out}: must end with {' or '.join(FORMATS)}")
 

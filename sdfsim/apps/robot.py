@@ -127,7 +127,7 @@ def write_scene(
     """Write a scene.yaml, and Shape folders in `NAME_shapes/` beside it: the files and folders, and notes on what was
     made otherwise, one line each. With a `floor`, a plane at z = 0, all is raised or lowered to stand on it.
 
-    Raises SdfsimError for a link that cannot be a body, or where files cannot be written.
+    Raises SdfsimError for a link that cannot be a body, or if files cannot be written.
     """
     whole, notes = _apart(_merged(robot, {WORLD, FLOOR} if floor else {WORLD}))
     folder = out.with_name(f"{out.stem}_shapes")

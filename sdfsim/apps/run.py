@@ -310,7 +310,7 @@ class Checkpoint:
 
     def restore(self) -> list[Rollout]:
         """The frames so far, the simulator's state brought to the last of them; none where nothing was kept. Raises
-        SdfsimError where that is of another scene, model or seed, or damaged."""
+        SdfsimError if that is of another scene, model or seed, or damaged."""
         file = self._folder / _STATE
         if not file.exists():
             return []
@@ -351,7 +351,7 @@ class Checkpoint:
 
 
 def finished(report_file: Path, identity: str, steps: int, *, until_settled: bool) -> dict[str, Any] | None:
-    """The report of a run that is finished; None where it was interrupted or is not there. Raises SdfsimError where it
+    """The report of a run that is finished; None where it was interrupted or is not there. Raises SdfsimError if it
     is another run, of another length (unless it ended `until_settled`), or its state broke."""
     if not report_file.exists():
         return None

@@ -26,7 +26,7 @@ _NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
 
 def stream_to_viewer(playback: Playback, kind: str) -> str:
     """Send everything that `playback` logs from now on to a viewer: a window (`native`), or a page (`web`) that is
-    there for as long as this process runs, whose address is returned. Raises SdfsimError where it does not start."""
+    there for as long as this process runs, whose address is returned. Raises SdfsimError if it does not start."""
     port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
     web = ["--serve-web", "--web-viewer-port", str(page_port)]
     viewer = _launch(port, web if kind == "web" else ["--expect-data-soon", "--hide-welcome-screen"])
@@ -73,7 +73,7 @@ def _launch(port: int, options: list[str]) -> subprocess.Popen:
 
 
 def check_screen(kind: str) -> None:
-    """Raises SdfsimError when a window (`native`) is wanted where there is no screen."""
+    """Raises SdfsimError if a window (`native`) is wanted where there is no screen."""
     if kind == "native" and not has_screen():
         raise SdfsimError("there is no screen here for a window", "watch it in the browser, --viewer web or view --web")
 
@@ -84,7 +84,7 @@ def has_screen() -> bool:
 
 def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lambda line: None) -> None:
     """Open a recording, or that of a run folder, and wait until the viewer is closed; `say` is told the address of a
-    page in the browser (`web`). Raises SdfsimError for no such recording, no screen for a window, or where it fails."""
+    page in the browser (`web`). Raises SdfsimError for no such recording, no screen for a window, or if it fails."""
     recording = _recording(recording)
     port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
     if not web:
@@ -161,7 +161,7 @@ def _end(process: subprocess.Popen) -> None:
 
 
 def _recording(place: Path) -> Path:
-    """The recording of a run folder or of a reconstruction, or the file itself. Raises SdfsimError where none is."""
+    """The recording of a run folder or of a reconstruction, or the file itself. Raises SdfsimError if none is."""
     inside = [place / name for name in ("rollout.rrd", "reconstruction.rrd") if (place / name).is_file()]
     file = inside[0] if inside else place
     if not file.is_file() or file.open("rb").read(3) != b"RRF":

@@ -19,7 +19,7 @@ def check_device(name: str) -> None:
 
 
 def pick_device(name: str) -> torch.device:
-    """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError for another name, or where there is no CUDA."""
+    """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError for another name, or if there is no CUDA."""
     import torch  # it takes its time to load
 
     if name == "auto":

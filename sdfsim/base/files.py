@@ -44,7 +44,7 @@ def path_from(folder: Path, path: Path | str) -> str:
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it takes the final name when the block ends without an error. Raises
-    SdfsimError where the disk is full or the folder not writable."""
+    SdfsimError if the disk is full or the folder not writable."""
     # Unique also across the threads of a worker, and the hosts that share a folder.
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
     try:
@@ -86,7 +86,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path, hint: str = "") -> Any:
-    """The content of a JSON file. Raises SdfsimError when it is absent or not JSON."""
+    """The content of a JSON file. Raises SdfsimError if it is absent or not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -108,7 +108,7 @@ def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True)
 
 
 def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file; messages call it `what`. Raises SdfsimError where it is
+    """All arrays of an `.npz` file; messages call it `what`. Raises SdfsimError if it is
     absent, cut short, not an archive, or would unpack to an absurd size."""
     try:
         with zipfile.ZipFile(path) as archive:
@@ -143,7 +143,7 @@ def locked(folder: Path) -> Iterator[None]:
     """Make a folder, lock other runs out of it inside the block, and remove half-written files of a killed run.
 
     The system lifts the lock when this process ends, however it ends. A folder made here is removed again if it stays
-    empty. Raises SdfsimError where another run is in there, or the folder cannot be written.
+    empty. Raises SdfsimError if another run is in there, or the folder cannot be written.
     """
     path, made = folder / LOCK, not folder.exists()
     try:
@@ -179,7 +179,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _lock(file: IO[str]) -> None:
-    """Take the lock of an open file, which ends with this process. Raises BlockingIOError or PermissionError where
+    """Take the lock of an open file, which ends with this process. Raises BlockingIOError or PermissionError if
     another one has it."""
     try:
         fcntl: Any = importlib.import_module("fcntl")

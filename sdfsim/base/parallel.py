@@ -95,7 +95,7 @@ def cluster(address: str | None) -> Iterator[None]:
     """Let `parallel` work on the Dask cluster of a scheduler, such as tcp://host:8786, inside the block; None leaves it
     on this machine.
 
-    Its workers need this package, and see the files of a job under the same paths. Raises SdfsimError where Dask is not
+    Its workers need this package, and see the files of a job under the same paths. Raises SdfsimError if Dask is not
     installed, or no scheduler answers.
     """
     if address is None:

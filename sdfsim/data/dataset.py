@@ -86,7 +86,7 @@ def at_instants(recorded: Trajectory, substep: float) -> Trajectory:
 
 def engine_substep(data: Path) -> float:
     """The recording engine's inner step in s, where the dataset (a folder or one of its splits) has it; 0 elsewhere.
-    Raises SdfsimError where the `dataset.json` holds something else there."""
+    Raises SdfsimError if the `dataset.json` holds something else there."""
     home = home_of(data)
     settings = (read_info(home).get("engine_settings") or {}) if home else {}
     found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
@@ -132,20 +132,20 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def check_names(where: str, names: Iterable[str]) -> None:
-    """Raises SdfsimError where one of the names cannot be that of a Shape folder of a dataset."""
+    """Raises SdfsimError if one of the names cannot be that of a Shape folder of a dataset."""
     for name in names:
         if not _NAME.fullmatch(name):
             raise SdfsimError(f"{where}: {name!r} cannot name a Shape folder", "use letters, digits, spaces, . _ -")
 
 
 def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
-    """Raises SdfsimError where trajectories that are used together differ in step or gravity."""
+    """Raises SdfsimError if trajectories that are used together differ in step or gravity."""
     if len({(t.dt, *t.gravity.tolist()) for t in trajectories}) > 1:
         raise SdfsimError(f"{where}: its trajectories differ in step or gravity", "give a dataset of one recipe")
 
 
 def read_info(folder: Path) -> dict:
-    """`dataset.json` of a dataset folder. Raises SdfsimError where it is absent, no JSON object, or of `sdfsim dataset`
+    """`dataset.json` of a dataset folder. Raises SdfsimError if it is absent, no JSON object, or of `sdfsim dataset`
     with another version of the teacher."""
     info = read_json(folder / INFO, "a dataset folder is what `sdfsim dataset` writes")
     if not isinstance(info, dict):
@@ -172,7 +172,7 @@ class Conditions:
 
 
 def conditions_of(data: Path) -> Conditions:
-    """How a dataset, a folder or one of its splits, was recorded. Raises SdfsimError where its `dataset.json` is not
+    """How a dataset, a folder or one of its splits, was recorded. Raises SdfsimError if its `dataset.json` is not
     readable, or has an invalid floor."""
     home = home_of(data)
     info = read_info(home) if home else {}
@@ -182,7 +182,7 @@ def conditions_of(data: Path) -> Conditions:
 
 def floor_of(info: dict, folder: Path = Path()) -> tuple[float, float]:
     """Friction and restitution of the floor in the `dataset.json` of a folder, or the recipes' own where it has none.
-    Raises SdfsimError where either is missing, negative or no number, or the restitution is above 1."""
+    Raises SdfsimError if either is missing, negative or no number, or the restitution is above 1."""
     floor = info.get("floor")
     if floor is None:
         return FLOOR
@@ -216,7 +216,7 @@ def ranges_of(
 
 def trajectory_files(folder: Path, split: str) -> list[Path]:
     """Trajectory files of a dataset in name order: of `folder/split/`, or of `folder` where nothing is split. Raises
-    SdfsimError where there are none, or other splits but not this one."""
+    SdfsimError if there are none, or other splits but not this one."""
     split_up = [name for name in SPLITS if (folder / name).is_dir()]
     if split_up and split not in split_up:
         raise SdfsimError(f"{folder}: no {split} split here, only {', '.join(split_up)}")

@@ -101,7 +101,7 @@ def report_lines(report: dict) -> list[str]:
 
 def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int = FPS) -> Trajectory:
     """One trajectory of `STEPS` steps, with velocities as the engine gives them, at `fps` in `RATES`. Raises
-    SdfsimError where no scene of `REDRAWS` had room for its bodies."""
+    SdfsimError if no scene of `REDRAWS` had room for its bodies."""
     for _ in range(REDRAWS):
         with Teacher(np.array(GRAVITY), FLOOR, step=1.0 / fps, substeps=RATES[fps]) as teacher:
             placed = RECIPES[recipe].spawn(teacher, rng, cast)
@@ -154,7 +154,7 @@ def _origins(
 
 
 def _check_same(out: Path, info: dict) -> None:
-    """Raises SdfsimError when the folder holds a dataset that differs from `info`."""
+    """Raises SdfsimError if the folder holds a dataset that differs from `info`."""
     there = read_info(out) if (out / INFO).exists() else info
     if other := [key for key, value in info.items() if there.get(key) != value]:
         raise SdfsimError(f"{out} holds a dataset with another {other[0]}", "choose another -o")

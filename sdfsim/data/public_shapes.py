@@ -34,7 +34,7 @@ for line in Path(__file__).with_suffix(".sha256").read_text(encoding="utf-8").sp
 
 def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
     """The folder that `--shapes` means: of this path, else the public set of this name in `SUMS`, fetched if need be.
-    Raises SdfsimError where a download failed or a file is not the one expected."""
+    Raises SdfsimError if a download failed or a file is not the one expected."""
     name = str(shapes)
     if name not in SUMS or shapes.is_dir():
         return shapes
@@ -69,7 +69,7 @@ def _check(content: bytes, expected: str, what: str, hint: str) -> None:
 
 def fetched(url: str, hint: str, inside: str = "", kept: Path | None = None) -> dict[str, bytes]:
     """The files of an archive by their base names, so that no path in it matters, of all folders or of those of one
-    name; a single file under "". `kept` is where people may have put it. Raises SdfsimError where it cannot be had."""
+    name; a single file under "". `kept` is where people may have put it. Raises SdfsimError if it cannot be had."""
     import pooch
 
     pooch.get_logger().setLevel("WARNING")  # it would log the checksum of each download

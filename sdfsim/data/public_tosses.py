@@ -77,7 +77,7 @@ FALL = [0.1, 0.05, -9.64]  # m/s^2, of all the elbow's flights
 
 def public_tosses(name: Path, on_progress: Progress = silent) -> Path:
     """The folder of this name, else that of the public set of this name in `SETS`: its `tosses.npz` and `scene.yaml`,
-    fetched if need be. Raises SdfsimError where the download failed or is not what is expected."""
+    fetched if need be. Raises SdfsimError if the download failed or is not what is expected."""
     if str(name) not in SETS or name.exists():
         return name
     known, folder = SETS[str(name)], user_cache("public") / name

@@ -79,7 +79,7 @@ def set_as_teacher(info: dict) -> bool:
 
 
 def substeps_of(step: float) -> int:
-    """Inner steps in a recorded step of `step` s. Raises SdfsimError when the teacher records at no such rate."""
+    """Inner steps in a recorded step of `step` s. Raises SdfsimError if the teacher records at no such rate."""
     for fps, substeps in RATES.items():
         if abs(step - 1.0 / fps) < 1e-9:
             return substeps

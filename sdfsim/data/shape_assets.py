@@ -113,7 +113,7 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
 def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[list[ShapeSource], dict[str, str]]:
     """Engine files of all shapes, about their centres of mass; files that are there already are kept.
 
-    Returns the usable shapes in the order of `found`; and the others, name -> why. Raises SdfsimError where a shape
+    Returns the usable shapes in the order of `found`; and the others, name -> why. Raises SdfsimError if a shape
     taken `as_is` cannot be used.
     """
     engine.mkdir(parents=True, exist_ok=True)
@@ -186,7 +186,7 @@ def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource
 
 def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
     """Convex pieces of a solid, given by its boundary in metres, by V-HACD; its files, `scratch` with endings, are
-    removed. Raises SdfsimError where it failed."""
+    removed. Raises SdfsimError if it failed."""
     before, after, log = (scratch.with_name(f".{scratch.name}.{end}") for end in ("in.obj", "out.obj", "log"))
     try:
         write_text(before, wavefront([mesh]))

@@ -247,7 +247,7 @@ def engine_motion(
     """The motion of an engine of `steps` calls of `advance`, and its time.
 
     `state` gives positions [M, 3] m, quaternions [M, 4] xyzw and velocities [M, 3] m/s and rad/s of the bodies that
-    move, in the frame of the world. Raises SdfsimError where the motion is not finite, and TooSlow.
+    move, in the frame of the world. Raises SdfsimError if the motion is not finite, and TooSlow.
     """
     began = time.process_time()
     frames = [state()]
@@ -313,7 +313,7 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
 
 
 def dataset_urdf(data: Path, shape: str) -> Path:
-    """The URDF of a dataset's shape. Raises SdfsimError when it, or the convex pieces beside it, are absent."""
+    """The URDF of a dataset's shape. Raises SdfsimError if it, or the convex pieces beside it, are absent."""
     path = shapes_folder(data) / "engine" / f"{shape}.urdf"
     if not path.is_file() or not path.with_suffix(".obj").is_file():
         raise SdfsimError(f"{path}: no engine file of shape {shape!r}", "`sdfsim dataset` writes them")

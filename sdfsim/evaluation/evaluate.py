@@ -189,7 +189,7 @@ def teacher_again(data: Path, trajectories: Motions, steps: int, seed: int = 0) 
     """Run the teacher again from recorded starts (velocities as recorded) of a dataset with a URDF for every shape.
 
     Returns, by the names of `PERTURBATIONS`, the motions (steps + 1 frames) that follow when the velocity of each body
-    that moves is changed by so much in a random direction. Raises SdfsimError where PyBullet or an engine file is
+    that moves is changed by so much in a random direction. Raises SdfsimError if PyBullet or an engine file is
     absent, or the recording is not this teacher's.
     """
     import_pybullet()

@@ -140,7 +140,7 @@ def srgb(light: np.ndarray) -> np.ndarray:
 
 def read_gltf(path: Path) -> FileMesh:
     """All triangles of the scene that a .gltf or .glb file shows, turned from glTF's y up to z up: the meshes of its
-    nodes where these place them, with their colours. Raises ValueError where it is damaged, or needs an extension that
+    nodes where these place them, with their colours. Raises ValueError if it is damaged, or needs an extension that
     is not read."""
     file = _GltfReader(path)
     parts = [part for _, part in file.parts()]
@@ -155,7 +155,7 @@ def read_gltf(path: Path) -> FileMesh:
 
 
 def read_painted(path: Path) -> dict[str, Painted]:
-    """The parts of a file with a texture each, by the names of their nodes. Raises ValueError where it is damaged, or a
+    """The parts of a file with a texture each, by the names of their nodes. Raises ValueError if it is damaged, or a
     part has no texture that is read."""
     file, found = _GltfReader(path), {}
     for name, part in file.parts():
@@ -166,7 +166,7 @@ def read_painted(path: Path) -> dict[str, Painted]:
 
 
 class _GltfReader:
-    """A file that is read: its header, and its buffers as bytes. Raises ValueError where it is damaged."""
+    """A file that is read: its header, and its buffers as bytes. Raises ValueError if it is damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -11,7 +11,7 @@ from sdfsim.geometry.mesh import Mesh, is_closed, lattice
 
 def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
     """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it of a closed mesh, exactly,
-    as a sum over signed tetrahedra. Raises SdfsimError where it is open or encloses nothing: see
+    as a sum over signed tetrahedra. Raises SdfsimError if it is open or encloses nothing: see
     `mass_properties_of_sdf`."""
     if not is_closed(mesh):
         raise SdfsimError("mesh is not closed, so it has no exact volume")
@@ -20,7 +20,7 @@ def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
 
 def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.ndarray, np.ndarray]:
     """`mass_properties` of a surface that is closed but for cracks: edges need not match, as after cutting its faces.
-    These have weights [F], 1 / n where n of them lie on each other. Raises SdfsimError where it encloses nothing."""
+    These have weights [F], 1 / n where n of them lie on each other. Raises SdfsimError if it encloses nothing."""
     # Moments about the vertices' mean: far from the origin the products of large coordinates would cancel.
     shift = mesh.vertices.mean(0)
     corners = mesh.vertices[mesh.faces] - shift

@@ -60,7 +60,7 @@ class Frame:
 
 
 def normal_frame(bounds: np.ndarray) -> Frame:
-    """The frame in which a box `bounds` [2, 3] m becomes [-0.5, 0.5] along its largest extent. Raises SdfsimError where
+    """The frame in which a box `bounds` [2, 3] m becomes [-0.5, 0.5] along its largest extent. Raises SdfsimError if
     it has no extent or is not finite."""
     extent = float((bounds[1] - bounds[0]).max())
     if not np.isfinite(extent) or extent <= 0:
@@ -69,7 +69,7 @@ def normal_frame(bounds: np.ndarray) -> Frame:
 
 
 def require_whole(mesh: Mesh) -> None:
-    """Raise ValueError where numbers are missing or faces have corners that are not there."""
+    """Raise ValueError if numbers are missing or faces have corners that are not there."""
     if not np.isfinite(mesh.vertices).all() or (mesh.uv is not None and not np.isfinite(mesh.uv).all()):
         raise ValueError("vertices that are not finite")
     if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
@@ -184,7 +184,7 @@ def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
-    """Convex hull of `points` [P, 3] m, outward faces. Raises SdfsimError for fewer than four points, or where they are
+    """Convex hull of `points` [P, 3] m, outward faces. Raises SdfsimError for fewer than four points, or if they are
     not finite or all in one plane."""
     from scipy.spatial import ConvexHull, QhullError
 

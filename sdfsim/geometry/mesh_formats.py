@@ -266,7 +266,7 @@ def read_image(content: bytes) -> np.ndarray | None:
 
 
 def side_file(path: Path, name: str) -> bytes:
-    """What a mesh file names, from its folder. Raises ValueError where that is elsewhere, or not there."""
+    """What a mesh file names, from its folder. Raises ValueError if that is elsewhere, or not there."""
     from trimesh.resolvers import FilePathResolver
 
     try:

@@ -162,7 +162,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
-    """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names. Raises SdfsimError where it
+    """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names. Raises SdfsimError if it
     is not readable or has no such property."""
     with _reading(path, f"damaged, or without {', '.join(names)}"):
         vertices = read_ply(path.read_bytes())[0]["vertex"]
@@ -220,7 +220,7 @@ def write_glb(meshes: dict[str, Mesh]) -> bytes:
 
 def load_pieces(path: str | Path) -> list[Mesh]:
     """The convex pieces of a collision geometry in Wavefront OBJ: the convex hull of each `o` group's vertices. Raises
-    SdfsimError where it cannot be read, has no pieces, or a piece is flat."""
+    SdfsimError if it cannot be read, has no pieces, or a piece is flat."""
     path = Path(path)
     if not path.is_file():
         raise SdfsimError(f"{path}: no such mesh file")

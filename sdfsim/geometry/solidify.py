@@ -65,7 +65,7 @@ class Solid:
 
     def mass_properties(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it: exact to rounding for a
-        surface that was not cut, to about 0.1 % otherwise. Raises SdfsimError where it encloses nothing."""
+        surface that was not cut, to about 0.1 % otherwise. Raises SdfsimError if it encloses nothing."""
         return integrals(self.surface, 1.0 if self.layers is None else 1.0 / self.layers)
 
 
@@ -74,7 +74,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     Inside is what the surface goes around, once or more (winding number above one half): overlapping parts are one
     body, shells inside it do not count unless they are wound the other way (cavities). Windings are made consistent,
-    small openings closed, and everything within the solid left out. Raises SdfsimError where the mesh encloses no
+    small openings closed, and everything within the solid left out. Raises SdfsimError if the mesh encloses no
     volume or is open beyond small holes, or `thicken` is too small or too large.
     """
     mesh = clean(mesh, name=name)

@@ -130,7 +130,7 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
 
 
 def _check_size(kind: str, config: dict[str, Any], found: dict[str, list[int]]) -> None:
-    """Raise ValueError where the weights of a file are not those of its network: before memory is taken for it."""
+    """Raise ValueError if the weights of a file are not those of its network: before memory is taken for it."""
     if any(isinstance(value, int) and not 0 <= value <= MOST for value in config.values()):
         raise ValueError(f"sizes of its network must be 0 to {MOST} (got {config})")
     import torch

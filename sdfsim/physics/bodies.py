@@ -163,7 +163,7 @@ class State(Motion):
     time: float = 0.0  # since the start
 
     def save(self, path: Path | str) -> Path:
-        """Write an .npz file from which `read` makes the same state, to the last bit. Raises SdfsimError where it
+        """Write an .npz file from which `read` makes the same state, to the last bit. Raises SdfsimError if it
         cannot be written."""
         path = Path(path)
         write_arrays(path, self.arrays(), compressed=False)
@@ -171,7 +171,7 @@ class State(Motion):
 
     @classmethod
     def read(cls, path: Path | str) -> "State":
-        """What `save` has written. Raises SdfsimError where it is missing or none of ours."""
+        """What `save` has written. Raises SdfsimError if it is missing or none of ours."""
         try:
             return cls.of_arrays(read_arrays(Path(path), "a state"))
         except (KeyError, TypeError, ValueError) as error:
@@ -205,7 +205,7 @@ def awake(bodies: Bodies, state: State) -> np.ndarray:
 
 
 def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
-    """Bodies and initial state of a scene, in model units. Raises SdfsimError where a body that moves has no mass or no
+    """Bodies and initial state of a scene, in model units. Raises SdfsimError if a body that moves has no mass or no
     surface nodes."""
     shapes = [scene.shapes[b.shape] for b in scene.bodies]
     for body, shape in zip(scene.bodies, shapes, strict=True):

@@ -83,7 +83,7 @@ class Rollout:
 
     @classmethod
     def load(cls, path: Path | str) -> "Rollout":
-        """Read a `rollout.npz`. Raises SdfsimError when it is missing or not one of ours."""
+        """Read a `rollout.npz`. Raises SdfsimError if it is missing or not one of ours."""
         arrays = read_arrays(Path(path), "a rollout", "give a run folder, or the rollout.npz in it")
         try:
             counters = {k.removeprefix("counter_"): arrays.pop(k) for k in list(arrays) if k.startswith("counter_")}

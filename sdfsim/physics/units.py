@@ -56,7 +56,7 @@ def inner_steps(scene: Scene) -> int:
 
 
 def _check_sizes(names: list[str], sizes: np.ndarray) -> None:
-    """Raises SdfsimError where a body of `sizes` [N] m is far wider than most. Of the two that are compared the less
+    """Raises SdfsimError if a body of `sizes` [N] m is far wider than most. Of the two that are compared the less
     ordinary one is to blame."""
     order = np.argsort(sizes, kind="stable")
     usual, widest = order[(len(order) - 1) // 2], order[-1]

@@ -76,7 +76,7 @@ def first_fault(state: Motion, dt: float, rows: np.ndarray | None = None, before
 
 
 def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
-    """Raises SdfsimError where a body that has an end is too large for its surface to keep to where points are placed
+    """Raises SdfsimError if a body that has an end is too large for its surface to keep to where points are placed
     exactly; a model unit is so many `metres`."""
     large = np.flatnonzero((bodies.size > FARTHEST) & np.isfinite(bodies.size))
     if len(large):
@@ -89,7 +89,7 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
 
 
 def check_nodes(scene: Scene) -> None:
-    """Raises SdfsimError where a dynamic body's nodes are one place or one line, and do not tell how it is turned, or a
+    """Raises SdfsimError if a dynamic body's nodes are one place or one line, and do not tell how it is turned, or a
     shape has more convex pieces than contacts can tell apart."""
     told = set()
     for shape in scene.shapes:

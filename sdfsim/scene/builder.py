@@ -103,7 +103,7 @@ class SceneBuilder:
 
     def save(self, path: Path | str) -> Path:
         """Write a scene.yaml; paths in it start at its folder. Nothing is checked: `load_scene` does that. Raises
-        SdfsimError where the file cannot be written."""
+        SdfsimError if the file cannot be written."""
         path = Path(path)
         write_text(path, self._text(path.resolve().parent))
         return path

@@ -23,7 +23,7 @@ def samples() -> dict[str, str]:
 
 def find_scene(given: Path | str, *, or_run: bool = False) -> Path:
     """The scene file that is meant: a path, or the name of a sample where there is no file of that name. Raises
-    SdfsimError where it can be neither; `or_run`: a run or shape folder of that name would have done as well."""
+    SdfsimError if it can be neither; `or_run`: a run or shape folder of that name would have done as well."""
     path = Path(given)
     if path.suffix or len(path.parts) != 1 or path.is_file():
         return path
@@ -39,7 +39,7 @@ def find_scene(given: Path | str, *, or_run: bool = False) -> Path:
 
 def copy_samples(out: Path) -> Path:
     """Copy all samples, with their shapes, photos and scripts, to a folder that is not there yet. Raises SdfsimError
-    where it is, or cannot be written."""
+    if it is, or cannot be written."""
     if out.exists():
         raise SdfsimError(f"{out}: exists already, and nothing is replaced", "choose another -o")
     try:

@@ -36,7 +36,7 @@ NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
 class Document:
     """The YAML of a file, and the faults found in it, each with its line.
 
-    `data` are dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value. Raises SceneError where the file
+    `data` are dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value. Raises SceneError if the file
     is missing, too large, not UTF-8, not YAML (with the line), or empty, or its aliases multiply it.
     """
 

@@ -31,7 +31,7 @@ UP = (0.0, 0.0, 1.0)
 @dataclass(frozen=True, eq=False)
 class MeshSdf:
     """The signed distance of a triangle mesh, with the sign of `MeshDistance`, good to about 1e-7 of the mesh's size.
-    It is evaluated on the CPU, wherever the points are. Raises SdfsimError where the mesh has no faces."""
+    It is evaluated on the CPU, wherever the points are. Raises SdfsimError if the mesh has no faces."""
 
     mesh: Mesh  # metres
 

@@ -39,7 +39,7 @@ class DistanceOracle(Protocol):
 
 class MeshDistance:
     """Signed distance to a solid that is bounded by triangles (see `solidify`), or to a mesh as it is: a sheet has no
-    inside. Raises SdfsimError where the mesh has no faces.
+    inside. Raises SdfsimError if the mesh has no faces.
 
     The sign is that of the solid's winding number: inside where the surface goes around a point more than half a time.
     Where a single clean surface bounds the solid, ray parity gives the same and is faster. `trusted` follows the paper
@@ -90,7 +90,7 @@ class MeshDistance:
 
 class PiecesDistance:
     """Signed distance to a union of convex closed pieces, metres: the exact body that a rigid-body engine collides.
-    Raises SdfsimError where there are no pieces.
+    Raises SdfsimError if there are no pieces.
 
     Whether a point is inside is exact (half-spaces of each piece). Outside, the distance is the minimum over the
     pieces. Inside, it is the distance to the boundary of the *union*: faces that another piece covers are left out, so

@@ -146,7 +146,7 @@ def shape_from_mesh(
 
     `units` are metres per unit of the file (None: unknown, taken as metres), `thicken` m is a thickness for an open
     sheet. With `sdf` "mlp" the network is fitted; "grid" and "mesh" need no fit (see `mesh_shape`). `source["notes"]`
-    lists what was done to the mesh, and `remarks`. Raises SdfsimError where the mesh cannot be used.
+    lists what was done to the mesh, and `remarks`. Raises SdfsimError if the mesh cannot be used.
     """
     path = Path(path)
     loaded = load_textured(path)

@@ -84,7 +84,7 @@ class Shape:
 
     def save(self, folder: str | Path) -> Path:
         """Write the shape folder and return it. Each file appears complete or not at all, and shape.json last, beside
-        the files it describes. Raises SdfsimError where the folder cannot be written, or the SDF is of a kind without a
+        the files it describes. Raises SdfsimError if the folder cannot be written, or the SDF is of a kind without a
         file format, or exact and of another mesh."""
         from safetensors.torch import save as to_bytes
 
@@ -122,7 +122,7 @@ class Shape:
 
 
 def load_shape(folder: str | Path) -> Shape:
-    """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`). Raises SdfsimError where a file is missing,
+    """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`). Raises SdfsimError if a file is missing,
     cut short, of another version, or holds what it should not."""
     from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes
@@ -226,7 +226,7 @@ def _finite(value: Any, what: str, *shape: int) -> np.ndarray:
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
-    """The same shape `factor` times as large, about its own origin. Raises SdfsimError where the factor is not positive
+    """The same shape `factor` times as large, about its own origin. Raises SdfsimError if the factor is not positive
     and finite."""
     if not (np.isfinite(factor) and factor > 0):
         raise SdfsimError(f"{shape.name}: scale must be > 0 (got {factor})")
@@ -264,7 +264,7 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
     Kinds: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the mesh, see
     `sample_grid`, with the certificate of `certify_grid`) or "mesh" (that distance itself, which needs no certificate);
     `source` notes the kind as `sdf`.
-    Raises SdfsimError where there is no network, of a plane, or of fewer than two samples a side.
+    Raises SdfsimError if there is no network, of a plane, or of fewer than two samples a side.
     """
     if kind == "mlp":
         if not isinstance(shape.sdf, MlpSdf):

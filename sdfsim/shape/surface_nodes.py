@@ -26,7 +26,7 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     Deterministic.
 
     The cube [-0.7, 0.7]^3 of the normalised frame has `grid` points a side; the point nearest the middle of each voxel
-    of width `voxel` stays. Raises SdfsimError where the SDF is unbounded, or no point reached its surface.
+    of width `voxel` stays. Raises SdfsimError if the SDF is unbounded, or no point reached its surface.
     """
     frame = normal_frame(sdf.bounds)
     axis = np.linspace(-GRID_HALF, GRID_HALF, grid)

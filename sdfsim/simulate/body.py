@@ -36,7 +36,7 @@ class LiveScene(ABC):
         neither `options`, gravity among them, nor what the scene says.
 
         Give it another one to start from there, or to change bodies: `simulator.state = replace(simulator.state,
-        velocity=...)`; its arrays are not to be written into. Raises SimulationError where what was changed cannot be.
+        velocity=...)`; its arrays are not to be written into. Raises SimulationError if what was changed cannot be.
         """
         self._accept()  # a state that is kept must know of every change, or what slept would sleep on
         return self._state
@@ -170,7 +170,7 @@ class BodyHandle:
 
     def push(self, impulse: Numbers, at: Numbers | None = None) -> None:
         """Change its velocities by an impulse [3] N s, now, that acts `at` [3] m, world, or at the centre of mass.
-        Raises SdfsimError where the body does not move by itself."""
+        Raises SdfsimError if the body does not move by itself."""
         self._must_move("be pushed")
         given = _vector("impulse", impulse)
         self.velocity = self.velocity + given / self.mass
@@ -188,7 +188,7 @@ class BodyHandle:
 
         The force acts `at` [3] m, world, now, or at the centre of mass. Its moment about the centre of mass stays as it
         is, however the body moves: pull again after a step to follow the point. The torque comes on top of it. Raises
-        SdfsimError where the body does not move by itself, or the model knows no forces.
+        SdfsimError if the body does not move by itself, or the model knows no forces.
         """
         self._must_move("be pulled")
         sim = self._simulator

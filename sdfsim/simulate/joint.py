@@ -83,7 +83,7 @@ class JointHandle:
     @property
     def target(self) -> float | None:
         """What the motor aims at: rad/s or m/s where it keeps a speed, else rad or m; None where nobody has told it
-        yet, and while it gives an `effort`. None lets the motor go. Raises SdfsimError where there is no motor."""
+        yet, and while it gives an `effort`. None lets the motor go. Raises SdfsimError if there is no motor."""
         unit, does = self._aim, int(self._number[MOTOR])
         return float(self._told[TARGET]) * unit if does in (TO_SPEED, TO_PLACE) else None
 
@@ -134,7 +134,7 @@ class JointHandle:
 
     @property
     def time(self) -> float:
-        """s, in which what is left of the way shrinks by a factor e. Raises SdfsimError where there is no motor that
+        """s, in which what is left of the way shrinks by a factor e. Raises SdfsimError if there is no motor that
         goes to a place."""
         _ = self._aim
         if self._keeps_speed:

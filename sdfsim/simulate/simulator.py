@@ -260,14 +260,14 @@ class Simulator(LiveScene):
         self.steps_done = round(state.time / self._options.dt)
 
     def __getitem__(self, name: str) -> BodyHandle:
-        """A body by its name. Raises SdfsimError where there is none of that name."""
+        """A body by its name. Raises SdfsimError if there is none of that name."""
         if name not in self._names:
             close = nearest(name, self._names)
             raise SdfsimError(f"there is no body {name!r}{close}", f"there are {', '.join(self._names[:20])}")
         return BodyHandle(self, self._names.index(name))
 
     def joint(self, name: str) -> JointHandle:
-        """A joint by its name. Raises SdfsimError where there is none of that name."""
+        """A joint by its name. Raises SdfsimError if there is none of that name."""
         names = [joint.name for joint in self.scene.joints]
         if name not in names:
             told = nearest(name, names)
@@ -335,7 +335,7 @@ class Simulator(LiveScene):
 
     def steps_in(self, seconds: float) -> int:
         """The number of steps that comes nearest to `seconds`: none for 0 s, else at least one. Raises SdfsimError
-        where that is negative or not finite."""
+        if that is negative or not finite."""
         check_seconds(seconds)
         return max(1, round(seconds / self.dt)) if seconds else 0
 
@@ -540,6 +540,6 @@ def _run_each(
 
 
 def check_seconds(seconds: float) -> None:
-    """Raises SdfsimError where `seconds` is no length of time."""
+    """Raises SdfsimError if `seconds` is no length of time."""
     if not 0.0 <= seconds < np.inf:
         raise SdfsimError(f"seconds: must be >= 0 and finite (got {seconds:g})")

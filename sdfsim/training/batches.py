@@ -45,7 +45,7 @@ class Draws(Dataset):
 
 def batches(draws: Draws, first: int, workers: int = 0) -> Iterator[Drawn]:
     """What the steps from `first` on train on, the same for any number of `workers`: processes that draw ahead. Raises
-    SdfsimError where one of them ended."""
+    SdfsimError if one of them ended."""
     steps = range(first, sys.maxsize)
     if not workers:
         yield from map(draws.__getitem__, steps)

@@ -94,7 +94,7 @@ class ContactFrames:
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray]) -> ContactFrames:
-        """The reverse. Raises TypeError where a field is missing or unknown."""
+        """The reverse. Raises TypeError if a field is missing or unknown."""
         told: dict[str, Any] = {}
         for name, value in arrays.items():
             of, _, inside = name.partition("/")

@@ -36,7 +36,7 @@ class Run:
 
     The task is an `ImpulseTask`, a `SurfaceTask` or a `MotionTask`. The learning rate depends on `total`, the
     optimiser's steps of the whole run; a `team` shares the work, and `workers` draw batches ahead. It begins with the
-    weights of `first`, where another training has made some. Raises SdfsimError where these are of another network than
+    weights of `first`, where another training has made some. Raises SdfsimError if these are of another network than
     the plan's.
     """
 
@@ -120,7 +120,7 @@ class Run:
         write_arrays(path, arrays | {"run": np.array(json.dumps(self.origin | progress))}, compressed=False)
 
     def load(self, path: Path) -> None:
-        """Take up a saved run. Raises SdfsimError when it is of another preset, seed or data, or unreadable."""
+        """Take up a saved run. Raises SdfsimError if it is of another preset, seed or data, or unreadable."""
         arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
         try:
             info: dict[str, Any] = json.loads(str(arrays.pop("run")))

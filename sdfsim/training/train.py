@@ -133,7 +133,7 @@ def _tasks(plan: Preset, folders: Sequence[Path], tell: Progress):
 
 
 def _check_kind(plan: Preset, scene: Path | None, workers: int) -> None:
-    """Raise SdfsimError where a preset does not train on what is given."""
+    """Raise SdfsimError if a preset does not train on what is given."""
     impacts, alone = (bool(plan.config.get(name)) for name in ("impacts", "alone"))
     if scene is None and impacts:
         raise SdfsimError("preset: impacts trains on recordings of real motions", "give them as --data, with --scene")
