@@ -8,7 +8,7 @@ import typer
 from pipeline.commands import distill, fit, joint, measure, mesh, poses, reconstruct
 from sdfsim import commands
 
-YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
+YOUNG = 100_000  # so many new objects may exist before Python looks for cycles
 
 app = typer.Typer(
     name="sdfsim", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
@@ -30,7 +30,7 @@ def options(
     ] = False,
 ) -> None:
     """Rigid-body simulation over learned signed-distance functions, from photos to commands."""
-    # Libraries make some 100,000 objects that stay; to look for cycles among them again and again as they load takes
+    # Libraries make some 100,000 objects that stay. Looking for cycles among them again and again while they load takes
     # a sixth of the time to the first step.
     gc.set_threshold(YOUNG)
 

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from sdfsim.shape.shape import Shape, load_shape
     from sdfsim.simulate.simulator import Simulator
 
-# Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
-# wait for: a step then takes ten times as long. So they spin for some microseconds only, which costs little on a free
-# machine. Has an effect only before torch is imported.
+# Threads of torch wait for one another by spinning. Beside other programs they take the processor from the threads that
+# they wait for, and a step takes ten times as long. So they spin for some microseconds only, which costs little on a
+# free machine. This must be set before torch is imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-# Numba tells of an old TBB as it takes the next best of its threading layers, which is as good here.
+# Numba warns of an old TBB and takes its next threading layer, which is as good here.
 warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB version")
 
 __all__ = [
@@ -72,7 +72,7 @@ _HOME = {
     "render": "sdfsim.apps.render",
     "simulate": "sdfsim.apps.run",
 }
-_THERE = {"Scene": "SceneBuilder"}  # names that differ there
+_THERE = {"Scene": "SceneBuilder"}  # names that differ in their module
 
 
 class _Package(ModuleType):

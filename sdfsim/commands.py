@@ -15,7 +15,7 @@ SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsi
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 Models = Annotated[
     list[str] | None,
-    typer.Option(help="Bundled model or path; may be given again (default: those on the solve)."),
+    typer.Option(help="Bundled model or path; repeat it for more (default: those that run on the contact solve)."),
 ]
 
 
@@ -29,14 +29,14 @@ def simulate(
     seed: Annotated[int | None, typer.Option(help="Default: the scene's.", min=0)] = None,
     viewer: Annotated[Literal["none", "file", "native", "web"], typer.Option(help="Where to watch.")] = "file",
     until_settled: Annotated[
-        bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
+        bool, typer.Option("--until-settled", help="End as soon as everything is at rest (at --seconds at the latest).")
     ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in the folder.")] = False,
     beside: Annotated[
         Path | None,
         typer.Option(
             metavar="RECORDING",
-            help="A recorded motion of the scene, as identify reads it, FILE[K] of many: begin as it does, show both.",
+            help="A recorded motion of the scene, or FILE[K] of many, to begin the run with and to show beside it.",
         ),
     ] = None,
     allow_outside: Outside = False,
@@ -78,13 +78,13 @@ def simulate(
 def plan(
     session: Session, scene: SceneFile, model: Model = None, allow_outside: Outside = False, device: str = "auto"
 ) -> None:
-    """Which effects are in play, why, and what a step costs."""
+    """Which effects are on in a scene, why, and what a step costs."""
     from sdfsim.apps import plan as room
 
     report = room.describe(scene, **session.given("scene"), on_progress=session.stage_progress)
     for note in report["notes"]:
         session.say(note)
-    for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
+    for check in report["failed_checks"]:  # reported only: a plan is as good with a shape that is less exact
         session.say(f"failed check: {check}")
     session.report(report, room.plan_lines(report))
 
@@ -94,7 +94,7 @@ def samples(
     session: Session,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="PATH", help="Copy all of them here.")] = None,
 ) -> None:
-    """The scenes that come with sdfsim; a copy of them to change."""
+    """List the scenes that come with sdfsim, or copy them to a folder."""
     from sdfsim.scene import bundled
 
     known = bundled.samples()
@@ -114,7 +114,7 @@ def view(
 ) -> None:
     """Watch a recording, or take a picture of it."""
     if at is not None and picture is None:
-        raise SdfsimError("--at goes with --screenshot", exit_code=EXIT_USAGE)
+        raise SdfsimError("--at needs --screenshot", exit_code=EXIT_USAGE)
     from sdfsim.apps import viewer
 
     if picture is not None:
@@ -144,7 +144,7 @@ def render(
 ) -> None:
     """Run -> movie or picture, without a screen."""
     if at is not None and out.suffix != ".png":
-        raise SdfsimError("--at goes with a picture, -o FILE.png", exit_code=EXIT_USAGE)
+        raise SdfsimError("--at needs a picture, -o FILE.png", exit_code=EXIT_USAGE)
     from sdfsim.apps import render as room
     from sdfsim.apps.beside import beside_of
     from sdfsim.apps.run import read_run
@@ -194,12 +194,14 @@ def import_(
         Path, typer.Option("-o", "--out", metavar="FILE", help="The scene.yaml to write.", show_default=False)
     ],
     packages: Annotated[
-        list[Path] | None, typer.Option(help="Folder of the packages that package:// names (URDF); may be given again.")
+        list[Path] | None,
+        typer.Option(help="Folder of packages that package:// paths name (URDF); repeat it for more."),
     ] = None,
     fixed: Annotated[bool, typer.Option("--fixed", help="The root never moves (URDF).")] = False,
-    floor: Annotated[bool, typer.Option("--floor", help="Add a floor at z = 0, and stand all on it.")] = False,
+    floor: Annotated[bool, typer.Option("--floor", help="Add a floor at z = 0, and stand everything on it.")] = False,
     key: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The keyframe that is the start (MJCF; default: start).")
+        str | None,
+        typer.Option(metavar="NAME", help="The keyframe to start from (MJCF; default: the one called start)."),
     ] = None,
 ) -> None:
     """URDF or MJCF -> scene.yaml with joints (docs/import.md)."""
@@ -222,7 +224,7 @@ def identify(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Run folders, rollout.npz, CSV or npz files of poses, folders of these (docs/identify.md); or "
+            help="Run folders, rollout.npz, CSV or npz files of poses, or folders of these (docs/identify.md); or "
             "contactnets-cube or contactnets-elbow: public ones with their scene, downloaded once.",
             show_default=False,
         ),
@@ -231,12 +233,15 @@ def identify(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", metavar="FILE", help="Write the scene with what was found, and a picture of it as FILE.png."
+            "-o",
+            "--out",
+            metavar="FILE",
+            help="Write the scene with the values that were found, and a picture of the fit as FILE.png.",
         ),
     ] = None,
     allow_outside: Outside = False,
 ) -> None:
-    """Recorded motions -> friction, restitution, sizes, masses, the lie of the ground."""
+    """Recorded motions -> friction, restitution, sizes, masses, height and tilt of the ground."""
     from sdfsim.apps import identify as room
     from sdfsim.apps.observed import load_recordings
     from sdfsim.base.files import check_writable
@@ -285,15 +290,15 @@ def dataset(
         ),
     ] = None,
     random_solids: Annotated[
-        int, typer.Option(help="So many of PyBullet's random solids beside them (not movi-b).", min=0, max=1000)
+        int, typer.Option(help="Number of PyBullet's random solids to add (not movi-b).", min=0, max=1000)
     ] = 0,
-    bodies: Annotated[int | None, typer.Option(help="How many move (bowl, pile).", min=1, max=512)] = None,
+    bodies: Annotated[int | None, typer.Option(help="Number of bodies that move (bowl, pile).", min=1, max=512)] = None,
     fps: Annotated[Literal["50", "60"], typer.Option(help="Recorded frames a second.")] = "50",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     split: Literal["train", "validation", "test"] = "train",
     cluster: Cluster = None,
 ) -> None:
-    """Trajectories of the teacher (PyBullet) to learn from."""
+    """Simulate training data in PyBullet."""
     from sdfsim.base.parallel import cluster as working_on
     from sdfsim.data.generate import make_dataset, report_lines
 
@@ -308,7 +313,7 @@ def train(
     data: Annotated[
         list[Path],
         typer.Option(
-            help="Dataset folder; several are trained on together. With --scene: recordings of it, as `identify` reads "
+            help="Dataset folder, or several to train on together. With --scene: recordings of it, as `identify` reads "
             "them.",
             show_default=False,
         ),
@@ -323,7 +328,7 @@ def train(
         ],
         typer.Option(help="Kind and size of the model."),
     ] = "small",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in the folder.")] = False,
     first: Annotated[
         str | None,
         typer.Option(
@@ -331,7 +336,8 @@ def train(
         ),
     ] = None,
     workers: Annotated[
-        int, typer.Option(help="Processes that draw batches ahead, for networks on surface nodes on a GPU.", min=0)
+        int,
+        typer.Option(help="Processes that prepare batches in advance, for networks on surface nodes on a GPU.", min=0),
     ] = 0,
     device: str = "auto",
 ) -> None:
@@ -348,10 +354,14 @@ def evaluate(
     model: Model = None,
     steps: Annotated[int, typer.Option(help="Length of each rollout.", min=1)] = 50,
     free_flight: Annotated[
-        Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: of published networks).")
+        Literal["exact", "learned"],
+        typer.Option(help="How bodies without contact move: exactly, or as the network predicts, as in the papers."),
     ] = "exact",
     chaos_floor: Annotated[
-        bool, typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet).")
+        bool,
+        typer.Option(
+            "--chaos-floor", help="Also run PyBullet from slightly different starts, as a lower bound of errors."
+        ),
     ] = False,
     device: str = "auto",
 ) -> None:
@@ -374,7 +384,7 @@ def tradeoff(
     model: Models = None,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
 ) -> None:
-    """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
+    """What accuracy costs in time: settings, models and engines on the same scenes. -o keeps what was measured."""
     from sdfsim.base.lazy import pyplot
     from sdfsim.evaluation import tradeoff as study
 
@@ -391,11 +401,12 @@ def stress(
     model: Models = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer and shorter cases, in minutes.")] = False,
     shapes: Annotated[
-        Path | None, typer.Option(help="Folder of meshes that are to rest on the floor too, or ycb: downloaded once.")
+        Path | None,
+        typer.Option(help="Folder of more meshes to let rest on the floor; or ycb, which is downloaded once."),
     ] = None,
     device: str = "auto",
 ) -> None:
-    """The hard cases, with every model and the teacher: a table, plots, and recordings of what went wrong."""
+    """Hard cases with every model and the teacher (PyBullet): a table, plots, and recordings of what went wrong."""
     from sdfsim.base.lazy import pyplot
     from sdfsim.evaluation import stress as study
 

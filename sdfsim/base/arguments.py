@@ -24,22 +24,20 @@ def seconds_of(text: str) -> float:
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, everything else on stderr.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Tracebacks with errors.")]
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
-Outside = Annotated[
-    bool, typer.Option("--allow-outside", help="Let the scene name files that are not in its own folder.")
-]
+Outside = Annotated[bool, typer.Option("--allow-outside", help="Let the scene use files outside its own folder.")]
 Out = Annotated[Path, typer.Option("-o", "--out", metavar="PATH", help="Folder to write.", show_default=False)]
 Model = Annotated[str | None, typer.Option(help="Bundled model or path (default: the scene's, else the best one).")]
 Budget = Annotated[
-    float | None, typer.Option(parser=seconds_of, metavar="TIME", help="Longest time to take, such as 90s, 10m or 1h.")
+    float | None, typer.Option(parser=seconds_of, metavar="TIME", help="Time limit, such as 90s, 10m or 1h.")
 ]
 Cluster = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on, tcp://HOST:8786.")
+    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to run on, tcp://HOST:8786.")
 ]
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
-    """A command: `work` with a `Session` made for it, and with the options --json, --device and -v. Work that does not
-    compute takes no `device`; the option is still checked."""
+    """Make a command of `work`: it gets a `Session`, and the options --json, --device and -v. If `work` takes no
+    `device`, the option is still checked."""
     given = inspect.signature(work, eval_str=True).parameters
 
     @wraps(work)

@@ -1,4 +1,4 @@
-"""Compilations that take long: announced, and made where they change nothing of what is then run."""
+"""Long compilations: announced, and done in another process so that results do not depend on them."""
 
 import json
 import logging
@@ -11,10 +11,10 @@ from typing import Any
 
 _log = logging.getLogger(__name__)
 _lock = Lock()
-_ready: set[str] = set()  # what has been compiled, or found to be, in this process
+_ready: set[str] = set()  # functions that this process has compiled, or found compiled
 
 
-# The path of modules first: types are read by what is in them.
+# The module path comes first: reading the types imports modules from it.
 _CHILD = (
     "import sys, json; sys.path[:] = json.loads(sys.stdin.buffer.readline());"
     "from sdfsim.base.compiling import _compile_here; _compile_here(sys.stdin.buffer.read())"
@@ -24,14 +24,14 @@ _CHILD = (
 def compile_before(
     function: Any, arguments: Sequence[Any], what: str, takes: str, missing: Mapping[int, bool] | None = None
 ) -> None:
-    """Have a `function` of numba, that is neither in memory nor in numba's cache for this source, compiled for such
-    arguments, and warn once in a process that `what` is. `missing`: see `is_compiled`.
+    """Compile a numba `function` for arguments of these types, unless it is in memory or in numba's cache for this
+    source. Warn once in a process that `what` is compiled. `missing`: see `is_compiled`.
 
-    It is compiled in a process of its own, and this one loads what that has kept, as all later ones do: code that has
-    just been compiled rounds differently, and a run could not be repeated bit by bit. Where nothing can be kept the
-    first call compiles.
+    A process of its own compiles it and fills the cache, and this one loads it from there, as all later ones do: code
+    that has just been compiled rounds differently, so a run could not be repeated bit by bit. If the cache cannot be
+    written, the first call compiles.
     """
-    with _lock:  # of several threads that need it one has it compiled
+    with _lock:  # if several threads need it, one of them compiles
         if what in _ready:
             return
         _ready.add(what)
@@ -52,7 +52,7 @@ def compile_before(
 
 
 def _compile_here(wanted: bytes) -> None:
-    """What the process that started this one wants compiled."""
+    """Compile what the parent process asks for."""
     from numba.core.serialize import loads
 
     module, name, types = loads(wanted)
@@ -60,10 +60,10 @@ def _compile_here(wanted: bytes) -> None:
 
 
 def is_compiled(function: Any, missing: Mapping[int, bool] | None = None) -> bool:
-    """Whether a function of numba is ready within a second; one that runs as Python needs no compiling.
+    """Whether a numba function is ready within a second. One that runs as plain Python needs no compiling.
 
     Args:
-        missing: by their place, whether arguments are None, where that makes it another function.
+        missing: argument index -> whether it is None, for arguments where None selects another specialisation.
     """
     if not hasattr(function, "signatures"):
         return True

@@ -37,13 +37,13 @@ class Session:
         self._clean_up = contextlib.ExitStack()
         self._bar = _Bar()
         self.say = self._bar.say  # a line on stderr
-        # Called with the name of one stage of several (each has its own bar and ETA), the fraction (0 to 1) of the work
-        # that is done, and a message; `progress` without the name.
+        # Called with the name of a stage (each has its own bar and ETA), the fraction (0 to 1) of the work that is
+        # done, and a message. `progress` is called without the name.
         self.stage_progress = self._bar.update
         self.progress = partial(self._bar.update, "")
 
     def __enter__(self) -> "Session":
-        # Consoles of Windows know few characters; others are escaped, as Python does on stderr by itself.
+        # Windows consoles show few characters; others are escaped, as Python already does on stderr.
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")
         default = signal.default_int_handler
@@ -85,12 +85,12 @@ class Session:
             message, hint, self.exit_code = error.message, error.hint, error.exit_code
             more = {"problems": error.problems} if isinstance(error, SceneError) else {}
         elif isinstance(error, KeyboardInterrupt) or (self._pressed and not isinstance(error, OSError)):
-            message, self.exit_code = "interrupted; what was finished is kept", EXIT_INTERRUPTED
+            message, self.exit_code = "interrupted; finished work is kept", EXIT_INTERRUPTED
         elif isinstance(error, OSError):
             message = (f"{error.filename}: " if error.filename else "") + str(error.strerror or error)
         else:
             message = f"internal error: {type(error).__name__}: {error}"
-            hint = "" if self.verbose else "this is a fault of sdfsim; -v shows where"
+            hint = "" if self.verbose else "this is a bug in sdfsim; -v shows where"
         if self.verbose:
             traceback.print_exc(file=sys.stderr)
         self.say("\n".join(f"error: {line}" for line in message.splitlines()))
@@ -104,24 +104,24 @@ class Session:
         try:
             print(text, flush=True)
         except OSError as error:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again at its end, and fails loudly
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again when it exits, and prints an error
             if not isinstance(error, BrokenPipeError):
                 self.say(f"error: the report cannot be written: {error.strerror}")
             self.exit_code = self.exit_code or EXIT_ERROR
 
     def report(self, result: dict[str, Any], lines: list[str] | None = None) -> None:
-        """The outcome: `result` for --json, `lines` (or the entries of `result`) for people."""
+        """Print the outcome: `result` for --json, `lines` (or the entries of `result`) for people."""
         self._result = result
         if not self.as_json:
             self._bar.close()
             self._print("\n".join(_as_lines(plain(result)) if lines is None else lines))
 
     def given(self, *others: str) -> dict[str, Any]:
-        """What the command was given, but for these options: what it hands on as it is."""
+        """The options of the command except these: those that it passes on unchanged."""
         return {name: value for name, value in self.options.items() if name not in others}
 
     def hold(self, why: str) -> None:
-        """Wait for Ctrl-C, if a person is there to press it."""
+        """Wait for Ctrl-C, if stdin is a terminal."""
         if not self.as_json and sys.stdin.isatty():
             self.say(why)
             with contextlib.suppress(KeyboardInterrupt):
@@ -129,7 +129,7 @@ class Session:
 
 
 class _Bar:
-    """A bar with an ETA on a terminal; elsewhere a line now and then."""
+    """A progress bar with an ETA on a terminal; elsewhere a plain line every few seconds."""
 
     def __init__(self) -> None:
         self._progress: Any = None
@@ -186,13 +186,13 @@ def duration(seconds: float) -> str:
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """The rows of a table as lines, their cells below each other."""
+    """The rows of a table as lines with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def plain(value: Any) -> Any:
-    """A value for JSON: NumPy numbers, arrays and paths become plain, numbers that are not finite null."""
+    """A value for JSON: NumPy numbers, arrays and paths become plain types; numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 
 def check_device(name: str) -> None:
-    """Raises SdfsimError where `name` is not a device ("auto", "cpu", "cuda" or "cuda:0"), or there is no CUDA.
-    Imports torch for CUDA only."""
+    """Raises SdfsimError if `name` is not a device ("auto", "cpu", "cuda" or "cuda:0"), or if there is no CUDA. Imports
+    torch only to check CUDA."""
     if name not in ("auto", "cpu"):
         pick_device(name)
 

@@ -1,4 +1,4 @@
-"""The one error type of the project; `cli.py` and `run_main` turn it into one line, a hint and an exit code."""
+"""The error types of the project; commands and `run_main` turn them into one line, a hint and an exit code."""
 
 import difflib
 import itertools
@@ -12,7 +12,7 @@ EXIT_INTERRUPTED = 130
 
 
 def printable(text: str) -> str:
-    """`text` with escapes for what is not printable: untrusted file names and keys may hold terminal codes."""
+    """`text` with unprintable characters escaped: untrusted file names and keys may hold terminal codes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -23,7 +23,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 class SdfsimError(Exception):
-    """Something a user can act on.
+    """An error that a user can act on.
 
     Args:
         message: one line: what is wrong, with the file, line and field where they are known.

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written under a temporary name, then renamed. Arrays without pickle. Digests."""
+"""Files that are complete or absent (written under a temporary name, then renamed), arrays without pickle, digests."""
 
 import hashlib
 import importlib
@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 LOCK = ".lock"
 # The options of a run, the command first.
 CONFIG = "config.yaml"
-# What an archive may unpack to: so many bytes, or so many times its own size.
+# What an archive may unpack to: this many bytes, or this many times its own size.
 FREELY, MOST_GROWTH = 2**30, 100
 
 
@@ -33,8 +33,8 @@ def user_cache(name: str) -> Path:
 
 
 def path_from(folder: Path, path: Path | str) -> str:
-    """A path as files tell it that lie in `folder`: with slashes, which every system reads; whole where it lies on
-    another drive."""
+    """A path relative to `folder`, as files there write it: with slashes, which every system reads; absolute if it lies
+    on another drive."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:
@@ -43,9 +43,9 @@ def path_from(folder: Path, path: Path | str) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; it takes the final name when the block ends without an error. Raises
+    """A temporary path beside `path` to write to; it is renamed to `path` when the block ends without an error. Raises
     SdfsimError if the disk is full or the folder not writable."""
-    # Unique also across the threads of a worker, and the hosts that share a folder.
+    # Unique across threads of a worker and hosts that share a folder, too.
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
     try:
         yield partial
@@ -60,28 +60,29 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def visible(folder: Path) -> list[Path]:
-    """Files and folders in a folder, by name, without hidden ones and those that macOS adds (`._NAME`, `__MACOSX`)."""
+    """Files and folders in a folder, sorted by name, without hidden ones and those that macOS adds (`._NAME`,
+    `__MACOSX`)."""
     return sorted(path for path in folder.iterdir() if not hidden(path.name))
 
 
 def hidden(name: str) -> bool:
-    """Whether the system made a file or folder of this name, not a person."""
+    """Whether a file or folder of this name is hidden or made by the system."""
     return name.startswith(".") or name == "__MACOSX"
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """A file of these bytes."""
+    """Write a file of these bytes."""
     with replacing(path) as partial:
         partial.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
-    """A UTF-8 text file."""
+    """Write a UTF-8 text file."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path, content: Any) -> None:
-    """A JSON file, indented. NaN and infinity are refused: they are not JSON."""
+    """Write an indented JSON file. Raises ValueError for NaN and infinity, which are not JSON."""
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
@@ -94,7 +95,7 @@ def read_json(path: Path, hint: str = "") -> Any:
 
 
 def not_read(error: Exception, what: str = "") -> str:
-    """Why a file cannot be read (as `what`), without its name, which the system's own words repeat."""
+    """Why a file cannot be read (as `what`), without its name, which the system's message would repeat."""
     if isinstance(error, FileNotFoundError):
         return "no such file"
     told = error.strerror if isinstance(error, OSError) and error.strerror else error
@@ -102,14 +103,14 @@ def not_read(error: Exception, what: str = "") -> str:
 
 
 def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True) -> None:
-    """An `.npz` file."""
+    """Write an `.npz` file."""
     with replacing(path) as partial, open(partial, "wb") as handle:
         (np.savez_compressed if compressed else np.savez)(handle, **arrays)
 
 
 def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file; messages call it `what`. Raises SdfsimError if it is
-    absent, cut short, not an archive, or would unpack to an absurd size."""
+    """All arrays of an `.npz` file, which messages call `what`. Raises SdfsimError if it is absent, cut short, not an
+    archive, or would unpack to an absurd size."""
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
@@ -122,8 +123,8 @@ def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
 
 
 def cached_arrays(path: Path, what: str, make: Callable[[], dict[str, Any]]) -> dict[str, np.ndarray]:
-    """The arrays of a cache file, made and written there on first use. A damaged file is made again. If none can be
-    written, as on a full disk, a warning says so and the arrays are made the next time too."""
+    """The arrays of a cache file, which is made on first use, and again if it is damaged. If it cannot be written, as
+    on a full disk, this logs a warning, and the arrays are made again the next time."""
     if path.is_file():
         try:
             return read_arrays(path, what, "delete it")
@@ -134,16 +135,16 @@ def cached_arrays(path: Path, what: str, make: Callable[[], dict[str, Any]]) -> 
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, arrays, compressed=False)
     except (SdfsimError, OSError) as error:
-        _log.warning("%s is not kept for the next time: %s", what, error)
+        _log.warning("%s cannot be cached: %s", what, error)
     return arrays
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make a folder, lock other runs out of it inside the block, and remove half-written files of a killed run.
+    """Make a folder, keep other runs out of it inside the block, and remove half-written files of a killed run.
 
     The system lifts the lock when this process ends, however it ends. A folder made here is removed again if it stays
-    empty. Raises SdfsimError if another run is in there, or the folder cannot be written.
+    empty. Raises SdfsimError if another run holds the folder, or if it cannot be written.
     """
     path, made = folder / LOCK, not folder.exists()
     try:
@@ -169,7 +170,7 @@ def locked(folder: Path) -> Iterator[None]:
         finally:
             try:
                 path.unlink(missing_ok=True)
-            except PermissionError:  # Windows removes no open file
+            except PermissionError:  # Windows does not remove an open file
                 file.close()
                 with suppress(PermissionError):  # another run has it by now
                     path.unlink(missing_ok=True)
@@ -179,8 +180,8 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _lock(file: IO[str]) -> None:
-    """Take the lock of an open file, which ends with this process. Raises BlockingIOError or PermissionError if
-    another one has it."""
+    """Lock an open file until this process ends. Raises BlockingIOError or PermissionError if another process holds the
+    lock."""
     try:
         fcntl: Any = importlib.import_module("fcntl")
     except ImportError:  # Windows
@@ -192,7 +193,7 @@ def _lock(file: IO[str]) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """That a folder can be made and written to, without making it. Raises SdfsimError otherwise."""
+    """Check that a folder can be made and written to, without making it. Raises SdfsimError if not."""
     there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     try:
         with tempfile.TemporaryFile(dir=there):
@@ -202,9 +203,9 @@ def check_writable(folder: Path) -> None:
 
 
 def check_own(folder: Path, command: str, *names: str) -> None:
-    """Raises SdfsimError if config.yaml or the files `names`, which a run replaces in a folder, do not come from an
-    earlier run of the same command."""
-    import yaml  # here, for training needs torch and numpy only
+    """Check that the files that a run replaces in a folder (config.yaml and `names`) come from an earlier run of the
+    same command. Raises SdfsimError if not."""
+    import yaml  # imported here because training needs torch and numpy only
 
     there = [name for name in (CONFIG, *names) if os.path.lexists(folder / name)]
     if not there:
@@ -215,7 +216,7 @@ def check_own(folder: Path, command: str, *names: str) -> None:
         config = None
     if not isinstance(config, dict) or config.get("command") != command:
         raise SdfsimError(
-            f"{folder / there[0]}: in the way, and not replaced: not from an earlier `sdfsim {command}`",
+            f"{folder / there[0]}: exists and is not from an earlier `sdfsim {command}`, so it is not replaced",
             "choose another folder to write to, or move it away",
         )
 

@@ -1,5 +1,5 @@
-"""Packages that are imported on first use: torch, which simulations with the solver alone never need, and those of
-extras."""
+"""Packages that are imported on first use: torch, which simulations with the contact solve alone never need, and the
+packages of extras."""
 
 import importlib
 from typing import Any
@@ -18,11 +18,11 @@ torch = _Torch()
 
 
 class NotInstalled(SdfsimError):
-    """A package of an extra is not there."""
+    """A package of an extra is not installed."""
 
 
 def optional(module: str, title: str, extra: str) -> Any:
-    """A module of a package that an extra brings. Raises NotInstalled."""
+    """A module of a package that belongs to an extra. Raises NotInstalled if it is missing."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -30,6 +30,6 @@ def optional(module: str, title: str, extra: str) -> Any:
 
 
 def pyplot() -> Any:
-    """That of matplotlib, drawing into files. Raises NotInstalled."""
+    """matplotlib's pyplot, set to draw into files. Raises NotInstalled if matplotlib is missing."""
     optional("matplotlib", "matplotlib", "bench").use("Agg")
     return importlib.import_module("matplotlib.pyplot")

@@ -1,4 +1,4 @@
-"""Work on all cores, in processes that stop when the caller does, or unchanged on a cluster; and how many threads."""
+"""Work on all cores, in processes that stop when the caller does, or on a cluster; and the number of threads."""
 
 from __future__ import annotations
 
@@ -21,23 +21,24 @@ else:
     from sdfsim.base.lazy import torch
 
 Progress = Callable[[float, str], None]  # called with the fraction of the work that is done, and a message
-StageProgress = Callable[[str, float, str], None]  # the same, behind the name of one stage of several
+StageProgress = Callable[[str, float, str], None]  # the same, with the name of a stage first
 
-TIMED = 3  # calls, after one that is not timed
-SCHEDULER_ANSWERS = 10.0  # s, within which
+TIMED = 3  # calls that are timed, after one that is not
+SCHEDULER_ANSWERS = 10.0  # s that a scheduler has to answer
 
 
 def silent(fraction: float, message: str) -> None:
-    """Progress that is not shown: what takes long, and what a command would print, is then warned of."""
+    """Progress that is not shown. Functions then log a warning for what takes long."""
 
 
 def share_of(progress: Progress, start: float, share: float) -> Progress:
-    """The progress of a part of some work: a share of it from a start, both 0 to 1."""
+    """Progress of one part of some work, mapped to the fractions from `start` to `start + share` of the whole (0 to
+    1)."""
     return lambda fraction, message: progress(start + share * fraction, message)
 
 
 def silent_stages(stage: str, fraction: float, message: str) -> None:
-    """The same of several stages."""
+    """The same for several stages."""
 
 
 def of_stage(on_progress: StageProgress, stage: str) -> Progress:
@@ -45,15 +46,15 @@ def of_stage(on_progress: StageProgress, stage: str) -> Progress:
     return silent if on_progress is silent_stages else partial(on_progress, stage)
 
 
-_most = 0  # threads that torch has by default; 0 before `choose_threads` asks
+_most = 0  # threads that torch uses by default; 0 until `choose_threads` asks
 
 
 def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
-    """Call `function(*job)` for every job; yield (index of the job, result) as they end.
+    """Call `function(*job)` for every job; yield (index of the job, result) as jobs end.
 
-    The work goes to processes of this machine, one a core and of one thread each, or to whatever engine
-    `joblib.parallel_config` names around the call (see `cluster`). The first error, or Ctrl-C, cancels what has not
-    begun and is raised.
+    The work runs in processes of this machine, one per core with one thread each, or in the backend that
+    `joblib.parallel_config` sets around the call (see `cluster`). The first error, or Ctrl-C, cancels the jobs that
+    have not begun, and is raised.
     """
     from joblib import Parallel, delayed
 
@@ -65,8 +66,8 @@ def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tu
 
 
 def threads(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
-    """As `parallel`, in threads of this process, for functions that spend their time in compiled code which other
-    threads need not wait for."""
+    """As `parallel`, in threads of this process: for functions that spend their time in compiled code that releases the
+    GIL."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         ahead = {pool.submit(function, *job): index for index, job in enumerate(jobs)}
         try:
@@ -78,13 +79,14 @@ def threads(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tup
 
 
 def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:
-    """In a worker: one thread, and Ctrl-C is left to the caller. On a single core the caller itself runs this."""
+    """Run one job in a worker, with one thread; Ctrl-C is left to the caller. On a single core the caller runs this
+    itself."""
     global _most
     if os.getpid() != caller:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         _most = 1
-        os.environ["OMP_NUM_THREADS"] = "1"  # of torch, where it is not there yet
+        os.environ["OMP_NUM_THREADS"] = "1"  # for torch, if it is not imported yet
         if "torch" in sys.modules:
             torch.set_num_threads(1)
     return index, function(*job)
@@ -92,11 +94,11 @@ def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> t
 
 @contextmanager
 def cluster(address: str | None) -> Iterator[None]:
-    """Let `parallel` work on the Dask cluster of a scheduler, such as tcp://host:8786, inside the block; None leaves it
-    on this machine.
+    """Inside the block `parallel` uses the Dask cluster of the scheduler at `address`, such as tcp://host:8786; with
+    None it stays on this machine.
 
-    Its workers need this package, and see the files of a job under the same paths. Raises SdfsimError if Dask is not
-    installed, or no scheduler answers.
+    The workers need this package, and must see the files of a job under the same paths. Raises SdfsimError if Dask is
+    not installed, or no scheduler answers.
     """
     if address is None:
         yield
@@ -116,7 +118,7 @@ def cluster(address: str | None) -> Iterator[None]:
 
 
 def choose_threads(work: Callable[[], object], threads: int | None = None) -> float:
-    """Time `work`, typically of tens of milliseconds, with one thread and with all; leave torch set to the faster (or
+    """Time `work`, typically tens of milliseconds, with one thread and with all. Set torch to the faster of the two (or
     to `threads`), and return the seconds that one call takes.
 
     On a busy machine a second thread slows a computation down by up to ten times.

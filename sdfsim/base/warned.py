@@ -1,4 +1,4 @@
-"""Tells who calls from Python what a command would print."""
+"""Warnings for callers from Python, in place of the lines that a command prints."""
 
 import logging
 
@@ -7,7 +7,7 @@ _said: set[str] = set()
 
 
 def warn_once(line: str) -> None:
-    """Warn, unless the same line has been said in this process: scenes are loaded again and again."""
+    """Warn, unless this process has given the same warning before: scenes are loaded again and again."""
     if line not in _said:
         _said.add(line)
         _log.warning("%s", line)

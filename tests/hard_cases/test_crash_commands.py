@@ -48,7 +48,7 @@ def test_ctrl_c_keeps_what_was_finished(works, undisturbed, tmp_path, name):
     ended, expected = undisturbed(name)
     work, folder = works[name], tmp_path / name
     stopped = call(work, folder, Moment(change=max(3, ended.changes // 2), how=signal.SIGINT), *work.again)
-    assert stopped.code == 130 and "interrupted; what was finished is kept" in stopped.said
+    assert stopped.code == 130 and "interrupted; finished work is kept" in stopped.said
     assert "Traceback" not in stopped.said
     whole(folder)
     kept = {
