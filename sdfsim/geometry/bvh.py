@@ -15,7 +15,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 class _Centred:
-    """A scene of Open3D's, which computes in float32: its coordinates are moved to the centre of the mesh."""
+    """An Open3D scene. Open3D computes in float32, so coordinates are moved to the centre of the mesh."""
 
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
@@ -52,17 +52,17 @@ class ClosestPoint(_Centred):
 
 
 class Winding:
-    """Generalized winding number (Jacobson et al. 2013; fast form: Barill et al. 2018), to about 0.01 a layer: how
-    often the surface goes around a point, by the solid angle that it covers where it is open. Some ten times slower
-    than ray parity."""
+    """Generalized winding number (Jacobson et al. 2013; fast form: Barill et al. 2018), to about 0.01 per layer: how
+    often the surface goes around a point; for an open surface, by the solid angle that it covers. About ten times
+    slower than ray parity."""
 
     def __init__(self, mesh: Mesh) -> None:
-        # igl computes in float32 inside: far from the origin, or in small units, signs would be wrong.
+        # igl computes in float32 internally: far from the origin, or in small units, signs would be wrong.
         self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
         self._size = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
         self._vertices = np.ascontiguousarray((mesh.vertices - self._centre) / self._size)
         self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
-        self._tree: Any = None  # made for the first points: of half a million faces it takes a second
+        self._tree: Any = None  # built at the first call: for half a million faces it takes a second
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """[P] float64 at `points` [P, 3] m."""
@@ -78,9 +78,9 @@ class Winding:
 
 
 class Crossings(_Centred):
-    """Winding number of a surface that is closed, by rays: how often they leave it more than they enter it. A hundred
-    times faster than `Winding` where faces are long and thin; wrong where a ray meets an edge, goes through an opening,
-    or meets two faces at once that the hierarchy takes for one."""
+    """Winding number of a closed surface by rays: how many times more they leave it than enter it. A hundred times
+    faster than `Winding` if faces are long and thin. Wrong if a ray meets an edge, goes through an opening, or meets
+    two faces at once that the hierarchy takes for one."""
 
     def __init__(self, mesh: Mesh) -> None:
         super().__init__(mesh)

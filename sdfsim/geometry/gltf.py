@@ -1,8 +1,8 @@
-"""glTF 2.0, written and read without trimesh, whose files have textures in JPEG of quality 75 and no motion. Its reader
-misreads normalised and sparse numbers, instances and fans.
+"""glTF 2.0, written and read without trimesh: trimesh writes textures as JPEG of quality 75 and no motion, and misreads
+normalised and sparse numbers, instances and fans.
 
-glTF has y up and we have z up. A file that we write has one node above all others that turns it, so that its meshes
-and motions hold our own numbers; what we read is turned back (a file of ours comes out as it was).
+glTF has y up and we have z up. In a file that we write, one node above all others turns it, so that meshes and motions
+keep our own numbers. What we read is turned back, so our own files come back unchanged.
 """
 
 import base64
@@ -20,13 +20,14 @@ from sdfsim.geometry.mesh import joined
 from sdfsim.geometry.mesh_formats import FileMesh, looked_up, read_image, side_file, strip
 from sdfsim.geometry.skins import Painted
 
-# What z up is to the y up of glTF: columns of a matrix [4, 4].
+# From z up to glTF's y up: columns of a matrix [4, 4].
 _Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
 _COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123}
 _UNLIT = "KHR_materials_unlit"
-Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # and back
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # the way back
 INSTANCES = "EXT_mesh_gpu_instancing"
-# Extensions that a file may need: those that are read, and those of how surfaces look, which change no geometry.
+# Extensions that a file may require: those that are read here, and those for the look of surfaces, which do not change
+# geometry.
 HONOURED = {"KHR_mesh_quantization", INSTANCES, "KHR_texture_transform", "EXT_texture_webp"}
 OF_LOOKS = ("KHR_materials_", "EXT_materials_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -34,7 +35,7 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
 MOST = 500_000_000  # vertices and corners
 WHITE = [1.0, 1.0, 1.0]
-SPARSE = 2**24  # most rows of an accessor that has no values but sparse ones
+SPARSE = 2**24  # most rows of an accessor that has sparse values only
 _OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
 
 
@@ -42,8 +43,8 @@ _VERTICES, _CORNERS = 34962, 34963  # what a buffer view is for, in glTF's numbe
 
 
 class GltfWriter:
-    """A file to be written: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
-    that turns z up to glTF's y up."""
+    """A file to be written: nodes, meshes, materials and animations, with glTF's own keys. All nodes are below one that
+    turns z up to glTF's y up."""
 
     def __init__(self) -> None:
         self.nodes: list[dict[str, Any]] = []
@@ -61,7 +62,8 @@ class GltfWriter:
         return len(self._views) - 1
 
     def array(self, values: np.ndarray, kind: str = "<f4") -> int:
-        """An accessor of values [K] or [K, 2 to 4]; whole numbers of 16 bits are fractions of 65535."""
+        """Add an accessor for values [K] or [K, 2 to 4], and return its index; 16-bit integers are fractions of
+        65535."""
         values = np.ascontiguousarray(values, kind)
         rows = values.reshape(len(values), -1)
         accessor = {
@@ -77,8 +79,8 @@ class GltfWriter:
     def material(
         self, name: str, color: np.ndarray, texture: np.ndarray | None = None, *, rough: float = 1.0, lit: bool = False
     ) -> int:
-        """A surface of a colour [3], as light, or with a texture [H, W, 3] uint8. The light of photos is in a texture
-        already, so it needs no other, unless it is to be `lit`: then shadows fall on it too."""
+        """Add a material with a colour [3] (linear light), or with a texture [H, W, 3] uint8. Textures from photos
+        contain the light already, so they are shown unlit unless `lit` is set: then shadows fall on them too."""
         surface: dict[str, Any] = {"baseColorFactor": [*map(float, color), 1.0]}
         made: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
         surface |= {"metallicFactor": 0.0, "roughnessFactor": rough}
@@ -95,7 +97,7 @@ class GltfWriter:
         return len(self.materials) - 1
 
     def mesh(self, name: str, attributes: dict[str, int], corners: int, material: int) -> int:
-        """A mesh of accessors: attributes of its vertices, and the corners of its faces."""
+        """Add a mesh from accessors: the attributes of its vertices, and the corners of its faces."""
         for accessors, target in ((attributes.values(), _VERTICES), ([corners], _CORNERS)):
             for accessor in accessors:
                 self._views[self._accessors[accessor]["bufferView"]]["target"] = target
@@ -126,22 +128,22 @@ class GltfWriter:
 
 
 def light(srgb: np.ndarray) -> np.ndarray:
-    """0 to 255 as light from 0 to 1, which glTF and USD count in."""
+    """sRGB values from 0 to 255 as linear light from 0 to 1, which glTF and USD use."""
     value = np.asarray(srgb) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def srgb(light: np.ndarray) -> np.ndarray:
-    """Light from 0 to 1 as uint8."""
+    """Linear light from 0 to 1 as sRGB, uint8."""
     value = np.clip(light, 0.0, 1.0)
     value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
     return np.round(255.0 * value).astype(np.uint8)
 
 
 def read_gltf(path: Path) -> FileMesh:
-    """All triangles of the scene that a .gltf or .glb file shows, turned from glTF's y up to z up: the meshes of its
-    nodes where these place them, with their colours. Raises ValueError if it is damaged, or needs an extension that
-    is not read."""
+    """All triangles of the scene that a .gltf or .glb file shows, turned from glTF's y up to z up: the meshes of all
+    nodes at the nodes' poses, with their colours. Raises ValueError if it is damaged, or needs an extension that is not
+    supported."""
     file = _GltfReader(path)
     parts = [part for _, part in file.parts()]
     if not parts:
@@ -155,18 +157,18 @@ def read_gltf(path: Path) -> FileMesh:
 
 
 def read_painted(path: Path) -> dict[str, Painted]:
-    """The parts of a file with a texture each, by the names of their nodes. Raises ValueError if it is damaged, or a
-    part has no texture that is read."""
+    """The parts of a file, each with its texture, by the names of their nodes. Raises ValueError if the file is
+    damaged, or if a part has no readable texture."""
     file, found = _GltfReader(path), {}
     for name, part in file.parts():
         if not file.textured or part.painted[0] is None:
-            raise ValueError(f"{name} has no texture that is read")
+            raise ValueError(f"{name} has no readable texture")
         found[name], file.textured = part.painted[0], False
     return found
 
 
 class _GltfReader:
-    """A file that is read: its header, and its buffers as bytes. Raises ValueError if it is damaged."""
+    """A file to be read: its header, and its buffers as bytes. Raises ValueError if it is damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -180,18 +182,18 @@ class _GltfReader:
             raise ValueError(f"glTF {version}, only 2.0 is read")
         for name in self.header.get("extensionsRequired", []):
             if name not in HONOURED and not str(name).startswith(OF_LOOKS):
-                raise ValueError(f"it needs the extension {name}, which is not read: export it without")
+                raise ValueError(f"it needs the extension {name}, which is not supported: export without it")
         self.buffers = [self._bytes(entry, own if k == 0 else None) for k, entry in enumerate(self._list("buffers"))]
         self._arrays: dict[int, np.ndarray] = {}
         self._images: dict[int, np.ndarray | None] = {}
-        self._tinted: dict[tuple, np.ndarray] = {}  # images by their number (-1 of plain colours) and their factor
-        self.textured = False  # whether a part that was read has an image
+        self._tinted: dict[tuple, np.ndarray] = {}  # images by their number (-1: plain colour) and colour factor
+        self.textured = False  # whether any part has an image
 
     def _list(self, name: str) -> list[dict[str, Any]]:
         return self.header.get(name, [])
 
     def _bytes(self, entry: dict[str, Any], own: bytes | None = None) -> bytes | None:
-        """The content of a buffer or of an image without a view; None where there is none."""
+        """The bytes of a buffer, or of an image without a view; None if there are none."""
         uri = entry.get("uri")
         if uri is None:
             return own
@@ -206,14 +208,14 @@ class _GltfReader:
         if buffer is None:
             packed = next((name for name in view.get("extensions", {}) if "compression" in name), "")
             raise ValueError(
-                f"it needs the extension {packed}: export it without" if packed else "a buffer has no data"
+                f"it needs the extension {packed}: export without it" if packed else "a buffer has no data"
             )
         if start < 0 or not 0 < length <= len(buffer) - start:
             raise ValueError(f"cut short: a view of {length} bytes does not fit its buffer of {len(buffer)}")
         return buffer[start : start + length]
 
     def array(self, number: int) -> np.ndarray:
-        """The rows [N, K] of an accessor: fractions as float64 where it is normalised, else as they are."""
+        """The rows [N, K] of an accessor: float64 fractions if it is normalised, else as stored."""
         if number not in self._arrays:
             self._arrays[number] = self._array(self.header["accessors"][_index(number)])
         return self._arrays[number]
@@ -228,7 +230,7 @@ class _GltfReader:
                 raise ValueError(f"an accessor of {count} rows has no data")
             rows = np.zeros((count, width), kind)
         else:
-            raise ValueError("an accessor has no data: compressed geometry is not read, export it without")
+            raise ValueError("an accessor has no data: compressed geometry is not supported, export without it")
         if "sparse" in accessor:
             few = accessor["sparse"]
             where = self._rows(few["indices"], np.dtype(TYPES[few["indices"]["componentType"]]), 1, few["count"])[:, 0]
@@ -250,7 +252,7 @@ class _GltfReader:
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
     def placed(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-        """Nodes with a mesh, and where they are [4, 4]."""
+        """Nodes with a mesh, and their poses [4, 4] in the scene."""
         nodes = self._list("nodes")
         if scenes := self._list("scenes"):
             roots = scenes[_index(self.header.get("scene", 0))].get("nodes", [])
@@ -270,7 +272,7 @@ class _GltfReader:
                 yield node, matrix
 
     def copies(self, node: dict[str, Any], matrix: np.ndarray) -> Iterator[np.ndarray]:
-        """Where each instance of a node's mesh is [4, 4]."""
+        """The pose [4, 4] of each instance of a node's mesh."""
         instances = node.get("extensions", {}).get(INSTANCES)
         if instances is None:
             yield matrix
@@ -293,7 +295,7 @@ class _GltfReader:
                 for place in self.copies(node, matrix):
                     count += len(part.vertices) + part.faces.size
                     if count > MOST:
-                        raise ValueError(f"with all copies more than {MOST:,} vertices and corners")
+                        raise ValueError(f"more than {MOST:,} vertices and corners, copies included")
                     vertices = (part.vertices @ place[:3, :3].T + place[:3, 3]) @ Z_UP.T
                     faces = part.faces[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else part.faces
                     paint = part.painted[0] and part.painted[0]._replace(vertices=vertices, faces=faces)
@@ -329,8 +331,8 @@ class _GltfReader:
     def _surface(
         self, primitive: dict[str, Any], attributes: dict[str, int], count: int
     ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
-        """Texture, colour of the material and those of the vertices, multiplied as light: at the vertices [V, 3] uint8;
-        and as places [V, 2] in an image, None where the vertices' own colours differ."""
+        """The product, in linear light, of texture, material colour and vertex colours: at the vertices [V, 3] uint8;
+        and as places [V, 2] in an image, None if the vertices' own colours differ."""
         factors, tint, uv, number = [], np.ones(3), np.zeros((count, 2)), -1
         if "material" in primitive:
             surface = self.header["materials"][_index(primitive["material"])].get("pbrMetallicRoughness", {})
@@ -358,7 +360,7 @@ class _GltfReader:
         return colors, uv, self._tint(number, tint)
 
     def _tint(self, texture: int, tint: np.ndarray) -> np.ndarray:
-        """[H, W, 3] uint8 of a texture, of -1 one white pixel, times a factor [3] of its light."""
+        """[H, W, 3] uint8 of a texture (-1: one white pixel), its light multiplied by a factor [3]."""
         key = (texture, *tint.tolist())
         if key not in self._tinted:
             image = self._image(texture) if texture >= 0 else None
@@ -370,7 +372,7 @@ class _GltfReader:
         return self._tinted[key]
 
     def _image(self, texture: int) -> np.ndarray | None:
-        """[H, W, 3] uint8 of a texture, None where it is of a kind that is not read."""
+        """[H, W, 3] uint8 of a texture, None if its format is not supported."""
         entry = self.header["textures"][_index(texture)]
         number = entry.get("extensions", {}).get("EXT_texture_webp", entry).get("source")
         if number is None:
@@ -383,7 +385,7 @@ class _GltfReader:
 
 
 def _index(number: int) -> int:
-    """A place in one of the header's lists; below 0 Python would count from their ends."""
+    """An index into one of the header's lists. Negative ones are refused: Python would count from the end."""
     if not isinstance(number, int) or number < 0:
         raise ValueError(f"{number!r} is not an index")
     return number
@@ -394,7 +396,7 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     matrix = np.eye(4)
-    from scipy.spatial.transform import Rotation  # it takes its time to load
+    from scipy.spatial.transform import Rotation  # slow to load
 
     turn = Rotation.from_quat(np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=np.float64)).as_matrix()
     matrix[:3, :3] = turn * np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
@@ -403,7 +405,7 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
-    """The JSON of a binary file, and its buffer where it has one."""
+    """The JSON of a binary file, and its buffer if it has one."""
     if content[:4] != b"glTF":
         raise ValueError("it does not begin with glTF")
     if len(content) < 20:

@@ -11,16 +11,16 @@ from sdfsim.geometry.mesh import Mesh, is_closed, lattice
 
 def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
     """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it of a closed mesh, exactly,
-    as a sum over signed tetrahedra. Raises SdfsimError if it is open or encloses nothing: see
-    `mass_properties_of_sdf`."""
+    as a sum over signed tetrahedra. Raises SdfsimError if it is open (use `mass_properties_of_sdf`) or encloses
+    nothing."""
     if not is_closed(mesh):
         raise SdfsimError("mesh is not closed, so it has no exact volume")
     return integrals(mesh)
 
 
 def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.ndarray, np.ndarray]:
-    """`mass_properties` of a surface that is closed but for cracks: edges need not match, as after cutting its faces.
-    These have weights [F], 1 / n where n of them lie on each other. Raises SdfsimError if it encloses nothing."""
+    """`mass_properties` of a surface that is closed except for cracks: edges need not match, as after cutting faces.
+    `weights` [F] are 1 / n for n faces that lie on each other. Raises SdfsimError if it encloses nothing."""
     # Moments about the vertices' mean: far from the origin the products of large coordinates would cancel.
     shift = mesh.vertices.mean(0)
     corners = mesh.vertices[mesh.faces] - shift
@@ -40,8 +40,8 @@ def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.
 def mass_properties_of_sdf(
     distance: Callable[[np.ndarray], tuple[Any, ...]], bounds: np.ndarray, *, cells: int = 64, wall: float = np.inf
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The integrals of `mass_properties`, taken on a grid over the inside of a solid within `bounds` [2, 3] m, or of a
-    wall, m, within it; by its signed distance (an Sdf or a `DistanceOracle`).
+    """The integrals of `mass_properties` on a grid, from the signed distance of a solid within `bounds` [2, 3] m (an
+    Sdf or a `DistanceOracle`). With a `wall` in m only the layer of that thickness inside the surface counts.
 
     A cell at distance f from the surface counts with the fraction 0.5 - f / cell (clamped), so the error is of second
     order in the cell. Raises SdfsimError for bounds that are infinite, or a distance that is negative nowhere.
@@ -66,6 +66,6 @@ def mass_properties_of_sdf(
     if volume <= 0:
         raise SdfsimError("the shape encloses no volume")
     com = first / volume
-    # A filled cell is a small cube, not a point: its own second moment.
+    # A filled cell is a small cube, not a point: this adds its own second moment.
     second += np.eye(3) * volume * cell**2 / 12.0 - volume * np.outer(com, com)
     return volume, com + start, np.trace(second) * np.eye(3) - second

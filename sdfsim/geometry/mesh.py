@@ -9,7 +9,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 
-FARTHEST = 1e12  # from the origin: beyond, double precision cannot separate the vertices of a room-sized mesh
+FARTHEST = 1e12  # from the origin, m: beyond it, double precision cannot separate the vertices of a room-sized mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Mesh:
     texture: np.ndarray | None = None
 
     def digest(self) -> str:
-        """SHA-256 of what it has, in hexadecimal."""
+        """SHA-256 of its content, in hexadecimal."""
         digest = hashlib.sha256()
         for array in (self.vertices, self.faces, self.colors, self.uv, self.texture):
             if array is not None:
@@ -55,7 +55,7 @@ class Frame:
         return points * self.scale + self.centre
 
     def scaled(self, factor: float) -> "Frame":
-        """That of the solid `factor` times as large about the origin."""
+        """The frame of the solid scaled by `factor` about the origin."""
         return Frame(self.centre * factor, self.scale * factor)
 
 
@@ -64,12 +64,12 @@ def normal_frame(bounds: np.ndarray) -> Frame:
     it has no extent or is not finite."""
     extent = float((bounds[1] - bounds[0]).max())
     if not np.isfinite(extent) or extent <= 0:
-        raise SdfsimError("the shape has no extent", "all of its vertices are at one point")
+        raise SdfsimError("the shape has no extent", "all its vertices are at one point")
     return Frame(centre=bounds.mean(0), scale=extent)
 
 
 def require_whole(mesh: Mesh) -> None:
-    """Raise ValueError if numbers are missing or faces have corners that are not there."""
+    """Raise ValueError if vertices are not finite or faces have corners that do not exist."""
     if not np.isfinite(mesh.vertices).all() or (mesh.uv is not None and not np.isfinite(mesh.uv).all()):
         raise ValueError("vertices that are not finite")
     if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
@@ -77,10 +77,11 @@ def require_whole(mesh: Mesh) -> None:
 
 
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
-    """Merge equal vertices, drop degenerate and doubled faces and unused vertices, turn a closed mesh right side out.
+    """Merge equal vertices, drop degenerate and doubled faces and unused vertices, and turn a closed mesh right side
+    out.
 
-    Two faces back to back both go where the rest is closed without them (a wall between touching cells). Raises
-    SdfsimError for no faces, vertices that are not finite or too far away, or indices out of range.
+    Two faces back to back are both dropped if the rest is closed without them (a wall between touching cells). Raises
+    SdfsimError if there are no faces, vertices are not finite or too far away, or indices are out of range.
     """
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) == 0:
@@ -97,8 +98,8 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     solid = _has_area(vertices, faces)
     if not solid.any():
         raise SdfsimError(f"{name}: mesh has no faces with an area")
-    # Files round to about seven digits: what agrees to a millionth of the size is one vertex. A face without an area
-    # may lie anywhere, so it does not count for the size.
+    # Files round to about seven digits: vertices that agree to a millionth of the size are one. A face without area may
+    # lie anywhere, so it does not count for the size.
     low, high = (fold(vertices[np.unique(faces[solid])], axis=0) for fold in (np.min, np.max))
     keys = np.round((vertices - low) / max(1e-6 * float((high - low).max()), 1e-300))
     _, first, label = np.unique(keys + 0.0, axis=0, return_index=True, return_inverse=True)
@@ -106,7 +107,7 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     vertices = vertices[first]
     colors = None if colors is None else colors[first]
 
-    # Without an area it may still join its neighbours, where it has corners of theirs only.
+    # A face without area may still join its neighbours, if all its corners are theirs.
     held = np.zeros(len(vertices), dtype=bool)
     held[faces[solid]] = True
     faces = faces[solid | held[faces].all(1)]
@@ -134,7 +135,7 @@ def without_doubles(faces: np.ndarray) -> np.ndarray:
     """One face [F', 3] for each set of three corners in `faces` [F, 3].
 
     Two faces back to back are either a wall between two touching cells, which is inside the solid, or a surface that
-    was drawn from both sides. Without a wall the rest is still closed; then both go. Otherwise one stays.
+    was drawn from both sides. If it is a wall, the rest is closed without it, and both go. Otherwise one stays.
     """
     order = np.argsort(faces, axis=1)
     # The sorted corners' permutation is even exactly when its inversions are.
@@ -175,7 +176,8 @@ def components(faces: np.ndarray) -> np.ndarray:
 
 
 def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For the 3 F directed edges (first ones, second, third): the undirected edge's number, and its sense +1 or -1."""
+    """For the 3 F directed edges (the first of each face, then the second, then the third): the number of the
+    undirected edge, and its sense, +1 or -1."""
     start = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]]).astype(np.int64)
     end = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]]).astype(np.int64)
     key = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
@@ -184,8 +186,8 @@ def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
-    """Convex hull of `points` [P, 3] m, outward faces. Raises SdfsimError for fewer than four points, or if they are
-    not finite or all in one plane."""
+    """Convex hull of `points` [P, 3] m, with outward faces. Raises SdfsimError if there are fewer than four points, or
+    if they are not finite or all in one plane."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(points) < 4 or not np.isfinite(points).all():
@@ -202,8 +204,8 @@ def convex_hull(points: np.ndarray) -> Mesh:
 
 
 def area_vectors(corners: np.ndarray) -> np.ndarray:
-    """[F, 3] along the normals of triangles [F, 3, 3 or more], of which the first three columns are places; twice their
-    area long."""
+    """[F, 3] vectors along the normals of triangles [F, 3, 3 or more], of which the first three columns are positions.
+    Each is as long as twice the triangle's area."""
     points = corners[..., :3]
     return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
 
@@ -225,20 +227,20 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 
 
 def joined(meshes: Sequence[Any]) -> Mesh:
-    """Several meshes, or whatever has vertices and faces as they do, as one, without colours."""
+    """One mesh of several (or of any objects with vertices and faces), without colours."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def lattice(*axes: Sequence[float] | np.ndarray) -> np.ndarray:
-    """All places [P, 3] with a coordinate of each of three axes, z running fastest."""
+    """All points [P, 3] of the grid of three axes, with z running fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def halves(places: np.ndarray, most: int, chosen: np.ndarray | None = None) -> list[np.ndarray]:
-    """Indices of places [P, D], or of those `chosen`, that lie together, at most so many each: halves of halves, along
-    their longest side."""
+    """Split places [P, D], or those `chosen`, into groups that lie together, at most `most` in each: their indices.
+    Each split halves a group along its longest side."""
     chosen = np.arange(len(places)) if chosen is None else chosen
     if len(chosen) <= most:
         return [chosen]

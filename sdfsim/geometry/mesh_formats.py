@@ -1,8 +1,8 @@
 """The contents of mesh files: PLY and OFF as arrays, and OBJ and STL in a form that trimesh reads correctly.
 
 trimesh refuses a binary PLY whose faces differ in their number of corners, and an OFF with its counts on the first
-line; Open3D, which reads both, gives up a whole file for one polygon with three corners in a line. So these two are
-read here. All readers raise ValueError for a file that is damaged or cut short.
+line; Open3D reads both, but rejects a whole file for one polygon with three corners in a line. So these two are read
+here. All readers raise ValueError for a file that is damaged or cut short.
 """
 
 import io
@@ -23,12 +23,12 @@ KINDS = {
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")
 PLACES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-# Corners of a polygon from which a fan is tried, before the first one is taken.
+# Number of corners of a polygon from which a fan is tried.
 TRIED = 64
-# A triangle of a fan may lean the other way by this part of its polygon's area.
+# A triangle of a fan may be turned over by at most this part of its polygon's area.
 FLAT = 1e-9
 TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # Pillow starts other programs for some of the other formats
-FACET = 50  # bytes of a triangle in a binary STL, behind 84 of its header
+FACET = 50  # bytes of a triangle in a binary STL; the header has 84
 
 
 class Ragged(NamedTuple):
@@ -44,10 +44,10 @@ class FileMesh(NamedTuple):
     vertices: np.ndarray  # [V, 3] float64
     faces: np.ndarray  # [F, 3] int64
     colors: np.ndarray | None = None  # [V, 3] uint8 RGB
-    # [F, 3, 2] places in a texture of the corners of faces, upper left (0, 0), and the name of its file
+    # [F, 3, 2] texture coordinates of face corners, upper left (0, 0), and the name of the texture's file
     places: np.ndarray | None = None
     texture: str = ""
-    # Parts with an image or a plain colour each, None where a part has neither; empty where nothing has an image
+    # Parts, each with an image or a plain colour, None if a part has neither; empty if no part has an image
     painted: tuple[Painted | None, ...] = ()
 
 
@@ -55,8 +55,8 @@ Element = dict[str, Any]  # columns [N] by their names, or `Ragged`
 
 
 def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, str]], str]:
-    """Elements of a PLY file by their names; the kinds of their columns, as NumPy has them; and the name of a texture
-    file, where a comment names it."""
+    """Elements of a PLY file by name, the NumPy types of their columns, and the name of a texture file if a comment
+    gives it."""
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
     line = re.escape(first[1]) if first else b""
     end = re.search(line + rb"end_header[ \t]*(?:" + line + rb"|\Z)", content)
@@ -64,7 +64,7 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
         raise ValueError("it has no complete PLY header")
     order, texture = "", ""
     counts: dict[str, int] = {}
-    columns: dict[str, list[tuple[str, str, str]]] = {}  # name, kind of the list's length or nothing, kind
+    columns: dict[str, list[tuple[str, str, str]]] = {}  # name, type of the list's length or nothing, type
     for row in content[first.end() : end.start()].decode("latin-1").splitlines():
         match row.split():
             case ["format", way, *_] if way in ORDERS:
@@ -80,11 +80,11 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise ValueError(f"its header has a line that PLY does not know: {row.strip()[:60]}")
+                raise ValueError(f"its header has a line that is not PLY:  {row.strip()[:60]}")
     if not order:
-        raise ValueError("its header has no format that PLY knows")
+        raise ValueError("its header has no PLY format")
     body, text = content[end.end() :], order == "ascii"
-    if text:  # every number becomes eight bytes, and the rest is as in a binary file
+    if text:  # convert every number to eight bytes, and continue as with a binary file
         try:
             body = np.array(body.split(), dtype="S").astype("<f8").tobytes() if body.strip() else b""
         except ValueError as error:
@@ -101,7 +101,7 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
 def _element(
     body: bytes, start: int, name: str, rows: int, layout: list[tuple[str, str, str]], order: str
 ) -> tuple[Element, int]:
-    """The columns of an element whose `rows` rows begin at byte `start`, and where they end."""
+    """The columns of an element whose `rows` rows begin at byte `start`, and the byte at which they end."""
     kinds = [np.dtype(order + kind) for _, _, kind in layout]
     counters = [struct.Struct(order + np.dtype(length).char) if length else None for _, length, _ in layout]
     if not rows or not layout:
@@ -131,13 +131,13 @@ def _element(
     least = sum(
         kind.itemsize if counter is None else counter.size for counter, kind in zip(counters, kinds, strict=True)
     )
-    if rows * least > len(body) - start:  # before memory is taken for them
+    if rows * least > len(body) - start:  # before memory is allocated
         raise short((len(body) - start) // least)
     try:
         items, after = lengths(start)
     except struct.error as error:
         raise short(0) from error
-    # As in most files, all rows may be alike.
+    # In most files all rows have the same length.
     stop = start + rows * (after - start)
     if stop <= len(body):
         fields = []
@@ -177,7 +177,7 @@ def _element(
 
 
 def ply_surface(content: bytes) -> FileMesh:
-    """The triangles of a PLY file, its polygons and strips cut into such, with colours of vertices or faces."""
+    """The triangles of a PLY file (polygons and strips are cut into triangles), with colours of vertices or faces."""
     elements, kinds, texture = read_ply(content)
     vertex = elements.get("vertex", {})
     if not {"x", "y", "z"} <= vertex.keys():
@@ -205,13 +205,13 @@ def ply_surface(content: bytes) -> FileMesh:
             places = own.values.reshape(-1, 2).astype(np.float64)[cuts]
         elif names is not None:
             places = np.stack([vertex[name] for name in names], axis=1).astype(np.float64)[faces]
-        if places is not None:  # they count from the lower edge
+        if places is not None:  # PLY counts from the lower edge
             places = places * [1.0, -1.0] + [0.0, 1.0]
     return FileMesh(vertices, faces, colors, places, texture)
 
 
 def _strips(strips: Ragged) -> list[np.ndarray]:
-    """Triangles [F, 3] of strips of vertices, each ended by -1 or its length."""
+    """Triangles [F, 3] of strips of vertices; -1 or its length ends each strip."""
     corners = whole(strips.values)
     ends = np.cumsum(strips.length)
     pieces = np.split(corners, np.union1d(np.flatnonzero(corners < 0), ends[:-1]))
@@ -219,27 +219,28 @@ def _strips(strips: Ragged) -> list[np.ndarray]:
 
 
 def strip(corners: np.ndarray) -> np.ndarray:
-    """Triangles [N - 2, 3] of a strip of N corners, every other one turned."""
+    """Triangles [N - 2, 3] of a strip of N corners; every other one is turned over."""
     faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1) if len(corners) > 2 else np.zeros((0, 3), int)
     faces[1::2] = faces[1::2, ::-1]
     return faces
 
 
 def _colors(columns: Element, kinds: dict[str, str]) -> np.ndarray | None:
-    """[N, 3] uint8 of columns red, green and blue: fractions as floats, else parts of what their kind holds."""
+    """[N, 3] uint8 from columns red, green and blue: floats are fractions, integers are relative to the largest of
+    their type."""
     names = ("red", "green", "blue")
     if not columns.keys() >= set(names) or any(isinstance(columns[name], Ragged) for name in names):
         return None
     values = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
     kind = np.dtype(kinds["red"])
     most = np.iinfo(kind).max if kind.kind in "iu" else 1.0
-    # Some programs write 0 to 255 whatever the kind.
+    # Some programs write 0 to 255 in any type.
     most = 255.0 if most > 65535 or (most == 1.0 and values.max(initial=0.0) > 1.0) else most
     return np.clip(np.round(255.0 / most * np.nan_to_num(values)), 0, 255).astype(np.uint8)
 
 
 def averaged(of_corners: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
-    """[count, 3] uint8 colours of vertices: means of those [F, 3, 3] of the corners of faces [F, 3]."""
+    """[count, 3] uint8 colours of vertices: means over the colours [F, 3, 3] of the corners of faces [F, 3]."""
     corner = faces.reshape(-1)
     weight = np.maximum(np.bincount(corner, minlength=count), 1)
     sums = [np.bincount(corner, of_corners[..., k].reshape(-1), count) for k in range(3)]
@@ -248,7 +249,7 @@ def averaged(of_corners: np.ndarray, faces: np.ndarray, count: int) -> np.ndarra
 
 def looked_up(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """[..., 3] uint8 pixels of an image [H, W, 3] at places [..., 2] from its upper left (0, 0) to its lower right
-    (1, 1), beyond which it repeats itself."""
+    (1, 1); the image repeats beyond."""
     size = np.array(image.shape[1::-1])
     pixel = np.floor(np.mod(np.nan_to_num(places), 1.0) * size).astype(np.int64)
     x, y = np.moveaxis(np.clip(pixel, 0, size - 1), -1, 0)
@@ -256,7 +257,7 @@ def looked_up(image: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def read_image(content: bytes) -> np.ndarray | None:
-    """[H, W, 3] uint8, or None where it is not an image of one of `TEXTURES`."""
+    """[H, W, 3] uint8, or None if it is not an image in one of the formats `TEXTURES`."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -266,7 +267,8 @@ def read_image(content: bytes) -> np.ndarray | None:
 
 
 def side_file(path: Path, name: str) -> bytes:
-    """What a mesh file names, from its folder. Raises ValueError if that is elsewhere, or not there."""
+    """The content of a file that a mesh file names, from its folder. Raises ValueError if that is outside the folder or
+    missing."""
     from trimesh.resolvers import FilePathResolver
 
     try:
@@ -276,23 +278,23 @@ def side_file(path: Path, name: str) -> bytes:
 
 
 def whole(values: np.ndarray) -> np.ndarray:
-    """Indices as int64. Raises ValueError for fractions, and for what is not finite."""
+    """Indices as int64. Raises ValueError for fractions and values that are not finite."""
     if values.dtype.kind == "f" and not (np.isfinite(values) & (np.round(values) == values)).all():
         raise ValueError("indices that are not whole numbers")
     return values.astype(np.int64)
 
 
 def triangles(length: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Polygons of `length` [P] corners each, one after the other in `corners` [sum], as triangles [F, 3] of places in
-    `corners`. Raises ValueError for corners that are no vertices [V, 3].
+    """Cut polygons into triangles [F, 3] of indices into `corners`. The polygons have `length` [P] corners, which
+    follow one another in `corners` [sum]. Raises ValueError for corners that are not in `vertices` [V, 3].
 
-    Each becomes a fan around the first corner from which no triangle lies outside the polygon; where there is no such
+    Each becomes a fan around the first corner from which no triangle lies outside the polygon. If there is no such
     corner, its ears are cut off one by one.
     """
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(vertices)):
         raise ValueError(f"face indices out of range (0 to {len(vertices) - 1} allowed)")
     start = np.cumsum(length) - length
-    # In the order of the file, polygon by polygon.
+    # Back to the order of the file, polygon by polygon.
     before = np.cumsum(np.maximum(length - 2, 0)) - np.maximum(length - 2, 0)
     cuts = np.empty((int(np.maximum(length - 2, 0).sum()), 3), dtype=np.int64)
     for count in np.unique(length[length > 2]).tolist():
@@ -311,7 +313,7 @@ def triangles(length: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> 
 
 
 def _apexes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[P] the corner of each polygon [P, N, 3] around which its fan is drawn, and [P] whether there is one."""
+    """For each polygon [P, N, 3] the corner [P] around which its fan is drawn, and whether there is one [P]."""
 
     def crosses(some: np.ndarray) -> np.ndarray:
         legs = some[:, 1:] - some[:, :1]
@@ -350,14 +352,14 @@ def _ears(points: np.ndarray) -> np.ndarray:
         if area(a, b, c) <= least:
             return False
         others = flat[np.setdiff1d(rest, corners)]
-        # What lies on a corner is the other end of a bridge to a hole.
+        # A point that lies on a corner is the other end of a bridge to a hole.
         others = others[~(others[:, None] == np.stack([a, b, c])).all(2).any(1)]
         within = (area(a, b, others) >= 0) & (area(b, c, others) >= 0) & (area(c, a, others) >= 0)
         return not within.any()
 
     rest, cut = list(range(len(points))), []
     while len(rest) > 3:
-        # Without an ear it crosses itself; then any corner will do.
+        # Without an ear the polygon crosses itself; then any corner will do.
         k = next((k for k in range(len(rest)) if is_ear(k)), 0)
         cut.append([rest[k - 1], rest[k], rest[(k + 1) % len(rest)]])
         del rest[k]
@@ -365,7 +367,7 @@ def _ears(points: np.ndarray) -> np.ndarray:
 
 
 def off_surface(content: bytes) -> FileMesh:
-    """The triangles of an OFF file (also COFF, NOFF, STOFF and their mixtures), its polygons cut into such."""
+    """The triangles of an OFF file (also COFF, NOFF, STOFF and their mixtures); polygons are cut into triangles."""
     lines = re.sub(r"#[^\r\n]*", "", content.decode("latin-1").lstrip("\ufeff\xef\xbb\xbf")).splitlines()
     rows = [words for line in lines if (words := line.split())]
     kind = re.fullmatch(r"(ST)?(C)?(N)?(4)?(n)?OFF", rows[0][0]) if rows else None
@@ -374,7 +376,7 @@ def off_surface(content: bytes) -> FileMesh:
     if kind[4] or kind[5]:
         raise ValueError(f"vertices of {kind[0]} do not have three coordinates")
     if "BINARY" in rows[0]:
-        raise ValueError("binary OFF is not read: export it as text, or as PLY")
+        raise ValueError("binary OFF is not supported: export it as text, or as PLY")
     rows = [rows[0][1:], *rows[1:]] if len(rows[0]) > 1 else rows[1:]
     if not rows or len(rows[0]) < 2 or not all(word.isdecimal() for word in rows[0][:2]):
         raise ValueError("its numbers of vertices and faces are missing")
@@ -383,7 +385,7 @@ def off_surface(content: bytes) -> FileMesh:
     for what, found, wanted in (("vertices", points, count), ("faces", rest, polygons)):
         if len(found) < wanted:
             raise ValueError(f"cut short: {len(found)} of {wanted} {what}")
-    shades = 6 if kind[3] else 3  # behind the normals
+    shades = 6 if kind[3] else 3  # after the normals
     has_shades = bool(kind[2]) and bool(points) and all(len(row) >= shades + 3 for row in points)
     taken = [row[:3] + row[shades : shades + 3] if has_shades else row[:3] for row in points]
     if any(len(row) < 3 for row in points):
@@ -404,8 +406,9 @@ def off_surface(content: bytes) -> FileMesh:
 
 
 def plain_obj(content: bytes) -> bytes:
-    """An OBJ file without what trimesh takes for something else: comments behind faces, lines that begin with a blank,
-    indices that count back from the rows before them, and polygons of five corners or more, which are cut here."""
+    """An OBJ file without what trimesh misreads: comments behind faces, lines that begin with a blank, indices that
+    count back from the end of the rows so far, and polygons of five corners or more, which are cut into triangles
+    here."""
     text = content.replace(b"\r\n", b"\n").replace(b"\\\n", b" ")
     text = text if b"\n" in text else text.replace(b"\r", b"\n")
     text = re.sub(rb"^[ \t]*((?:v|vt|vn|f)[ \t][^#\n]*)(?:#[^\n]*)?", rb"\1", text, flags=re.MULTILINE)
@@ -448,7 +451,7 @@ def _face_line(corners: list[list[bytes]]) -> bytes:
 
 
 def _index(word: bytes, count: int) -> bytes:
-    """An index from 1 on, where the rows so far are `count`."""
+    """An index that counts from 1, when there are `count` rows so far."""
     if not word or int(word) > 0:
         return word
     if int(word) == 0 or -int(word) > count:
@@ -457,7 +460,7 @@ def _index(word: bytes, count: int) -> bytes:
 
 
 def plain_stl(content: bytes) -> bytes:
-    """An STL file without what comes behind the triangles of a binary one."""
+    """An STL file without the bytes that follow the triangles of a binary one."""
     count = int.from_bytes(content[80:84], "little") if len(content) >= 84 else 0
     needed = 84 + FACET * count
     if len(content) == needed:
@@ -477,14 +480,14 @@ def plain_stl(content: bytes) -> bytes:
 
 
 def by_trimesh(path: Path, content: bytes) -> Any:
-    """A trimesh of `content`, whose side files stay in the folder of `path`."""
+    """A trimesh mesh of `content`; files that it names are read from the folder of `path` only."""
     import trimesh
 
     return trimesh.load(io.BytesIO(content), **_how(path), force="mesh")
 
 
 def scene_by_trimesh(path: Path, content: bytes) -> Any:
-    """Likewise a scene of trimesh's, with a mesh for each material."""
+    """Likewise a trimesh scene, with a mesh for each material."""
     import trimesh
 
     return trimesh.load_scene(io.BytesIO(content), **_how(path))

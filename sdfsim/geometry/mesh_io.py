@@ -1,4 +1,4 @@
-"""Meshes from files of all kinds, and the files that we write: PLY, glTF with textures, convex pieces as OBJ."""
+"""Reading mesh files of all kinds, and the files that we write: PLY, glTF with textures, convex pieces as OBJ."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ from sdfsim.geometry.mesh_formats import (
 )
 from sdfsim.geometry.skins import Painted, one_skin
 
-# trimesh logs what it skips, sometimes with tracebacks. Callers may add a handler to see that.
+# trimesh logs what it skips, sometimes with tracebacks. Callers may add a handler to see these lines.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
@@ -41,14 +41,14 @@ OTHERS |= {".dae": "COLLADA", ".3ds": "3DS", ".abc": "Alembic", ".step": "STEP",
 class Loaded(NamedTuple):
     """What a mesh file holds."""
 
-    mesh: Mesh  # cleaned by `clean`; a texture is looked up at its vertices
-    skin: Mesh | None = None  # the same triangles with their texture, where they have one
-    notes: tuple[str, ...] = ()  # what of it is lost, a line each
+    mesh: Mesh  # cleaned by `clean`; vertices get their colours from the texture
+    skin: Mesh | None = None  # the same triangles with their texture, if they have one
+    notes: tuple[str, ...] = ()  # what is lost on reading, one line each
 
 
 def load_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
-    Raises SdfsimError for a file that is missing, cut short or not a mesh, that needs an unsupported extension, or that
+    Raises SdfsimError if the file is missing, cut short or not a mesh, if it needs an unsupported extension, or if it
     has no faces, vertices that are not finite or indices out of range."""
     return load_textured(path).mesh
 
@@ -60,10 +60,10 @@ def load_textured(path: str | Path) -> Loaded:
     if not path.is_file():
         around = visible(path.parent) if path.parent.is_dir() else []
         near = nearest(path.name, [file.name for file in around if file.suffix.lower() in MESH_SUFFIXES])
-        raise SdfsimError(f"{path}: no such mesh file{near}", f"it was looked for in {path.parent.resolve()}")
+        raise SdfsimError(f"{path}: no such mesh file{near}", f"sdfsim looked for it in {path.parent.resolve()}")
     if suffix not in MESH_SUFFIXES:
         kind = OTHERS.get(suffix)
-        told = f"{kind} is not read" if kind else f"not a mesh file ({path.suffix or 'no suffix'})"
+        told = f"{kind} is not supported" if kind else f"not a mesh file ({path.suffix or 'no suffix'})"
         how = "export glb from Blender; " if kind else ""
         raise SdfsimError(f"{path}: {told}", f"{how}use " + " ".join(MESH_SUFFIXES))
     try:
@@ -81,7 +81,7 @@ def load_textured(path: str | Path) -> Loaded:
 
 
 def _read(path: Path, suffix: str) -> tuple[Mesh, tuple[Painted | None, ...]]:
-    """The triangles of a file, and the parts with their images; none where there are no images."""
+    """The triangles of a file, and its parts with their images; no parts if there are no images."""
     if suffix in GLTF:
         found = read_gltf(path)
     elif suffix == ".ply":
@@ -109,7 +109,7 @@ def _read(path: Path, suffix: str) -> tuple[Mesh, tuple[Painted | None, ...]]:
 
 
 def _painted(path: Path, content: bytes) -> tuple[Painted, ...]:
-    """The parts of an OBJ file by their materials; none where no material has an image."""
+    """The parts of an OBJ file by their materials; none if no material has an image."""
     parts, textured = [], False
     for drawn in scene_by_trimesh(path, content).geometry.values():
         faces = _faces(drawn)
@@ -120,7 +120,7 @@ def _painted(path: Path, content: bytes) -> tuple[Painted, ...]:
         if getattr(visual, "kind", None) == "texture":
             picture = _picture(visual)
             if picture is not None:
-                # trimesh counts up from the lower edge of a texture.
+                # trimesh counts from the lower edge of a texture.
                 uv, image = np.asarray(visual.uv) * [1.0, -1.0] + [0.0, 1.0], np.asarray(picture.convert("RGB"))
                 textured = True
             else:
@@ -130,7 +130,7 @@ def _painted(path: Path, content: bytes) -> tuple[Painted, ...]:
 
 
 def _picture(visual: Any) -> Any:
-    """The image of a material of trimesh's, None where it has none that is read."""
+    """The image of a trimesh material, None if it has no readable one."""
     image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
     return None if image is None or image.format not in TEXTURES or visual.uv is None else image
 
@@ -140,7 +140,7 @@ def _faces(loaded: Any) -> np.ndarray:
 
 
 def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
-    """[V, 3] uint8 when the file carries colours; a texture is looked up at each vertex."""
+    """[V, 3] uint8 if the file has colours; from a texture, its colour at each vertex."""
     visual: Any = getattr(loaded, "visual", None)
     if getattr(visual, "kind", None) == "texture":
         if _picture(visual) is None:
@@ -153,7 +153,8 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError: damaged."""
+    """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError if it is
+    damaged."""
     with _reading(path):
         found = ply_surface(path.read_bytes())
         mesh = Mesh(found.vertices, found.faces, found.colors)
@@ -170,8 +171,8 @@ def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
 
 
 def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """A mesh as binary PLY, vertices in double precision: it is read back to the last bit. `attributes` are more
-    properties of the vertices by name, [V] int32 or float32; most programs ignore them."""
+    """A mesh as binary PLY with vertices in double precision, so that it is read back to the last bit. `attributes` are
+    more properties of the vertices by name, [V] int32 or float32; most programs ignore them."""
     columns = [(axis, "<f8", "double") for axis in "xyz"]
     values = list(mesh.vertices.T)
     if mesh.colors is not None:
@@ -192,7 +193,7 @@ def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) ->
 
 
 def read_glb(path: Path) -> dict[str, Mesh]:
-    """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError: not readable."""
+    """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError if it is not readable."""
     with _reading(path):
         found = {
             name: Mesh(part.vertices, part.faces, None, part.uv, part.image)
@@ -204,9 +205,10 @@ def read_glb(path: Path) -> dict[str, Mesh]:
 
 
 def write_glb(meshes: dict[str, Mesh]) -> bytes:
-    """Meshes with textures as binary glTF: a node each by its name, all below one that turns them to glTF's y up.
+    """Meshes with textures as binary glTF: a node for each with its name, all below one that turns them to glTF's y up.
 
-    Vertices become single precision, textures JPEG. They hold the light of the photos, so viewers should add no light.
+    Vertices become single precision, textures JPEG. Textures contain the light of the photos, so viewers should add no
+    light.
     """
     file = GltfWriter()
     for name, mesh in meshes.items():

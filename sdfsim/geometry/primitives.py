@@ -7,7 +7,7 @@ import numpy as np
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, lattice
 
 BOWL_WALL = 0.12  # of the bowl, relative to its outer radius
-PACKED = 0.6  # part of a space which packed balls fill
+PACKED = 0.6  # part of a space that packed balls fill
 
 
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
@@ -62,7 +62,7 @@ def gear() -> Mesh:
 
 
 def _sleeve(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
-    """What is between two outlines [K, 2] m, counter-clockwise, and half of `height` m from z = 0."""
+    """The solid between two outlines [K, 2] m, counter-clockwise, from -height / 2 to height / 2 m."""
     count = len(outer)
     layers = [np.column_stack([line, np.full(count, z)]) for z in (-height / 2, height / 2) for line in (outer, inner)]
     this, following = np.arange(count), (np.arange(count) + 1) % count
@@ -86,7 +86,8 @@ def bowl(radius: float = 0.5, wall: float = 0.5 * BOWL_WALL) -> Mesh:
 
 
 def bowl_radii(count: int, ball: float) -> tuple[float, float]:
-    """Inner and outer radius m of a bowl with twice the room that `count` packed balls of diameter `ball` m take."""
+    """Inner and outer radius, m, of a bowl with twice the volume that `count` packed balls of diameter `ball` m
+    take."""
     inner = ball * (2.0 * count / (4 * PACKED)) ** (1 / 3)
     return inner, inner / (1 - BOWL_WALL)
 
@@ -97,7 +98,7 @@ def shoe() -> Mesh:
 
     axis = np.linspace(-0.58, 0.58, 72)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
-    # The body thins towards the toe, so do its cavity and its height.
+    # The body gets thinner towards the toe, and so do its cavity and its height.
     reach = np.clip((x + 0.3) / 0.6, 0.0, 1.0)
     thickness = 0.2 - 0.07 * reach
     along = np.maximum(np.abs(x) - 0.3, 0.0)
@@ -133,7 +134,8 @@ def plane(half: float) -> Mesh:
 
 
 def convex_pieces(kind: str) -> list[Mesh]:
-    """Convex pieces whose union is (close to) the default mesh of a primitive; none of any other or of "shoe"."""
+    """Convex pieces whose union is (close to) the default mesh of a primitive; an empty list for "shoe" and unknown
+    names."""
     if kind in ("box", "sphere", "cylinder", "cone"):
         return [convex_hull(PRIMITIVES[kind]().vertices)]
     if kind == "torus":
@@ -160,24 +162,25 @@ def convex_pieces(kind: str) -> list[Mesh]:
 
 
 def _quads(quads: np.ndarray) -> np.ndarray:
-    """Two triangles for each of [Q, 4]."""
+    """Two triangles for each quad of [Q, 4]."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
-    """(radius, z) points [K, 2] at the angle `turn` about z: [K, 3]."""
+    """Points [K, 2] of (radius, z) at the angle `turn` about z: [K, 3]."""
     return np.stack([profile[:, 0] * np.cos(turn), profile[:, 0] * np.sin(turn), profile[:, 1]], axis=1)
 
 
 def _revolve(profile: np.ndarray, segments: int) -> Mesh:
     """The solid of a profile [K, 2] of (radius, z), both ends on the axis, turned about z."""
     rings = np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
-    # On the axis all turns of a point are one vertex and half of each quad vanishes; `clean` handles both.
+    # On the axis all copies of a point are one vertex and half of each quad vanishes; `clean` handles both.
     return _tube(rings, len(profile) - 1)
 
 
 def _tube(rings: np.ndarray, strips: int | None = None) -> Mesh:
-    """The tube through rings [R, K, 3], the last joined to the first, of K strips around, or the first of these."""
+    """The tube through rings [R, K, 3], the last joined to the first, with K strips around it, or only the first
+    `strips`."""
     turns, sides = rings.shape[:2]
     this, following = np.arange(turns)[:, None], ((np.arange(turns) + 1) % turns)[:, None]
     left = np.arange(strips or sides)[None]

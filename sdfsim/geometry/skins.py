@@ -1,4 +1,4 @@
-"""One mesh with one texture, out of the parts of a file that are painted with an image each."""
+"""One mesh with one texture, made from the parts of a file, each of which has an image of its own."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,9 +7,9 @@ import numpy as np
 
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume
 
-LARGEST = 8192  # px, of the longer side of what several images, or repetitions of one, are put into
-SWATCH = 8  # px to each side, of a plain colour beside images
-EDGE = 1e-4  # of an image: places outside it by no more than this are on its border
+LARGEST = 8192  # px, the longest side of the image that combines several images, or repetitions of one
+SWATCH = 8  # px, side of the patch of a plain colour beside images
+EDGE = 1e-4  # relative to an image: places outside it by no more than this count as on its border
 
 
 class Painted(NamedTuple):
@@ -18,12 +18,12 @@ class Painted(NamedTuple):
     vertices: np.ndarray  # [V, 3] float64
     faces: np.ndarray  # [F, 3] int64
     uv: np.ndarray  # [V, 2] places in the image from its upper left (0, 0) to its lower right (1, 1); it repeats itself
-    image: np.ndarray  # [H, W, 3] uint8; of one pixel for a plain colour
+    image: np.ndarray  # [H, W, 3] uint8; one pixel for a plain colour
 
 
 def one_skin(parts: Sequence[Painted]) -> Mesh | None:
-    """The parts as one mesh; their images side by side, where there are several. None where an image repeats itself
-    too often to be written out."""
+    """The parts as one mesh, with their images side by side if there are several. None if an image repeats too often to
+    be written out."""
     from PIL import Image
 
     places, tiles, images = [], {}, {}
@@ -60,7 +60,7 @@ def one_skin(parts: Sequence[Painted]) -> Mesh | None:
         key = id(part.image)
         size = np.array(sheets[key].shape[1::-1])
         pixel = uv / tiles[key] * size
-        if len(sheets) > 1:  # no colour of the image beside it
+        if len(sheets) > 1:  # so that no colour of the next image shows
             pixel = np.clip(pixel, 0.5, size - 0.5) + np.array([at[key], 0.0])
         placed.append(np.clip(pixel / extent, 0.0, 1.0))
     whole = joined(parts)

@@ -1,4 +1,4 @@
-"""Any triangle mesh -> the solid that it bounds, or an error that says why it bounds none.
+"""From any triangle mesh to the solid that it bounds, or an error that says why it bounds none.
 
 Vertices [V, 3 + K] and corners of triangles [F, 3, 3 + K] hold coordinates, and K columns (colours) that new vertices
 get by the same averages.
@@ -25,26 +25,26 @@ from sdfsim.geometry.mesh import (
     normal_frame,
 )
 
-# Openings are always closed up to this fraction of the surface, smallest first.
+# Openings are always closed, smallest first, up to this fraction of the surface in all.
 SMALL = 0.02
-# Mean of how far winding numbers at the surface are from those of a closed one. A sphere with an opening of the
-# fraction a has a / 2; cracks of no width have nearly nothing, however long they are.
+# Largest mean deviation of winding numbers at the surface from those of a closed one. A sphere with an opening of the
+# fraction a has a / 2; cracks without width have almost none, however long they are.
 LEAK = 0.01
-# Both sides of a face are tested this far from it; sizes are relative to the largest extent.
+# Both sides of a face are tested at this distance from it; sizes are relative to the largest extent.
 STEP = 1e-4
-# Less of the surface than this is not worth cutting: the corners of small faces that cross each other.
+# A smaller part of the surface is not worth cutting: the corners of small faces that cross each other.
 TRIFLE = 1e-3
-# Longer faces may hide something between the points at which they are tested; a centroid speaks for the whole of
-# shorter ones, which is wrong along seams only, by a fraction of their size.
+# Longer faces may hide something between the points at which they are tested. For shorter ones the centroid is enough:
+# that is wrong along seams only, by a fraction of their size.
 COARSE, FINE = 0.1, 0.008
-# A sheet thinner than this is below what a fit resolves (mean errors of 0.0015 near the surface are allowed).
+# A fit cannot resolve a thinner sheet (mean errors of 0.0015 near the surface are allowed).
 THINNEST = 0.01
-THICKEST = 2.0  # likewise, of what is thickened
+THICKEST = 2.0  # likewise: the largest thickness
 THICKEN = "--thicken METRES (thicken: METRES) gives a sheet a thickness"
 HINT = f"--cap (cap: on) closes openings of any size, {THICKEN}"
-SHEET = 1e-3  # thinner than this part of its size, and a surface is a flat sheet, of which no cap makes a solid
-# [P, 3] points of faces and the unit normals there -> [P] int: 0 where that is no boundary, else of how many layers in
-# the same place, negative where it is wound inwards.
+SHEET = 1e-3  # a surface thinner than this part of its size is a flat sheet, and a cap does not make a solid of it
+# Points [P, 3] of faces and the unit normals there -> [P] int: 0 if the face is not boundary there, else the number of
+# layers in the same place, negative if they are wound inwards.
 Side = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -52,30 +52,30 @@ Side = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class Solid:
     """A body bounded by triangles."""
 
-    # its boundary, wound outwards: for distances, samples and display. Edges need not match where faces were cut along
-    # the line in which they cross others.
+    # its boundary, wound outwards: for distances, samples and display. Where faces were cut along the line in which
+    # they cross others, edges need not match.
     surface: Mesh
-    body: Mesh  # what winding numbers, or the distance of a thickened solid, are taken of: the whole mesh, repaired
-    notes: tuple[str, ...] = ()  # what was done to the mesh, a plain line each
-    thickness: float = 0.0  # m, of the sheet that `body` then is; 0 for a solid
-    closed: bool = True  # whether its inside is certain; cracks and pinholes leave doubt
+    body: Mesh  # the whole mesh, repaired: for winding numbers, and for the distance of a thickened solid
+    notes: tuple[str, ...] = ()  # what was done to the mesh, one line each
+    thickness: float = 0.0  # m, if `body` is a sheet; 0 for a solid
+    closed: bool = True  # whether inside and outside are certain; with cracks and pinholes they are not
     simple: bool = False  # whether `surface` is one clean boundary, for which ray parity is exact
-    # [F] int, how many faces of `surface` lie on each other where each is; None: one everywhere
+    # [F] int, how many faces of `surface` lie on each other there; None: one everywhere
     layers: np.ndarray | None = None
 
     def mass_properties(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it: exact to rounding for a
-        surface that was not cut, to about 0.1 % otherwise. Raises SdfsimError if it encloses nothing."""
+        """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it: exact to rounding if
+        the surface was not cut, else to about 0.1 %. Raises SdfsimError if it encloses nothing."""
         return integrals(self.surface, 1.0 if self.layers is None else 1.0 / self.layers)
 
 
 def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: float | None = None) -> Solid:
-    """The solid that `mesh`, in metres, bounds; or all within half of `thicken` m from it.
+    """The solid that `mesh`, in metres, bounds; with `thicken`, all points within half of `thicken` m from it.
 
-    Inside is what the surface goes around, once or more (winding number above one half): overlapping parts are one
-    body, shells inside it do not count unless they are wound the other way (cavities). Windings are made consistent,
-    small openings closed, and everything within the solid left out. Raises SdfsimError if the mesh encloses no
-    volume or is open beyond small holes, or `thicken` is too small or too large.
+    A point is inside if the surface goes around it once or more (winding number above one half). Overlapping parts are
+    one body, and shells inside it do not count unless they are wound the other way (cavities). Windings are made
+    consistent, small openings are closed, and all faces within the solid are left out. Raises SdfsimError if the mesh
+    encloses no volume or is open beyond small holes, or `thicken` is too small or too large.
     """
     mesh = clean(mesh, name=name)
     frame = normal_frame(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]))
@@ -90,7 +90,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
     faces = _outwards(vertices, faces, patch)
     turned = int(_differ(before, faces).sum())
     if turned:
-        notes.append(f"{turned} of {len(before)} faces turned round, to be wound alike and outwards")
+        notes.append(f"{turned} of {len(before)} faces turned over, so that all are wound outwards")
 
     area = face_areas(vertices[faces]).sum()
     vertices, faces = _close(vertices, faces, SMALL * area, area, frame.scale, notes)
@@ -105,7 +105,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
     rays = Crossings(_plain(vertices, faces))
 
     def around(points: np.ndarray) -> np.ndarray:
-        """Winding numbers [P]: by three rays where these agree, which is nearly everywhere, else exactly."""
+        """Winding numbers [P]: by three rays if these agree, as nearly everywhere, else exactly."""
         found = np.stack([rays(points, direction) for direction in range(3)])
         value, doubt = found[0], (found != found[0]).any(0)
         value[doubt] = winding(points[doubt])
@@ -118,7 +118,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     body = _mesh(vertices, faces, frame, mesh.colors)
     corners = vertices[faces]
-    # First a test every 0.05 of the surface; only surfaces that cross themselves are cut, and finely.
+    # First a test in steps of 0.05; only surfaces that cross themselves are cut finely.
     probes = no_longer_than(corners, 0.05)
     boundary = side(*centres_and_normals(probes))
     weights = face_areas(probes)
@@ -130,7 +130,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
             surface = _mesh(*_joined(kept), frame, mesh.colors)
         left = 1.0 - float((face_areas(kept) / layers).sum() / face_areas(corners).sum())
         if left > 5e-4:
-            notes.append(f"faces that do not bound the solid left out ({left:.1%} of the area)")
+            notes.append(f"left out faces that do not bound the solid ({left:.1%} of the area)")
     solid = Solid(surface, body, tuple(notes), closed=closed, simple=closed and odd == 0.0, layers=layers)
     try:
         if layers is None or len(layers):
@@ -165,7 +165,7 @@ def _differ(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """Turn bodies that are inside out, except shells in others that are so by the winding of the whole: cavities."""
+    """Turn bodies that are inside out, except shells inside others whose winding makes them cavities."""
     label = bodies(faces, patch)
     middle = np.stack([np.bincount(label, weights=vertices[faces, k].mean(1)) for k in range(3)], axis=1)
     middle /= np.bincount(label)[:, None]
@@ -175,7 +175,7 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.
         faces, volume = faces[:, ::-1], -volume
     inverted = (volume < 0)[label]
     if inverted.any() and not inverted.all():
-        # At most 16 points of each: a body that reaches out of all others is not a cavity.
+        # At most 16 points of each body are tested: one that reaches out of all others is not a cavity.
         chosen = np.flatnonzero(inverted)
         chosen = chosen[np.argsort(label[chosen], kind="stable")]
         chosen = chosen[np.arange(len(chosen)) - np.searchsorted(label[chosen], label[chosen]) < 16]
@@ -189,8 +189,9 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.
 def _close(
     vertices: np.ndarray, faces: np.ndarray, limit: float, area: float, scale: float, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area); note it. A
-    fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers."""
+    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area), and add a
+    note. A fan is right for any flat loop, though it may overlap itself: what it covers twice cancels in winding
+    numbers."""
     fans = []
     for loop in openings(faces):
         ring = vertices[loop]
@@ -221,7 +222,7 @@ def _close(
 
 
 def _require_tight(vertices: np.ndarray, faces: np.ndarray, winding: Winding, scale: float, name: str) -> None:
-    """Refuse a surface whose openings let the outside be seen from within."""
+    """Raise SdfsimError if the surface has openings that are too large to count as closed."""
     probes = no_longer_than(vertices[faces], 0.05)
     centres, normals = centres_and_normals(probes)
     weights = face_areas(probes)
@@ -241,7 +242,7 @@ def _require_tight(vertices: np.ndarray, faces: np.ndarray, winding: Winding, sc
 
 
 def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
-    """All within half the thickness: its surface by marching cubes, on cells that are computed only near it."""
+    """All points within half the thickness of a mesh: the surface by marching cubes, on cells near it only."""
     from skimage.measure import marching_cubes
 
     size = frame.scale + thickness
@@ -264,17 +265,17 @@ def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
         return (low + cell * (starts[:, None] * block + lattice(axis, axis, axis))).reshape(-1, 3)
 
     blocks = lattice(*(np.arange(count) for count in counts))
-    # Distances change by no more than the way gone: a block that is far from the surface has its middle's sign.
+    # A distance changes by at most the step taken: a block far from the surface has the sign of its middle everywhere.
     middle = distance(nodes(blocks, np.array([0.5 * (block - 1)])))
     values = np.repeat(middle[:, None], block**3, axis=1).astype(np.float32)
     near = np.abs(middle) < np.sqrt(3.0) * (0.5 * (block - 1) + 1.0) * cell
     values[near] = distance(nodes(blocks[near], np.arange(block))).reshape(-1, block**3)
     values = values.reshape(*counts, block, block, block).transpose(0, 3, 1, 4, 2, 5).reshape(counts * block)
-    # A node on the very surface would make triangles without area.
+    # A node exactly on the surface would make triangles without area.
     values[np.abs(values) < 0.01 * cell] = 0.01 * cell
     vertices, faces, *_ = marching_cubes(values, 0.0, spacing=(cell,) * 3, gradient_direction="descent")
     vertices = vertices.astype(np.float64) + low
-    # Straight lines through the cells are off by a fraction of a cell; the true distance puts them right.
+    # Linear interpolation in the cells is off by a fraction of a cell; the true distance corrects it.
     foot, _ = nearest(vertices)
     away = vertices - foot
     vertices = foot + away * (0.5 * thickness / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300))
@@ -284,7 +285,7 @@ def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
 
 
 def consistent(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wind neighbours alike within each patch (faces joined by edges of two faces), as most of its area was wound:
+    """Wind all faces of a patch (faces joined by edges of two faces) alike, as most of its area was wound. Returns the
     faces [F, 3] and the patch [F] of each."""
     import igl
 
@@ -298,7 +299,7 @@ def consistent(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def bodies(faces: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """[F] labels of what can be turned on its own: closed patches, and components of all the other faces."""
+    """[F] labels of parts that can be turned on their own: closed patches, and components of all other faces."""
     edge, sign = directed_edges(faces)
     owner = np.tile(patch, 3)
     _, pair = np.unique(edge * (int(patch.max()) + 1) + owner, return_inverse=True)
@@ -311,7 +312,7 @@ def bodies(faces: np.ndarray, patch: np.ndarray) -> np.ndarray:
 
 
 def openings(faces: np.ndarray) -> list[np.ndarray]:
-    """Loops of vertices [N] around which the surface ends, in the direction of its faces' edges."""
+    """Loops of vertices [N] where the surface ends, in the direction of its faces' edges."""
     import igl
 
     ends: Any = igl.exterior_edges(np.ascontiguousarray(faces, dtype=np.int64))
@@ -319,7 +320,7 @@ def openings(faces: np.ndarray) -> list[np.ndarray]:
     for start, end in ends.tolist():
         leaving.setdefault(start, []).append(end)
     loops = []
-    # As many edges come to a vertex as leave it, so a walk can only end where it began.
+    # As many edges end at a vertex as begin there, so a walk can only end where it began.
     for origin in list(leaving):
         path, place = [origin], {origin: 0}
         while leaving.get(path[-1]):
@@ -343,7 +344,8 @@ def face_areas(corners: np.ndarray) -> np.ndarray:
 
 def exposed(corners: np.ndarray, side: Side) -> tuple[np.ndarray, np.ndarray]:
     """The parts of triangles [F, 3, 3 + K] that are boundary, [F', 3, 3 + K] wound outwards, and their layers [F'].
-    Faces longer than `COARSE` are cut before they are judged; those shorter than `FINE` go by their centroid."""
+    Faces longer than `COARSE` are cut before they are tested; those shorter than `FINE` are tested at their centroid
+    only."""
     weights = np.array([[30, 1, 1], [1, 30, 1], [1, 1, 30], [15, 15, 1], [15, 1, 15], [1, 15, 15]], dtype=np.float64)
     weights /= weights.sum(1, keepdims=True)
     kept, layers = [corners[:0]], [np.zeros(0, dtype=np.int64)]
@@ -380,10 +382,10 @@ def no_longer_than(corners: np.ndarray, length: float) -> np.ndarray:
 
 
 def _cut(corners: np.ndarray, length: float) -> np.ndarray:
-    """Smaller triangles. Needles become strips across, as many as halving would make of their long edges in the end:
-    halves of halves would be three for each of two strips. Edges are cut at the same places by either way."""
+    """Smaller triangles. Needles are cut across into strips, as many as repeated halving would make of their long
+    edges, but with fewer triangles (two a strip instead of three). Both ways cut edges at the same places."""
     sides = _sides(corners)
-    # How often an edge must be halved; those of needles all but one more than once, and equally often.
+    # How often each edge must be halved. A needle has one short edge; the others are halved equally often, not just once.
     times = np.ceil(np.log2(np.maximum(sides / length, 1.0))).astype(np.int64)
     foot = times.argmin(1)
     turn = (foot[:, None] + np.arange(3)) % 3

@@ -45,7 +45,7 @@ def test_what_is_missing_or_of_another_kind_comes_with_a_way_out(tmp_path: Path)
     assert str(tmp_path) in error.value.hint
     for name, kind in (("a.fbx", "FBX"), ("b.USDZ", "USD"), ("c.blend", "Blender")):
         (tmp_path / name).write_bytes(b"Kaydara")
-        with pytest.raises(SdfsimError, match=f"{kind}.* is not read") as error:
+        with pytest.raises(SdfsimError, match=f"{kind}.* is not supported") as error:
             load_mesh(tmp_path / name)
         assert "glb" in error.value.hint and "Blender" in error.value.hint
 

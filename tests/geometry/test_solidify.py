@@ -142,7 +142,7 @@ def test_separate_bodies_are_turned_outwards_each() -> None:
     points = query(1.8)
     truth = np.minimum(box_distance(points, centre=(-1, 0, 0)), box_distance(points, centre=(1, 0, 0)))
     np.testing.assert_allclose(MeshDistance(solid)(points).distance, truth, atol=2e-6)
-    assert solid.notes == ("12 of 24 faces turned round, to be wound alike and outwards",)
+    assert solid.notes == ("12 of 24 faces turned over, so that all are wound outwards",)
 
 
 def test_a_crack_all_around_leaves_doubt_only_beside_it() -> None:
@@ -194,7 +194,7 @@ def test_pinholes_are_closed_and_said() -> None:
     assert is_closed(solid.surface)
     assert signed_volume(solid.surface) == pytest.approx(signed_volume(BALL), rel=1e-3)
     assert any("small holes closed (0." in note for note in solid.notes)
-    assert any("turned round" in note for note in solid.notes)
+    assert any("turned over" in note for note in solid.notes)
 
 
 def test_colours_go_with_what_is_added_and_cut() -> None:
