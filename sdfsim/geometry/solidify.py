@@ -385,7 +385,8 @@ def _cut(corners: np.ndarray, length: float) -> np.ndarray:
     """Smaller triangles. Needles are cut across into strips, as many as repeated halving would make of their long
     edges, but with fewer triangles (two a strip instead of three). Both ways cut edges at the same places."""
     sides = _sides(corners)
-    # How often each edge must be halved. A needle has one short edge; the others are halved equally often, not just once.
+    # How often each edge must be halved. A needle has one short edge; the two others are halved equally often, at least
+    # twice.
     times = np.ceil(np.log2(np.maximum(sides / length, 1.0))).astype(np.int64)
     foot = times.argmin(1)
     turn = (foot[:, None] + np.arange(3)) % 3

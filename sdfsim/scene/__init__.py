@@ -1,1 +1,1 @@
-"""Scene files, what they become, and the plan of what is in play in them."""
+"""Scene files, the scenes that they become, and the plan: which effects are on in a scene."""

@@ -21,14 +21,14 @@ from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, Shap
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")
-_ANY: dict[str, Any] = {"sphere": {"radius": 1.0}}  # where an entry is checked alone, for shapes that are not there yet
+_ANY: dict[str, Any] = {"sphere": {"radius": 1.0}}  # for shapes that are not defined yet, as an entry is checked
 _BALL = {"shape": "a"}
-_HERE = "<scene>"  # the name in messages of a scene without a file
+_HERE = "<scene>"  # the name of a scene without a file in messages
 
 
 class SceneBuilder:
-    """A scene that is being written. `print` shows it as the file that `save` writes. Settings are keys of the file
-    itself: gravity, duration, seed, model, effects; raises SceneError for no such key."""
+    """A scene that is being written in Python. `print` shows it as the file that `save` writes. Settings are the
+    top-level keys of the file: gravity, duration, seed, model, effects. Raises SceneError for an unknown key."""
 
     def __init__(self, **settings: Any) -> None:
         known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies", "joints")]
@@ -42,8 +42,8 @@ class SceneBuilder:
 
     @classmethod
     def read(cls, path: Path | str, *, allow_outside: bool = False) -> "SceneBuilder":
-        """The scene of a file, or of a sample by its name, to be gone on with: `Scene.read("arm.yaml").add(...)`.
-        Raises SceneError as `load_scene` does, with one line for every fault."""
+        """Read a scene file, or a sample by its name, to extend it: `Scene.read("arm.yaml").add(...)`. Raises
+        SceneError as `load_scene` does, with one line for every fault."""
         path = find_scene(path)
         document = read_scene(path, allow_outside=allow_outside)[1].data
         scene, home = cls(), path.parent
@@ -59,14 +59,14 @@ class SceneBuilder:
     def add(self, name: str, **keys: Unpack[BodyKeys]) -> "SceneBuilder":
         """Add a body, or many copies of one, and return the scene.
 
-        Keys are of the body and of its shape, which has the same name, as docs/scene.md has them, such as
-        sphere={"radius": 0.1}, position=(0, 0, 1). Paths of meshes and folders start at the current folder. A body that
-        looks like an earlier one takes shape="name of that one". Raises SceneError for no such key, or a value that it
-        cannot have; whether all fit together is checked by `load`.
+        The keys are those of a body and of its shape in docs/scene.md, such as sphere={"radius": 0.1}, position=(0, 0,
+        1); the shape gets the name of the body. Paths of meshes and folders start at the current folder. To reuse the
+        shape of an earlier body, give shape="name of that body". Raises SceneError for an unknown key or an invalid
+        value; `load` checks whether all of them fit together.
         """
         _check(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], f"body {name!r}")
         if any(body["name"] == name for body in self._bodies):
-            raise SceneError([f"body {name!r}: two bodies are called so"], "give each a name of its own")
+            raise SceneError([f"body {name!r}: two bodies have this name"], "give each a name of its own")
         shape = _plain({key: value for key, value in keys.items() if key in _OF_SHAPE})
         body = _plain({"name": name, **({"shape": name} if shape else {}),
                        **{key: value for key, value in keys.items() if key not in _OF_SHAPE}})  # fmt: skip
@@ -78,12 +78,11 @@ class SceneBuilder:
         return self
 
     def join(self, name: str, type: JointKind, *bodies: str, **keys: Unpack[JointKeys]) -> "SceneBuilder":
-        """Add a joint between two bodies, the second of which may be "world" and is so where only one is given, and
-        return the scene.
+        """Add a joint between two bodies, and return the scene. The second body may be "world", which is also the
+        default.
 
-        Keys are those of `joints` in docs/scene.md: `join("door", "hinge", "leaf", anchor=(0, 0, 1), axis=(0, 0, 1))`.
-        Raises SceneError for no such key, or a value that it cannot have; whether there are such bodies is checked by
-        `load`.
+        The keys are those of `joints` in docs/scene.md: `join("door", "hinge", "leaf", anchor=(0, 0, 1), axis=(0, 0,
+        1))`. Raises SceneError for an unknown key or an invalid value; `load` checks whether the bodies exist.
         """
         given = ("name", "type", "bodies")
         _check(keys, [key for key in JointTable.model_fields if key not in given], f"joint {name!r}")
@@ -96,13 +95,14 @@ class SceneBuilder:
         return self
 
     def load(self, on_progress: Progress = silent) -> Scene:
-        """What a simulator takes; `Simulator` calls it by itself. Shapes are loaded or fitted as `load_scene` does.
-        Raises SceneError with one line for every fault, with the line that `print` shows it in."""
+        """The immutable scene that a simulator needs; `Simulator` calls this itself. Shapes are loaded or fitted as in
+        `load_scene`. Raises SceneError with one line for every fault; its line numbers are those of what `print`
+        shows."""
         found = load_scene(Path(_HERE), on_progress, allow_outside=True, text=str(self))
         return replace(found, path=None)
 
     def save(self, path: Path | str) -> Path:
-        """Write a scene.yaml; paths in it start at its folder. Nothing is checked: `load_scene` does that. Raises
+        """Write a scene.yaml, with paths relative to its folder. Nothing is checked: `load_scene` does that. Raises
         SdfsimError if the file cannot be written."""
         path = Path(path)
         write_text(path, self._text(path.resolve().parent))
@@ -112,7 +112,7 @@ class SceneBuilder:
         return self._text(None)
 
     def _text(self, folder: Path | None) -> str:
-        """The file; paths start at `folder`, or stay as they are."""
+        """The text of the file, with paths relative to `folder`, or unchanged for None."""
 
         def moved(path: Any) -> Any:
             return path_from(folder, path) if folder and isinstance(path, str) else path
@@ -133,8 +133,8 @@ class SceneBuilder:
 
 
 def loaded(scene: Any, on_progress: Progress = silent) -> Scene:
-    """A scene that is loaded, written in Python, in a file, or a sample by its name. Raises SdfsimError for anything
-    else, and as `load_scene` does."""
+    """The scene of a `Scene`, a `SceneBuilder`, a scene file or a sample's name. Raises SdfsimError for anything else,
+    and as `load_scene` does."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, SceneBuilder):
@@ -146,7 +146,8 @@ def loaded(scene: Any, on_progress: Progress = silent) -> Scene:
 
 
 def _refuse(data: dict[str, Any], what: str, places: dict[tuple, str]) -> None:
-    """Raise SceneError with a line for every fault of a scene that lies below one of `places`, behind `what`."""
+    """Raise SceneError with a line for every fault of a scene that lies below one of `places`; each line begins with
+    `what`."""
     found = []
     try:
         SceneTable.model_validate(_numerals(data), context={"folder": Path(), "allow_outside": True})
@@ -166,7 +167,7 @@ def _without(entry: dict[str, Any], *keys: str) -> dict[str, Any]:
 
 
 def _numerals(value: Any) -> Any:
-    """Plain values as a scene file has them."""
+    """Plain values in the form that the scene file parser gives."""
     if isinstance(value, dict):
         return {key: _numerals(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -175,7 +176,7 @@ def _numerals(value: Any) -> Any:
 
 
 def _values(value: Any) -> Any:
-    """The other way round."""
+    """The inverse of `_numerals`."""
     if isinstance(value, dict):
         return {key: _values(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -188,11 +189,12 @@ def _values(value: Any) -> Any:
 def _check(keys: Mapping[str, Any], known: list[str], what: str) -> None:
     wrong = [f"{what}: unknown key {key!r}{meant(key, known)}" for key in keys if key not in known]
     if wrong:
-        raise SceneError(wrong, f"known are {', '.join(known)}")
+        raise SceneError(wrong, f"known keys: {', '.join(known)}")
 
 
 def _plain(value: Any) -> Any:
-    """Dicts, lists, texts and numbers only: arrays and tuples become lists, paths texts, and what is on or off so."""
+    """A value as dicts, lists, strings and numbers only: arrays and tuples become lists, paths become strings, and True
+    and False become "on" and "off"."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items() if entry is not None}
     if isinstance(value, np.ndarray | np.generic):

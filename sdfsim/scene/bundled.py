@@ -7,13 +7,13 @@ from sdfsim.base.errors import SdfsimError, nearest
 
 
 def sample_folder() -> Path:
-    """Where the samples lie: in the installed package, or beside it in a checkout."""
+    """The folder of the samples: in the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     return next(folder for folder in (package / "samples", package.parent / "samples") if folder.is_dir())
 
 
 def samples() -> dict[str, str]:
-    """What every sample scene shows, by its name: the comment in its first line."""
+    """What each sample scene shows, by the sample's name: the comment in its first line."""
     lines = {}
     for file in sorted(sample_folder().glob("*.yaml")):
         with file.open(encoding="utf-8") as opened:
@@ -22,15 +22,15 @@ def samples() -> dict[str, str]:
 
 
 def find_scene(given: Path | str, *, or_run: bool = False) -> Path:
-    """The scene file that is meant: a path, or the name of a sample where there is no file of that name. Raises
-    SdfsimError if it can be neither; `or_run`: a run or shape folder of that name would have done as well."""
+    """The scene file for a path, or for the name of a sample if there is no file of that name. Raises SdfsimError if it
+    is neither; with `or_run` the message says that a run folder or Shape folder would have been accepted too."""
     path = Path(given)
     if path.suffix or len(path.parts) != 1 or path.is_file():
         return path
     known = samples()
     if path.name not in known:
         if or_run:
-            told = f"{path}: there is no run folder, Shape folder, scene file or sample of this name"
+            told = f"{path}: no run folder, Shape folder, scene file or sample has this name"
             raise SdfsimError(told + nearest(path.name, known), "sdfsim samples lists the samples")
         told = f"{path}: neither a scene file nor a sample{nearest(path.name, known)}"
         raise SdfsimError(told, f"give a scene.yaml, or one of {', '.join(known)}")
@@ -38,10 +38,10 @@ def find_scene(given: Path | str, *, or_run: bool = False) -> Path:
 
 
 def copy_samples(out: Path) -> Path:
-    """Copy all samples, with their shapes, photos and scripts, to a folder that is not there yet. Raises SdfsimError
-    if it is, or cannot be written."""
+    """Copy all samples, with their shapes, photos and scripts, to a new folder. Raises SdfsimError if the folder exists
+    or cannot be written."""
     if out.exists():
-        raise SdfsimError(f"{out}: exists already, and nothing is replaced", "choose another -o")
+        raise SdfsimError(f"{out}: exists already, and is not replaced", "choose another -o")
     try:
         shutil.copytree(sample_folder(), out, ignore=shutil.ignore_patterns("__pycache__"))
     except OSError as error:

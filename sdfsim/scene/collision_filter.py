@@ -1,4 +1,5 @@
-"""Which bodies may touch: by groups, and counted by kinds, so that thousands of bodies make no millions of tests."""
+"""Which bodies may touch. Bodies are grouped, and pairs are counted by groups, so that thousands of bodies do not need
+millions of tests."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,33 +10,33 @@ import numpy as np
 from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.scene import Body
 
-MOST = 30_000  # groups: the table of who may touch whom has a byte for each pair of them
-ROWS = 1024  # of that table that are counted at once
+MOST = 30_000  # groups; the table of which groups may touch has a byte for each pair of groups
+ROWS = 1024  # rows of that table that are counted at once
 
 
 @dataclass(frozen=True)
 class PairCounts:
     """The unordered pairs of bodies of a scene."""
 
-    total: int  # all there are
-    unmoved: int  # of these, without a dynamic body: they may overlap as they like
-    excluded: int  # of the others, those that `collides_with` keeps apart
+    total: int  # all pairs
+    unmoved: int  # of these, pairs without a dynamic body: they may overlap
+    excluded: int  # of the others, pairs that `collides_with` excludes
     possible: int  # the remaining pairs
-    frictional: int  # of the possible ones, with a friction product above zero
-    bouncy: int  # of the possible ones, with a restitution product above zero
+    frictional: int  # of the possible pairs, those with a friction product above zero
+    bouncy: int  # of the possible pairs, those with a restitution product above zero
 
 
 def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies that may touch the same others are one group: the group [N] int64 of every body, and [G, G] bool, whether
-    `collides_with` of both lets two groups touch. Takes time with the bodies and the lengths of different lists. Raises
-    SdfsimError for more than `MOST` groups."""
+    """The group [N] int64 of every body, and [G, G] bool whether two groups may touch by their `collides_with`. Bodies
+    that may touch the same others are one group. The time grows with the number of bodies and the lengths of different
+    lists. Raises SdfsimError for more than `MOST` groups."""
     own, listed_by = _lists(bodies)
     kinds: dict[tuple, int] = {}
     kind = np.array([kinds.setdefault((o, *by), len(kinds)) for o, by in zip(own, listed_by, strict=True)], np.int64)
     many = np.bincount(kind, minlength=len(kinds))
     partners = _partners([(o, frozenset(by)) for o, *by in kinds])
-    # Kinds become one group where they may touch the same others, and each other as well, or not. One body alone does
-    # not meet itself, so it may be taken either way; no body has others like itself in both ways.
+    # Kinds become one group if they may touch the same others, and also if they agree on touching each other. A kind of
+    # one body never meets itself, so it fits either way; no kind fits both ways with different others.
     keys: list[tuple[bool, frozenset]] = []
     for k, (has, *_) in enumerate(kinds):
         touches = has < 0 or k in partners[k]
@@ -62,8 +63,8 @@ def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lists(bodies: Sequence[Body]) -> tuple[list[int], list[list[int]]]:
-    """The number of every body's list (-1: it has none), and the numbers of those in which it is; equal lists have one
-    number."""
+    """For every body the number of its list (-1: it has none), and the numbers of the lists that name it. Equal lists
+    have the same number."""
     numbers: dict[frozenset[str], int] = {}
     looked_at: dict[int, int] = {-1: -1}  # many bodies may share a tuple
     own = []
@@ -80,8 +81,8 @@ def _lists(bodies: Sequence[Body]) -> tuple[list[int], list[list[int]]]:
 
 
 def _partners(kinds: Sequence[tuple[int, frozenset[int]]]) -> list[frozenset[int]]:
-    """The kinds that each kind of bodies may touch. A kind is the list that it has (-1: none), and the lists that name
-    it. Kinds without a list may all touch each other; these pairs are left out."""
+    """The kinds that each kind of bodies may touch. A kind is given by the list that its bodies have (-1: none) and the
+    lists that name them. Kinds without a list may all touch each other; these pairs are left out."""
     named: dict[int, list[int]] = {}
     for k, (_, listed) in enumerate(kinds):
         for number in listed:
@@ -103,13 +104,13 @@ def count_pairs(bodies: Sequence[Body]) -> PairCounts:
     known = [(b.motion != "dynamic", b.friction > 0, b.restitution > 0) for b in bodies]
     still, rough, lively = np.array(known, dtype=bool).reshape(-1, 3).T
     sets = [which & part for which in (np.ones_like(still), rough, lively) for part in (np.ones_like(still), still)]
-    # [G, 6] how many bodies of every group: all, all that are still, those with friction, and so on
+    # [G, 6] number of bodies in every group: all, those that are not dynamic, those with friction, and so on
     count = np.stack([np.bincount(group[some], minlength=len(allowed)) for some in sets], 1).astype(np.float64)
     total = np.zeros(len(sets))
     for start in range(0, len(allowed), ROWS):
         rows = slice(start, start + ROWS)
         total += (count[rows] * (allowed[rows].astype(np.float64) @ count)).sum(0)
-    # Every pair was counted twice, and every body with itself where its group touches itself.
+    # Every pair was counted twice, and every body with itself if its group may touch itself.
     touching = [int(n) for n in np.rint(0.5 * (total - count[allowed.diagonal()].sum(0)))]
     possible, frictional, bouncy = (touching[k] - touching[k + 1] for k in (0, 2, 4))
     many, resting = len(bodies), int(still.sum())

@@ -12,8 +12,8 @@ from sdfsim.base.files import not_read
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 
 MOST_BYTES = 16 * 2**20  # of a file
-MOST_VALUES = 500_000  # of a file, each as often as an alias repeats it
-_LEVELS = 8  # no key lies deeper
+MOST_VALUES = 500_000  # of a file; a value that an alias repeats counts each time
+_LEVELS = 8  # no key is nested deeper
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _NULL = ("", "~", "null", "Null", "NULL")
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{t}" for t in ("str int float bool null map seq timestamp merge value".split())}
@@ -22,33 +22,34 @@ Loc = tuple[str | int, ...]  # keys and indices that lead to a value
 
 
 class Numeral(str):
-    """A number without quotes, as the file writes it. YAML 1.1 guesses: `1:30` would become 90, and `1e-3` a text."""
+    """A number without quotes, as the file writes it. YAML 1.1 would guess: `1:30` becomes 90, and `1e-3` a string."""
 
 
 def as_written(text: str) -> str:
-    """A value without quotes: a number or a text."""
+    """Read a value without quotes: a `Numeral` or a string."""
     return (Numeral if _NUMBER.fullmatch(text) else str)(text)
 
 
-NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
+NOTHING = object()  # the value of a key that is followed by nothing, `~` or `null`
 
 
 class Document:
     """The YAML of a file, and the faults found in it, each with its line.
 
-    `data` are dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value. Raises SceneError if the file
-    is missing, too large, not UTF-8, not YAML (with the line), or empty, or its aliases multiply it.
+    `data` is made of dicts, lists, strings and `Numeral`s, and of `NOTHING` for keys without a value. Raises SceneError
+    if the file is missing, too large, not UTF-8, not YAML (with the line) or empty, or if its aliases multiply its
+    size.
     """
 
     def __init__(self, path: Path, text: str | None = None) -> None:
         self._path = path
         self._line: dict[Loc, int] = {}  # of every key, and of every entry of a list
-        self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, each once
+        self._found: dict[tuple[int, str], None] = {}  # in the order in which they were found, each once
         root = _compose(path, _text_of(path) if text is None else text)
         self.data = self._read(root, (), root.start_mark.line + 1)
 
     def wrong(self, loc: Loc, text: str, line: int | None = None) -> None:
-        """Record a fault of the value under `loc`, in its line or another."""
+        """Record a fault of the value at `loc`, with its own line or another."""
         if line is None:
             line = next(self._line[loc[:depth]] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:200]
@@ -62,7 +63,7 @@ class Document:
     def _read(self, node: yaml.Node, loc: Loc, line: int) -> Any:
         self._line[loc] = line
         if len(self._line) > MOST_VALUES:
-            raise SceneError([f"{self._path}:1: with its aliases it has more than {MOST_VALUES} values"])
+            raise SceneError([f"{self._path}:1: it has more than {MOST_VALUES} values, repeated aliases included"])
         if node.tag not in _PLAIN_TAGS:
             self.wrong(loc, f"must be plain YAML without tags (got {node.tag!r})")
         if len(loc) > _LEVELS:
@@ -88,7 +89,7 @@ class Document:
 def _text_of(path: Path) -> str:
     try:
         if path.exists() and not path.is_dir() and not path.is_file():
-            raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may have no end
+            raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may never end
         if path.is_file() and path.suffix.lower() in MESH_SUFFIXES:
             scene = f"shapes: {{thing: {{mesh: {path.name}, sdf: grid}}}}"
             raise SceneError(
@@ -101,7 +102,7 @@ def _text_of(path: Path) -> str:
         raise SceneError([f"{path}: {not_read(error)}"], "give the path of a scene.yaml") from error
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        raise SceneError([f"{path}:{line}: not a text in UTF-8"], "a scene is a YAML text file") from error
+        raise SceneError([f"{path}:{line}: not UTF-8 text"], "a scene is a YAML text file") from error
 
 
 def _compose(path: Path, text: str) -> yaml.Node:

@@ -1,4 +1,4 @@
-"""Joints of a scene: from points and axes in the world, or in a body, to a frame at each of both bodies."""
+"""Joints of a scene: from points and axes in the world, or in a body, to a frame in each of the two bodies."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from sdfsim.scene.document import Loc
 from sdfsim.scene.scene import WORLD, Body, Joint, JointKind, Motor, Spring
 from sdfsim.scene.schema import JointTable
 
-NEAR = 1e-3  # of its length, by which a rod may differ from the distance at the start
+NEAR = 1e-3  # relative: by how much a rod's length may differ from the distance of its ends at the start
 
 
 def held(
@@ -25,15 +25,15 @@ def held(
     start: float = 0.0,
     **others: Any,
 ) -> Joint:
-    """A joint of bodies as they lie at the start.
+    """A joint between bodies in their poses at the start.
 
     Args:
         bodies: indices into `known`, the second -1 for the world.
-        anchor: [3] m, world; of a distance its end at the first body.
-        axis: [3] unit vector, world; None where the joint has none.
+        anchor: [3] m, world; for a distance, its end at the first body.
+        axis: [3] unit vector, world; None if the joint has no axis.
         to: [3] m, world, the end of a distance at the second body.
         start: the angle (rad) of a hinge, or the position (m) of a slider.
-        others: fields of `Joint`.
+        others: further fields of `Joint`.
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
@@ -57,7 +57,7 @@ def held(
 def joints_of(
     tables: Sequence[JointTable], bodies: Sequence[Body], wrong: Callable[[Loc, str], None]
 ) -> tuple[Joint, ...]:
-    """The joints of a scene file whose bodies are known; calls `wrong` where points do not fit what joins them."""
+    """The joints of a scene file. Calls `wrong` for points that do not fit the joint."""
     number = {body.name: k for k, body in enumerate(bodies)}
     return tuple(
         _joint(table, bodies, number, lambda key, told, i=i: wrong(("joints", i, key), told))

@@ -1,5 +1,5 @@
-"""The keys of bodies and joints of scene.yaml as arguments, for type checkers; `schema` says what they mean and checks
-their values, and a test that both have the same keys."""
+"""The keys of bodies and joints in scene.yaml as arguments, for type checkers. `schema` says what they mean and checks
+their values; a test checks that both have the same keys."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ Switch = bool | Literal["on", "off"]
 
 
 class BodyKeys(TypedDict, total=False):
-    """Of `Scene.add`: those of a body, and those of its shape."""
+    """Keyword arguments of `Scene.add`: the keys of a body and those of its shape."""
 
     asset: Path | str | None
     mesh: Path | str | None

@@ -1,4 +1,4 @@
-"""`load_scene`: a scene file is read and checked, and becomes a `Scene` with its shapes made."""
+"""`load_scene`: reads and checks a scene file, makes its shapes, and returns a `Scene`."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,8 +22,8 @@ from sdfsim.shape.shape import Shape, load_shape, with_nodes, with_sdf, with_wal
 
 
 def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
-    """Read and check a scene file; nothing is loaded yet. Returns its tables, and the document, which takes faults
-    that show only later. Raises SceneError with every fault found."""
+    """Read and check a scene file; nothing is loaded yet. Returns its tables, and the document, to which faults that
+    show later can be added. Raises SceneError with every fault found."""
     document, context = Document(path, text), {"folder": path.parent, "allow_outside": allow_outside}
     try:
         table = SceneTable.model_validate(document.data, context=context)
@@ -39,11 +39,11 @@ def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = No
 def load_scene(
     path: Path | str, on_progress: Progress = silent, *, allow_outside: bool = False, text: str | None = None
 ) -> Scene:
-    """Read a scene file, by its path or the name of a sample, and load or fit the shapes that its bodies use; the scene
+    """Read a scene file, by its path or the name of a sample, and load or fit the shapes that its bodies use. The scene
     is in SI units.
 
-    Paths inside the file are taken from its folder; unless `allow_outside`, they may not lead out of it. `text` is what
-    is in the file, where it is not written yet. Raises SceneError with one line `FILE:LINE: FIELD: what is wrong` for
+    Paths in the file are relative to its folder; unless `allow_outside`, they may not lead out of it. `text` is the
+    content of a file that is not written yet. Raises SceneError with one line `FILE:LINE: FIELD: what is wrong` for
     every fault found.
     """
     path = find_scene(path) if text is None else Path(path)
@@ -90,9 +90,10 @@ def load_scene(
 def _load_shapes(
     table: SceneTable, document: Document, on_progress: Progress
 ) -> tuple[dict[str | None, str | None], dict[str | None, Shape]]:
-    """Of the keys in use, in the order of first use, the first that says the same, and the shapes of these first ones:
-    in Python every body may bring its mesh along. None is the plane that all bodies with a `plane` share. Shapes that
-    must be fitted or sampled are made last, when all else is valid: a fit takes a minute."""
+    """Load the shapes in use. Returns for each key, in order of first use, the first key with the same entry (in Python
+    every body may bring its own copy of a mesh), and the shapes of these first keys. The key None is the plane that all
+    bodies with a `plane` share. Shapes that must be fitted or sampled are made last, when all else is valid: a fit
+    takes a minute."""
     first: dict[str, str] = {}
     same: dict[str | None, str | None] = {}
     for key in dict.fromkeys(body.shape for body in table.bodies):
@@ -134,7 +135,7 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
 
 
 def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:
-    """The first copy, without its mass."""
+    """The first copy of a body, without its mass."""
     partners, path = entry.collides_with, None
     if entry.avoids:
         avoided = {n for p in entry.avoids for n in groups.get(p, [p])}
@@ -163,7 +164,7 @@ def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[s
 
 
 def _mass(entry: BodyTable, shape: Shape, wrong: Callable[[str], None]) -> float:
-    """Mass of a dynamic body, kg; calls `wrong` with the reason where it cannot move."""
+    """Mass of a dynamic body, kg. Calls `wrong` with the reason if the body cannot move."""
     volume = shape.volume * entry.scale**3
     mass = entry.density * volume if entry.mass is None else entry.mass
     if not (np.isfinite(volume) and volume > 0):

@@ -1,4 +1,4 @@
-"""The plan: which effects are in play in a scene, and why. The simulator leaves out what is off."""
+"""The plan: which effects are on in a scene, and why. The simulator does not compute effects that are off."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,8 @@ from sdfsim.scene.scene import Scene
 class Effect:
     """One decision."""
 
-    on: bool  # whether it is in play
-    why: str  # the reason in a few words
+    on: bool  # whether the simulator computes it
+    why: str  # the reason, in a few words
     field: str  # what to edit in the scene file to change it
 
 
@@ -31,11 +31,11 @@ class Plan:
     restitution: Effect
     joints: Effect
     sleep: Effect
-    static: tuple[str, ...]  # names of the bodies by how they move, as the next two
+    static: tuple[str, ...]  # names of the bodies that are static; the next two likewise
     dynamic: tuple[str, ...]
     kinematic_bodies: tuple[str, ...]
     pairs: PairCounts  # which pairs of bodies may touch
-    nodes: int  # surface nodes of all bodies, the infinite planes having none
+    nodes: int  # surface nodes of all bodies; infinite planes have none
 
     def effects(self) -> dict[str, Effect]:
         """Every decision by its name."""
@@ -61,7 +61,7 @@ def plan(scene: Scene) -> Plan:
         return Effect(count > 0, f"{count} {kind} bodies, {what}" if count else f"no body is {kind}", "bodies[].motion")
 
     def of_pairs(choice: str, count: int, name: str, note: str = "") -> Effect:
-        """Friction or restitution: asked for or not, without contact there is nothing for them to act on."""
+        """Friction or restitution. Without contact they have nothing to act on, whatever the file asks for."""
         field = f"effects.{name}, bodies[].{name}"
         if not contact.on:
             return Effect(False, "contact is off", field)
@@ -70,7 +70,7 @@ def plan(scene: Scene) -> Plan:
         why = f"{count} pairs have {name} above zero" if count else f"no pair has {name} above zero"
         return Effect(count > 0, why + note, field)
 
-    sleep = "the file says off" if asked.sleep == "off" else "what rests freezes until something disturbs it"
+    sleep = "the file says off" if asked.sleep == "off" else "bodies at rest are frozen until something disturbs them"
     turning = "the file says off: bodies translate only" if asked.rotation == "off" else "only the file can say off"
     no_saving = "; off saves nothing"
     jointed = len(scene.joints) > 0 and asked.joints != "off"

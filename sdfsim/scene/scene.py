@@ -1,4 +1,4 @@
-"""A scene as immutable data in SI units: what a scene file becomes."""
+"""A scene as immutable data in SI units: what loading a scene file gives."""
 
 import math
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ from sdfsim.shape.shape import Shape
 Motion = Literal["static", "dynamic", "kinematic"]
 Switch = Literal["auto", "on", "off"]
 JointKind = Literal["hinge", "slider", "ball", "fixed", "distance"]
-WORLD = "world"  # what joints call that which never moves
+WORLD = "world"  # what joints call the fixed world
 
 
 @dataclass(frozen=True)
 class Effects:
-    """Which effects the file asks for; `auto` lets the plan decide."""
+    """The switches of effects in the file; with `auto` the plan decides."""
 
     contact: Switch = "auto"
     friction: Switch = "auto"
@@ -32,7 +32,8 @@ class Effects:
 
 @dataclass(frozen=True)
 class Waypoints:
-    """The poses that a kinematic body passes through: straight and at an even turn in between, at rest outside.
+    """The poses that a kinematic body passes through. In between it moves straight and turns evenly; before the first
+    and after the last it rests.
 
     Attributes:
         time: [K] s, increasing.
@@ -60,10 +61,10 @@ class Body:
         angular_velocity: [3] rad/s, world frame.
         mass: kg (already resolved from a density; bodies that are not dynamic have 0).
         inertia: [3, 3] kg m^2 about the centre of mass, shape axes; None means mass / volume times the shape's own.
-        friction: Coulomb coefficient (the product of the two bodies' counts).
-        restitution: likewise the product counts.
+        friction: Coulomb coefficient (a contact has the product of the two bodies').
+        restitution: coefficient of restitution (likewise the product).
         collides_with: names of the bodies it may touch, or None for all.
-        path: of a kinematic body.
+        path: the waypoints of a kinematic body, else None.
     """
 
     name: str
@@ -84,7 +85,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Spring:
-    """Of a joint: stiffness in N m/rad of a hinge, else N/m, about `rest` in rad or m."""
+    """The spring of a joint: stiffness in N m/rad for a hinge, else N/m, about `rest` in rad or m."""
 
     stiffness: float
     rest: float = 0.0
@@ -92,9 +93,9 @@ class Spring:
 
 @dataclass(frozen=True)
 class Motor:
-    """Of a hinge (rad, N m) or a slider (m, N): it keeps `speed`, or goes to `position`, with at most the torque or
-    force `most`; what is left of the way shrinks by a factor e in `time` s. Where both are None it does nothing until
-    it is told a place."""
+    """The motor of a hinge (rad, N m) or a slider (m, N). It keeps `speed`, or goes to `position`, with at most the
+    torque or force `most`. The distance to the position shrinks by a factor e in `time` s. If both are None it does
+    nothing until a target is set."""
 
     most: float
     speed: float | None = None
@@ -106,26 +107,27 @@ class Motor:
 class Joint:
     """Holds two bodies together. `joints.held` makes one from points and axes in the world.
 
-    A frame is fixed to each of both bodies; the joint's axis is its x axis. A hinge keeps the origins and the x axes of
-    both together, and its angle turns the second's frame about x to the first's. A slider keeps both parallel, and its
-    position is how far the first's origin is from the second's along x. A ball keeps the origins together; its limit is
-    the angle between the x axes. A fixed joint keeps both frames together. A distance is that of the origins.
+    Each of the two bodies has a frame fixed to it, whose x axis is the joint's axis. A hinge keeps the origins and the
+    x axes of the two frames together; its angle is the turn about x from the second body's frame to the first's. A
+    slider keeps the frames parallel; its position is the distance along x from the second frame's origin to the
+    first's. A ball keeps the origins together; its limit is the angle between the x axes. A fixed joint keeps the
+    frames together. A distance joint is about the distance between the origins.
 
     Attributes:
         name: unique among the joints of the scene.
         kind: "hinge", "slider", "ball", "fixed" or "distance".
-        bodies: indices into `Scene.bodies`, the second -1 for the world; the first is held by the second.
-        anchor: [2, 3] float64 m, the frames' origins, from the shapes' own origins in the axes of the bodies as large
-            as they are (for the world, in the world).
+        bodies: indices into `Scene.bodies`; the second is -1 for the world. The second body holds the first.
+        anchor: [2, 3] float64 m, the frames' origins relative to the shapes' origins, in body axes, with the bodies'
+            scale applied (for the world: world coordinates).
         quat_xyzw: [2, 4] float64 unit quaternions, the frames' axes -> the bodies' axes.
         limits: the least and the largest angle (rad), position (m), angle between the axes of a ball (rad; the least is
-            0), or distance (m; a rope, the least is 0); None where nothing bounds it.
-        length: m, of a rod; None for any other joint.
-        restitution: of limits.
-        damping: N m s/rad of hinges and balls, else N s/m.
-        friction: N m of hinges and balls, N of sliders.
-        spring, motor: None where it has none.
-        breaks_force, breaks_torque: N and N m, beyond which it breaks.
+            0), or distance (m; for a rope the least is 0); None if nothing bounds it.
+        length: m, length of a rod; None for any other joint.
+        restitution: coefficient with which limits rebound.
+        damping: N m s/rad for hinges and balls, else N s/m.
+        friction: N m for hinges and balls, N for sliders.
+        spring, motor: None if it has none.
+        breaks_force, breaks_torque: N and N m; beyond either the joint breaks.
         collides: whether its bodies may touch each other.
     """
 
@@ -153,16 +155,16 @@ class Scene:
     Attributes:
         shapes: the shapes in use.
         bodies: every body, planes included, in file order.
-        joints: what holds them together, in file order.
+        joints: the joints between bodies, in file order.
         gravity: [3] float64 m/s^2.
         duration: s.
         seed: random seed of the run.
         model: bundled model name or path, None for the default.
         effects: the switches of the file.
         path: the file it came from, if any.
-        missed: shapes fitted for this scene that are not usable, with the reason, one line each.
-        caveats: those that are, but are not as exact as fits can be; one line each.
-        notes: what was done to meshes on reading, and sizes that may be mistaken; one line each.
+        missed: fitted shapes of this scene that are not usable, with the reason, one line each.
+        caveats: fitted shapes that are usable, but not as exact as fits can be; one line each.
+        notes: what was done to meshes on reading, and sizes that may be a mistake; one line each.
     """
 
     shapes: tuple[Shape, ...]
@@ -180,10 +182,10 @@ class Scene:
 
 
 def fingerprints(scene: Scene) -> dict[str, str]:
-    """Distinguish a scene from others with bodies of the same names: a digest each of its `shapes` (which bodies have
-    which, how large, and how they move), of what else its `bodies` are (but for paths and who may touch whom), and of
-    `gravity`. Six digits count, and of fitted shapes the mesh, so that a fit that is made again, or the last digits of
-    another machine, make no other scene of it."""
+    """Digests that tell a scene from others with bodies of the same names: one of its `shapes` (the bodies' shapes,
+    sizes and kinds of motion), one of the other properties of its `bodies` (except paths and collision lists), and one
+    of `gravity`. Only six digits of numbers count, and of fitted shapes only the mesh. So a repeated fit, or rounding
+    on another machine, gives the same digests."""
     bodies = scene.bodies
 
     def numbers(*names: str) -> list[np.ndarray]:
@@ -201,7 +203,7 @@ def fingerprints(scene: Scene) -> dict[str, str]:
 
 
 def _held(joints: Sequence[Joint]) -> list:
-    """What joints are; nothing where there are none."""
+    """The properties of joints for a digest; an empty list if there are no joints."""
     if not joints:
         return []
     told = [f"{j.kind} {j.bodies} {j.collides} {j.limits is None} {j.spring is None} {j.motor}" for j in joints]
@@ -222,9 +224,9 @@ def _described(shape: Shape) -> list:
 
 
 def _six_digits(values: Sequence | np.ndarray) -> np.ndarray:
-    """[N, K] rows of numbers, rounded to 2^-20 of the largest of the row."""
+    """Rows of numbers [N, K], rounded to 2^-20 of the largest in the row."""
     rows = np.asarray(values, np.float64)
     rows = rows.reshape(len(rows), math.prod(rows.shape[1:]))
-    # Just below a power of two counts as that power: rounding must not separate the two.
+    # A number just below a power of two counts as that power: rounding must not separate the two.
     unit = np.ldexp(1.0, np.frexp(np.abs(rows).max(1, initial=0.0) * (1.0 + 1e-9))[1] - 20)[:, None]
     return np.round(rows / unit) * unit + 0.0  # no negative zeros

@@ -34,9 +34,7 @@ def test_commands_take_names(tmp_path, monkeypatch):
     done = run("export", "tower", "-o", "tower.csv", "--json")
     assert done.exit_code == 0 and json.loads(done.stdout)["bodies"] == 5
     done = run("export", "nosuchrun", "-o", "x.glb")
-    assert (
-        done.exit_code == 1 and "nosuchrun: there is no run folder, Shape folder, scene file or sample" in done.stderr
-    )
+    assert done.exit_code == 1 and "nosuchrun: no run folder, Shape folder, scene file or sample" in done.stderr
     assert "pile" not in done.stderr
     done = run("export", "runs/none", "-o", "x.glb")
     assert done.exit_code == 1 and "none: there is no such folder or file" in done.stderr

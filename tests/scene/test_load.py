@@ -111,7 +111,7 @@ def test_missing_files(tmp_path):
     with pytest.raises(SceneError, match="cannot be read"):
         load_scene(tmp_path)
     (tmp_path / "scene.yaml").write_bytes(b"version: 1\n\xff\xfe")
-    with pytest.raises(SceneError, match=r"scene\.yaml:2: not a text"):
+    with pytest.raises(SceneError, match=r"scene\.yaml:2: not UTF-8 text"):
         load_scene(tmp_path / "scene.yaml")
     (tmp_path / "scene.yaml").write_text("[" * 5_000)
     with pytest.raises(SceneError, match="not valid YAML"):

@@ -97,7 +97,7 @@ def test_a_wrong_joint_is_refused_where_it_is_added(kind, keys, told):
 
 
 def test_two_bodies_of_one_name_and_settings_are_refused():
-    with pytest.raises(SceneError, match="body 'a': two bodies are called so"):
+    with pytest.raises(SceneError, match="body 'a': two bodies have this name"):
         sdfsim.Scene().add("a", sphere={"radius": 1}).add("a", sphere={"radius": 2})
     with pytest.raises(SceneError, match=r"a scene: duration: must be > 0 \(got -1 s\)"):
         sdfsim.Scene(duration=-1)
