@@ -33,10 +33,10 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 DEFAULT_DURATION = 4.0  # s
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 MOST_COPIES = 100_000
-LARGEST = 1e12  # of any number: beyond it powers and products of what is legal are no longer finite
-_SHOWN = 40  # letters of a value in a message
+LARGEST = 1e12  # largest number allowed: powers and products of larger ones may not be finite
+_SHOWN = 40  # characters of a value that a message shows
 
-Fault = tuple[Loc, str]  # where below a table, and what is wrong there
+Fault = tuple[Loc, str]  # the place below a table, and what is wrong there
 
 
 def _shown(value: Any) -> str:
@@ -52,18 +52,18 @@ _LENGTHS = {"quat_xyzw": 4, "quat_wxyz": 4, "limits": 2, "limits_deg": 2, "grid"
 
 
 def _numbers(name: str) -> str:
-    """What a list of numbers of that name holds; all that are not named here are vectors."""
+    """What a list of numbers with this name holds; lists that are not named here are vectors."""
     return f"{_LENGTHS.get(name, 3)} numbers"
 
 
 def _many(value: Any, name: str) -> str:
-    """How many entries a list of that name has."""
+    """How many entries a list with this name has."""
     if name == "bodies" and not any(isinstance(entry, str) for entry in value):
         return "have at least one body"
     return _LISTS.get(name) or f"be {_numbers(name)}"
 
 
-# What other programs call keys that have another name here; the first that is known counts.
+# Keys of other programs, and their names here.
 _TURNS = "quat_xyzw, quat_wxyz or euler_xyz_deg"
 _MEANT = {
     "rotation": _TURNS, "orientation": _TURNS, "quat": _TURNS, "quaternion": _TURNS, "euler": _TURNS, "rpy": _TURNS,
@@ -75,7 +75,7 @@ _MEANT = {
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """What a key that is not known is called here, for a message; an empty text where nobody can tell."""
+    """A suggestion for an unknown key, for a message; an empty string if there is none."""
     known = list(known)
     told = _MEANT.get(name.lower(), "")
     return f" (give {told})" if any(key in known for key in re.findall(r"\w+", told)) else nearest(name, known)
@@ -86,7 +86,7 @@ def _problem(text: str) -> PydanticCustomError:
 
 
 def _told(error: Any, table: "type[Table]") -> str:
-    """What pydantic found in a table, in our words."""
+    """A message in our words for what pydantic found in a table."""
     kind, known = error["type"], table.model_fields
     if kind == "value":
         return error["msg"]
@@ -121,11 +121,11 @@ def _numeral(value: Any) -> Any:
 
 
 def _unit(values: list[float]) -> np.ndarray:
-    """A direction, made one long."""
+    """A direction as a unit vector."""
     largest = np.abs(values).max()
     if largest < 1e-9:
         raise _problem("must not be zero")
-    made = np.array(values) / largest  # first, so that the length of huge numbers does not overflow
+    made = np.array(values) / largest  # scaled first, so that the length of huge numbers does not overflow
     return made / np.linalg.norm(made)
 
 
@@ -136,14 +136,14 @@ def _partners(value: Any, handler: Callable[[Any], list[str]]) -> list[str] | No
 
 
 def _find(text: str, info: ValidationInfo) -> Path:
-    """The place that a path of the file names, whether something is there or not."""
+    """The place that a path in the file names, whether or not something is there."""
     context: Any = info.context
     home: Path = context["folder"]
     place = home / text
     if "\\" in text and not os.path.lexists(place):  # written on Windows
         place = home / text.replace("\\", "/")
     try:
-        # Where it leads when every link is followed; of a folder, also where the files of a shape lead.
+        # Where it leads when all links are followed; for a folder, also where the files of a shape lead.
         inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE, SKIN_FILE) if place.is_dir() else ()
         ends = [place.resolve(), *((place / name).resolve() for name in inside)]
         outside = not all(end.is_relative_to(home.resolve()) for end in ends)
@@ -156,7 +156,7 @@ def _find(text: str, info: ValidationInfo) -> Path:
 
 
 def _there(text: str, info: ValidationInfo) -> str:
-    """An `asset` is a folder, a `mesh` a file."""
+    """Check that an `asset` is a folder and a `mesh` a file."""
     place, what = _find(text, info), "folder" if info.field_name == "asset" else "file"
     if not (place.is_dir() if what == "folder" else place.is_file()):
         raise _problem(f"no such {what}: {place}")
@@ -164,13 +164,15 @@ def _there(text: str, info: ValidationInfo) -> str:
 
 
 def _model(text: str, info: ValidationInfo) -> str:
-    """A bundled model's name, or the path of a file, taken from the scene's folder."""
+    """The name of a bundled model, or the path of a file relative to the scene's folder."""
     return str(_find(text, info)) if text.endswith(".safetensors") else text
 
 
 def _primitive(name: str) -> str:
     if name not in PRIMITIVES:
-        raise _problem(f"no such primitive: {name!r}{nearest(name, PRIMITIVES)}; there are {', '.join(PRIMITIVES)}")
+        raise _problem(
+            f"no such primitive: {name!r}{nearest(name, PRIMITIVES)}; primitives are {', '.join(PRIMITIVES)}"
+        )
     return name
 
 
@@ -218,11 +220,11 @@ class Table(BaseModel):
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
-        """Faults in which keys are given together; checked whether their values are right or not."""
+        """Faults in the combination of keys; checked even if values are wrong."""
         yield from ()
 
     def check_values(self) -> Iterator[Fault]:
-        """Faults in values that do not fit each other; checked once each is right by itself."""
+        """Faults in values that do not fit each other; checked once each value is valid."""
         yield from ()
 
 
@@ -241,7 +243,7 @@ class EffectsTable(Table):
     friction: Switch = key("contacts have friction", "auto")
     restitution: Switch = key("contacts rebound", "auto")
     rotation: Switch = key("bodies turn", "auto")
-    sleep: Switch = key("what rests is frozen until something disturbs it", "auto")
+    sleep: Switch = key("bodies at rest are frozen until something disturbs them", "auto")
     joints: Switch = key("joints hold bodies", "auto")
 
 
@@ -262,7 +264,7 @@ class Upright(Table):
     """An exact capsule or cylinder along z, about the origin."""
 
     radius: Number = key("radius", unit="m", gt=0)
-    height: Number = key("along z; of a capsule with its caps, so above twice the radius", unit="m", gt=0)
+    height: Number = key("along z; for a capsule with its caps, so above twice the radius", unit="m", gt=0)
 
 
 class Box(Table):
@@ -277,17 +279,17 @@ class PlaneShape(Table):
 
 _KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane")
 FITTED = ("mesh", "primitive")  # made on first use, which may take a minute
-_WITH_SDF = ("asset", *FITTED)  # the others have an exact SDF of their own
+_WITH_SDF = ("asset", *FITTED)  # the other kinds have an exact SDF
 
 
 class ShapeTable(Table):
     """One shape: exactly one of `asset` to `plane`, and how its distances and surface nodes are made."""
 
     asset: Annotated[Text, AfterValidator(_there)] | None = key(
-        "folder that `reconstruct` or `fit` has written, from the scene's folder", None
+        "folder that `reconstruct` or `fit` has written, relative to the scene's folder", None
     )
     mesh: Annotated[Text, AfterValidator(_there)] | None = key(
-        "mesh file, from the scene's folder; fitted on first use, then taken from a cache", None
+        "mesh file, relative to the scene's folder; fitted on first use, then taken from a cache", None
     )
     primitive: Primitive | None = key("a procedural shape, fitted on first use", None)
     sphere: Sphere | None = key("an exact sphere", None)
@@ -295,20 +297,20 @@ class ShapeTable(Table):
     cylinder: Upright | None = key("an exact cylinder", None)
     box: Box | None = key("an exact box", None)
     plane: PlaneShape | None = key("an infinite plane", None)
-    units: Literal["m", "cm", "mm", "in"] = key("of the numbers in a mesh file", "m")
+    units: Literal["m", "cm", "mm", "in"] = key("unit of the numbers in a mesh file", "m")
     cap: Literal["on", "off"] = key("close the openings of a mesh", "off")
     thicken: Number | None = key("thickness that an open sheet of a mesh gets", None, "m", gt=0)
     sdf: SdfKind | None = key(
-        "where distances come from: a fitted network, samples on a grid, or the mesh itself; without it "
+        "where distances come from: a fitted network, samples on a grid, or the mesh itself; by default "
         "an asset keeps its own and others are fitted",
         None,
     )
-    resolution: Whole = key("samples along each side, with `sdf: grid`", DEFAULT_RESOLUTION, ge=8, le=512)
+    resolution: Whole = key("samples along the longest side, with `sdf: grid`", DEFAULT_RESOLUTION, ge=8, le=512)
     nodes: Whole | None = key(
-        "N of the N^3 grid whose points become surface nodes; without it a shape keeps its own", None, ge=3, le=128
+        "N of the N^3 grid whose points become surface nodes; by default a shape keeps its own", None, ge=3, le=128
     )
     wall: Number | None = key(
-        "makes the shape hollow: only what lies within this of its surface has mass", None, "m", gt=0
+        "makes the shape hollow: only the layer of this thickness below its surface has mass", None, "m", gt=0
     )
 
     @classmethod
@@ -317,14 +319,14 @@ class ShapeTable(Table):
         kind = next((key for key in data if key in _KINDS), None)
         for key in ("units", "cap", "thicken"):
             if key in data and kind not in ("mesh", None):
-                yield (key,), f"goes with mesh only (this is a {kind})"
+                yield (key,), f"is for mesh only (this is a {kind})"
         if "sdf" in data and kind not in (*_WITH_SDF, None):
-            yield ("sdf",), f"goes with {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
+            yield ("sdf",), f"is for {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
         if "resolution" in data and data.get("sdf") in (None, "mlp", "mesh"):
-            yield ("resolution",), "goes with sdf: grid only"
+            yield ("resolution",), "is for sdf: grid only"
         for key in ("nodes", "wall"):
             if key in data and kind == "plane":
-                yield (key,), "goes with bodies only (a plane has no nodes and no mass)"
+                yield (key,), "is not for a plane, which has no nodes and no mass"
 
     def check_values(self) -> Iterator[Fault]:
         if self.capsule and self.capsule.height <= 2 * self.capsule.radius:
@@ -333,7 +335,7 @@ class ShapeTable(Table):
 
     @property
     def kind(self) -> str:
-        """The one of `_KINDS` that is given."""
+        """Which of `_KINDS` is given."""
         return next(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
@@ -341,11 +343,11 @@ _ROTATIONS = ("quat_xyzw", "quat_wxyz", "euler_xyz_deg")
 
 
 class Turned(Table):
-    """What has an orientation, given by at most one of three keys."""
+    """An entry with an orientation, given by at most one of three keys."""
 
     quat_xyzw: Quaternion | None = key("orientation as a quaternion, scalar last; of any length", None)
-    quat_wxyz: Quaternion | None = key("the same with its scalar first", None)
-    euler_xyz_deg: Vector | None = key("the same as turns about the fixed x, then y, then z", None, "degrees")
+    quat_wxyz: Quaternion | None = key("the same, scalar first", None)
+    euler_xyz_deg: Vector | None = key("orientation as turns about the fixed axes x, then y, then z", None, "degrees")
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -363,32 +365,33 @@ class Turned(Table):
 
 
 class Waypoint(Turned):
-    """One pose of a path. In between a body goes straight and turns evenly; before and after it rests."""
+    """One pose of a path. Between poses a body moves straight and turns evenly; before the first and after the last it
+    rests."""
 
-    time: Number = key("when; later than the pose before it", unit="s", ge=0)
-    position: Vector = key("of the shape's own origin", unit="m")
+    time: Number = key("time of the pose; later than the pose before it", unit="s", ge=0)
+    position: Vector = key("position of the shape's own origin", unit="m")
 
 
 class Plane(Table):
-    """The points x with normal . x = offset, of a body without a shape."""
+    """The points x with normal . x = offset, for a body without a shape."""
 
-    normal: Direction = key("the direction it faces; of any length", (0.0, 0.0, 1.0))
+    normal: Direction = key("direction in which it faces; of any length", (0.0, 0.0, 1.0))
     offset: Number = key("distance from the origin along the normal", 0.0, "m")
 
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Position [3] m and quaternion [4] xyzw that carry z = 0 onto the plane."""
         normal = np.array(self.normal)
-        # The shortest turn from z; straight down has none of its own, so turn about x.
+        # The shortest turn from z. Straight down it is not unique, so turn about x.
         quat = np.array([-normal[1], normal[0], 0.0, 1.0 + normal[2]])
         quat = np.array([1.0, 0.0, 0.0, 0.0]) if np.linalg.norm(quat) < 1e-9 else quat / np.linalg.norm(quat)
         return normal * self.offset, quat
 
 
 class Arrange(Table):
-    """Copies on a grid, centred on the position in x and y, its lowest layer at the position."""
+    """Copies on a grid that is centred on the position in x and y, with its lowest layer at the position."""
 
     grid: Annotated[list[Annotated[Whole, Field(ge=1)]], _THREE] = key("copies along x, y, z")
-    spacing: Number = key("from one to the next", unit="m", gt=0)
+    spacing: Number = key("distance from one copy to the next", unit="m", gt=0)
 
 
 _NOT_WITH_PATH = ("position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density", "inertia_factor")
@@ -399,38 +402,40 @@ _ORIGIN = (0.0, 0.0, 0.0)
 class BodyTable(Turned):
     """One body, or many copies of it: either a `shape` or a `plane` of its own."""
 
-    name: Text = key("unique; copies are called name[0], name[1], ...")
+    name: Text = key("unique; copies are called NAME[0], NAME[1], ...")
     shape: Text | None = key("a name under `shapes`", None)
     plane: Plane | None = key("makes it an infinite static plane", None)
     motion: Motion | None = key(
-        "kinematic bodies follow their `path`, whatever they meet; dynamic without it, planes static", None
+        "kinematic bodies follow their `path`, whatever they meet; by default dynamic, for planes static", None
     )
     path: Annotated[list[Waypoint], Field(min_length=1)] | None = key(
-        "poses of a kinematic body, in place of `position` and its turn", None
+        "poses of a kinematic body, in place of a position and an orientation", None
     )
     scale: Number = key("factor on the size of the shape", 1.0, gt=0)
-    position: Vector = key("of the shape's own origin", _ORIGIN, "m")
-    velocity: Vector = key("of the centre of mass", _ORIGIN, "m/s")
-    angular_velocity: Vector = key("in world axes", _ORIGIN, "rad/s")
-    mass: Number | None = key("without it the density counts", None, "kg", gt=0)
-    density: Number = key("not together with mass", 1000.0, "kg/m^3", gt=0)
-    inertia_factor: Number = key("on the inertia that this mass has, spread evenly in the shape", 1.0, gt=0, le=100)
+    position: Vector = key("position of the shape's own origin", _ORIGIN, "m")
+    velocity: Vector = key("velocity of the centre of mass", _ORIGIN, "m/s")
+    angular_velocity: Vector = key("angular velocity in world axes", _ORIGIN, "rad/s")
+    mass: Number | None = key("by default density times volume", None, "kg", gt=0)
+    density: Number = key("not used if `mass` is given", 1000.0, "kg/m^3", gt=0)
+    inertia_factor: Number = key("factor on the inertia of this mass spread evenly in the shape", 1.0, gt=0, le=100)
     friction: Number = key(
-        "Coulomb coefficient; two bodies' product counts, 0.25 of two that say nothing", 0.5, ge=0, le=1000
+        "Coulomb coefficient; a contact has the product of both bodies', 0.25 by default", 0.5, ge=0, le=1000
     )
-    restitution: Number = key("two bodies' product counts, 0.25 of two that say nothing", 0.5, ge=0, le=1)
+    restitution: Number = key(
+        "coefficient of restitution; a contact has the product of both bodies', 0.25 by default", 0.5, ge=0, le=1
+    )
     collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(
         "`all`, or a list of names: two bodies touch where each lists the other", None
     )
-    avoids: list[Text] = key("names of bodies that it never touches, whatever their lists say", [])
-    count: Whole | None = key("how many copies; without it, as many as the grid has places", None, ge=1)
-    arrange: Arrange | None = key("where the copies are", None)
+    avoids: list[Text] = key("names of bodies that it never touches, whatever `collides_with` says", [])
+    count: Whole | None = key("number of copies; by default as many as the grid has places", None, ge=1)
+    arrange: Arrange | None = key("places of the copies", None)
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         for key in _NOT_WITH_PLANE if "plane" in data else ():
             if key in data:
-                yield (key,), "does not go with plane: a plane is static and has its pose from normal and offset"
+                yield (key,), "cannot be given with plane: a plane is static and has its pose from normal and offset"
         if "plane" in data and data.get("motion", "static") != "static":
             yield ("motion",), "a plane must be static"
         if "plane" not in data:
@@ -440,11 +445,11 @@ class BodyTable(Turned):
         if data.get("motion") == "kinematic":
             for key in _NOT_WITH_PATH:
                 if key in data:
-                    yield (key,), "does not go with motion: kinematic: its path decides where it is"
+                    yield (key,), "cannot be given with motion: kinematic, as the path decides where the body is"
             if "path" not in data:
                 yield ("path",), "is required: a kinematic body follows timed poses"
         elif "path" in data:
-            yield ("path",), "goes with motion: kinematic only"
+            yield ("path",), "is for motion: kinematic only"
 
     def check_values(self) -> Iterator[Fault]:
         for i, (before, pose) in enumerate(itertools.pairwise(self.path or []), 1):
@@ -459,21 +464,21 @@ class BodyTable(Turned):
 
     @property
     def places(self) -> int:
-        """Of the grid, or the one of a body alone."""
+        """The number of places of the grid, or 1 for a single body."""
         return 1 if self.arrange is None else math.prod(self.arrange.grid)
 
     @property
     def copies(self) -> int:
-        """How many bodies it stands for."""
+        """The number of bodies that the entry stands for."""
         return self.count or self.places
 
     def names(self) -> list[str]:
-        """`balls[0]`, `balls[1]` ... where there is a count or a grid, be it of one; else its own name."""
+        """`balls[0]`, `balls[1]` ... if there is a count or a grid, even of one; else the name itself."""
         grouped = self.count is not None or self.arrange is not None
         return [f"{self.name}[{i}]" for i in range(self.copies)] if grouped else [self.name]
 
     def offsets(self) -> np.ndarray:
-        """[copies, 3] m, added to the position."""
+        """[copies, 3] m, offsets of the copies from the position."""
         if self.arrange is None:
             return np.zeros((1, 3))
         nx, ny, _ = self.arrange.grid
@@ -483,35 +488,39 @@ class BodyTable(Turned):
 
 
 class SpringTable(Table):
-    """A spring of a hinge, a slider or a distance: linear, about where it is at rest."""
+    """A linear spring of a hinge, a slider or a distance."""
 
-    stiffness: Number = key("of a hinge in N m/rad, else in N/m", unit="", gt=0)
-    rest: Number = key("where a slider, or the length at which a distance, is at rest", 0.0, "m")
-    rest_deg: Number = key("where a hinge is at rest", 0.0, "degrees")
+    stiffness: Number = key("in N m/rad for a hinge, else in N/m", unit="", gt=0)
+    rest: Number = key("position at which a slider, or length at which a distance, is at rest", 0.0, "m")
+    rest_deg: Number = key("angle at which a hinge is at rest", 0.0, "degrees")
 
 
 class MotorTable(Table):
-    """A motor of a hinge or a slider: it keeps a speed, or goes to a place and holds it there, as far as it is strong
-    enough. Without either it does nothing until it is told in Python: `simulator.joint(NAME).target` or `effort`."""
+    """A motor of a hinge or a slider. It keeps a speed, or goes to a position and stays there, as far as its strength
+    allows. Without either it does nothing until Python sets `simulator.joint(NAME).target` or `effort`."""
 
-    speed: Number | None = key("of the first body against the second; of a hinge in rad/s, else in m/s", None)
-    position: Number | None = key("where a slider is to go", None, "m")
-    position_deg: Number | None = key("where a hinge is to go", None, "degrees")
-    most: Number = key("the largest torque of a hinge in N m, the largest force of a slider in N", gt=0)
-    time: Number = key("what is left of the way shrinks by a factor e in this time; not with speed", 0.1, "s", gt=0)
+    speed: Number | None = key(
+        "speed of the first body relative to the second; in rad/s for a hinge, else in m/s", None
+    )
+    position: Number | None = key("target position of a slider", None, "m")
+    position_deg: Number | None = key("target angle of a hinge", None, "degrees")
+    most: Number = key("largest torque of a hinge in N m, or largest force of a slider in N", gt=0)
+    time: Number = key(
+        "time in which the distance to the target shrinks by a factor e; not with `speed`", 0.1, "s", gt=0
+    )
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         yield from _one_of(data, ("speed", "position", "position_deg"))
         if "time" in data and "speed" in data:
-            yield ("time",), "does not go with speed"
+            yield ("time",), "cannot be given with speed"
 
 
 class BreaksTable(Table):
-    """What a joint can bear; what is more breaks it for good."""
+    """The load that a joint can bear; more breaks it for good."""
 
-    force: Number | None = key("the largest", None, "N", gt=0)
-    torque: Number | None = key("the largest", None, "N m", gt=0)
+    force: Number | None = key("largest force", None, "N", gt=0)
+    torque: Number | None = key("largest torque", None, "N m", gt=0)
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -519,7 +528,7 @@ class BreaksTable(Table):
             yield (), "force or torque is required"
 
 
-# Which keys go with which joints, beside those that go with all.
+# Which keys belong to which joints, besides those that all joints have.
 _OF_JOINT: dict[str, tuple[str, ...]] = {
     "hinge": ("axis", "limits_deg", "start_deg", "restitution", "damping", "friction", "spring", "motor"),
     "slider": ("axis", "limits", "start", "restitution", "damping", "friction", "spring", "motor"),
@@ -541,43 +550,43 @@ Ends = Annotated[list[Number], Field(min_length=2, max_length=2), AfterValidator
 
 
 class JointTable(Table):
-    """Holds two bodies together, or one in the `world`. The first is held by the second: angles and positions are those
-    of the first against the second, right-handed about the axis."""
+    """Holds two bodies together, or one body to the `world`. Angles and positions are those of the first body relative
+    to the second, right-handed about the axis."""
 
     name: Text = key("unique among joints")
     type: JointKind = key(
-        "`hinge` turns about an axis, `slider` goes along one, `ball` turns about a point, `fixed` lets nothing move, "
+        "`hinge` turns about an axis, `slider` moves along one, `ball` turns about a point, `fixed` allows no motion, "
         "`distance` keeps two points apart: by a `rod`, a `rope` or a `spring`"
     )
     bodies: Annotated[list[Text], Field(min_length=2, max_length=2)] = key(
         f"names of two bodies; the second may be `{WORLD}`"
     )
     anchor: Vector | None = key(
-        "the point that both share; of a distance its end at the first body; required of hinges, balls and distances, "
-        "of others the first body's origin without it", None, "m",
+        "the point that both share, or the end of a distance at the first body; required for hinges, balls, distances, "
+        "for others by default the first body's origin", None, "m",
     )  # fmt: skip
-    to: Vector | None = key("of a distance: its end at the second body", None, "m")
-    axis: Direction | None = key("of a hinge, a slider and the cone of a ball; of any length", None)
+    to: Vector | None = key("end of a distance at the second body", None, "m")
+    axis: Direction | None = key("axis of a hinge, a slider or the cone of a ball; of any length", None)
     frame: Text = key(
-        f"where anchor, to and axis are given: `{WORLD}`, as bodies lie at the start, or the name of one of both "
-        "bodies: from its shape's origin along its axes",
+        f"frame of anchor, to and axis: `{WORLD}`, with bodies as they are at the start, or the name of one of the two "
+        "bodies: relative to its shape's origin, along its axes",
         WORLD,
     )
-    start: Number = key("the position that a slider has at the start", 0.0, "m")
-    start_deg: Number = key("the angle that a hinge has at the start", 0.0, "degrees")
-    limits: Ends | None = key("the least and the largest position of a slider", None, "m")
-    limits_deg: Ends | None = key("the least and the largest angle of a hinge; turns add up", None, "degrees")
+    start: Number = key("position of a slider at the start", 0.0, "m")
+    start_deg: Number = key("angle of a hinge at the start", 0.0, "degrees")
+    limits: Ends | None = key("lowest and highest position of a slider", None, "m")
+    limits_deg: Ends | None = key("lowest and highest angle of a hinge; full turns add up", None, "degrees")
     cone_deg: Number | None = key(
-        "of a ball: how far the axis of the first body may lean from that of the second", None, "degrees", ge=0, le=180
+        "for a ball: largest angle between the axes of the two bodies", None, "degrees", ge=0, le=180
     )
-    rod: Number | None = key("the points stay so far apart; as they are at the start", None, "m", gt=0)
-    rope: Number | None = key("the points are at most so far apart", None, "m", gt=0)
-    restitution: Number = key("how limits and ropes rebound", 0.0, ge=0, le=1)
-    damping: Number = key("of hinges and balls in N m s/rad, else in N s/m", 0.0, ge=0)
-    friction: Number = key("of hinges and balls a torque in N m, of sliders a force in N", 0.0, ge=0)
-    spring: SpringTable | None = key("pulls back", None)
-    motor: MotorTable | None = key("drives", None)
-    breaks_at: BreaksTable | None = key("what it can bear", None)
+    rod: Number | None = key("the distance that the points keep; it must be that at the start", None, "m", gt=0)
+    rope: Number | None = key("the largest distance of the points", None, "m", gt=0)
+    restitution: Number = key("coefficient with which limits and ropes rebound", 0.0, ge=0, le=1)
+    damping: Number = key("in N m s/rad for hinges and balls, else in N s/m", 0.0, ge=0)
+    friction: Number = key("torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0)
+    spring: SpringTable | None = key("a spring that pulls back", None)
+    motor: MotorTable | None = key("a motor that drives it", None)
+    breaks_at: BreaksTable | None = key("load at which it breaks", None)
     collide: Literal["on", "off"] = key("whether the two bodies may touch each other", "off")
 
     @classmethod
@@ -590,7 +599,7 @@ class JointTable(Table):
                 fit = ", ".join(k for k, keys in _OF_JOINT.items() if name in keys)
                 other = name.removesuffix("_deg") if name.endswith("_deg") else f"{name}_deg"
                 other = f"; give {other}" if other in _OF_JOINT[kind] else ""
-                yield (name,), f"goes with {fit} only (this is a {kind}{other})"
+                yield (name,), f"is for {fit} only (this is a {kind}{other})"
         for name in _NEEDED.get(kind, ()):
             if name not in data:
                 yield (name,), f"is required: this is a {kind}"
@@ -602,14 +611,14 @@ class JointTable(Table):
         if "cone_deg" in data and "axis" not in data:
             yield ("axis",), "is required: cone_deg is measured from it"
         if "restitution" in data and not {"limits", "limits_deg", "cone_deg", "rope"} & data.keys():
-            yield ("restitution",), "goes with limits or a rope only"
+            yield ("restitution",), "is for limits or a rope only"
         if kind == "distance" and "damping" in data and "rod" in data:
-            yield ("damping",), "does not go with rod: its ends come no nearer"
+            yield ("damping",), "cannot be given with rod: the distance of its ends does not change"
         for table, wrong in (("spring", ("rest", "rest_deg")), ("motor", ("position", "position_deg"))):
             inner = data.get(table)
             name = wrong[0 if kind == "hinge" else 1]
             if isinstance(inner, dict) and name in inner and table in _OF_JOINT[kind]:
-                yield (table, name), f"does not go with a {kind}: give {wrong[1 if kind == 'hinge' else 0]}"
+                yield (table, name), f"is not for a {kind}: give {wrong[1 if kind == 'hinge' else 0]}"
 
     def check_values(self) -> Iterator[Fault]:
         if self.frame not in (WORLD, *self.bodies):
@@ -628,7 +637,7 @@ class JointTable(Table):
 
 
 def _named(bodies: list, joints: Any) -> Iterator[tuple[Loc, str]]:
-    """Where lists of bodies and joints name bodies, and what they name, as far as they are lists."""
+    """The places where bodies and joints name bodies, and the names, as far as these are lists."""
     named = ("bodies", bodies, "collides_with"), ("bodies", bodies, "avoids"), ("joints", joints, "bodies")
     for of, entries, key in named:
         for i, entry in enumerate(entries if isinstance(entries, list) else ()):
@@ -648,15 +657,15 @@ class SceneTable(Table):
 
     version: Annotated[Whole, AfterValidator(_version)] = key(f"always {VERSION}")
     model: Annotated[Text, AfterValidator(_model)] | None = key(
-        "bundled model, or a .safetensors file in the scene's folder; it owns its time step", None
+        "bundled model, or a .safetensors file in the scene's folder; the model sets the time step", None
     )
     duration: Number = key("simulated time", DEFAULT_DURATION, "s", gt=0)
-    seed: Whole = key("of the run's random numbers", 0, ge=0)
-    gravity: Vector = key("pull on every free body", DEFAULT_GRAVITY, "m/s^2")
+    seed: Whole = key("seed of the run's random numbers", 0, ge=0)
+    gravity: Vector = key("acceleration of free fall", DEFAULT_GRAVITY, "m/s^2")
     effects: EffectsTable = key("which effects to compute", EffectsTable())
     shapes: dict[str, ShapeTable] = key("shapes by name", {})
     bodies: Annotated[list[BodyTable], Field(min_length=1)] = key("all bodies")
-    joints: list[JointTable] = key("what holds bodies together", [])
+    joints: list[JointTable] = key("joints between bodies", [])
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -681,7 +690,7 @@ class SceneTable(Table):
         first = {body.name: i for i, body in enumerate(self.bodies)}
         for i, copies in enumerate(itertools.accumulate(body.copies for body in self.bodies)):
             if copies > MOST_COPIES:
-                yield ("bodies", i), f"one too many: a scene has at most {MOST_COPIES} bodies, copies included"
+                yield ("bodies", i), f"too many bodies: a scene has at most {MOST_COPIES} bodies, copies included"
                 return
         copies = {name: i for i, body in enumerate(self.bodies) for name in body.names() if name != body.name}
         for name in copies.keys() & first.keys():
@@ -720,15 +729,15 @@ class SceneTable(Table):
             if known and joint.bodies[0] == joint.bodies[1]:
                 yield ("joints", i, "bodies"), f"must be two (got {joint.bodies[0]!r} twice)"
             elif known and "dynamic" not in (motion.get(name) for name in joint.bodies):
-                yield ("joints", i, "bodies"), "holds nothing: one of both must be dynamic"
+                yield ("joints", i, "bodies"), "holds nothing: one of the two must be dynamic"
 
     def flat(self, body: BodyTable) -> bool:
-        """Whether it is a plane."""
+        """Whether a body is a plane."""
         shape = self.shapes.get(body.shape or "")
         return body.plane is not None or (shape is not None and shape.plane is not None)
 
     def motion_of(self, body: BodyTable) -> Motion:
-        """As the file has it; by default planes are static and others dynamic."""
+        """The motion of a body; by default planes are static and other bodies dynamic."""
         return body.motion or ("static" if self.flat(body) else "dynamic")
 
 

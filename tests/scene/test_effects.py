@@ -226,7 +226,7 @@ def test_bodies_by_how_they_move(scene):
     ("fields", "told"),
     [
         ("motion: kinematic", "bodies[1].path: is required"),
-        (PATH + ", mass: 1", "bodies[1].mass: does not go with motion: kinematic"),
+        (PATH + ", mass: 1", "bodies[1].mass: cannot be given with motion: kinematic"),
         (PATH.replace("time: 2", "time: 0"), "bodies[1].path[1]: must be later than the pose before it"),
     ],
 )

@@ -74,7 +74,7 @@ def test_a_plane_does_not_move(load):
     bodies = "  - {name: a, plane: {}, motion: dynamic}\n  - {name: b, plane: {}, mass: 1}\n"
     first, second = problems_of(load, "version: 1\nbodies:\n" + bodies)
     assert first == "scene.yaml:3: bodies[0].motion: a plane must be static"
-    assert second.startswith("scene.yaml:4: bodies[1].mass: does not go with plane")
+    assert second.startswith("scene.yaml:4: bodies[1].mass: cannot be given with plane")
 
 
 def test_copies_fill_a_grid_from_the_bottom(load):

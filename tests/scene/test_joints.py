@@ -31,10 +31,10 @@ HINGE = "name: door, type: hinge, anchor: [0.9, 0, 0], axis: [0, 0, 1]"
         ("{HINGE, bodies: [leaf, craet]}", "bodies[1]: no body is called 'craet' (did you mean 'crate'?)"),
         ("{HINGE, bodies: [leaf, leaf]}", "bodies: must be two (got 'leaf' twice)"),
         ("{HINGE, bodies: [world, leaf]}", "bodies[0]: world must be the second: it holds the first"),
-        ("{HINGE, bodies: [floor, world]}", "bodies: holds nothing: one of both must be dynamic"),
+        ("{HINGE, bodies: [floor, world]}", "bodies: holds nothing: one of the two must be dynamic"),
         ("{HINGE, bodies: [leaf, crates]}", "bodies[1]: there are 2 bodies 'crates': give one, such as crates[0]"),
         ("{name: a, type: hinge, bodies: [leaf, world], axis: [1, 0, 0]}", "anchor: is required: this is a hinge"),
-        ("{HINGE, bodies: [leaf, world], limits: [0, 1]}", "limits: goes with slider only (this is a hinge; give"),
+        ("{HINGE, bodies: [leaf, world], limits: [0, 1]}", "limits: is for slider only (this is a hinge; give"),
         ("{HINGE, bodies: [leaf, world], limits_deg: [9, 1]}", "limits_deg: must not be below the first (got 9 to 1)"),
         (
             "{HINGE, bodies: [leaf, world], limits_deg: [10, 20]}",
@@ -44,13 +44,13 @@ HINGE = "name: door, type: hinge, anchor: [0.9, 0, 0], axis: [0, 0, 1]"
         ("{HINGE, bodies: [leaf, world], spring: {rest_deg: 3}}", "spring.stiffness: is required"),
         (
             "{HINGE, bodies: [leaf, world], spring: {stiffness: 1, rest: 3}}",
-            "spring.rest: does not go with a hinge: give rest_deg",
+            "spring.rest: is not for a hinge: give rest_deg",
         ),
         ("{HINGE, bodies: [leaf, world], motor: {most: 3, speed: 1, position_deg: 2}}", "motor.position_deg: give"),
         ("{HINGE, bodies: [leaf, world], motor: {speed: 3}}", "motor.most: is required"),
         ("{HINGE, bodies: [leaf, world], breaks_at: {}}", "breaks_at: force or torque is required"),
         ("{HINGE, bodies: [leaf, world], frame: crate}", "frame: must be world, leaf or world (got 'crate')"),
-        ("{HINGE, bodies: [leaf, world], restitution: 0.5}", "restitution: goes with limits or a rope only"),
+        ("{HINGE, bodies: [leaf, world], restitution: 0.5}", "restitution: is for limits or a rope only"),
         (
             "{name: a, type: distance, bodies: [leaf, world], anchor: [1, 0, 0], to: [0, 0, 0]}",
             "one of rod, rope, spring is required: this is a distance",

@@ -73,10 +73,10 @@ TOP = [
     ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
     ("shapes: {cup: {sphere: {}}}", "shapes.cup.sphere.radius: is required"),
     ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, plane is"),
-    ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: goes with mesh only"),
-    ("shapes: {cup: {plane: {}, wall: 0.01}}", "shapes.cup.wall: goes with bodies only"),
-    ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: goes with asset, mesh, primitive only"),
-    ("shapes: {cup: {primitive: {name: box}, resolution: 64}}", "shapes.cup.resolution: goes with sdf: grid only"),
+    ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: is for mesh only"),
+    ("shapes: {cup: {plane: {}, wall: 0.01}}", "shapes.cup.wall: is not for a plane"),
+    ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: is for asset, mesh, primitive only"),
+    ("shapes: {cup: {primitive: {name: box}, resolution: 64}}", "shapes.cup.resolution: is for sdf: grid only"),
     ("shapes: {cup: {primitive: {name: tours}}}", "shapes.cup.primitive.name: no such primitive: 'tours'"),
 ]
 

@@ -80,9 +80,9 @@ def test_a_wrong_body_is_refused_where_it_is_added(keys, told):
     [
         ("hinge", {"anchor": (0, 0, 0)}, "joint 'j': axis: is required: this is a hinge"),
         ("hinge", {"anchor": (0, 0, 0), "axis": (0, 0, 1), "limits": (0, 1)},
-         "limits: goes with slider only (this is a hinge; give limits_deg)"),
+         "limits: is for slider only (this is a hinge; give limits_deg)"),
         ("slider", {"axis": (0, 0, 1), "start_deg": 3},
-         "start_deg: goes with hinge only (this is a slider; give start)"),
+         "start_deg: is for hinge only (this is a slider; give start)"),
         ("hinge", {"anchor": (0, 0), "axis": (0, 0, 1)}, "anchor: must be 3 numbers (got 2)"),
         ("slider", {"axis": (0, 0, 1), "limits": [1.0]}, "limits: must be 2 numbers (got 1)"),
         ("slider", {"axis": (0, 0, 1), "limits": (0, 1), "motor": {"position": 1.5, "most": 3}},
