@@ -15,13 +15,14 @@ from sdfsim.sdf.sdf import Sdf
 BAKE_VERSION = 2
 SIDE = 8  # cells of a brick along each side
 CELLS = 128  # along the largest extent of a solid
-FINEST = 512  # likewise, where walls are thin
+FINEST = 512  # likewise, for thin walls
 PADDING = 4.0  # cells around the solid
-WALL = 2.0  # cells that a wall must be thick for a grid to have both of its sides
+WALL = 2.0  # cells: a wall must be this thick for a grid to hold both of its sides
 CHUNK = 2**18  # points evaluated at once
-BESIDE = 0.05  # cells: what is farther from a surface is not on it
-SPREAD = 512  # places all over a surface
-# Of the largest extent: how near these places are at first, and after so many steps towards the surface.
+BESIDE = 0.05  # cells: points farther from a surface are not on it
+SPREAD = 512  # number of places spread over a surface
+# How near these places are at first, as a part of the largest extent, and the number of steps towards the surface after
+# that.
 CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
 
 
@@ -32,17 +33,18 @@ class BakedGrid:
     low: np.ndarray  # [3] the first sample
     cell: float  # m between two samples
     coarse: np.ndarray  # [X + 1, Y + 1, Z + 1] float32 m, at the corners of bricks
-    brick: np.ndarray  # [X, Y, Z] int32, which of `fine` holds a brick; -1 far from the surface
+    brick: np.ndarray  # [X, Y, Z] int32, index of a brick in `fine`; -1 far from the surface
     fine: np.ndarray  # [B, 9, 9, 9] float32 m
-    thickness: float  # m, of the thinnest walls (twentieth part of the surface)
-    error: float  # m, the largest difference from what was baked, at random places in the bricks of the surface
+    thickness: float  # m, of the thinnest walls (those of a twentieth of the surface)
+    error: float  # m, the largest difference from the SDF, at random places in the bricks of the surface
 
 
 def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None) -> BakedGrid:
-    """The grid of an SDF (or of the union of the convex pieces, vertices [V, 3] m each, that it was fitted to), baked
+    """The grid of an SDF, or of the union of convex pieces (vertices [V, 3] m each) that it was fitted to. It is baked
     on first use and then taken from the cache. The thickness of walls is measured at `nodes` [K, 3] m."""
     cache_dir = cache_dir or user_cache("baked")
-    # Walls at the nodes decide how fine the grid is. Nodes come from bodies of any scale: nine digits count.
+    # The walls at the nodes decide how fine the grid is. Nodes come from bodies of any scale, so only nine digits
+    # count.
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     known = digest(sdf, np.round(np.asarray(nodes) / extent, 9) + 0.0, [*pieces], CELLS, FINEST)
     path = cache_dir / f"{known}-{BAKE_VERSION}.npz"
@@ -53,7 +55,7 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
 
 def grid_certificate(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> dict[str, float]:
     """What the grid adds to the certificate of a fit, as fractions of the largest extent: `baked_cell` and
-    `baked_error` (see `BakedGrid`). It stays in the cache for the first simulation."""
+    `baked_error` (see `BakedGrid`). The grid stays in the cache for the first simulation."""
     if not isinstance(sdf, MlpSdf):
         return {}
     grid, extent = baked(sdf, nodes, pieces), float(np.ptp(sdf.bounds, axis=0).max())
@@ -61,7 +63,7 @@ def grid_certificate(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] =
 
 
 def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> BakedGrid:
-    """Sample an SDF: `CELLS` along the largest extent, more where walls are thin, up to `FINEST`."""
+    """Sample an SDF with `CELLS` cells along the largest extent, or more if walls are thin, up to `FINEST`."""
     union = PiecesDistance([convex_hull(piece) for piece in pieces]) if len(pieces) else None
 
     def ask(points: np.ndarray) -> np.ndarray:
@@ -80,7 +82,7 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
     low = 0.5 * (low + high) - 0.5 * count * SIDE * cell
     coarse = ask(low + SIDE * cell * lattice(*(np.arange(n + 1) for n in count))).reshape(count + 1)
     middles = low + SIDE * cell * lattice(*(np.arange(n) + 0.5 for n in count))
-    # Distances change by no more than the way gone; two cells are for contacts that have not quite been made.
+    # A distance changes by at most the step taken; two more cells are for contacts that are about to be made.
     near = np.abs(ask(middles)) <= (0.5 * np.sqrt(3.0) * SIDE + 2.0) * cell
     brick = np.full(len(middles), -1, dtype=np.int32)
     brick[near] = np.arange(near.sum())
@@ -96,10 +98,10 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
 
 
 def surface_samples(grid: BakedGrid) -> np.ndarray:
-    """[P, 3] m, points all over the surface of a grid, about a cell apart.
+    """Points [P, 3] m all over the surface of a grid, about a cell apart.
 
-    One step from the middle of a cell leads to the surface, but not from beyond the middle of a wall: there the
-    distance has no slope that could be followed. What ends beside the surface is left out.
+    One step from the middle of a cell leads to the surface, except from near the middle of a wall: there the distance
+    has no slope to follow. Points that end beside the surface are left out.
     """
     corners = [grid.fine[:, i : i + SIDE, j : j + SIDE, k : k + SIDE] for i, j, k in np.ndindex(2, 2, 2)]
     middle = np.mean(corners, axis=0)
@@ -114,8 +116,8 @@ def surface_samples(grid: BakedGrid) -> np.ndarray:
 
 
 def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
-    """[K, 3] unit vectors from nodes [K, 3] m on the surface into the solid: against the mean of the normals around. On
-    an edge or in a corner a distance has several normals; this is what lies between them."""
+    """[K, 3] unit vectors from nodes [K, 3] m on the surface into the solid: opposite to the mean of the normals
+    around. At an edge or corner a distance has several normals; this is their average."""
     if not len(nodes):
         return np.zeros((0, 3))
     reach = 0.008 * float(np.ptp(sdf.bounds, axis=0).max())
@@ -127,31 +129,30 @@ def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
 
 
 def wall_thickness(sdf: Sdf, nodes: np.ndarray) -> float:
-    """m: twice the depth to which one can go inwards from a node until the surface opposite is nearer. The least that
-    all nodes but a twentieth have: edges that come to a point are thin everywhere."""
+    """Thickness of walls in m: twice the depth to which a point can move inwards from a node before the opposite
+    surface is nearer. A twentieth of the nodes may have less: sharp edges are always thin."""
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     some = nodes[:: max(1, len(nodes) // 512)]
     depth = np.geomspace(1.0 / 512.0, 0.5, 32) * extent
     inside = some[:, None] + depth[:, None] * inwards(sdf, some)[:, None]
-    # From what the distance is at the node itself: a fit is a little off.
+    # Relative to the distance at the node itself, as a fit is slightly off.
     found = sdf(some)[0][:, None] - sdf(inside.reshape(-1, 3))[0].reshape(len(some), len(depth))
-    # In a corner the distance grows half as fast as one goes; in the middle of a wall it stops growing.
+    # In a corner the distance grows half as fast as the point moves; in the middle of a wall it stops growing.
     stops = np.argmax(np.concatenate([found < 0.4 * depth, np.ones((len(some), 1), bool)], 1), axis=1)
     reached = np.concatenate([depth[:1], depth])[stops]
     return float(2.0 * np.quantile(reached, 0.05))
 
 
 def unseen_wall(sdf: Sdf, grid: BakedGrid) -> float | None:
-    """m, the thickness of walls that are too thin for the cells of a grid; None where it has no such
-    walls. Nodes lie close along edges and at corners, where every solid is thin: what counts are places all over the
-    surface."""
+    """Thickness in m of walls that are too thin for the cells of a grid; None if there are none. Nodes are dense along
+    edges and at corners, where every solid is thin, so this looks at places all over the surface."""
     limit = 1.001 * WALL * grid.cell
     if grid.thickness > limit:
         return None
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     low, high = sdf.bounds
     places = np.random.default_rng(0).uniform(low, high, (64 * SPREAD, 3))
-    # From close by: farther away edges are nearest to much of the space.
+    # Start close to the surface: farther away, edges are nearest to much of the space.
     places = places[np.abs(np.asarray(sdf(places)[0])) <= CLOSE * extent][: 2 * SPREAD]
     for _ in range(PROJECTIONS):
         distance, gradient = sdf(places)
@@ -162,7 +163,7 @@ def unseen_wall(sdf: Sdf, grid: BakedGrid) -> float | None:
 
 
 def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:
-    """[P] m at `points` [P, 3] m within bricks that are there."""
+    """Distances [P] m at `points` [P, 3] m, which must lie within stored bricks."""
     place = (points - grid.low) / grid.cell
     block = np.clip((place / SIDE).astype(int), 0, np.array(grid.brick.shape) - 1)
     local = place - SIDE * block

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 
 class ClosedForm(ABC):
-    """A solid about the origin with an exact distance; its fields are its sizes, m, positive (else SdfsimError)."""
+    """A solid about the origin with an exact distance. Its fields are its sizes in m. Raises SdfsimError if one is not
+    positive."""
 
     KIND: ClassVar[str]
 
@@ -28,7 +29,7 @@ class ClosedForm(ABC):
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """m, one after the other."""
+        """The sizes in m, in the order of the fields."""
         return tuple(np.hstack([*vars(self).values()]).tolist()) if vars(self) else ()
 
     @property
@@ -37,7 +38,7 @@ class ClosedForm(ABC):
         return np.outer([-1.0, 1.0], self._reach())
 
     def _reach(self) -> tuple[float, ...]:
-        """(x, y, z) m, its half extents. A plane has none and gives its `bounds` itself, so this is not abstract."""
+        """Half extents (x, y, z) in m. Not abstract, because a plane has none and gives its `bounds` itself."""
         raise NotImplementedError
 
     @abstractmethod
@@ -45,7 +46,7 @@ class ClosedForm(ABC):
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
 
     def to(self, device: torch.device | str) -> Self:
-        """Itself: it holds no tensors."""
+        """Returns itself, as it holds no tensors."""
         return self
 
     def scaled(self, factor: float) -> Self:
@@ -67,7 +68,7 @@ class PlaneSdf(ClosedForm):
 
     @property
     def bounds(self) -> np.ndarray:
-        """[2, 3] m: infinite but for the top."""
+        """[2, 3] m: infinite except for the top."""
         return np.array([[-np.inf] * 3, [np.inf, np.inf, 0.0]])
 
     def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -93,8 +94,8 @@ class SphereSdf(ClosedForm):
 
 @dataclass(frozen=True, eq=False)
 class BoxSdf(ClosedForm):
-    """An axis-aligned box with half extents `half` (x, y, z) m. Inside, the gradient points to the nearest face: the
-    first of equally near ones, and the positive side of an axis at its middle."""
+    """An axis-aligned box with half extents `half` (x, y, z) m. Inside, the gradient points to the nearest face; of
+    equally near ones to the first, and on a middle plane to the positive side."""
 
     KIND = "box"
     half: tuple[float, float, float]
@@ -117,7 +118,7 @@ class BoxSdf(ClosedForm):
 
 @dataclass(frozen=True, eq=False)
 class CapsuleSdf(ClosedForm):
-    """All within `radius` m of the segment |z| <= `half` m."""
+    """All points within `radius` m of the segment |z| <= `half` m on the z axis."""
 
     KIND = "capsule"
     radius: float
@@ -134,8 +135,8 @@ class CapsuleSdf(ClosedForm):
 
 @dataclass(frozen=True, eq=False)
 class CylinderSdf(ClosedForm):
-    """A cylinder about z of `radius` m and half height `half` m. Inside, the gradient points to the nearer of side and
-    end; of equally near ones to the end."""
+    """A cylinder about z of `radius` m and half height `half` m. Inside, the gradient points to the side or the end,
+    whichever is nearer, and to the end if both are equally near."""
 
     KIND = "cylinder"
     radius: float

@@ -1,4 +1,4 @@
-"""Signed distances that are known in a box around a solid, continued everywhere."""
+"""Signed distances that are known in a box around a solid, extended to all of space."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ else:
 
 # Half extent of the box, in the normalised frame, on which distances are fitted or sampled (the paper's sampling box).
 BOX = 0.7
-# Gradients are returned no shorter and no longer than this. A network's slope is within it almost everywhere near the
-# surface, but rounds off the ridge in the middle of a thin wall, where x - f grad f / |grad f|^2 would fly off.
+# Bounds of the length of returned gradients. A network's slope is within them almost everywhere near the surface, but a
+# network rounds off the ridge in the middle of a thin wall, where x - f grad f / |grad f|^2 would be far away.
 SLOPE = (0.9, 1.1)
-# Beyond the box distances are returned smaller by this part, because feet are not quite the nearest; the full part from
-# `FADE` on, so that distances do not jump at the box.
+# Beyond the box distances are reduced by this part, because feet are not quite the nearest points. The reduction is
+# full from `FADE` on, so that distances do not jump at the box.
 CAUTION, FADE = 0.03, 0.1
 
 # Points [P, 3] in the box -> value [P], gradient [P, 3].
@@ -32,12 +32,13 @@ def in_metres(
     inner: Inner, frame: Frame, bounds: np.ndarray, points: torch.Tensor, chunk: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; computed in float32, `chunk` at once, and cast back.
-    `inner` is what is known in the box of the normalised `frame`; `bounds` [2, 3] m are the solid's."""
+    `inner` gives values and gradients in the box of the normalised `frame`; `bounds` [2, 3] m are those of the
+    solid."""
     centre = torch.from_numpy(frame.centre).to(points)
     half = torch.from_numpy(np.abs(bounds - frame.centre).max(0) / frame.scale).to(points.device, torch.float32)
     distance, gradient = [], []
     for part in points.split(chunk):
-        # The centre leaves in the precision of the points, before the cast.
+        # The centre is subtracted in the precision of the points, before the cast.
         value, slope = everywhere(inner, ((part - centre) / frame.scale).float(), half)
         distance.append(value.to(points.dtype) * frame.scale)
         gradient.append(slope.to(points.dtype))
@@ -47,9 +48,9 @@ def in_metres(
 def everywhere(inner: Inner, points: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Value [P] and gradient [P, 3] at normalised points [P, 3], inside the box and beyond it.
 
-    The length of the gradient is kept within `SLOPE`; where it vanishes, it points away from the centre. Outside the
-    solid's bounding box, of half extents `half` [3], the distance to that box is a lower bound that no error of the fit
-    may undercut.
+    The length of the gradient is kept within `SLOPE`; a zero gradient is replaced by the direction away from the
+    centre. Outside the solid's bounding box, of half extents `half` [3], the value is at least the distance to that
+    box, whatever the error of the fit.
     """
     clamped = points.clamp(-BOX, BOX)
     value, gradient = inner(clamped)
@@ -71,16 +72,16 @@ def everywhere(inner: Inner, points: torch.Tensor, half: torch.Tensor) -> tuple[
 def _beyond(inner: Inner, points: torch.Tensor, first: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Distance and gradient at points [P, 3] outside the box, where `first` [P, 3] are feet from its nearest points.
 
-    From a point q of the box with value f and direction g the nearest surface is at its foot c = q - f g. No |x - c| is
-    shorter than the distance, so the shortest of several is taken: `first`, the foot from where the segment from x to
-    that one enters the box, and the same two from where the segment from x to the middle enters it. The gradient
-    points from the foot to x; so far out this is better than the fitted one.
+    For a point q of the box with value f and direction g, the nearest surface point is its foot c = q - f g. No |x - c|
+    is shorter than the distance from x, so the shortest of several is taken: `first`; the foot from where the segment
+    from x to that foot enters the box; and the same two for the segment from x to the middle. The gradient points from
+    the foot to x; this far out it is better than the fitted one.
     """
 
     def feet_towards(*goals: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """A foot for each goal, of one query."""
+        """A foot for each goal, from one query."""
         way = points - torch.stack(goals)
-        # Of the sides of the box that lie between, the segment passes the one it comes to last.
+        # Where the segment enters the box: at the side of the box that it reaches last.
         passed = ((points.abs() - BOX) / way.abs().clamp_min(1e-12)).clamp(0, 1).amax(-1, keepdim=True)
         entry = (points - passed * way).clamp(-BOX, BOX)
         value, gradient = inner(entry.flatten(0, 1))

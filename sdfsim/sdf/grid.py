@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 else:
     from sdfsim.base.lazy import torch
 
-# Points of a grid evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point.
+# Points of a grid evaluated at once: with eight corners and temporary arrays about 250 bytes a point.
 CHUNK = 262_144
 
 
 def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN. The
-    gradient is the exact one of the interpolant, so that the step x - f grad f leads to the level that the value has;
-    it jumps from cell to cell."""
+    gradient is the exact one of the interpolant, so it fits the value in steps x - f grad f; it jumps from cell to
+    cell."""
     side = values.shape[-1]
     per_cell = (side - 1) / (2 * BOX)
     place = (points + BOX) * per_cell
-    # Cut to the grid as integers, so that not even a NaN reads beside it; the far faces belong to the last cell.
+    # Clamp indices as integers, so that not even a NaN reads outside the grid; the far faces belong to the last cell.
     cell = place.long().clamp_(0, side - 2)
     across, along, up = (place - cell).unbind(1)
     first = (cell[:, 0] * side + cell[:, 1]) * side + cell[:, 2]
@@ -62,7 +62,7 @@ class GridSdf:
     def __post_init__(self) -> None:
         shape = tuple(self.values.shape)
         if len(shape) != 3 or len(set(shape)) != 1 or shape[0] < 2:
-            raise ValueError(f"a grid must have as many samples along x, y and z, two or more (got {shape})")
+            raise ValueError(f"a grid must have equal numbers of samples along x, y and z, at least two (got {shape})")
 
     @property
     def device(self) -> torch.device:
@@ -84,7 +84,7 @@ class GridSdf:
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32 (see `trilinear`), cast
-        back. See `everywhere` for what is far."""
+        back. See `everywhere` for points outside the box."""
         return in_metres(partial(trilinear, self.values), self.frame, self.bounds, points, CHUNK)
 
 
@@ -97,8 +97,9 @@ def sample_grid(
 ) -> GridSdf:
     """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m at `resolution`^3
     places over a cube 1.4 times as wide as the solid. With `coarse` above 1 (it divides `resolution` - 1) only blocks
-    of so many cells a side that the surface may cross are sampled in full, others at their corners and trilinear
-    between. Raises SdfsimError for fewer than two samples a side, or bounds without extent or not finite."""
+    of `coarse` cells a side that the surface may cross are sampled in full; others are sampled at their corners and
+    trilinear between. Raises SdfsimError for fewer than two samples a side, or for bounds that have no extent or are
+    not finite."""
     if resolution < 2:
         raise SdfsimError(f"a grid needs at least two samples along each side (got {resolution})")
     if (resolution - 1) % coarse:
@@ -109,8 +110,8 @@ def sample_grid(
         return np.asarray(distance(frame.outward(points))[0]) / frame.scale
 
     if coarse > 1:
-        # No place of a block is farther from a corner than half of its diagonal; a quarter of a side more for what is
-        # near.
+        # No point of a block is farther from a corner than half of its diagonal; a quarter of a side more adds a
+        # margin.
         reach = (0.5 * np.sqrt(3.0) + 0.25) * (axis[coarse] - axis[0])
         values = near_samples(ask, axis, coarse, reach, on_progress)
     else:
@@ -127,7 +128,7 @@ def near_samples(
 ) -> np.ndarray:
     """Samples [R, R, R] float32 of a distance [P] at points [P, 3], at evenly spaced places [R] along each axis. Blocks
     of `coarse` cells a side, which divides R - 1, are sampled in full only where a corner is within `reach` of the
-    surface or not all corners are on one side of it; others at their corners, and trilinear between."""
+    surface or not all corners are on one side of it; others are sampled at their corners, and trilinear between."""
     from scipy.ndimage import zoom
 
     knots = axis[::coarse]

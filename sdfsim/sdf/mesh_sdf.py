@@ -17,21 +17,22 @@ if TYPE_CHECKING:
     import torch
 
 # All lengths of `MeshSdf` are relative to the mesh's largest extent. The hierarchy works in float32, so closest points
-# are off by some 1e-7: nearer than this the offset to them gives no direction, and differences over the step do.
+# are wrong by some 1e-7. Nearer than this the offset to them gives no direction, so central differences with this step
+# are used.
 NEAR = 1e-5
 STEP = 1e-4
-# Farther out float32 overflows (at 1e19), so such points are moved to this box. The face that is nearest to the moved
-# point is near enough.
+# Farther out float32 overflows (at 1e19), so such points are moved to this box. The face nearest to the moved point is
+# a good enough answer.
 FAR = 1e3
-# A difference quotient shorter than this is no direction: a crack, a sheet without thickness.
+# A difference quotient shorter than this gives no direction, as at a crack or at a sheet without thickness.
 FLAT = 0.05
 UP = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class MeshSdf:
-    """The signed distance of a triangle mesh, with the sign of `MeshDistance`, good to about 1e-7 of the mesh's size.
-    It is evaluated on the CPU, wherever the points are. Raises SdfsimError if the mesh has no faces."""
+    """The signed distance of a triangle mesh, with the sign of `MeshDistance`, exact to about 1e-7 of the mesh's size.
+    It runs on the CPU, also for points on a GPU. Raises SdfsimError if the mesh has no faces."""
 
     mesh: Mesh  # metres
 
@@ -51,7 +52,7 @@ class MeshSdf:
 
     @cached_property
     def _oracle(self) -> MeshDistance:
-        # Built on first use: a scene that merely holds such a shape needs no open3d.
+        # Built on first use: a scene that only contains such a shape does not need open3d.
         return MeshDistance(self.mesh)
 
     def to(self, device: torch.device | str) -> MeshSdf:
@@ -64,8 +65,9 @@ class MeshSdf:
 
     @accepts_tensors
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m: along the line to the closest point, on the
-        surface along the normal (at an edge or corner between normals), and where there is neither, up."""
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m: the gradient is along the line to the closest
+        point; on the surface it is the normal (at an edge or corner a direction between normals); if neither exists, it
+        points up."""
         distance, gradient = self._exact(points.astype(np.float64))
         return distance.astype(points.dtype), gradient.astype(points.dtype)
 
@@ -77,7 +79,7 @@ class MeshSdf:
         offset = points - truth.closest
         distance = np.where((points == near).all(1), truth.distance, np.linalg.norm(offset, axis=1))
         here = np.abs(distance) <= NEAR * size
-        # A touch on either side of zero has a direction too; only zero itself has none.
+        # A tiny distance on either side of zero has a direction too; only zero itself has none.
         gradient = offset / np.where(distance == 0, 1.0, distance)[:, None]
         if here.any():
             gradient[here] = self._normal(points[here], gradient[here], STEP * size)

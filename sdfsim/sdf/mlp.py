@@ -1,7 +1,7 @@
 """The compact SDF network, and its hand-written forward, gradient and training sweeps.
 
-The sweeps keep their memory. The system takes back an array of a megabyte and faults it in again at every operation,
-which would cost more than the arithmetic.
+The sweeps keep their memory. Otherwise the system would take back an array of a megabyte and page it in again at every
+operation, which costs more than the arithmetic.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Activation = Literal["wave", "relu"]
 
 # Points prepared and finished at once, a few hundred bytes each.
 PREPARED = 131_072
-# Points in one sweep. 64 wide and 8 layers are 4 kB a point: 33 MB on the CPU, of which the two layers at
-# work stay in the cache; a GPU wants more at a time.
+# Points in one sweep. With 8 layers of width 64 a point takes 4 kB: 33 MB on the CPU, where the two active layers stay
+# in the cache. A GPU needs more points at a time.
 SWEPT = {"cpu": 8192, "cuda": 131_072}
 
 
@@ -40,8 +40,8 @@ class MlpSdf:
     activation: Activation  # of the hidden layers (the frequency of the periodic ones is part of the weights)
     frame: Frame  # metres <-> normalised
     bounds: np.ndarray  # [2, 3] float64 m, the box that holds the solid
-    # across which of the frame's planes x = 0, y = 0, z = 0 the solid is its own mirror image; the network knows the
-    # positive side only
+    # for each of the frame's planes x = 0, y = 0, z = 0, whether the solid is its own mirror image; the network holds
+    # the positive side only
     mirrors: tuple[bool, bool, bool] = (False, False, False)
 
     @property
@@ -64,7 +64,7 @@ class MlpSdf:
         return in_metres(self._inside, self.frame, self.bounds, points, PREPARED)
 
     def _inside(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        # -1 where the point is on the side of a mirror plane that the network does not know.
+        # -1 if the point is on the side of a mirror plane that the network does not hold.
         mirrored = torch.tensor(self.mirrors, device=points.device)
         side = 1.0 - 2.0 * (mirrored & (points < 0)).to(points.dtype)
         value, gradient = value_and_gradient(self.weights, self.biases, self.activation, points * side)
@@ -92,7 +92,7 @@ ACTIVATIONS = {"wave": wave, "relu": relu}
 
 class Tape:
     """Working memory of the sweeps. A layer is `act(W x + b)`; the last one, which `layers` counts too, is linear with
-    one output. Weights are [out, in] and biases [out], one a layer, of the device and dtype of `like`."""
+    one output. Each layer has weights [out, in] and biases [out], with the device and dtype of `like`."""
 
     def __init__(self, activation: Activation, width: int, layers: int, like: torch.Tensor) -> None:
         self._act = ACTIVATIONS[activation]
@@ -118,7 +118,7 @@ class Tape:
         return torch.addmm(biases[-1], below, weights[-1].T)[:, 0]
 
     def gradient(self, weights: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Gradients [T, 3] of the values that `forward` gave; destroys what it left."""
+        """Gradients [T, 3] of the values that `forward` returned; overwrites what it stored."""
         # The last layer is one row, so its product with the slope broadcasts.
         flow = self.slope[-1].mul_(weights[-1])
         for layer in range(len(weights) - 2, 0, -1):
@@ -148,7 +148,7 @@ class Tape:
                 flow = torch.mm(flow, weights[layer], out=self._free(layer)).mul_(self.slope[layer - 1])
 
     def _free(self, layer: int) -> torch.Tensor:
-        """The one of two arrays that the layer above does not hold its flow in."""
+        """The one of two arrays that the layer above does not use."""
         return self._flow if layer % 2 else self._spare
 
 

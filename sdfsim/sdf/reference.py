@@ -12,10 +12,10 @@ from sdfsim.geometry.solidify import Solid, exposed
 
 # The paper trusts a sign only where the offset to the surface is less than 75 degrees from the normal's line.
 TRUSTED_COSINE = float(np.cos(np.radians(75.0)))
-# How far from a half a winding number must be to decide the side of a surface that does not quite close.
+# Least difference of a winding number from one half for a reliable sign, if the surface is not quite closed.
 CLEAR = 0.2
 CHUNK = 200_000
-# Points tested together against the convex pieces.
+# Number of points tested together against the convex pieces.
 BLOCK = 512
 
 
@@ -28,7 +28,7 @@ class Reference(NamedTuple):
 
 
 class DistanceOracle(Protocol):
-    """True distances, from which a fit learns."""
+    """True distances, to which networks are fitted."""
 
     surface: Mesh  # the boundary as triangles, for sampling points on it
     closed: bool  # whether signs are reliable everywhere, not only where `Reference.trusted`
@@ -38,13 +38,13 @@ class DistanceOracle(Protocol):
 
 
 class MeshDistance:
-    """Signed distance to a solid that is bounded by triangles (see `solidify`), or to a mesh as it is: a sheet has no
-    inside. Raises SdfsimError if the mesh has no faces.
+    """Signed distance to a solid that is bounded by triangles (see `solidify`), or to a mesh as it is (then a sheet has
+    no inside). Raises SdfsimError if the mesh has no faces.
 
-    The sign is that of the solid's winding number: inside where the surface goes around a point more than half a time.
-    Where a single clean surface bounds the solid, ray parity gives the same and is faster. `trusted` follows the paper
-    (appendix on SDF training): the angle between (point - closest) and the face normal is below 75 or above 105
-    degrees; where the surface does not quite close, the winding number must also be clear.
+    The sign comes from the solid's winding number: a point is inside if the surface goes around it more than half a
+    time. If a single clean surface bounds the solid, ray parity gives the same and is faster. `trusted` follows the
+    paper (appendix on SDF training): the angle between (point - closest) and the face normal is below 75 or above 105
+    degrees; if the surface is not quite closed, the winding number must also be clear.
     """
 
     def __init__(self, body: Solid | Mesh) -> None:
@@ -57,7 +57,7 @@ class MeshDistance:
         self.surface = body.surface
         self.closed = body.closed
         self.bounds = np.stack([self.surface.vertices.min(0), self.surface.vertices.max(0)])
-        # All distances to a thickened sheet are taken from the sheet.
+        # Distances to a thickened sheet are measured from the sheet.
         self._nearest = ClosestPoint(body.body if body.thickness else body.surface)
         self._winding = Winding(body.body)
 
@@ -107,10 +107,11 @@ class PiecesDistance:
         everything = joined(pieces)
         self.bounds = np.stack([everything.vertices.min(0), everything.vertices.max(0)])
         size = float((self.bounds[1] - self.bounds[0]).max())
-        # Pieces that touch leave seams of no width between them: a hair's breadth outside still counts as inside.
+        # Touching pieces leave seams without width between them, so points outside by a tiny margin count as inside.
         self._seam = 1e-5 * size
         self._boxes = np.stack([np.stack([piece.vertices.min(0), piece.vertices.max(0)]) for piece in pieces])
-        # [H, 4] the outward normals and offsets of each piece's faces, each once; inside is normal . x + offset < 0.
+        # [H, 4] outward normals and offsets of each piece's faces, without repetitions; inside is normal . x + offset <
+        # 0.
         unit = np.array([1.0, 1.0, 1.0, size])
         planes = (ConvexHull(piece.vertices).equations / unit for piece in pieces)
         self.planes = [np.unique(found.round(9), axis=0) * unit for found in planes]
@@ -126,7 +127,7 @@ class PiecesDistance:
         """[P] bool: deeper than `margin` m in at least one piece."""
         result = np.zeros(len(points), dtype=bool)
         low, high = self._boxes[:, 0] + margin, self._boxes[:, 1] - margin
-        # Neighbours are judged together, against the few pieces that reach their block.
+        # Neighbouring points are tested together, against the few pieces that reach their block.
         cell = np.clip((points - self.bounds[0]) / (self.bounds[1] - self.bounds[0]) * 16, 0, 15).astype(np.int64)
         order = np.argsort(cell @ [256, 16, 1], kind="stable")
         for start in range(0, len(points), BLOCK):

@@ -1,4 +1,4 @@
-"""Signed distances: what all of them are, and how they take NumPy arrays."""
+"""The protocol of signed distances, and decorators that let them take NumPy arrays or tensors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ else:
 class Sdf(Protocol):
     """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
 
-    Its members, `MlpSdf`, the closed forms, `GridSdf` and `MeshSdf`, also have `to(device)` and `scaled(factor)`.
+    The implementations `MlpSdf`, the closed forms, `GridSdf` and `MeshSdf` also have `to(device)` and `scaled(factor)`.
 
     Attributes:
         bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).
@@ -31,14 +31,15 @@ class Sdf(Protocol):
         """Distance [P] m and gradient [P, 3] (unit length where the SDF is exact) at `points` [P, 3] m.
 
         The result has the dtype and device of `points`. Never NaN: where the gradient is undefined (medial axis, an
-        edge) any valid one-sided gradient is returned. The members also take a NumPy array, and then return some.
+        edge) any valid one-sided gradient is returned. The implementations also take a NumPy array, and then return
+        NumPy arrays.
         """
         ...
 
 
 def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
-    """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3] (whole numbers become float64), and then answer
-    in NumPy. Raises ValueError for other shapes."""
+    """Let an Sdf's `__call__` also take anything that converts to a NumPy array [P, 3] (integers become float64), and
+    then return NumPy arrays. Raises ValueError for other shapes."""
 
     @wraps(call)
     def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
@@ -53,7 +54,7 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
 
 def accepts_tensors(call: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Callable[..., tuple[Any, Any]]:
-    """The same of an Sdf that computes in NumPy: it also takes a tensor, and then answers in tensors."""
+    """The same for an Sdf that computes in NumPy: it also takes a tensor, and then returns tensors."""
 
     @wraps(call)
     def wrapper(self: Any, points: Any) -> tuple[Any, Any]:

@@ -1,1 +1,1 @@
-"""Shapes: a mesh, its signed distance, nodes and mass; their folders; what contacts need of them."""
+"""Shapes: a mesh with its signed distance, nodes and mass; shape folders; the geometry that contacts need."""

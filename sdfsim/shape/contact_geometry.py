@@ -1,7 +1,8 @@
-"""What contacts need of a shape, in its own frame at scale 1: made once, and kept beside the baked grids on disk.
+"""The geometry that contacts need of a shape, in its own frame at scale 1: made once, and cached beside the baked grids
+on disk.
 
-A shape that is convex, or made of convex pieces, collides as solids; any other as a surface in the distances of others.
-A thousand bodies of one shape share one geometry.
+A shape that is convex, or made of convex pieces, collides as solids. Any other collides as a surface: its points are
+tested against the distances of other shapes. A thousand bodies of one shape share one geometry.
 """
 
 import logging
@@ -22,38 +23,45 @@ from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
 
-VERSION = 9  # of what is kept on disk, beside that of the grid that surfaces are sampled from
-DENSEST = 4000  # nodes that a closed form has about at most
-LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
-MOST_PATCHES = 1024  # of a shape: the contact solve distinguishes no more
-OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
-APART, DENSEST_ON_GRID = 2.0, 3000  # cells between nodes on the surface of a grid at least, and how many it has at most
-LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
-ROUNDED = 0.1  # cells that the grid of a fit is off on an edge of its mesh that it rounds off
-ALONG_EDGE, MOST_ON_EDGES = 2.0, 4000  # cells between nodes of such an edge, and how many of them a shape has at most
+VERSION = 9  # version of the cache files, in addition to that of the baked grid
+DENSEST = 4000  # largest number of nodes of a closed form, roughly
+LATTICE = 40  # cells, along the largest extent, of the lattice that says which patch is nearest
+MOST_PATCHES = 1024  # patches of a shape: the contact solve cannot distinguish more
+OUTSIDE = 1e-3  # relative to the extent: vertices deeper in the union are not on its surface
+APART, DENSEST_ON_GRID = (
+    2.0,
+    3000,
+)  # least distance, in cells, of nodes on a grid, and their largest number
+LEAF, CLUMP = 16, 256  # largest number of nodes in a leaf, and in a clump of leaves
+ROUNDED = 0.1  # cells: an edge of the mesh counts as rounded off if the grid is off by this much there
+ALONG_EDGE, MOST_ON_EDGES = (
+    2.0,
+    4000,
+)  # distance, in cells, of nodes on such edges, and their largest number
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class ContactSurface:
-    """The surface of a shape as K nodes in L leaves, and these in C clumps: neighbours are searched together.
+    """The surface of a shape as K nodes in L leaves, and the leaves in C clumps, so that neighbours are searched
+    together.
 
-    Leaves and clumps have balls that hold the surface around their nodes, not the nodes alone: a body that is farther
-    from a ball than a contact may be cannot touch, whatever the shape and however few its nodes are.
+    The balls of leaves and clumps hold the surface around their nodes, not the nodes alone. So a body that is too far
+    from a ball for a contact cannot touch, whatever the shape and however few its nodes.
     """
 
     node: np.ndarray  # [K, 3] m, leaf by leaf
-    cover: np.ndarray  # [K] m, how far the surface around a node goes that is nearer to it than to others
+    cover: np.ndarray  # [K] m, radius of the part of the surface that is nearer to this node than to others
     leaf_node: np.ndarray  # [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1]
     leaf_ball: np.ndarray  # [L, 4] m, centre and radius
-    leaf_patch: np.ndarray  # [L] int64, the patch of the surface that a leaf's nodes are of
+    leaf_patch: np.ndarray  # [L] int64, the patch of the surface to which a leaf's nodes belong
     clump_leaf: np.ndarray  # [C + 1] int64, clump c holds leaves clump_leaf[c] : clump_leaf[c + 1]
     clump_ball: np.ndarray  # [C, 4] m
-    # [X, Y, Z] int16, the patch that is nearest to the places of a lattice; of no places for a single patch
+    # [X, Y, Z] int16, the nearest patch at the places of a lattice; empty for a single patch
     label: np.ndarray
     label_low: np.ndarray  # [3] m, the first of these places
-    label_cell: np.ndarray  # [] m between two
+    label_cell: np.ndarray  # [] m, their distance
 
 
 NO_LABELS = {"label": np.zeros((0, 0, 0), np.int16), "label_low": np.zeros(3), "label_cell": np.ones(())}
@@ -61,7 +69,7 @@ NO_LABELS = {"label": np.zeros((0, 0, 0), np.int16), "label_low": np.zeros(3), "
 
 @dataclass(frozen=True, eq=False)
 class ContactGeometry:
-    """What contacts need of one shape; each part is made on first use."""
+    """The geometry that contacts need of one shape; each part is made on first use."""
 
     sdf: Sdf
     nodes: np.ndarray
@@ -70,19 +78,20 @@ class ContactGeometry:
 
     @cached_property
     def grid(self) -> BakedGrid | None:
-        """The baked distance of a shape without a closed form. A wall that is too thin for it gives a warning."""
+        """The baked distance of a shape without a closed form, else None. Logs a warning if a wall is too thin for
+        it."""
         if isinstance(self.sdf, ClosedForm):
             return None
         grid = baked(self.sdf, self.nodes, self.pieces)
         if not self.solids and (wall := unseen_wall(self.sdf, grid)) is not None:
             extent = np.ptp(self.sdf.bounds, axis=0).max()
-            _log.warning("a shape of %.2g m has walls of at most %.2g m: things may pass through", extent, wall)
+            _log.warning("a shape of %.2g m has walls of at most %.2g m: bodies may pass through them", extent, wall)
         return grid
 
     @cached_property
     def solids(self) -> tuple[ConvexPiece, ...]:
-        """What the shape collides as: its convex pieces, its closed form, or its own hull; empty for a plane, and for a
-        shape that is not convex and has no pieces."""
+        """The convex solids that the shape collides as: its pieces, its closed form, or its own hull. Empty for a
+        plane, and for a shape that is not convex and has no pieces."""
         if self.pieces:
             return tuple(hull(piece) for piece in self.pieces)
         if isinstance(self.sdf, ClosedForm):
@@ -102,7 +111,7 @@ class ContactGeometry:
 
     @cached_property
     def surface(self) -> ContactSurface:
-        """Of a plane without nodes. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
+        """The surface nodes for contacts; a plane has none. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
         if isinstance(self.sdf, ClosedForm):
             return ContactSurface(**self._surface())
         faces = () if self.pieces else (self.mesh.vertices, self.mesh.faces)
@@ -137,11 +146,11 @@ class ContactGeometry:
 
 
 def between(nodes: np.ndarray, samples: np.ndarray, spacing: float) -> np.ndarray:
-    """Of samples [P, 3] m of a surface those that lie between its nodes [K, 3], at least `spacing` m apart.
+    """Those of the samples [P, 3] m of a surface that lie between its nodes [K, 3], at least `spacing` m apart.
 
-    The nodes of a network are few. What rolls from one to the next sinks in between them, until the way down the
-    distance leads there, and what lifts it out again is energy from nothing. Shapes that have as many as a grid has at
-    most need no others.
+    A network's shape has few nodes. A body that rolls from one to the next would sink in between them, until descent
+    along the distance finds the contact, and lifting it out again would create energy. Shapes that already have as many
+    nodes as a grid may have need no others.
     """
     from scipy.spatial import KDTree
 
@@ -153,9 +162,9 @@ def between(nodes: np.ndarray, samples: np.ndarray, spacing: float) -> np.ndarra
 
 
 def on_edges(mesh: Mesh, grid: BakedGrid) -> np.ndarray:
-    """Points [K, 3] m along the sharp edges of a fit's mesh that its grid rounds off. Between two nodes that lie far
-    apart such an edge would sink into what it stands on: the way down the distance ends on the rounded surface. Where
-    the mesh itself was sampled, such nodes throw a rolling hoop up."""
+    """Points [K, 3] m along the sharp edges of a fit's mesh that its grid rounds off. Between distant nodes such an
+    edge would sink into the ground: descent along the distance ends on the rounded surface. For grids sampled from the
+    mesh itself this is not used, as such nodes would throw up a rolling hoop."""
     spacing, normal = ALONG_EDGE * grid.cell, face_normals(mesh)[0]
     number, _ = directed_edges(mesh.faces)
     order = np.argsort(number, kind="stable")
@@ -174,15 +183,15 @@ def on_edges(mesh: Mesh, grid: BakedGrid) -> np.ndarray:
 
 
 def patches_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """The `node`s that carry contact, with the vertices [V, 3] m of convex pieces, where the shape has some, the
-    `patch` of each, and the labels of a `ContactSurface`. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
+    """The `node`s that carry contact (with the vertices [V, 3] m of convex pieces, if the shape has any), the `patch`
+    of each, and the labels of a `ContactSurface`. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
     if len(pieces) == 0:
         return {"node": nodes, "patch": np.zeros(len(nodes), np.int64), **NO_LABELS}
     check_pieces("a shape", pieces)
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     vertices, union = np.concatenate(pieces), PiecesDistance([convex_hull(piece) for piece in pieces])
     bare = union(vertices).distance > -OUTSIDE * extent
-    nodes = union(nodes).closest  # those of a fitted surface lie beside it
+    nodes = union(nodes).closest  # nodes of a fitted surface lie slightly beside the pieces
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     cell = extent / LATTICE
     low = sdf.bounds[0] - cell
@@ -199,14 +208,14 @@ def patches_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> dic
 
 
 def check_pieces(what: str, pieces: Sequence[np.ndarray]) -> None:
-    """Raises SdfsimError, which says `what` has them, for more than `MOST_PATCHES` convex pieces."""
+    """Raises SdfsimError if `what` has more than `MOST_PATCHES` convex pieces."""
     if len(pieces) > MOST_PATCHES:
         message = f"{what} is made of {len(pieces):,} convex pieces (at most {MOST_PATCHES:,})"
-        raise SdfsimError(message, "cut it into fewer ones, or fit its mesh without pieces")
+        raise SdfsimError(message, "cut it into fewer pieces, or fit its mesh without pieces")
 
 
 def _nearest_piece(union: PiecesDistance, places: np.ndarray) -> np.ndarray:
-    """[P] int64: the convex piece whose farthest face plane is least far from a place."""
+    """[P] int64: for each place the convex piece whose farthest face plane is nearest."""
     least, nearest = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
     for k, planes in enumerate(union.planes):
         far = np.full(len(places), -np.inf)
@@ -218,9 +227,8 @@ def _nearest_piece(union: PiecesDistance, places: np.ndarray) -> np.ndarray:
 
 
 def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, facing: np.ndarray) -> dict[str, np.ndarray]:
-    """Nodes [K, 3] in the order of leaves, and these in clumps. A leaf has nodes of one patch only, and of one side of
-    a wall, which they face: its deepest node stands for all of it, and from behind a wall no way leads along the
-    surface."""
+    """Sort nodes [K, 3] into leaves, and leaves into clumps. A leaf has nodes of one patch and one side of a wall only:
+    its deepest node stands for the whole leaf, and the descent from it cannot reach the other side of a wall."""
     leaves: list[np.ndarray] = []
     clump_leaf, clump_ball = [0], [np.zeros((0, 4))]
     for clump in halves(node, CLUMP) if len(node) else []:
@@ -244,7 +252,7 @@ NO_SURFACE = ContactSurface(
 
 
 def _ball(places: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """[1, 4] middle and radius of a ball around the surface that nodes stand for."""
+    """[1, 4] centre and radius of a ball around the part of the surface that nodes stand for."""
     middle = 0.5 * (places.min(0) + places.max(0))
     return np.array([[*middle, (np.linalg.norm(places - middle, axis=1) + around).max()]])
 
@@ -257,7 +265,7 @@ def _area(sdf: BoxSdf | CylinderSdf) -> float:
 
 
 def _on_box(half: np.ndarray, spacing: float) -> np.ndarray:
-    """Points all over a box at most `spacing` m apart along its sides, corners and edges among them."""
+    """Points all over a box, at most `spacing` m apart along its sides, corners and edges included."""
     axes = [np.linspace(-h, h, 1 + max(1, int(np.ceil(2.0 * h / spacing)))) for h in half]
     points = [axes[0][[0, -1]], axes[1][[0, -1]], axes[2][[0, -1]]]
     sides = [lattice(*(points[k] if k == axis else axes[k] for k in range(3))) for axis in range(3)]
@@ -265,7 +273,7 @@ def _on_box(half: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _on_cylinder(sdf: CylinderSdf, spacing: float) -> np.ndarray:
-    """Points all over a cylinder at most `spacing` m apart, its rims among them."""
+    """Points all over a cylinder, at most `spacing` m apart, rims included."""
     around = 2.0 * np.pi * np.arange(count := max(8, int(np.ceil(2.0 * np.pi * sdf.radius / spacing)))) / count
     circle = np.stack([np.cos(around), np.sin(around)], axis=1)
     heights = np.linspace(-sdf.half, sdf.half, 1 + max(1, int(np.ceil(2.0 * sdf.half / spacing))))

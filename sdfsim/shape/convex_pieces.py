@@ -1,4 +1,4 @@
-"""Convex pieces of a shape as contacts use them: closed forms, and hulls with their flat faces."""
+"""The convex pieces of a shape that contacts use: closed forms, and hulls with flat faces."""
 
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
@@ -9,10 +9,10 @@ from sdfsim.geometry.mesh import Mesh
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
 from sdfsim.sdf.sdf import Sdf
 
-FLAT = 1e-6  # faces whose unit normals differ by less are one
-DENT = 5e-4  # of the largest extent: a mesh whose dents are no deeper is convex
-HOLLOW = 1e-3  # of its volume, that a convex mesh may have less than its hull
-CORNERS = 64  # of a face at most: of one with more, so many evenly chosen ones bound the contact
+FLAT = 1e-6  # faces whose unit normals differ by less are one face
+DENT = 5e-4  # relative to the largest extent: a mesh with shallower dents counts as convex
+HOLLOW = 1e-3  # relative: how much less volume than its hull a convex mesh may have
+CORNERS = 64  # corners of a face at most; of a face with more, this many evenly chosen ones bound the contact
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,18 +20,18 @@ class ConvexPiece:
     """One convex solid in the frame of its shape, at scale 1."""
 
     kind: str  # "sphere", "capsule", "box", "cylinder" or "hull"
-    sizes: tuple[float, ...]  # m, as the closed form has them; of a hull none
-    ball: np.ndarray  # [4] m, middle and radius of a ball around it
-    thickness: float  # m, the least distance of two parallel planes that hold it, along the normals of faces
-    vertices: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [V, 3] m, of a hull
-    normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [F, 3] outward, one a flat face
+    sizes: tuple[float, ...]  # m, as the closed form has them; empty for a hull
+    ball: np.ndarray  # [4] m, centre and radius of a ball around it
+    thickness: float  # m, the least distance of two parallel planes that enclose it, among face normals
+    vertices: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [V, 3] m, for a hull
+    normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [F, 3] outward, one for each flat face
     loops: tuple[np.ndarray, ...] = ()  # [F] the vertices of each face, counter-clockwise as seen from outside
     beside: tuple[np.ndarray, ...] = ()  # [V] the vertices at the other ends of each one's edges
     around: tuple[np.ndarray, ...] = ()  # [V] the faces that meet there
 
 
 def closed_form(sdf: Sdf) -> ConvexPiece | None:
-    """The piece that a closed form is; None for a plane, and for what has no closed form."""
+    """The convex piece of a closed form; None for a plane and for other SDFs."""
     if isinstance(sdf, SphereSdf):
         return ConvexPiece("sphere", sdf.sizes, np.array([0, 0, 0, sdf.radius]), 2.0 * sdf.radius)
     if isinstance(sdf, CapsuleSdf):
@@ -76,13 +76,13 @@ def hull(vertices: np.ndarray) -> ConvexPiece:
 
 
 def _grouped(owner: np.ndarray, value: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
-    """The different values of each of `count` owners."""
+    """The different values that belong to each of `count` owners."""
     pairs = np.unique(np.stack([owner, value], axis=1), axis=0)
     return tuple(np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, count))))
 
 
 def _around(corners: np.ndarray, chosen: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The vertices of a flat face in turn."""
+    """The vertices of a flat face in order around it."""
     places = corners[chosen] - corners[chosen].mean(0)
     one = places[np.argmax(np.linalg.norm(places, axis=1))]
     one = one - (one @ normal) * normal
@@ -95,7 +95,7 @@ _convex: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
 
 
 def convex_vertices(mesh: Mesh) -> np.ndarray:
-    """[V, 3] m, the vertices of a mesh that is its own convex hull, but for dents and rounding; none of any other."""
+    """[V, 3] m, the vertices of a mesh that is convex except for small dents and rounding; empty for other meshes."""
     if mesh not in _convex:
         _convex[mesh] = mesh.vertices if _is_convex(mesh) else np.zeros((0, 3))
     return _convex[mesh]
@@ -114,7 +114,7 @@ def _is_convex(mesh: Mesh) -> bool:
     volume = abs(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
     if not abs(volume - found.volume) <= HOLLOW * found.volume:
         return False
-    # What lies deepest in a dent is a corner, or the middle of an edge or a face, well enough.
+    # The deepest point of a dent is close enough to a corner, or to the middle of an edge or a face.
     middles = 0.5 * (corners + np.roll(corners, 1, axis=1))
     places = np.concatenate([mesh.vertices, corners.mean(1), middles.reshape(-1, 3)])
     planes, deep = np.unique(found.equations.round(9), axis=0), DENT * np.ptp(mesh.vertices, axis=0).max()

@@ -1,4 +1,4 @@
-"""Makes shapes: closed forms; of meshes, by a fit (cached) or without one; of convex pieces."""
+"""Makes shapes: from closed forms, from meshes (with a cached fit or without one), and from convex pieces."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sa
 if TYPE_CHECKING:
     import torch
 
-# m, sizes of meshes that need no remark; without known units the largest is less, for few moving things are larger.
+# m, sizes of meshes that need no remark. If the units are not given the upper limit is lower, as few moving things are
+# larger.
 USUAL, LARGE = (1e-3, 100.0), 5.0
-# Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
+# Largest part of the nodes of convex pieces that are vertices of the pieces, and that are vertices or points on edges.
 OWN_SHARE, EDGE_SHARE = 0.6, 0.85
-# Between points on the edges of convex pieces, relative to the size of the whole.
+# Distance of points on the edges of convex pieces, relative to the size of the whole shape.
 EDGE_SPACING = 0.06
 
 _log = logging.getLogger(__name__)
@@ -54,9 +55,9 @@ def analytic_shape(
     """A shape with an exact SDF, about the origin: "plane" (z = 0, +z outside, infinite), "sphere", "capsule",
     "cylinder" or "box".
 
-    Radius and height (along z, of a capsule with its caps) are in m, and so is the box's size, full extents along x, y,
-    z. Mass properties are exact (of the plane 0); the plane shows a 20 m square and has no nodes. Raises SdfsimError
-    for a size that is missing or not positive.
+    Radius and height (along z, for a capsule with its caps) are in m, and so is the box's size, its full extents along
+    x, y, z. Mass properties are exact (0 for the plane). The plane is shown as a 20 m square and has no nodes. Raises
+    SdfsimError if a size is missing or not positive.
     """
     volume, inertia, nodes = 0.0, np.zeros((3, 3)), np.zeros((0, 3))
     if kind == "plane":
@@ -83,12 +84,13 @@ def analytic_shape(
 
 
 def _round_mass(radius: float, half: float, *, caps: bool) -> tuple[float, np.ndarray]:
-    """Volume m^3 and inertia [3, 3] m^5 (per unit density) of a cylinder about z, with half balls at its ends."""
+    """Volume m^3 and inertia [3, 3] m^5 (per unit density) of a cylinder about z; with `caps`, half balls at its
+    ends."""
     trunk = 2.0 * np.pi * radius**2 * half
     across, about = trunk * (radius**2 / 4.0 + half**2 / 3.0), trunk * radius**2 / 2.0
     if caps:
         balls = 4.0 / 3.0 * np.pi * radius**3
-        # Half balls whose flat sides lie at +-half, their middles 3/8 of the radius beyond.
+        # Half balls with flat sides at +-half; their centres of mass are 3/8 of the radius beyond.
         across += balls * (0.4 * radius**2 + half**2 + 0.75 * half * radius)
         about += 0.4 * balls * radius**2
         trunk += balls
@@ -96,7 +98,7 @@ def _round_mass(radius: float, half: float, *, caps: bool) -> tuple[float, np.nd
 
 
 def _round_nodes(radius: float, half: float, *, caps: bool, around: int = 16) -> np.ndarray:
-    """Rings about z on the surface of a capsule or cylinder: [K, 3] m, those of the ends first."""
+    """Rings about z on the surface of a capsule or cylinder: [K, 3] m, the rings of the ends first."""
     turns = 2.0 * np.pi * np.arange(around) / around
     circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     rings = [(radius, half * z) for z in (-1.0, 1.0)]
@@ -124,10 +126,10 @@ def shape_from_primitive(
     kind: str, size: float = 1.0, cache_dir: str | Path | None = None, *, name: str | None = None,
     sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
-    """The shape of a procedural mesh of `primitives.PRIMITIVES`, its largest extent `size` m, made on first use and
-    cached; other arguments as of `shape_from_mesh`. Raises SdfsimError for no such primitive."""
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, with the largest extent `size` m. It is made on first
+    use and cached; other arguments are as in `shape_from_mesh`. Raises SdfsimError for an unknown primitive."""
     if kind not in primitives.PRIMITIVES:
-        raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(primitives.PRIMITIVES))
+        raise SdfsimError(f"no primitive called {kind!r}", "primitives are " + ", ".join(primitives.PRIMITIVES))
     mesh = primitives.PRIMITIVES[kind]()
     unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
     # Rounded, since sines and cosines differ in their last digit from machine to machine.
@@ -141,8 +143,8 @@ def shape_from_mesh(
     cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
     on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
-    """The shape of a mesh file: made on first use, then taken from a cache (by default `sdfsim/shapes` in the user's
-    cache folder) keyed by what the file describes.
+    """The shape of a mesh file. It is made on first use, then taken from a cache (by default `sdfsim/shapes` in the
+    user's cache folder), whose key is the content of the mesh.
 
     `units` are metres per unit of the file (None: unknown, taken as metres), `thicken` m is a thickness for an open
     sheet. With `sdf` "mlp" the network is fitted; "grid" and "mesh" need no fit (see `mesh_shape`). `source["notes"]`
@@ -151,7 +153,7 @@ def shape_from_mesh(
     path = Path(path)
     loaded = load_textured(path)
     mesh = loaded.mesh
-    # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
+    # Not the file's bytes: a glTF may keep its vertices, and an OBJ its colours, in other files.
     key = mesh.digest()
     metres = 1.0 if units is None else units
     how = {"cap": cap, "thicken": None if thicken is None else thicken / metres, "on_progress": on_progress}
@@ -163,15 +165,15 @@ def shape_from_mesh(
 
 
 def dressed(loaded: Loaded, *, thicken: float | None) -> tuple[Mesh | None, list[str]]:
-    """The textured mesh that is shown for a mesh file, in the file's units; and notes on what is lost of it. A sheet
-    that is thickened is shown as the solid that it becomes."""
+    """The textured mesh that is shown for a mesh file, in the file's units, and notes on what is lost. A thickened
+    sheet is shown as the solid that it becomes."""
     if loaded.skin is None or thicken is None:
         return loaded.skin, list(loaded.notes)
-    return None, ["its texture becomes colours of its vertices, since thicken gives it other surfaces"]
+    return None, ["its texture becomes colours of its vertices, as thicken gives it other surfaces"]
 
 
 def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
-    """Notes on a mesh file, a line each: that glTF was turned; and its size, where that is unusual in the `units`
+    """Notes on a mesh file, one line each: that glTF was turned, and its size, if that is unusual in these `units`
     (metres per unit). Many parts are drawn in millimetres, and few files state it."""
     notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
     size = units * float(np.ptp(mesh.vertices, axis=0).max())
@@ -186,8 +188,8 @@ def mesh_shape(
     mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
     file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent, coarse: int = 1,
 ) -> Shape:  # fmt: skip
-    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it (see `sample_grid`), nodes and mass
-    as a fit has them. Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
+    """The shape of a mesh (metres) without a fit: its exact SDF or a grid of it (see `sample_grid`), with nodes and
+    mass as for a fit. Raises SdfsimError, which calls the mesh `file` (or else `name`), if the mesh cannot be used."""
     solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
     sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress, coarse)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
@@ -198,7 +200,7 @@ def mesh_shape(
 def _cached(
     mesh: Mesh, key: str, name: str, kind: SdfKind, resolution: int, cache_dir: str | Path | None, **how: Any
 ) -> Shape:
-    if kind == "mesh":  # made as fast as it is read
+    if kind == "mesh":  # making it is as fast as reading it
         return mesh_shape(mesh, name=name, kind=kind, **how)
     variant = "-cap" if how.get("cap") else ""
     variant += "" if how.get("thicken") is None else f"-thick{how['thicken']:g}"
@@ -209,20 +211,21 @@ def _cached(
             return load_shape(folder)
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
-    if how["on_progress"] is silent:  # no progress is shown: warn at least what takes so long
+    if how["on_progress"] is silent:  # no progress is shown, so log what takes long
         _log.warning("making the shape %s, once for this mesh: about half a minute", name)
     if kind == "grid":
         shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
     else:
         shape = fit_mesh(mesh, name=name, **how)
-    # A folder of its own first, so that processes and threads fitting the same mesh never see each other's half.
+    # Write to a temporary folder first, so that processes and threads that fit the same mesh never see half-written
+    # files.
     partial = folder.with_name(f"{folder.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
         shape.save(partial)
-        if not folder.is_dir():  # else another process was first: its entry is as good
+        if not folder.is_dir():  # else another process was faster, and its entry is as good
             partial.rename(folder)
     except (SdfsimError, OSError) as error:
-        _log.warning("the shape %s is not kept for the next time: %s", name, error)
+        _log.warning("the shape %s cannot be cached: %s", name, error)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return shape
@@ -243,17 +246,17 @@ def fit_mesh(
 ) -> Shape:
     """Fit the compact SDF network to the solid that a triangle mesh in metres bounds, see `solidify`.
 
-    The result depends on the mesh, the recipe (see `RECIPES`) and the seed only (up to rounding, which the number of
-    threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` has the
-    errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError, which
-    calls the mesh `file` (or else `name`), where it cannot be used or bounds no solid.
+    The result depends only on the mesh, the recipe (see `RECIPES`) and the seed, up to rounding, which depends on the
+    number of threads and the device; unless the budget in s ends the training early. The shape's `certificate` has the
+    errors and whether it is usable (`passed`); `source["notes"]` says what was done to the mesh. Raises SdfsimError,
+    which calls the mesh `file` (or else `name`), if the mesh cannot be used or bounds no solid.
     """
     solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
 
     def pick(sdf: Sdf) -> np.ndarray:
         return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
 
-    from sdfsim.sdf.fit.train import fit_sdf  # torch takes its time to load
+    from sdfsim.sdf.fit.train import fit_sdf  # torch is slow to load
 
     sdf, points, certificate = fit_sdf(MeshDistance(solid), recipe, budget, seed, pick, on_progress, device)
     source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
@@ -269,12 +272,12 @@ def fit_pieces(
     nodes: int = DEFAULT_COUNT,
     kind: Literal["mlp", "grid"] = "mlp",
 ) -> Shape:
-    """Fit the compact SDF network to the union of convex pieces, or sample that on a grid (`kind` "grid", in a second):
-    the body that a rigid-body engine collides.
+    """Fit the compact SDF network to the union of convex pieces (the body that a rigid-body engine collides), or sample
+    its distance on a grid (`kind` "grid", which takes a second).
 
-    At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
-    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface. Mass
-    properties are those of the union, and so is the mesh to show unless `display` is given.
+    The shape has at most `nodes` nodes: first the pieces' own vertices (without repetitions and those inside another
+    piece), because contact with a flat floor is exact only there; then points along their sharp edges, then points all
+    over the surface. Mass properties are those of the union, and so is the mesh to show unless `display` is given.
     """
     oracle = PiecesDistance(pieces)
     size = float(np.ptp(oracle.bounds, axis=0).max())
@@ -282,7 +285,7 @@ def fit_pieces(
     def bare(points: np.ndarray) -> np.ndarray:
         _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
         points = points[np.sort(first)]
-        # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
+        # Measured from the boundary of the union: a point on the seam of two pieces is not deep in either.
         return points[oracle(points).distance >= -1e-3 * size]
 
     vertices = bare(np.concatenate([piece.vertices for piece in pieces]))

@@ -1,4 +1,4 @@
-"""A `Shape` (geometry, SDF, surface nodes, mass properties), and the folder that holds it."""
+"""A `Shape` (geometry, SDF, surface nodes, mass properties), and the folder that stores it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FORMAT_VERSION = 1
 # Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
 DEFAULT_RESOLUTION = 64
 WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
-SKIN_FILE = "textured.glb"  # where there is a texture
+SKIN_FILE = "textured.glb"  # only for shapes with a texture
 
 
 @dataclass(frozen=True)
@@ -45,18 +45,19 @@ class Shape:
     """One rigid shape in its own frame, metres, at scale 1.
 
     Attributes:
-        name: what messages and the viewer call it.
-        mesh: what is shown, and what the SDF was made from (of convex pieces, the SDF is that of their union).
+        name: its name in messages and in the viewer.
+        mesh: the mesh that is shown, and from which the SDF was made (for convex pieces the SDF is that of their
+            union).
         sdf: signed distance in the same frame.
         nodes: [K, 3] float64 m, surface nodes that carry contact (empty for a plane).
         volume: m^3.
         com: [3] float64 m, centre of mass.
         inertia: [3, 3] float64 kg m^2 per unit density, about `com`, shape axes.
-        certificate: errors measured on held-out points (empty where the distance is exact).
-        source: where it came from and a content hash (for caching and for the record).
-        pieces: the vertices [V, 3] float64 m of each of its convex pieces, where it was made of such.
-        skin: a mesh with a texture that is shown in place of `mesh`, where there is one.
-        faces: [F, 3] int64 triangles between the nodes, where these are the vertices of a mesh; never stored.
+        certificate: errors measured on held-out points (empty if the distance is exact).
+        source: where it came from, and a hash of its content.
+        pieces: the vertices [V, 3] float64 m of each of its convex pieces, if it was made of pieces.
+        skin: a mesh with a texture that is shown in place of `mesh`, or None.
+        faces: [F, 3] int64 triangles between the nodes, if these are the vertices of a mesh; never stored.
     """
 
     name: str
@@ -79,13 +80,13 @@ class Shape:
 
     @cached_property
     def contact(self) -> ContactGeometry:
-        """What contacts need of it."""
+        """The geometry that contacts need of it."""
         return ContactGeometry(self.sdf, self.nodes, self.pieces, self.mesh)
 
     def save(self, folder: str | Path) -> Path:
-        """Write the shape folder and return it. Each file appears complete or not at all, and shape.json last, beside
-        the files it describes. Raises SdfsimError if the folder cannot be written, or the SDF is of a kind without a
-        file format, or exact and of another mesh."""
+        """Write the shape folder and return it. Each file appears complete or not at all, and shape.json last, after
+        the files that it describes. Raises SdfsimError if the folder cannot be written, if this kind of SDF has no file
+        format, or if it is the exact SDF of another mesh."""
         from safetensors.torch import save as to_bytes
 
         folder = Path(folder)
@@ -123,7 +124,7 @@ class Shape:
 
 def load_shape(folder: str | Path) -> Shape:
     """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`). Raises SdfsimError if a file is missing,
-    cut short, of another version, or holds what it should not."""
+    cut short, of another version, or has invalid content."""
     from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes
 
@@ -146,7 +147,7 @@ def load_shape(folder: str | Path) -> Shape:
     skins = read_glb(folder / SKIN_FILE) if (folder / SKIN_FILE).is_file() else {}
     try:
         for name, tensor in tensors.items():
-            if name != "bounds":  # a plane's are infinite
+            if name != "bounds":  # a plane has infinite bounds
                 _finite(tensor.numpy(), name, *tensor.shape)
         sizes = record.get("pieces", [])
         return Shape(
@@ -168,7 +169,7 @@ def load_shape(folder: str | Path) -> Shape:
 
 
 def _sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors and a description (for JSON) of an SDF, beside the folder's `mesh`."""
+    """Tensors and a description (for JSON) of an SDF; the exact SDF of `mesh` needs no tensors."""
     if isinstance(sdf, MlpSdf | GridSdf):
         frame = {"centre": np.asarray(sdf.frame.centre).tolist(), "scale": float(sdf.frame.scale)}
         if isinstance(sdf, GridSdf):
@@ -218,7 +219,7 @@ def _sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor]
 
 
 def _finite(value: Any, what: str, *shape: int) -> np.ndarray:
-    """Finite numbers [*shape] out of JSON. Raises TypeError or ValueError otherwise."""
+    """Finite numbers [*shape] from JSON. Raises TypeError or ValueError otherwise."""
     numbers = np.array(value, dtype=np.float64).reshape(shape)
     if not np.isfinite(numbers).all():
         raise ValueError(f"{what} is not finite")
@@ -247,7 +248,7 @@ def scaled(shape: Shape, factor: float) -> Shape:
 
 
 def own_pieces(shape: Shape) -> list[Mesh]:
-    """Convex pieces [m] that a shape comes with, or that its primitive has; empty where there are none."""
+    """Convex pieces [m] that a shape has, or that its primitive has; empty if there are none."""
     if shape.pieces:
         return [convex_hull(points) for points in shape.pieces]
     kind = str(shape.source.get("primitive", ""))
@@ -263,15 +264,15 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 
     Kinds: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the mesh, see
     `sample_grid`, with the certificate of `certify_grid`) or "mesh" (that distance itself, which needs no certificate);
-    `source` notes the kind as `sdf`.
-    Raises SdfsimError if there is no network, of a plane, or of fewer than two samples a side.
+    `source["sdf"]` is the kind. Raises SdfsimError if there is no network, for a plane, or for fewer than two samples a
+    side.
     """
     if kind == "mlp":
         if not isinstance(shape.sdf, MlpSdf):
             raise SdfsimError(f"{shape.name}: the shape has no SDF network", "fit its mesh")
         return shape
     if isinstance(shape.sdf, PlaneSdf):
-        raise SdfsimError(f"{shape.name}: a plane has no end, so no grid or mesh holds it")
+        raise SdfsimError(f"{shape.name}: a plane is infinite, so no grid or mesh can hold it")
     sdf, note, certificate = sdf_of_mesh(shape.mesh, kind, resolution)
     return replace(shape, sdf=sdf, certificate=certificate, source=shape.source | note)
 
@@ -279,7 +280,8 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 def sdf_of_mesh(
     mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent, coarse: int = 1
 ) -> tuple[Sdf, dict, dict]:
-    """A mesh's exact SDF or a grid of it, see `sample_grid`; its entries of a shape's `source`, and its certificate."""
+    """A mesh's exact SDF or a grid of it (see `sample_grid`), its entries for a shape's `source`, and its
+    certificate."""
     if kind == "mesh":
         return MeshSdf(mesh), {"sdf": "mesh"}, {}
     oracle = MeshDistance(mesh)
@@ -290,15 +292,15 @@ def sdf_of_mesh(
 def with_nodes(shape: Shape, grid: int) -> Shape:
     """The same shape with the surface nodes of a grid of `grid`^3 points, sampled from its SDF alone, as the paper
     resamples a trained simulator's bodies. Raises as `sample_nodes` does."""
-    # What was measured of the former nodes does not hold for these.
+    # Measurements of the former nodes do not hold for these.
     certificate = {key: value for key, value in shape.certificate.items() if key != "coverage"}
     return replace(shape, nodes=sample_nodes(shape.sdf, grid=grid), certificate=certificate)
 
 
 def with_wall(shape: Shape, wall: float) -> Shape:
-    """The same shape as a hollow one: only what lies within `wall` m of its surface has mass.
+    """The same shape, but hollow: only the layer within `wall` m of its surface has mass.
 
-    Volume, centre of mass and inertia are taken from the SDF on a grid. Where the SDF is exact and the wall at least
+    Volume, centre of mass and inertia are computed from the SDF on a grid. If the SDF is exact and the wall is at least
     1/100 of the shape's longest side, the volume is within 1 % and the inertia within 4 %. Raises SdfsimError for a
     plane.
     """

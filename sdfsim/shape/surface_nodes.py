@@ -14,8 +14,8 @@ VOXEL = 0.025
 REACHED = 0.005
 PROJECTIONS = 3
 DEFAULT_GRID = 24
-DEFAULT_COUNT = 512  # what the bundled model was trained with; docs/tradeoff.md has what fewer cost
-DIRECTIONS = 1000  # in which nodes are to reach as far as the surface
+DEFAULT_COUNT = 512  # number with which the bundled model was trained; docs/tradeoff.md shows the effect of fewer
+DIRECTIONS = 1000  # directions in which nodes should reach as far as the surface
 CHUNK = 10_000  # points in one product
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
@@ -33,7 +33,8 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     points = project(sdf, frame.outward(lattice(axis, axis, axis)))
     distance = np.asarray(sdf(points)[0])
     reached = np.abs(distance) <= REACHED * frame.scale
-    # A network may have a stray zero level in the corners of its box: nothing outside the solid's bounds is surface.
+    # A network may have a stray zero level in the corners of its box, so nothing outside the solid's bounds counts as
+    # surface.
     margin = REACHED * frame.scale
     reached &= ((points >= sdf.bounds[0] - margin) & (points <= sdf.bounds[1] + margin)).all(1)
     points = points[reached]
@@ -46,7 +47,7 @@ def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
     """Move points [P, 3] m to the zero level by a few steps x - f grad f / |grad f|^2."""
     for _ in range(PROJECTIONS):
         distance, gradient = sdf(points)
-        # A step never gets longer than twice the distance: slopes below 0.7 are errors of a fit, not geometry.
+        # A step is at most twice the distance: slopes below 0.7 are errors of a fit, not geometry.
         squared = np.maximum(np.square(gradient).sum(1), 0.5)
         points = points - (np.asarray(distance) / squared)[:, None] * np.asarray(gradient)
     return points
@@ -62,8 +63,9 @@ def one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> np.ndarray:
-    """At most `count` of points [P, 3]: all of `keep` [Q, 3], which are thinned themselves where they are more, then
-    the farthest remaining point again and again, starting (without `keep`) at that farthest from the centroid."""
+    """At most `count` of points [P, 3], by farthest point sampling: first all of `keep` [Q, 3] (thinned if they are
+    more than `count`), then again and again the point farthest from those chosen. Without `keep` it starts at the point
+    farthest from the centroid."""
     if keep is not None and len(keep) >= count:
         return thin(keep, count) if len(keep) > count else keep.copy()
     chosen: list[np.ndarray] = [] if keep is None else list(keep)
@@ -80,8 +82,8 @@ def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> n
 
 
 def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of a polyhedral body's own vertices [V, 3] m: first those of the convex hull, for only they can
-    touch a flat floor; the others farthest first."""
+    """At most `count` of a polyhedral body's own vertices [V, 3] m: first those of the convex hull, as only they can
+    touch a flat floor, then the others, farthest first."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -92,8 +94,8 @@ def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
 
 
 def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
-    """Points [K, 3] m along the sharp edges of a convex polyhedron, at most `spacing` m apart, its corners left out:
-    two polyhedra often touch edge against edge, which their corners alone do not see."""
+    """Points [K, 3] m along the sharp edges of a convex polyhedron, at most `spacing` m apart, without its corners. Two
+    polyhedra often touch edge against edge, which corners alone would miss."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(piece)
@@ -111,14 +113,15 @@ def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
-    """Nodes for contact, at most `count` [K, 3] m: a third that reach farthest outwards, then points all over `sdf`."""
+    """Nodes for contact, at most `count` [K, 3] m: a third of them reach farthest outwards, the others are spread over
+    the surface."""
     return thin(sample_nodes(sdf), count, keep=_reaching(surface.vertices, count // 3))
 
 
 def _reaching(points: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of points [P, 3] whose convex hull comes nearest to that of all: in turn the outermost in the
-    direction in which those before fall short the most. Evenly spread points leave gaps of a tenth of a body along a
-    rim, through which it sinks into a floor."""
+    """At most `count` of points [P, 3], chosen so that their convex hull is near that of all points: each is the
+    outermost point in the direction in which those before it fall short the most. Evenly spread points would leave gaps
+    of a tenth of a body along a rim, through which it sinks into a floor."""
     directions = spiral(DIRECTIONS)
     best, most = np.zeros(DIRECTIONS, np.int64), np.full(DIRECTIONS, -np.inf)
     for start in range(0, len(points), CHUNK):

@@ -65,7 +65,7 @@ def two_halves() -> list[np.ndarray]:
 def test_walls_that_no_grid_sees_are_reported(wall, told, caplog):
     rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
     assert ContactGeometry(rod.sdf, rod.nodes, (), NOTHING).grid is not None
-    assert ("things may pass through" in caplog.text) is told and "--thicken" not in caplog.text
+    assert ("bodies may pass through" in caplog.text) is told and "--thicken" not in caplog.text
 
 
 CONVEX = {

@@ -164,7 +164,7 @@ def test_grids_that_cannot_be_are_refused() -> None:
     with pytest.raises(SdfsimError, match="no extent"):
         sample_grid(SphereSdf(0.5), np.array([[-np.inf] * 3, [np.inf] * 3]), 8)
     for shape in ((4, 4, 5), (4, 4), (1, 1, 1)):
-        with pytest.raises(ValueError, match="as many samples"):
+        with pytest.raises(ValueError, match="equal numbers of samples"):
             GridSdf(torch.zeros(shape), Frame(np.zeros(3), 1.0), BOUNDS)
 
 

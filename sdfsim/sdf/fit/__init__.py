@@ -1,8 +1,8 @@
-"""SDF networks from exact distances: training, and the certificate at its end."""
+"""Fits SDF networks to exact distances: training, and the certificate at its end."""
 
 from typing import Literal
 
 Recipe = Literal["quick", "default", "paper"]
 
-# Changes whenever the same mesh would come out differently; part of every cache key.
+# Increase it whenever the same mesh would be fitted differently; it is part of every cache key.
 FIT_VERSION = 8

@@ -1,4 +1,4 @@
-"""How good a fitted SDF is on points that it was not fitted to, and how well nodes stand for a surface."""
+"""The quality of a fitted SDF on held-out points, and how well nodes cover a surface."""
 
 import math
 from typing import Any
@@ -23,9 +23,9 @@ EXACT = {
     "sign_errors": 1.0e-3,
     "walls_lost": 1.0e-3,
 }
-# With larger errors than these bodies rest at another height than they should by 5 % of their size, creep, or leave a
-# straight hit more than 6 degrees aside (docs/sdf.md). Distances farther away only decide where contacts are searched
-# for, and 0.8 of them is trusted.
+# With larger errors bodies rest at a height that is wrong by 5 % of their size, creep, or rebound from a straight hit
+# more than 6 degrees aside (docs/sdf.md). Distances farther away only decide where to search for contacts, and only 0.8
+# of such a distance is trusted.
 USABLE = {
     "error_within_0.01": 3.2e-3,
     "error_in_box": 2.0e-2,
@@ -36,17 +36,19 @@ USABLE = {
 }
 SIGN_FROM = 0.002
 WALL_FROM = 1e-5  # thinner walls do not count
-# Of half its thickness: how deep the middle of a wall is at least, whose sides make at most 26 degrees.
+# Least depth of the middle of a wall, as a part of half its thickness, if the angle between its sides is at most 26
+# degrees.
 PARALLEL = 0.9
 FAR_FROM = 0.1
 FAR_HALF = 2.0  # half extent of the cube in which the far field is tested
 FAR_FROM_A_NODE = 0.1
-EXPOSED_STEP = 5e-4  # a surface sample is hidden where this far along its normal is inside
+EXPOSED_STEP = 5e-4  # a surface sample is hidden if the point this far along its normal is inside
 
 
 def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None, points: int = 10_000) -> dict:
-    """Errors of `sdf` on held-out points near the surface, in the fitted box and beyond it, ready for JSON (None: could
-    not be measured, as where an open mesh leaves the sign in doubt); lengths relative to the largest extent.
+    """Errors of `sdf` on held-out points near the surface, in the fitted box and beyond it, ready for JSON. Lengths are
+    relative to the largest extent. None: could not be measured, for example because an open mesh leaves the sign in
+    doubt.
 
     Points within 0.01 and within 0.1 are spread over the surface by area and moved by normal noise of 0.006 and 0.06;
     those of the box are uniform in [-0.7, 0.7]^3 of the normalised frame.
@@ -58,12 +60,13 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
     distance farther than 0.1, out to [-2, 2]^3 (a step as long as f goes through the surface where it is above 1);
     `coverage` of the nodes [K, 3] m, if there are any; and the result of `verdict`.
     """
-    # A stream of its own, so that no seed of the fit draws these points.
+    # Its own random stream, so that no seed of the fit draws these points.
     rng = np.random.default_rng([1, 0xCE47])
     frame = normal_frame(oracle.bounds)
 
     def evaluate(local: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Metres, true and given distance, nearest place and gradient at normalised points whose sign is known."""
+        """For normalised points whose sign is known: the points in metres, true distance, distance by the SDF, nearest
+        surface point and gradient."""
         metres = frame.outward(local)
         truth = oracle(metres)
         usable = truth.trusted | oracle.closed
@@ -84,7 +87,7 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
             local = rng.uniform(-BOX, BOX, (points, 3))
         found = evaluate(local)
         far.append(found[1:3])
-        # What lies beyond a kind's limit does not count.
+        # Points beyond the limit of their kind do not count.
         metres, true, value, closest, gradient = (part[np.abs(found[1]) <= limit] for part in found)
         counted.append((true, value))
         result[f"error_{key}"] = mean(np.abs(value - true))
@@ -107,17 +110,17 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
     if nodes is not None:
         result["coverage"] = coverage(nodes, oracle)
     result.update(verdict(result))
-    # None for what could not be measured: JSON has no NaN.
+    # None for values that could not be measured: JSON has no NaN.
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
 
 
 def walls_lost(sdf: Sdf, oracle: DistanceOracle, *, points: int = 4000) -> float:
     """The part of the surface, by area, behind which the solid is missing: the middle of the wall there is not inside.
-    Signs that count only from a fixed distance on do not show thinner walls.
+    `sign_errors`, which counts from a fixed distance on, misses thinner walls.
 
-    A middle lies halfway between a surface sample and where a straight line inwards comes out again, and then twice
-    halfway between the nearest place of the surface and the place opposite. Edges, where walls run out, do not count.
-    NaN where no middle is known to be inside.
+    The middle is first halfway between a surface sample and the point where a straight line inwards leaves the solid;
+    then, twice, halfway between the nearest surface point and the point opposite. Edges, where walls end, do not count.
+    NaN if no middle is known to be inside.
     """
     frame = normal_frame(oracle.bounds)
     samples, inwards = sample_surface(oracle.surface, points, np.random.default_rng([1, 0x3A11]))
@@ -140,8 +143,8 @@ def walls_lost(sdf: Sdf, oracle: DistanceOracle, *, points: int = 4000) -> float
 
 
 def certify_grid(grid: GridSdf, oracle: DistanceOracle) -> dict:
-    """The certificate of samples of the truth: `walls_lost`, and as of `verdict` whether it is too much. Between its
-    samples a grid knows nothing of a wall that is thinner than its cells."""
+    """The certificate of a grid of exact samples: `walls_lost`, and, as in `verdict`, whether it is too large. A grid
+    can miss walls that are thinner than its cells."""
     lost, limit = walls_lost(grid, oracle), USABLE["walls_lost"]
     cell = 2 * BOX * grid.frame.scale / (grid.resolution - 1)
     advice = f"its cells are {cell:.2g} m: take a higher resolution, or sdf: mesh"
@@ -150,11 +153,11 @@ def certify_grid(grid: GridSdf, oracle: DistanceOracle) -> dict:
 
 
 def verdict(errors: dict) -> dict:
-    """What a simulation can make of a field with such errors: `passed` if usable, else `reason`, the first limit of
-    `USABLE` that it misses; `caveat`, the first limit of `EXACT` that a usable field misses."""
+    """Whether a simulation can use a field with these errors: `passed`; `reason`, the first limit of `USABLE` that it
+    misses; and `caveat`, the first limit of `EXACT` that a usable field misses."""
 
     def missed(limits: dict[str, float], word: str) -> str:
-        # Written so that NaN misses too.
+        # Written so that NaN counts as a miss.
         found = (f"{k} is {errors[k]:.2g}, {word} {limit:.2g}" for k, limit in limits.items() if not errors[k] <= limit)
         return next(found, "")
 
@@ -163,16 +166,16 @@ def verdict(errors: dict) -> dict:
 
 
 def coverage(nodes: np.ndarray, oracle: DistanceOracle) -> dict:
-    """How evenly nodes [K, 3] m stand for a surface, ready for JSON, relative to the largest extent: the `count` of
-    nodes, `largest_hole` (largest distance from a surface sample to the nearest node), `uncovered` (fraction of the
-    surface farther than 0.1 from every node) and `off_surface` (largest distance of a node from the surface)."""
+    """How evenly nodes [K, 3] m cover a surface, ready for JSON, relative to the largest extent: the `count` of nodes,
+    `largest_hole` (largest distance from a surface sample to the nearest node), `uncovered` (fraction of the surface
+    farther than 0.1 from every node) and `off_surface` (largest distance of a node from the surface)."""
     from scipy.spatial import KDTree
 
     frame = normal_frame(oracle.bounds)
     if len(nodes) == 0:
         return {"count": 0, "largest_hole": None, "uncovered": 1.0, "off_surface": None}
     samples, normal = sample_surface(oracle.surface, 20_000, np.random.default_rng([1, 0xC0E4]))
-    if oracle.closed:  # overlapping parts hide faces, and so do the seams between convex pieces
+    if oracle.closed:  # overlapping parts and the seams between convex pieces hide faces
         outside = oracle(samples + EXPOSED_STEP * frame.scale * normal).distance > 0
         samples = samples[outside] if outside.any() else samples
     gap = KDTree(frame.inward(nodes)).query(frame.inward(samples))[0]

@@ -6,9 +6,9 @@ import torch
 class Soap:
     """SOAP (Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam", 2024) on a small network.
 
-    For each matrix gradient G of `parameters`, each [L, rows, columns] of L equal layers, it tracks averages of G G^T
-    and G^T G, and runs Adam in the basis of their eigenvectors, which one step of orthogonal iteration follows every
-    few updates. The first step only sets up the bases. A dimension of size 1 is not rotated.
+    For each matrix gradient G of `parameters`, each [L, rows, columns] for L equal layers, it tracks averages of G G^T
+    and G^T G, and runs Adam in the basis of their eigenvectors. One step of orthogonal iteration updates this basis
+    every few steps. The first step only sets up the bases. A dimension of size 1 is not rotated.
     """
 
     MOMENTUM, SECOND, LEAST = 0.95, 0.95, 1e-10
@@ -32,7 +32,7 @@ class Soap:
 
     @torch.no_grad()
     def step(self, factor: float) -> None:
-        """Apply the gradients; `factor` is of the learning-rate schedule."""
+        """Apply the gradients; `factor` multiplies the learning rate (its schedule)."""
         self.count += 1
         for parameter, state in zip(self.parameters, self.state, strict=True):
             gradient = parameter.grad
@@ -55,7 +55,7 @@ class Soap:
         return direction @ state["right_basis"].mT if "right_basis" in state else direction
 
     def _follow(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> None:
-        """Update the averages of G G^T and G^T G, and now and then their eigenvectors."""
+        """Update the averages of G G^T and G^T G, and every few steps their eigenvectors."""
         for side, product in (("left", gradient @ gradient.mT), ("right", gradient.mT @ gradient)):
             average = state.get(f"{side}_average")
             if average is None:

@@ -1,4 +1,4 @@
-"""Exact distances -> SDF network: recipes, the points a fit learns from, the training loop."""
+"""From exact distances to an SDF network: recipes, training points and the training loop."""
 
 import math
 import time
@@ -24,54 +24,55 @@ from sdfsim.sdf.sdf import Sdf
 # Weights and biases per layer, [out, in] and [out].
 Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
 
-# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
+# Points are also drawn slightly outside the box that is used: at the edge of its data a network's slope is poor.
 MARGIN = 1.15
-# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
+# A solid is fitted on one side only if its distances agree with their mirror images to this, relative to its size.
 SAME = 1e-4
-# A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
+# During training a fit is checked on this many points of each of three kinds: with these spreads around the surface,
+# and in the box.
 CHECKED = 4000
 CHECKED_SIGMAS = (0.006, 0.06)
-# Weights of the first periodic layer are uniform in +- this; it sets the finest scale that a fit starts with.
+# Weights of the first periodic layer are uniform in +- this, which sets the finest scale that a fit starts with.
 FIRST = 8.0
 WARMUP = 50  # updates
 CHECK_EVERY = 100  # updates
-# Seconds that the certificate takes of a budget, beside a tenth.
+# Seconds of a budget that are kept for the certificate, besides a tenth.
 RESERVE = 2.0
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """One recipe; the defaults were chosen by measurement on scanned and thin-walled shapes.
+    """A recipe for fits; the defaults were chosen by measurements on scanned and thin-walled shapes.
 
-    Lengths are relative to the shape's largest extent. The box gets its share of points and the loss stays soft up to
-    some hundredths of the size, without which the far field is off by as much.
+    Lengths are relative to the shape's largest extent. Part of the points are in the box, and the loss is soft up to
+    some hundredths of the size; without both, the far field would be wrong by as much.
     """
 
-    # of the hidden layers; "relu" is trained as the paper does: by Adam, on both sides of every mirror plane, and by
-    # signs only where the paper's rule trusts them
+    # of the hidden layers. "relu" is trained as in the paper: by Adam, on both sides of every mirror plane, with signs
+    # only where the paper's rule trusts them
     activation: Activation = "wave"
     width: int = 64  # of the hidden layers
     layers: int = 6  # linear layers, the last one included
     lr: float = 1e-2  # step size
-    decay: float = 0.5  # the part of the steps over which it falls to zero, at the end (0: constant)
+    decay: float = 0.5  # part of the steps, at the end, over which the step size falls to zero (0: constant)
     steps: int = 5000  # updates
-    batch: int = 4096  # points an update
-    # points lie this far from the surface (standard deviation, log-uniform between the two)
+    batch: int = 4096  # points per update
+    # distance of points from the surface (standard deviation, log-uniform between the two)
     sigmas: tuple[float, float] = (0.002, 0.15)
     near: float = 0.8  # fraction of points near the surface; the others are uniform in the box
     resample: int = 0  # updates between fresh pools of points (0: one pool)
     pool: int = 400_000  # points in a pool
-    soften: float | None = 0.04  # errors count with soften / (|distance| + soften); None counts all alike
-    # errors of the averaged weights at which the decay begins early, which halves them: of the distance (means within
-    # 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction wrong farther
-    # than 0.002). None never stops early.
+    soften: float | None = 0.04  # errors have the weight soften / (|distance| + soften); None: all have the same
+    # errors of the averaged weights at which the decay begins early (the decay halves them): of the distance (means
+    # within 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction wrong
+    # farther than 0.002). None: never stop early
     goal: tuple[float, float, float, float] | None = (7e-4, 6e-3, 4e-3, 1.3e-3)
     settle: int = 1000  # steps of an early decay
 
 
 RECIPES = {
     "default": FitOptions(),
-    # A surface from a few minutes of training is not known as exactly as a full fit would follow it.
+    # A surface from a few minutes of training is not exact enough for a full fit.
     "quick": FitOptions(steps=1500, settle=600, pool=200_000),
     # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
     "paper": FitOptions(
@@ -100,8 +101,8 @@ def fit_sdf(
     on_progress: Progress,
     device: torch.device | str,
 ) -> tuple[MlpSdf, np.ndarray, dict]:
-    """Fit a network to the distances of a solid within `budget` s (None: no limit). Returns it, the nodes [K, 3] m that
-    `pick` takes from it, and its certificate. Raises SdfsimError for a budget that is not positive."""
+    """Fit a network to the distances of a solid within `budget` s (None: no limit). Returns the network, the nodes [K,
+    3] m that `pick` takes from it, and its certificate. Raises SdfsimError if the budget is not positive."""
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started, options = time.monotonic(), RECIPES[recipe]
@@ -136,20 +137,20 @@ class Pool(NamedTuple):
 
     points: torch.Tensor  # [P, 3]
     distance: torch.Tensor  # [P] signed
-    signed: torch.Tensor  # [P] bool, whether the sign of the distance counts
+    signed: torch.Tensor  # [P] bool, whether the sign of the distance is known
     direction: torch.Tensor  # [P, 3] unit, from the surface outwards; zero on the surface itself
 
 
 class _Fit:
-    """A network in training, and samples of the solid that it learns. The decay of its steps begins at update `turn`
-    and ends at `stop`; an early stop or a short budget moves both forward."""
+    """A network in training, and samples of its solid. The decay of the step size begins at update `turn` and ends at
+    `stop`; an early stop or a short budget moves both forward."""
 
     def __init__(self, oracle: DistanceOracle, options: FitOptions, seed: int, device: torch.device) -> None:
         self.oracle, self.options, self.device, self._seed = oracle, options, device, seed
         self.frame = normal_frame(oracle.bounds)
         self.mirrors = self._mirrors() if options.activation == "wave" else (False, False, False)
         self.pool = self._pool(0)
-        # Points to judge by on the way: `CHECKED` of each of three kinds.
+        # Points for checks during training: `CHECKED` of each of three kinds.
         sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
         self.check = self._sample(sigma, CHECKED, np.random.default_rng([seed, 1]))
         # Drawn on the CPU, so that points and first weights do not depend on the device.
@@ -164,7 +165,7 @@ class _Fit:
         self._tape = Tape(options.activation, options.width, options.layers, self.parameters[0])
 
     def _pool(self, step: int) -> Pool:
-        """Points to learn from, as drawn before update `step`."""
+        """Training points as drawn before update `step`."""
         options = self.options
         rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
         near = int(options.pool * options.near)
@@ -173,7 +174,7 @@ class _Fit:
         return self._sample(sigma, options.pool - near, rng)
 
     def _sample(self, sigma: np.ndarray, elsewhere: int, rng: np.random.Generator) -> Pool:
-        """Points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
+        """N points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
         local = self.frame.inward(sample_surface(self.oracle.surface, len(sigma), rng)[0])
         around = local + sigma * rng.standard_normal((len(sigma), 3))
         local = np.concatenate([around, rng.uniform(-MARGIN * BOX, MARGIN * BOX, (elsewhere, 3))])
@@ -181,17 +182,17 @@ class _Fit:
         truth = self.oracle(self.frame.outward(local))
         distance = truth.distance / self.frame.scale
         signed = truth.trusted | (self.oracle.closed and self.options.activation == "wave")
-        # So close to the surface the direction from it is rounding.
+        # This close to the surface the direction from it is only rounding error.
         clear = np.abs(distance) > 1e-4
         offset = local - self.frame.inward(truth.closest)
         direction = np.where(clear[:, None], offset / np.where(clear, distance, 1.0)[:, None], 0.0)
-        # What lies on the other side of a mirror plane is learned from its image.
+        # Points on the other side of a mirror plane are replaced by their images.
         side = np.where(np.asarray(self.mirrors) & (local < 0), -1.0, 1.0)
         where, away, along = (torch.from_numpy(x).float() for x in (local * side, distance, direction * side))
         return Pool(*(part.to(self.device) for part in (where, away, torch.from_numpy(signed), along)))
 
     def _mirrors(self) -> tuple[bool, bool, bool]:
-        """Across which planes of its frame the solid is its own mirror image, by sampled distances."""
+        """For each plane of the frame, whether the solid is its own mirror image, by sampled distances."""
         rng = np.random.default_rng(0)
         local = self.frame.inward(sample_surface(self.oracle.surface, 2000, rng)[0])
         local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
@@ -223,8 +224,8 @@ class _Fit:
             mean.lerp_(parameter, 0.02)
 
     def differentiate(self, chosen: torch.Tensor) -> None:
-        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known, at the points of the
-        pool that are chosen [T]; fills the gradients."""
+        """Fill the gradients of the weighted L1 loss at the `chosen` [T] points of the pool: of the signed distance, or
+        of the unsigned one if the sign is not known."""
         points, distance, signed, _ = (part[chosen.to(self.device)] for part in self.pool)
         weights, biases = _layers(self.parameters, self.options.activation)
         value = self._tape.forward(weights, biases, points)
@@ -238,7 +239,7 @@ class _Fit:
             gradient.mul_(scale)
 
     def judge(self) -> tuple[float, float]:
-        """Begin the decay where the goal is met. Returns mean errors near the surface and in the box."""
+        """Begin the decay if the goal is met. Returns mean errors near the surface and in the box."""
         layers = _layers(self.average, self.options.activation)
         value, gradient = value_and_gradient(*layers, self.options.activation, self.check.points)
         distance, signed = self.check.distance, self.check.signed
@@ -254,8 +255,9 @@ class _Fit:
         return near, far
 
     def hurry(self, possible: int) -> None:
-        """Place decay and end so that `possible` updates in all suffice. Until the decay has begun the end moves both
-        ways, since the first steps of a busy machine predict little; after that it only comes nearer."""
+        """Set the start of the decay and the end so that at most `possible` updates are made in all. Until the decay
+        has begun the end may move both ways, since the first steps on a busy machine predict little; after that it only
+        moves nearer."""
         begun = self.step >= self.turn
         self.stop = min(self.stop if begun else self.options.steps, max(possible, self.step))
         if not begun:
@@ -293,7 +295,7 @@ _SCALES = {"wave": (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0), "rel
 
 
 def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
-    """What the networks compute with."""
+    """The layers as networks use them."""
     return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)])
 
 
