@@ -1,1 +1,1 @@
-"""Rigid motion: bodies and states, free flight, the contact solve, and what judges a motion."""
+"""Rigid motion: bodies and states, free flight, the contact solve, and the instruments that judge a motion."""

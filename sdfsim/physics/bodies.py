@@ -1,4 +1,5 @@
-"""A scene as arrays in the model's units: what stays constant while it is simulated, and the state that changes."""
+"""A scene as arrays in the model's units: the part that stays constant during a simulation, and the state that
+changes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -23,10 +24,10 @@ from sdfsim.shape.shape import Shape
 
 @dataclass(frozen=True)
 class Units:
-    """How many metres, seconds and kilograms one model unit is.
+    """Size of one model unit in metres, seconds and kilograms.
 
-    Rigid contact is invariant when lengths are scaled by `length`, times by sqrt(length / gravity) and masses by
-    anything (Froude scaling), so one trained model serves every size and every planet.
+    Rigid contact does not change if lengths are scaled by `length`, times by sqrt(length / gravity) and masses by any
+    factor (Froude scaling). So one trained model serves every size and every planet.
     """
 
     length: float
@@ -35,26 +36,26 @@ class Units:
 
     @property
     def velocity(self) -> float:
-        """m/s in one model unit of velocity."""
+        """One model unit of velocity, m/s."""
         return self.length / self.time
 
     @property
     def acceleration(self) -> float:
-        """m/s^2 in one model unit of acceleration."""
+        """One model unit of acceleration, m/s^2."""
         return self.length / self.time**2
 
     @property
     def energy(self) -> float:
-        """J in one model unit of energy."""
+        """One model unit of energy, J."""
         return self.mass * self.velocity**2
 
     def in_si(self, motion: Motion) -> dict[str, np.ndarray]:
-        """The arrays of a motion in model units, in metres and seconds."""
+        """The arrays of a motion, converted from model units to metres and seconds."""
         return {name: getattr(motion, name) * unit for name, unit in self.motion.items()}
 
     @property
     def motion(self) -> dict[str, float]:
-        """Metres and seconds in one model unit of each array of a `Motion`."""
+        """One model unit of each array of a `Motion`, in metres and seconds."""
         return dict(zip(MOTION, (self.length, 1.0, self.velocity, 1.0 / self.time), strict=True))
 
 
@@ -62,7 +63,7 @@ class Units:
 class Tracks:
     """The paths of K kinematic bodies with up to P poses each, model units."""
 
-    body: np.ndarray  # [K] int64 the bodies they move
+    body: np.ndarray  # [K] int64, the bodies that they move
     time: np.ndarray  # [K, P] float64, increasing; infinite beyond the last pose of a path
     origin: np.ndarray  # [K, P, 3] float64, of the shapes' own origins
     orientation: np.ndarray  # [K, P, 4] float64 xyzw
@@ -81,7 +82,8 @@ class Tracks:
         return origin + pose.rotate(orientation, self.com), orientation
 
     def velocity(self, time: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Mean velocity [K, 3] and angular velocity [K, 3] from `time` to `time + dt`: what leads from pose to pose."""
+        """Mean velocity [K, 3] and angular velocity [K, 3] from `time` to `time + dt`: those that lead from pose to
+        pose."""
         (place, turn), (later, turned) = self.at(time), self.at(time + dt)
         return (later - place) / dt, pose.to_rotvec(pose.multiply(turned, pose.conjugate(turn))) / dt
 
@@ -105,15 +107,15 @@ class Bodies:
     radius: np.ndarray  # [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane)
     node: np.ndarray  # [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled
     node_start: np.ndarray  # [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1]
-    # [F, 3] int64, corners of the surfaces' triangles, indices into `node`; none where nodes are points alone
+    # [F, 3] int64, corners of the surfaces' triangles, indices into `node`; empty if nodes are only points
     face: np.ndarray
-    group: np.ndarray  # [N] int64, what `collides_with` makes of a body
+    group: np.ndarray  # [N] int64, the group of a body by its `collides_with`
     allowed: np.ndarray  # [G, G] bool, whether bodies of two groups may touch
-    world: np.ndarray  # [N] int64: bodies of two worlds never meet; -1 is in all of them
+    world: np.ndarray  # [N] int64: bodies of different worlds never meet; -1 is in all of them
     sdfs: tuple[Sdf, ...]  # signed distances of the shapes that may be touched
-    contact: tuple[ContactGeometry, ...] = ()  # of each of these
-    tracks: Tracks | None = None  # the paths of kinematic bodies, None where there are none
-    joints: Joints | None = None  # None where there are none
+    contact: tuple[ContactGeometry, ...] = ()  # contact geometry of each of these
+    tracks: Tracks | None = None  # the paths of kinematic bodies, None if there are none
+    joints: Joints | None = None  # None if there are none
 
     def __len__(self) -> int:
         return len(self.shape)
@@ -126,13 +128,13 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Touch(Rows):
-    """What the contact solve knows of N bodies from one step to the next."""
+    """What the contact solve keeps about N bodies from one step to the next."""
 
     touching: np.ndarray  # [N] bool, whether contacts acted in the last inner step
-    quiet: np.ndarray  # [N] int64, for how many steps a body in contact has stayed near its anchor
-    anchor: np.ndarray  # [N, 14] float64, pose that it has stayed near, and that half of that time later
-    island: np.ndarray  # [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake
-    pair: np.ndarray  # [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has
+    quiet: np.ndarray  # [N] int64, number of steps that a body in contact has stayed near its anchor
+    anchor: np.ndarray  # [N, 14] float64, the pose that it has stayed near, and its pose half of that time later
+    island: np.ndarray  # [N] int64, a number shared by the bodies that fell asleep together; -1 if awake
+    pair: np.ndarray  # [P, 2] int64, bodies with contact points; count: [P] int64, their number for each pair
     count: np.ndarray
     # [P, POINTS, COLUMNS] float64, see `sdfsim.physics.solver.world`
     point: np.ndarray
@@ -140,45 +142,45 @@ class Touch(Rows):
 
 @dataclass(frozen=True)
 class Moment(Motion):
-    """Where N bodies are and how they move at one instant, in metres and seconds."""
+    """Poses and velocities of N bodies at one instant, in metres and seconds."""
 
     time: float = 0.0  # s, since the start
 
 
 @dataclass(frozen=True)
 class State(Motion):
-    """All that a run goes on from, in model units: where N bodies are and how they move at one instant, what touches,
-    sleeps, pulls and drives. A simulator's `options` and what the scene says are not in it."""
+    """Everything that is needed to continue a run, in model units: poses and velocities of N bodies at one instant,
+    contacts, sleep, pulling forces and motors. A simulator's `options` and the scene are not part of it."""
 
-    # [2, N, 3] and [2, N, 4], the two poses before (oldest first), for networks on surface nodes; None for others
+    # [2, N, 3] and [2, N, 4], the two poses before (oldest first), for networks on surface nodes; None for other models
     earlier_position: np.ndarray | None = None
     earlier_orientation: np.ndarray | None = None
-    touch: Touch | None = None  # contacts and sleep of the solve; None before its first step
-    # [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does
+    touch: Touch | None = None  # contacts and sleep, for the contact solve; None before its first step
+    # [N, 6] force at the centre of mass and torque that pull at a body, world axes; None if nothing pulls
     load: np.ndarray | None = None
-    # [J, STATE] of the joints, see `sdfsim.physics.joint_columns`; None where there are none
+    # [J, STATE] of the joints, see `sdfsim.physics.joint_columns`; None if there are none
     joints: np.ndarray | None = None
-    # [J, NUMBERS] of the joints, where somebody has told one of them something else than the scene does; else None
+    # [J, NUMBERS] of the joints, if a user has changed numbers of one of them; else None
     drive: np.ndarray | None = None
     time: float = 0.0  # since the start
 
     def save(self, path: Path | str) -> Path:
-        """Write an .npz file from which `read` makes the same state, to the last bit. Raises SdfsimError if it
-        cannot be written."""
+        """Write an .npz file from which `read` restores the same state, bit by bit. Raises SdfsimError if it cannot be
+        written."""
         path = Path(path)
         write_arrays(path, self.arrays(), compressed=False)
         return path
 
     @classmethod
     def read(cls, path: Path | str) -> "State":
-        """What `save` has written. Raises SdfsimError if it is missing or none of ours."""
+        """Read a file of `save`. Raises SdfsimError if it is missing or not one of ours."""
         try:
             return cls.of_arrays(read_arrays(Path(path), "a state"))
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{path}: not a state of this version ({error})") from error
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Every array of the state and of what touches in it, by name."""
+        """Every array of the state and of its `touch`, by name."""
         found = {"time": np.array(self.time)}
         for prefix, part in (("", self), ("touch.", self.touch)):
             for f in fields(part) if part is not None else ():
@@ -188,7 +190,7 @@ class State(Motion):
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray]) -> "State":
-        """The state that has these `arrays`; others are left alone."""
+        """The state with these `arrays`; unknown names are ignored."""
 
         def known(kind: type, prefix: str) -> dict[str, np.ndarray]:
             names = {f.name: prefix + f.name for f in fields(kind) if f.name != "time"}
@@ -205,7 +207,7 @@ def awake(bodies: Bodies, state: State) -> np.ndarray:
 
 
 def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
-    """Bodies and initial state of a scene, in model units. Raises SdfsimError if a body that moves has no mass or no
+    """Bodies and initial state of a scene, in model units. Raises SdfsimError if a dynamic body has no mass or no
     surface nodes."""
     shapes = [scene.shapes[b.shape] for b in scene.bodies]
     for body, shape in zip(scene.bodies, shapes, strict=True):
@@ -269,8 +271,8 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
 
 
 def _tracks(paths: Sequence[tuple[int, Waypoints]], com: np.ndarray, *, length: float, time: float) -> Tracks | None:
-    """The paths of a scene, in SI units by the number of the body, as tracks; None where there are none. Centres of
-    mass [N, 3] from the shapes' origins are in model units, of which one is `length` m and `time` s."""
+    """The tracks of a scene's paths (pairs of a body's number and its path in SI units); None if there are none. `com`
+    [N, 3] are the centres of mass from the shapes' origins, in model units of `length` m and `time` s."""
     if not paths:
         return None
     most = 1 + max(len(path.time) for _, path in paths)

@@ -1,4 +1,5 @@
-"""Free flight in closed form: ballistic motion, and torque-free rotation that keeps its angular momentum; of states."""
+"""Free flight: ballistic motion in closed form, and torque-free rotation that conserves angular momentum; also for
+whole states."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from sdfsim.physics.options import Options
 from sdfsim.physics.pose import from_rotvec, multiply, normalise, to_matrix
 
 MAX_TURN = 0.1  # rad of rotation per inner step of the torque-free rotation
-MOST_TURN = 100.0  # rad of rotation that a step can follow
+MOST_TURN = 100.0  # rad of rotation in a step, beyond which it is not exact
 
 
 def ballistic(
@@ -25,15 +26,15 @@ def ballistic(
 def torque_free(
     orientation: np.ndarray, angular_velocity: np.ndarray, inertia: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation of bodies on which no torque acts: orientation [N, 4] and angular velocity [N, 3] rad/s, world, after
-    `dt` s, by inertias [N, 3, 3] kg m^2 in body axes.
+    """Rotation without torque: orientation [N, 4] and angular velocity [N, 3] rad/s, world, after `dt` s, for inertias
+    [N, 3, 3] kg m^2 in body axes.
 
-    The world angular momentum is held exactly; the orientation follows dR/dt = [R I^-1 R^T L] R by a
-    Runge-Kutta-Munthe-Kaas method of order 4, each inner step turning at most `MAX_TURN`. Beyond `MOST_TURN` in all it
-    is no longer exact.
+    The angular momentum in world axes is conserved exactly; the orientation follows dR/dt = [R I^-1 R^T L] R by a
+    Runge-Kutta-Munthe-Kaas method of order 4, each inner step turning at most `MAX_TURN`. If the total is beyond
+    `MOST_TURN`, the result is no longer exact.
     """
     turning = np.flatnonzero((angular_velocity != 0).any(-1))
-    if len(turning) < len(orientation):  # what does not turn stays as it is
+    if len(turning) < len(orientation):  # bodies that do not turn stay as they are
         after = orientation.copy(), angular_velocity.copy()
         if len(turning):
             some = torque_free(orientation[turning], angular_velocity[turning], inertia[turning], dt)
@@ -80,7 +81,7 @@ def _rkmk4(q: np.ndarray, start: np.ndarray, spin: Callable[[np.ndarray], np.nda
 
 
 def driven(bodies: Bodies, state: State, dt: float) -> State:
-    """Scripted bodies take the velocities that lead them along their paths in the coming step."""
+    """Give scripted bodies the velocities that lead them along their paths in the coming step."""
     if bodies.tracks is None:
         return state
     velocity, angular = bodies.tracks.velocity(state.time, dt)
@@ -88,7 +89,7 @@ def driven(bodies: Bodies, state: State, dt: float) -> State:
 
 
 def fly(bodies: Bodies, state: State, options: Options) -> State:
-    """Free flight of every body that moves: exact, whatever the step. Scripted bodies go on along their paths."""
+    """Free flight of every dynamic body: exact, whatever the step. Scripted bodies continue along their paths."""
     rows, after = awake(bodies, state), state
     if len(rows):
         pull = options.gravity
@@ -112,8 +113,8 @@ def fly(bodies: Bodies, state: State, options: Options) -> State:
 
 
 def with_history(state: State, bodies: Bodies, options: Options, changed: np.ndarray | None = None) -> State:
-    """The state with the two poses that bodies would have come from in free flight: those that were `changed` [N] bool,
-    all of them where it has no earlier poses, or None is given."""
+    """The state with the two earlier poses that free flight would give: for the `changed` [N] bool bodies, or for all
+    bodies if the state has no earlier poses or `changed` is None."""
     back = options._replace(dt=-options.dt)
     one = fly(bodies, replace(state, earlier_position=None, earlier_orientation=None), back)
     two = fly(bodies, one, back)
@@ -125,7 +126,7 @@ def with_history(state: State, bodies: Bodies, options: Options, changed: np.nda
 
 
 def _turned(bodies: Bodies, state: State, rows: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Orientation and angular velocity after free flight; a torque acts half before and half after it."""
+    """Orientation and angular velocity after free flight; half of a torque's effect comes before it and half after."""
     orientation, angular = (state.rows_of(name, rows) for name in ("orientation", "angular_velocity"))
     inertia = bodies.inertia[rows]
     if state.load is None:

@@ -1,4 +1,5 @@
-"""What judges a motion, whatever made it: overlap and free space of true surfaces, and an account of energy.
+"""Instruments that judge a motion, whatever made it: overlap and free space between true surfaces, and an account of
+energy.
 
 Nothing here uses the contact search, baked grids or the solver's own penetration: only poses, velocities, shapes'
 closed forms and meshes.
@@ -22,31 +23,31 @@ from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Joint, Scene
 from sdfsim.shape.shape import Shape
 
-DEEP = 0.01  # of the smaller thickness of two bodies: who is deeper in another is told
-FREE = 0.005  # likewise, of free space around a body that something pushes or holds up
-MADE = 0.01  # of the energy in play, beyond which what came from nothing is told
-SHARE = 0.1  # of what lifts a body by its own size, that is in play at least
-FADE = 0.9  # of what was in play before is so much, whenever energy is lost
-PART, LEAST = 0.05, 0.1  # of a run's time that the surfaces may take, and s that they may take anyway
-FEW, MANY = 32, 4096  # pairs that are measured together at first, and at most
-LOOSE = 0.001  # of the size of the smaller body, by which a joint may be from holding
-FEW_BODIES = 64  # that move: of more, energy is accounted for together only
+DEEP = 0.01  # relative to the smaller thickness of two bodies: a deeper overlap is reported
+FREE = 0.005  # likewise: wider free space around a body that something pushes or holds up is reported
+MADE = 0.01  # relative to the available energy: larger gains from nothing are reported
+SHARE = 0.1  # available energy is at least this part of what lifts a body by its own size
+FADE = 0.9  # whenever energy is lost, this part of the earlier available energy remains so
+PART, LEAST = 0.05, 0.1  # part of a run's time that measuring surfaces may take, and s that it may always take
+FEW, MANY = 32, 4096  # pairs that are measured together: at first, and at most
+LOOSE = 0.001  # relative to the size of the smaller body: how far a joint's parts may be apart
+FEW_BODIES = 64  # dynamic bodies: with more, only their total energy is accounted for
 
 
 @dataclass(frozen=True)
 class Energy:
-    """Energy that came from nothing: mechanical energy may be lost, and only pulls and bodies on paths may add to it.
+    """Energy that came from nothing: mechanical energy may be lost, but only pulls and bodies on paths may add to it.
 
     Attributes:
-        sum_J: all steps in which it grew.
-        worst: the largest of a step, as a part of what was in play then.
-        steps_above_1_percent: the part of the steps that made more than 0.01 of that.
-        climb_J: the most by which the energy of the scene, or of one body while it touched no other that moves, ever
-            stood above an earlier time.
-        climb: likewise, the most as a part of what was in play at that earlier time: kinetic energy, what it gained in
+        sum_J: total gain over all steps in which energy grew.
+        worst: the largest gain of a step, relative to the energy available then.
+        steps_above_1_percent: the part of the steps that gained more than 0.01 of that.
+        climb_J: the largest rise of energy above an earlier time, of the scene, or of one body while it touched no
+            other moving body.
+        climb: likewise, relative to the energy available at that earlier time: kinetic energy, what it gained in
             falling since, and a tenth of what lifts the body by its own size.
-        body: whose that is; empty for the scene.
-        at_s: when.
+        body: the body of this rise; empty for the scene.
+        at_s: time of this rise, s.
     """
 
     sum_J: float
@@ -59,12 +60,12 @@ class Energy:
 
 
 class Near(NamedTuple):
-    """Two bodies that are in each other, or that are apart while something acts."""
+    """Two bodies that overlap, or that are apart although something acts on one of them."""
 
-    metres: float  # how deep, or how far apart
-    part: float  # of the smaller thickness of the two
+    metres: float  # depth or distance
+    part: float  # the same, relative to the smaller thickness of the two
     first: str
-    second: str  # empty where nothing is near
+    second: str  # empty if nothing is near
     at_s: float
 
 
@@ -74,10 +75,10 @@ class Verdict:
 
     Attributes:
         energy: see `Energy`.
-        overlap: the deepest of bodies in each other, as a part of the smaller thickness; None where there is none.
-        floating: the widest free space around a body that was pushed or held up all the same; None where there is none.
-        frames: how many frames the surfaces were measured in.
-        broken: a line for each law that is broken.
+        overlap: the deepest overlap of two bodies, relative to the smaller thickness; None if there is none.
+        floating: the widest free space around a body that was nevertheless pushed or held up; None if there is none.
+        frames: number of frames in which surfaces were measured.
+        broken: one line for each law that is broken.
     """
 
     energy: Energy
@@ -101,11 +102,11 @@ def judged(
     scene: Scene | SceneBuilder | Path | str, rollout: Rollout, *, seconds: float = np.inf, every: int = 1,
     on_progress: Progress = silent,
 ) -> Verdict:  # fmt: skip
-    """What a motion of a scene breaks of the laws that hold of all rigid bodies.
+    """Check a motion of a scene against the laws that hold for all rigid bodies.
 
-    Surfaces are measured in every so many frames; where they would take longer than `seconds`, in fewer, spread evenly,
-    the last always among them. `on_progress` is called with the share of these frames that are measured. Scenes that
-    are not loaded yet are, as `Simulator` loads them.
+    Surfaces are measured in every `every`-th frame; if that would take longer than `seconds`, in fewer frames, spread
+    evenly and always including the last. `on_progress` is called with the share of these frames that are measured. A
+    scene that is not loaded yet is loaded as `Simulator` does.
     """
     scene = loaded(scene)
     energy = energy_account(scene, rollout)
@@ -114,23 +115,23 @@ def judged(
     loose = _loosest(scene, rollout)
     if loose is not None and loose.part > LOOSE:
         broken.append(
-            f"joint: {loose.first!r} is {loose.metres:.2g} m from holding at {loose.at_s:.2f} s, "
+            f"joint: {loose.first!r} is {loose.metres:.2g} m off at {loose.at_s:.2f} s, "
             f"{100 * loose.part:.2g} % of the size of its smaller body"
         )
     if overlap is not None and overlap.part > DEEP:
         broken.append(
-            f"overlap: {overlap.first!r} and {overlap.second!r} are {overlap.metres:.2g} m in each other at "
-            f"{overlap.at_s:.2f} s, {100 * overlap.part:.2g} % of the thinner's thickness"
+            f"overlap: {overlap.first!r} and {overlap.second!r} are {overlap.metres:.2g} m deep in each other at "
+            f"{overlap.at_s:.2f} s, {100 * overlap.part:.2g} % of the thinner one's thickness"
         )
     if floating is not None:
         beside = f"{floating.second!r} is {floating.metres:.2g} m away" if floating.second else "nothing is near it"
         broken.append(f"floating: {floating.first!r} is held or pushed at {floating.at_s:.2f} s, and {beside}")
     if energy.climb > MADE or energy.worst > MADE:
         whose = f" of {energy.body!r}" if energy.body else ""
-        steps = f"{100 * energy.steps_above_1_percent:.1f} % of the steps made more than 1 % of what was in play"
+        steps = f"{100 * energy.steps_above_1_percent:.1f} % of the steps gained more than 1 % of the available energy"
         broken.append(
             f"energy from nothing: {energy.climb_J:.3g} J{whose} by {energy.at_s:.2f} s, {100 * energy.climb:.2g} % of "
-            f"what was in play; {steps}, the worst {100 * energy.worst:.2g} %"
+            f"the available energy; {steps}, the worst {100 * energy.worst:.2g} %"
         )
     return Verdict(energy, overlap, floating, frames, tuple(broken))
 
@@ -139,8 +140,8 @@ def judged(
 
 
 def energies(scene: Scene, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of every body, 0 unless it is dynamic: kinetic and potential energy [T+1, N] J, the latter from its first frame
-    on, and what lifts it by its own size [N] J."""
+    """For every body (0 unless it is dynamic): kinetic and potential energy [T+1, N] J, the latter relative to the
+    first frame, and the energy that lifts it by its own size [N] J."""
     shape = rollout.position.shape[:2]
     kinetic, potential, lift = np.zeros(shape), np.zeros(shape), np.zeros(shape[1])
     strength = float(np.linalg.norm(scene.gravity))
@@ -160,8 +161,8 @@ def energies(scene: Scene, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np
 
 
 def energy_account(scene: Scene, rollout: Rollout) -> Energy:
-    """By how much mechanical energy has grown, step by step and in all. What pulls and pushes give (the
-    counter `energy_given`) is taken off; steps in which a body on a path touches something may gain what they like."""
+    """How much mechanical energy has grown, step by step and in all. Work of pulls and pushes (the counter
+    `energy_given`) is subtracted; steps in which a body on a path touches something are not limited."""
     kinetic, potential, lift = energies(scene, rollout)
     steps, count = len(rollout), len(scene.bodies)
     dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
@@ -196,19 +197,19 @@ def energy_account(scene: Scene, rollout: Rollout) -> Energy:
 
 
 def _joints(scene: Scene) -> tuple[Joint, ...]:
-    """The joints that are in play."""
+    """The joints that are switched on."""
     return () if scene.effects.joints == "off" else scene.joints
 
 
 def held_bodies(scene: Scene) -> np.ndarray:
-    """[N] bool, the bodies that joints hold: these may push and pull, where nothing touches."""
+    """[N] bool, the bodies that joints hold: joints may push and pull them without contact."""
     held = np.zeros(len(scene.bodies), bool)
     held[[b for joint in _joints(scene) for b in joint.bodies if b >= 0]] = True
     return held
 
 
 def _of_springs(scene: Scene, rollout: Rollout) -> np.ndarray:
-    """[T+1] J, the energy of springs of joints."""
+    """[T+1] J, the energy in springs of joints."""
     total = np.zeros(len(rollout.time))
     for k, joint in enumerate(_joints(scene)):
         if joint.spring is not None and rollout.joint_names:
@@ -217,8 +218,8 @@ def _of_springs(scene: Scene, rollout: Rollout) -> np.ndarray:
 
 
 def _loosest(scene: Scene, rollout: Rollout) -> Near | None:
-    """The joint that is farthest from holding, as a part of the size of the smaller body; those that can break are left
-    out."""
+    """The joint whose parts are farthest apart, relative to the size of the smaller body. Joints that can break are
+    left out."""
     worst: Near | None = None
     sizes = [body.scale * largest_extent(scene.shapes[body.shape]) for body in scene.bodies]
     centre = [scene.shapes[body.shape].com * body.scale for body in scene.bodies]
@@ -251,7 +252,7 @@ def _loosest(scene: Scene, rollout: Rollout) -> Near | None:
 
 
 def _beside(scene: Scene, rollout: Rollout) -> np.ndarray:
-    """[T+1, N, N] whether a dynamic body could touch another that moves, by the balls around them, in the step that
+    """[T+1, N, N] whether a dynamic body could touch another moving body, by the balls around them, in the step that
     led to a frame."""
     mover = np.array([b.motion != "static" for b in scene.bodies])
     dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
@@ -272,8 +273,9 @@ def _beside(scene: Scene, rollout: Rollout) -> np.ndarray:
 def _climb(
     course: np.ndarray, kinetic: np.ndarray, floor: np.ndarray, anew: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of K courses of energy [T+1, K] J the highest rise above an earlier time in J, and as a part of what was in play
-    since then, with the frame of the latter, [K] each. An account starts `anew` [T+1, K] with such frames."""
+    """For K courses of energy [T+1, K] J the highest rise above an earlier time, in J and relative to the energy
+    available since then, with the frame of the latter; [K] each. An account starts again at frames where `anew` [T+1,
+    K]."""
     low, play = course[0].copy(), kinetic[0].copy()
     most, part, when = np.zeros(len(low)), np.zeros(len(low)), np.zeros(len(low), int)
     for t in range(1, len(course)):
@@ -283,7 +285,7 @@ def _climb(
             fresh = fresh | anew[t]
         low = np.where(fresh, now, low)
         rise = now - low
-        # What was there already of the motion that there is now. An impact stays in play for a while.
+        # The part of the present motion that existed before. The energy of an impact stays available for a while.
         play = np.maximum(np.where(fresh, FADE * play, play), kinetic[t] - rise)
         whole = play + floor
         share = np.divide(rise, whole, out=np.zeros_like(rise), where=whole > 0)
@@ -297,7 +299,7 @@ def _climb(
 
 
 def in_order(count: int) -> Iterator[int]:
-    """The last of so many frames, the first, the middle, the quarters, ...: each once."""
+    """The numbers of `count` frames, each once: the last, the first, the middle, the quarters, ..."""
     seen = set()
     for value in (count - 1, 0):
         if 0 <= value < count and value not in seen:
@@ -323,7 +325,7 @@ class _Course:
     dynamic: np.ndarray  # [N] bool
     group: np.ndarray  # [N]
     allowed: np.ndarray  # [G, G]
-    pushed: np.ndarray  # [T+1, N] bool: whether something else than gravity acted in the step that led here
+    pushed: np.ndarray  # [T+1, N] bool: whether anything but gravity acted in the step that led here
 
 
 def _surfaces(
@@ -352,7 +354,7 @@ def _surfaces(
         if wide and (widest is None or wide.part > widest.part):
             widest = wide
         took, now = time.perf_counter() - before, time.perf_counter() - started
-        # As many frames at once as fit into half of the time that is left.
+        # Take as many frames at once as fit into half of the remaining time.
         left = seconds - now
         if left <= 0:
             break
@@ -377,7 +379,7 @@ _SOLIDS: dict[int, tuple[Shape, TrueSurface]] = {}
 
 
 def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
-    """[T+1, N] whether the change of a velocity is not gravity's, where nothing pulls."""
+    """[T+1, N] whether gravity does not explain a change of velocity, for bodies that nothing pulls."""
     dt = np.diff(rollout.time)[:, None, None]
     change = np.diff(rollout.velocity, axis=0) - scene.gravity * dt
     fast = np.linalg.norm(rollout.velocity, axis=2)
@@ -385,8 +387,8 @@ def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
     least = 0.02 * strength * dt[..., 0] + 1e-6 * np.maximum(fast[1:], fast[:-1]) + 1e-9
     pushed = np.zeros(fast.shape, bool)
     pushed[1:] = (np.linalg.norm(change, axis=2) > least) & dynamic
-    # The velocity of a body that has just been touched may be that of the inner step before: gravity then acts for up
-    # to half a step longer in the next one.
+    # The velocity of a body that has just been touched may be that of the inner step before. Gravity then acts for up
+    # to half a step longer in the next step.
     if strength:
         down = scene.gravity / strength
         longer = np.clip(change @ down, 0.0, 0.5 * strength * dt[..., 0])[..., None] * down
@@ -399,7 +401,7 @@ def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
 
 
 def placed(course_scene: Scene, rollout: Rollout, frame: np.ndarray, body: np.ndarray) -> Placed:
-    """Bodies [K] in frames [K], their solids called by their shapes' numbers."""
+    """Bodies [K] in frames [K]; solids have the numbers of their shapes."""
     turn = pose.to_matrix(rollout.orientation[frame, body])
     shape = np.array([b.shape for b in course_scene.bodies])[body]
     scale = np.array([b.scale for b in course_scene.bodies])[body]
@@ -409,7 +411,7 @@ def placed(course_scene: Scene, rollout: Rollout, frame: np.ndarray, body: np.nd
 
 
 def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
-    """[P, 2] bodies, one of them dynamic, whose boxes come within the larger of their `margin`s [N] m in a frame."""
+    """[P, 2] bodies, one of them dynamic, whose boxes are within the larger of their `margin`s [N] m in a frame."""
     scene, rollout = course.scene, course.rollout
     count = len(scene.bodies)
     every = np.arange(count)
@@ -426,7 +428,7 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
     if 1 < len(small) <= FEW_BODIES:
         found.append(small[np.stack(np.triu_indices(len(small), 1), 1)])
     elif len(small) > FEW_BODIES:
-        from scipy.spatial import KDTree  # it takes its time to load
+        from scipy.spatial import KDTree  # slow to load
 
         close = KDTree(middle[small]).query_pairs(2 * float(radius[small].max()), output_type="ndarray")
         found.append(small[close])
@@ -442,7 +444,7 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
     pair = pair[kept]
     one, other = pair.T
     slack = np.maximum(margin[one], margin[other])
-    # Along the axes of both boxes and their products no gap may show.
+    # Separating axis test: no gap along the axes of both boxes and their cross products.
     axes = np.concatenate([at.turn[one], at.turn[other]], 2).swapaxes(1, 2)
     across = np.cross(at.turn[one].swapaxes(1, 2)[:, :, None], at.turn[other].swapaxes(1, 2)[:, None]).reshape(-1, 9, 3)
     length = np.linalg.norm(across, axis=2, keepdims=True)
@@ -464,8 +466,9 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
 
 
 def _measured(course: _Course, frames: np.ndarray, deadline: float) -> tuple[Near | None, Near | None]:
-    """The deepest overlap in frames, and the widest free space of bodies that are pushed in the steps that start in
-    them. Pairs that are left at the `deadline` (of `time.perf_counter`) are not measured, and then no free space."""
+    """The deepest overlap in these frames, and the widest free space around bodies that are pushed in the steps that
+    start in them. Pairs that are left at the `deadline` (of `time.perf_counter`) are not measured, and free space is
+    then not reported."""
     scene, rollout = course.scene, course.rollout
     size = np.array([course.solids[b.shape].thickness * b.scale for b in scene.bodies])
     reach = np.array([_reach(course.solids[b.shape], scene.shapes[b.shape]) * b.scale for b in scene.bodies])
@@ -502,13 +505,13 @@ def _measured(course: _Course, frames: np.ndarray, deadline: float) -> tuple[Nea
         found = Gaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
         thin = np.minimum(size[row[:, 1]], size[row[:, 2]])
         closing, turned = _coming(course, row, found, reach)
-        # An impact is noticed within a step; a body may go that far into the other before it is stopped.
+        # An impact is noticed within a step; a body may move that far into the other before it is stopped.
         before, _ = _coming(course, row, found, reach, back=1)
         share = (-found.apart - np.maximum(np.abs(closing), np.abs(before))) / thin
         k = int(share.argmax()) if len(share) else -1
         if k >= 0 and share[k] > 0:
             deepest = _near(course, row[k], float(-found.apart[k]), float(share[k]))
-        # Who is hit by a third may hit the other within the same step, as fast as it is at the step's end.
+        # A body that a third one hits may hit the other within the same step, with its speed at the step's end.
         later, turned_later = _coming(course, row, found, reach, back=-1)
         free = found.surely - np.maximum(np.maximum(closing, later), 0.0) - np.maximum(turned, turned_later)
     else:
@@ -538,12 +541,12 @@ def _near(course: _Course, row: Sequence[int] | np.ndarray, metres: float, part:
 
 
 def _reach(one: TrueSurface, shape: Shape) -> float:
-    """m, how far a solid reaches from its centre of mass."""
+    """m, the distance of a solid's farthest point from its centre of mass."""
     return float(np.linalg.norm(np.abs(one.bounds - shape.com).max(0))) if np.isfinite(one.bounds).all() else np.inf
 
 
 def _turning(course: _Course, frame: int) -> np.ndarray:
-    """[N] rad/s, of turns that move a body's surface to where it was not."""
+    """[N] rad/s, the part of the angular velocity that moves a body's surface (a ball may spin freely)."""
     spin = course.rollout.angular_velocity[frame]
     kind = np.array([course.solids[b.shape].turns_into_itself for b in course.scene.bodies])
     axis = pose.to_matrix(course.rollout.orientation[frame])[:, :, 2]
@@ -554,13 +557,13 @@ def _turning(course: _Course, frame: int) -> np.ndarray:
 def _coming(
     course: _Course, row: np.ndarray, found: Gaps, reach: np.ndarray, back: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[P] m, how much two bodies come nearer in a step, along the line between their nearest points, by the speeds of
-    these so many frames `back`; and what turning and gravity may add for others of their points."""
+    """[P] m, how much two bodies come nearer in a step along the line between their nearest points, by the speeds of
+    these points `back` frames before; and how much turning and gravity may add for other points."""
     rollout = course.rollout
     frame, one, other = row.T
     dt = np.diff(rollout.time, append=rollout.time[-1:])[frame]
     dt[frame == len(rollout.time) - 1] = float(np.diff(rollout.time).max(initial=0.0))
-    toward = found.normal * found.sign[:, None]  # from the second to the first
+    toward = found.normal * found.sign[:, None]  # from the second body to the first
 
     def of(body: np.ndarray) -> np.ndarray:
         arm = found.point - rollout.position[frame, body]

@@ -1,4 +1,4 @@
-"""Joints of a scene as arrays in model units: what they are, what is known of them, and where they stand."""
+"""Joints of a scene as arrays in model units: their constants, their state, and their angles and positions."""
 
 import heapq
 from collections.abc import Sequence
@@ -33,22 +33,22 @@ from sdfsim.physics.joint_columns import (
 )
 from sdfsim.scene.scene import Joint
 
-# Beside `TO_SPEED` and `TO_PLACE`: a motor gives a torque or force, which the target then is. The compiled step knows
-# no such motor: to it that is the most that one gives for a speed that it never reaches.
+# A mode besides `TO_SPEED` and `TO_PLACE`: the motor gives a torque or force, and the target is this value. The
+# compiled step has no such mode: it gets a motor with this maximum and a target speed that it never reaches.
 EFFORT = 3
-NEVER = 1e4  # model units of speed
+NEVER = 1e4  # model units of speed, which no joint reaches
 
 
 @dataclass(frozen=True)
 class Joints:
     """J joints of N bodies; lengths, times and masses in model units."""
 
-    body: np.ndarray  # [J, 2] int64, the second -1 for the world
-    kind: np.ndarray  # [J] int64, of `KINDS`
+    body: np.ndarray  # [J, 2] int64; the second is -1 for the world
+    kind: np.ndarray  # [J] int64, index into `KINDS`
     anchor: np.ndarray  # [J, 2, 3] from the centres of mass, in the bodies' axes
-    axes: np.ndarray  # [J, 2, 3, 3] the axes of the joint's frames in those of the bodies, a row each
+    axes: np.ndarray  # [J, 2, 3, 3] the axes of the joint's frames in body axes, one per row
     number: np.ndarray  # [J, NUMBERS], see the columns
-    target: np.ndarray  # [J] what motors aim at
+    target: np.ndarray  # [J] targets of motors
     collides: np.ndarray  # [J] bool, whether the two bodies may touch
 
     def __len__(self) -> int:
@@ -56,8 +56,8 @@ class Joints:
 
 
 def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: float, mass: float) -> Joints:
-    """Those of a scene; `com` [N, 3] are the centres of mass from the shapes' origins in model units, of which one is
-    `length` m, `time` s and `mass` kg."""
+    """The joints of a scene; `com` [N, 3] are the centres of mass from the shapes' origins, in model units of `length`
+    m, `time` s and `mass` kg."""
     count = len(joints)
     number, target = np.zeros((count, NUMBERS)), np.zeros(count)
     number[:, LOW], number[:, HIGH], number[:, LENGTH] = -np.inf, np.inf, -1.0
@@ -95,10 +95,10 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
 
 
 def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """[J, STATE] of joints of which nothing is known yet but where they stand."""
+    """[J, STATE] of joints at the start, when only the poses of bodies are known."""
     state = np.zeros((len(joints), STATE))
     state[:, TARGET], state[:, FRESH] = joints.target, 1.0
-    # A hinge may be more than half a turn away from its zero: where it is within its limits.
+    # A hinge may be more than half a turn from its zero: take the angle that is within its limits.
     ends = joints.number[:, LOW : HIGH + 1]
     state[:, COORD] = np.where(np.isfinite(ends), ends, 0.0).mean(1)
     state[:, COORD] = coordinates(joints, state[:, COORD], position, orientation)
@@ -107,7 +107,7 @@ def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np
 
 def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
     """[J] the angle of hinges (the one nearest to `near` [J]), the position of sliders, the angle between the axes of
-    balls, the length of distances, and 0 of what is fixed, of bodies at `position` [N, 3] and `orientation` [N, 4]."""
+    balls, the length of distances, and 0 for fixed joints, for bodies at `position` [N, 3] and `orientation` [N, 4]."""
     if not len(joints):
         return np.zeros(0)
     known = joints.body >= 0
@@ -128,7 +128,7 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
 
 
 def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """[J, NUMBERS] and the targets [J] as the compiled step takes them, of joints that were told `drive` since."""
+    """[J, NUMBERS] and the targets [J] for the compiled step, for joints whose numbers were changed to `drive`."""
     number = joints.number if drive is None else drive
     target, effort = state[:, TARGET], number[:, MOTOR] == EFFORT
     if not effort.any():
@@ -139,14 +139,14 @@ def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple
 
 
 def stored(joints: Joints, state: np.ndarray) -> float:
-    """The energy of springs."""
+    """The energy in springs."""
     stiffness, away = joints.number[:, STIFFNESS], state[:, COORD] - joints.number[:, REST]
     return float((0.5 * stiffness * away**2 * (state[:, BROKEN] == 0.0)).sum())
 
 
 @dataclass(frozen=True)
 class Order:
-    """In which bodies and joints are eliminated, and what that fills in; see `solver.joints.Held`."""
+    """The order in which bodies and joints are eliminated, and the fill-in; see `solver.joints.Held`."""
 
     comp: np.ndarray
     node: np.ndarray
@@ -160,9 +160,9 @@ class Order:
 
 
 def ordered(joints: Joints, moves: np.ndarray) -> Order:
-    """Eliminate what has the fewest neighbours first: bodies that move, and joints once one of their bodies is gone,
-    or both where what is gone already is held by the world or in a loop, and so cannot give way in all directions.
-    Trees are solved in a time that grows with their size, whatever their form."""
+    """Eliminate nodes with the fewest neighbours first: bodies that move, and joints once one of their bodies is
+    eliminated; or once both are, if what is eliminated already is held by the world or in a loop, and so cannot give
+    way in all directions. Trees are solved in time proportional to their size, whatever their form."""
     ends: list[list[int]] = [[int(b) for b in row if b >= 0 and moves[b]] for row in joints.body]
     near: dict[int, set[int]] = {}
     for j, bodies in enumerate(ends):
@@ -186,10 +186,10 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
     node: list[int] = []
     fill: dict[int, list[int]] = {}
     comp = [0]
-    own: dict[int, int] = {}  # of every body that is gone one that stands for all it is connected to among these
-    firm: set[int] = set()  # those of them that the world or a loop holds
-    waiting: dict[int, list[int]] = {}  # bodies that are not gone, and what joints that are hold to them
-    pinned: set[int] = set()  # what is held so: as long as that lasts
+    own: dict[int, int] = {}  # for every eliminated body, the one that represents all eliminated bodies connected to it
+    firm: set[int] = set()  # representatives whose group the world or a loop holds
+    waiting: dict[int, list[int]] = {}  # bodies not eliminated yet, and the groups that eliminated joints hold to them
+    pinned: set[int] = set()  # groups that are held this way, as long as that lasts
 
     def whose(n: int) -> int:
         while own[n] != n:
@@ -275,8 +275,8 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
 
 
 def apart(joints: Joints, count: int) -> np.ndarray:
-    """[N + 1 + E] int64: which bodies a body may not touch, as joints hold them: from place `apart[b]` to
-    `apart[b + 1]`; empty where there are none."""
+    """[N + 1 + E] int64: the bodies that body b may not touch because of joints are entries `apart[b]` to `apart[b +
+    1]`; empty if there are none."""
     pairs = [(int(a), int(b)) for a, b in joints.body[~joints.collides] if a >= 0 and b >= 0]
     if not pairs:
         return np.zeros(0, np.int64)

@@ -1,4 +1,4 @@
-"""Where bodies are and how they move: one record for states, rollouts and recordings."""
+"""Poses and velocities of bodies: one record for states, rollouts and recordings."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -7,13 +7,13 @@ import numpy as np
 
 
 class Rows:
-    """A frozen record of arrays with a row for each body."""
+    """A frozen record of arrays with one row for each body."""
 
     def with_rows(self, rows: np.ndarray, changed: dict[str, np.ndarray], **others: Any) -> Self:
-        """The record with other rows (ascending) in some arrays, and `others` in place of what else it holds.
+        """A copy of the record with other rows (ascending) in some arrays, and `others` in place of further fields.
 
-        An array is put together when it is first asked for: what is not looked at costs the changed rows alone,
-        however many bodies there are, and however often rows have been changed before.
+        An array is assembled on first access. Until then a change costs only the changed rows, however many bodies
+        there are, and however often rows have been changed before.
         """
         before, known, values = self.parts or (self, rows, {})
         if rows is not known and not np.array_equal(rows, known):
@@ -30,7 +30,7 @@ class Rows:
         return new
 
     def rows_of(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """A copy of some rows of an array, which is not put together for them."""
+        """A copy of some rows of an array, without assembling the array."""
         before, known, values = self.parts or (self, rows, {})
         if name not in values or not len(known):
             return getattr(self, name)[rows]
@@ -42,12 +42,11 @@ class Rows:
 
     @property
     def parts(self) -> tuple[Self, np.ndarray, dict[str, np.ndarray]] | None:
-        """What `with_rows` has made it of: a record that is whole, the rows, and what they hold; None for a whole
-        one."""
+        """What `with_rows` was given: a complete record, the rows, and their values; None for a complete record."""
         known = vars(self)
         return (known["_before"], known["_rows"], known["_changed"]) if "_before" in known else None
 
-    def __getattr__(self, name: str) -> np.ndarray:  # of what `with_rows` has left out
+    def __getattr__(self, name: str) -> np.ndarray:  # for arrays that `with_rows` has not assembled
         if name.startswith("_") or name not in self._changed:
             raise AttributeError(name)
         whole = getattr(self._before, name).copy()
@@ -60,7 +59,7 @@ class Rows:
 class Motion(Rows):
     """Poses and velocities of N bodies, [N, ...] at one instant or [T, N, ...] at several, float64.
 
-    In metres and seconds, or in the units of a model. Nobody writes to the arrays.
+    In metres and seconds, or in the units of a model. The arrays must not be written to.
     """
 
     position: np.ndarray  # [..., N, 3] centres of mass

@@ -39,7 +39,7 @@ def from_rotvec(r: np.ndarray) -> np.ndarray:
 
 
 def to_rotvec(q: np.ndarray) -> np.ndarray:
-    """Rotation vectors [..., 3] rad, of at most half a turn, of unit quaternions [..., 4]."""
+    """Rotation vectors [..., 3] rad, at most half a turn, of unit quaternions [..., 4]."""
     q = np.where(q[..., 3:] < 0, -q, q)
     s = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(s, q[..., 3:])

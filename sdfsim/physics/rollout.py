@@ -20,18 +20,18 @@ class Rollout:
         orientation: [T+1, N, 4] float64 xyzw, shape axes -> world.
         velocity: [T+1, N, 3] m/s.
         angular_velocity: [T+1, N, 3] rad/s, world frame.
-        contact_count: [T+1] int64, contact edges that acted in the step that led here (0 where none did).
-        contact_point: [sum(contact_count), 3] float64 m, world, in step order: the points of their owners on which
-            the edges acted, with the bodies as they are in this entry.
+        contact_count: [T+1] int64, number of contacts that acted in the step that led here.
+        contact_point: [sum(contact_count), 3] float64 m, world, in step order: the points of their owners at which
+            contacts acted, with the bodies as they are in this entry.
         contact_body: [sum(contact_count), 2] int64, (owner of the node, body it meets).
         counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `energy_given` J (by pulls, pushes and
-            whoever set a state, since the frame before), `contacts`, `worst_penetration` m, `step_ms`, and what else
-            the simulator counts. The penetration is how deep the deepest of an entry's
-            contact points lies within the body it meets, by that body's distances; 0 where none does.
+            changes of the state, since the frame before), `contacts`, `worst_penetration` m, `step_ms`, and other
+            counts of the simulator. The penetration is the depth of the deepest of an entry's contact points within the
+            body that it meets, by that body's distances; 0 if none is inside.
         names: N body names.
-        joint_names: J names of joints; none where joints are off.
+        joint_names: J names of joints; empty if joints are off.
         joint_position: [T+1, J] the angle of hinges and balls in rad, the position of sliders and the length of
-            distances in m, 0 of what is fixed.
+            distances in m, 0 for fixed joints.
         joint_force: [T+1, J, 3] N, world, on the joint's first body in the last inner step; joint_torque: [T+1, J, 3]
             N m, about the joint's anchor.
         meta: model, seed, versions, dt s.
@@ -102,7 +102,7 @@ _PER_FRAME = (
 
 
 def join(frames: list[Rollout]) -> Rollout:
-    """One rollout out of consecutive pieces."""
+    """One rollout from consecutive pieces."""
     return replace(
         frames[0],
         **{k: np.concatenate([getattr(f, k) for f in frames]) for k in (*_PER_FRAME, "contact_point", "contact_body")},

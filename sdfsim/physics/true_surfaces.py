@@ -1,9 +1,9 @@
-"""How far bodies are from each other, or how deep in each other, by their true surfaces alone.
+"""Distance or overlap depth of bodies, measured on their true surfaces.
 
-Nothing here knows of the contact search, of baked grids or of surface nodes. A surface is cut into triangles that lie
-on it, and those that may hold the nearest (or deepest) point are cut further: of a distance function that is
-1-Lipschitz, and convex where the solid is, a triangle's lowest value has a bound, so that crossing sticks, which have
-no vertex in each other, are measured like everything else.
+This does not use the contact search, baked grids or surface nodes. A surface is cut into triangles that lie on it, and
+those that may hold the nearest (or deepest) point are cut further. A distance function is 1-Lipschitz, and convex if
+the solid is convex, so its lowest value on a triangle has a bound. So crossing sticks, which have no vertex in each
+other, are measured like everything else.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,14 +20,14 @@ from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf,
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape
 
-CLUSTER = 32  # triangles that are looked at together at first
-MOST = 384  # triangles of a pair that are cut further at once; what is left out makes the answer less sure
-ROUNDS = 26  # of cutting
-FINE = 2e-4  # of the smaller thickness: how exact a distance is
-ROUGH = 4e-3  # likewise, from a body that is not convex: there bounds are weaker, and triangles many
-AROUND = 16  # corners of the circles from which round surfaces are cut further
-TURN = 0.05  # winding number of a point that is outside of everything, at most
-FLAT = 1e-9  # of a mesh's size: how far beside a face's plane a convex mesh may have a vertex
+CLUSTER = 32  # triangles that are tested together at first
+MOST = 384  # triangles of a pair that are cut further at once; the others make the answer less sure
+ROUNDS = 26  # rounds of cutting
+FINE = 2e-4  # relative to the smaller thickness: precision of a distance
+ROUGH = 4e-3  # likewise, for a body that is not convex: bounds are weaker there, and there are many triangles
+AROUND = 16  # corners of the circles with which cutting of round surfaces starts
+TURN = 0.05  # largest winding number of a point that is outside everything
+FLAT = 1e-9  # relative to a mesh's size: how far beyond a face's plane a vertex of a convex mesh may be
 
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -36,16 +36,16 @@ Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 class TrueSurface:
     """A shape's exact geometry in its own frame, at scale 1."""
 
-    corner: np.ndarray  # [F, 3, 3] m, triangles with their corners on the surface, in clusters (none of a plane)
-    bend: np.ndarray  # [F] m, the surface's smaller radius of curvature (infinite where it is flat)
+    corner: np.ndarray  # [F, 3, 3] m, triangles with their corners on the surface, in clusters (empty for a plane)
+    bend: np.ndarray  # [F] m, the surface's smaller radius of curvature (infinite if it is flat)
     start: np.ndarray  # [C + 1], where the clusters start
     ball: np.ndarray  # [C, 4] m, centres and radii of balls around the surface of each cluster
     bounds: np.ndarray  # [2, 3] m (infinite for a plane)
     distance: Distance  # [P, 3] m -> distance [P] m, negative inside, and gradient [P, 3]
-    onto: Callable[[np.ndarray], np.ndarray]  # [P, 3] m near the surface -> the point of a bent surface beside it
+    onto: Callable[[np.ndarray], np.ndarray]  # [P, 3] m near the surface -> the nearest point of a curved surface
     convex: bool
-    turns_into_itself: int  # 2: by every turn (a ball), 1: by turns about z, 0: by none
-    straight: float  # m, a round side is straight along z up to here from the middle; 0 where there is none
+    turns_into_itself: int  # symmetry: 2 under every rotation (a ball), 1 under rotations about z, 0 none
+    straight: float  # m, half length along z of a round side that is straight; 0 if there is none
 
     @property
     def thickness(self) -> float:
@@ -54,7 +54,7 @@ class TrueSurface:
 
 
 def true_surface(shape: Shape) -> TrueSurface:
-    """The geometry that a shape stands for: its closed form, its convex pieces, or its mesh."""
+    """The exact geometry of a shape: its closed form, its convex pieces, or its mesh."""
     if isinstance(shape.sdf, ClosedForm):
         return _closed_form(shape.sdf)
     if shape.pieces:
@@ -137,8 +137,8 @@ def of_mesh(mesh: Mesh) -> TrueSurface:
         answer = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         squared, face, closest = (np.asarray(part) for part in answer)
         length, normal, away = np.sqrt(squared), normals[face], points - closest
-        # From within a convex solid, and wherever the nearest point is in the middle of a face, the way there is along
-        # the normal. At edges of others the winding number tells; of convex ones no face there is behind.
+        # Inside a convex solid, and wherever the nearest point is within a face, the way to the surface is along the
+        # normal. At other edges the winding number gives the sign; at those of convex solids no face is hidden.
         height = (away * normal).sum(1)
         inside = height < -0.5 * length
         if not convex:
@@ -147,8 +147,8 @@ def of_mesh(mesh: Mesh) -> TrueSurface:
             unclear = (np.min(parts, axis=0) <= 1e-6 * area[face]) & (length > 0)
             if unclear.any():
                 inside[unclear] = winding(points[unclear]) > 0.5
-            # Where a surface is folded flat, what is nearest may be a layer that faces the other way. Of a surface that
-            # is open, what is behind it has a part of a turn around it.
+            # If a surface is folded flat, the nearest layer may face the other way. Behind an open surface the winding
+            # number is a fraction.
             behind = inside & ~unclear
             if behind.any():
                 inside[behind] = winding(points[behind]) > TURN
@@ -176,7 +176,7 @@ def _triangles(mesh: Mesh, distance: Distance, *, convex: bool) -> TrueSurface:
 
 
 def _is_convex(mesh: Mesh) -> bool:
-    """Whether no vertex lies beyond the plane of a face; asked of small meshes only."""
+    """Whether no vertex lies beyond the plane of a face; used for small meshes only."""
     corner = mesh.vertices[mesh.faces]
     if len(corner) > 6000:
         return False
@@ -218,29 +218,29 @@ def _clustered(
         centre = 0.5 * (points.min(0) + points.max(0))
         radius = np.linalg.norm(points - centre, axis=1).max()
         curved = np.abs(bend[first:last])
-        # How far a round surface stands out beyond triangles with their corners on it.
+        # How far a round surface extends beyond triangles with their corners on it.
         out = radius if not np.isfinite(curved).all() else curved.min() * (1 - np.cos(np.pi / AROUND)) * 2.5
         balls.append([*centre, radius + (out if np.isfinite(curved).any() else 0.0)])
     return TrueSurface(corner, bend, start, np.array(balls), bounds, distance, onto, convex, turns, straight)
 
 
 class Gaps(NamedTuple):
-    """Of P pairs the distance between two surfaces, negative where the bodies are in each other."""
+    """The distance between the surfaces of P pairs, negative if the bodies overlap."""
 
-    apart: np.ndarray  # [P] m, of the best point that was found: never too low
-    surely: np.ndarray  # [P] m, what it is at least (that far where the bodies are apart)
-    point: np.ndarray  # [P, 3] m, that point, world
-    normal: np.ndarray  # [P, 3] from the second to the first, or to it from the first: `sign`
-    sign: np.ndarray  # [P], 1 where the point is on the first body, -1 where it is on the second
+    apart: np.ndarray  # [P] m, at the best point that was found: never too low
+    surely: np.ndarray  # [P] m, a lower bound of the distance
+    point: np.ndarray  # [P, 3] m, the best point, world
+    normal: np.ndarray  # [P, 3] from the second body to the first, or the other way round: see `sign`
+    sign: np.ndarray  # [P], 1 if the point is on the first body, -1 if it is on the second
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Bodies in many poses: K of them."""
+    """K bodies with poses."""
 
     solid: np.ndarray  # [K] int, which solid
     scale: np.ndarray  # [K]
-    origin: np.ndarray  # [K, 3] m, of the solids' frames
+    origin: np.ndarray  # [K, 3] m, origins of the solids' frames
     turn: np.ndarray  # [K, 3, 3], solid -> world
 
     def __getitem__(self, rows: np.ndarray) -> "Placed":
@@ -248,12 +248,12 @@ class Placed:
 
 
 def gaps(solids: Sequence[TrueSurface], first: Placed, second: Placed, most: np.ndarray) -> Gaps:
-    """How far P pairs are apart, or how deep in each other (the deepest point of either surface in the other body).
-    What is farther than `most` [P] m is only known to be that."""
+    """Distances or overlap depths of P pairs (the depth is that of the deepest point of either surface in the other
+    body). Distances beyond `most` [P] m are not computed exactly."""
     count = len(first.solid)
     smooth = np.array([s.convex for s in solids])
     empty = np.array([len(s.corner) == 0 for s in solids])
-    # Of the two surfaces the one whose other body is convex, and which has an end.
+    # Cut the surface whose other body is convex; a plane's surface cannot be cut.
     swap = (empty[first.solid] | (~smooth[second.solid] & smooth[first.solid])) & ~empty[second.solid]
     thin = np.minimum(*(p.scale * np.array([s.thickness for s in solids])[p.solid] for p in (first, second)))
     apart, surely = np.full(count, np.inf), np.full(count, -np.inf)
@@ -273,7 +273,7 @@ def gaps(solids: Sequence[TrueSurface], first: Placed, second: Placed, most: np.
     every = np.arange(count)
     take(every, swap)
     inside = surely <= 0
-    # A body that is swallowed has its whole surface in the other, whose surface is far.
+    # If a body is swallowed, its whole surface is inside the other, and the other's surface is far.
     for k in np.unique(first.solid) if count else ():
         rows = every[(first.solid == k) & ~inside]
         inside[rows] = _holds(solids, first, second, rows) | _holds(solids, second, first, rows)
@@ -282,7 +282,7 @@ def gaps(solids: Sequence[TrueSurface], first: Placed, second: Placed, most: np.
 
 
 def _holds(solids: Sequence[TrueSurface], one: Placed, other: Placed, rows: np.ndarray) -> np.ndarray:
-    """[R] whether a point of the other's surface is in the one."""
+    """[R] whether a point of `other`'s surface is inside `one`."""
     found = np.zeros(len(rows), bool)
     for a in np.unique(one.solid[rows]):
         for b in np.unique(other.solid[rows]):
@@ -299,8 +299,8 @@ def _holds(solids: Sequence[TrueSurface], one: Placed, other: Placed, rows: np.n
 def _lowest(
     solids: Sequence[TrueSurface], mine: Placed, other: Placed, most: np.ndarray, fine: np.ndarray, known: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The lowest distance from other bodies on the surfaces of P bodies, where that is lower than what is `known`:
-    found, at least, where (world), gradient."""
+    """The lowest distance to another body over the surfaces of P bodies, if it is lower than what is `known`: the
+    distance that was found, its lower bound, the point (world) and the gradient."""
     count = len(mine.solid)
     best, missed = known.copy(), np.full(count, np.inf)
     where, slope = np.zeros((count, 3)), np.zeros((count, 3))
@@ -360,7 +360,7 @@ def _lowest(
         if not len(pair):
             break
         middle = corner.mean(1)
-        for k in np.unique(mine.solid[pair]):  # a middle of a bent surface is on it
+        for k in np.unique(mine.solid[pair]):  # the midpoint on a curved surface is moved onto it
             rows = np.flatnonzero((mine.solid[pair] == k) & (bend > 0) & np.isfinite(bend))
             if len(rows):
                 middle[rows] = solids[k].onto(middle[rows])
@@ -370,7 +370,8 @@ def _lowest(
         offset = corners_at - at[:, None]
         reach = np.linalg.norm(offset, axis=2).max(1)
         scale = mine.scale[pair]
-        # What a bent surface has beyond the triangle: a sagitta, or of a flat one with a round rim the rim's.
+        # How far a curved surface extends beyond the triangle: its sagitta, or that of the rim for a flat end with a
+        # round rim.
         side = np.abs(corner[..., 2]).max(1) <= straight[mine.solid[pair]] * (1 + 1e-9)
         chord = np.where(side, scale * np.linalg.norm((corner - middle[:, None])[..., :2], axis=2).max(1), reach)
         out = np.where(np.isfinite(bend), np.minimum(chord**2 / (np.abs(bend) * scale), 2 * chord), 0.0)
@@ -385,7 +386,7 @@ def _lowest(
             value, tilt = ask(pair[rows], tip[rows])
             told(pair[rows], value, tip[rows], tilt)
         left = (lower < best[pair] - fine[pair]) & (lower <= most[pair])
-        # What is not looked at any more is at least this far.
+        # Triangles that are no longer cut are at least this far.
         np.minimum.at(missed, pair[~left], lower[~left])
         pair, corner, bend, lower = pair[left], corner[left], bend[left], lower[left]
         order = np.lexsort((lower, pair))
@@ -410,8 +411,8 @@ def _halved(
     lower: np.ndarray,
     side: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Every triangle cut across its longest edge; new corners of round surfaces and rims lie on them. On the straight
-    `side` of a round body that meets a convex one, only the way around it makes the bound worse."""
+    """Cut every triangle across its longest edge, with new corners on the round surface or rim. On the straight `side`
+    of a round body that meets a convex one, only the extent around it makes the bound worse."""
     edge = np.roll(corner, -1, 1) - corner
     edge[side, :, 2] *= 0.05
     edge = np.linalg.norm(edge, axis=2)
@@ -422,7 +423,7 @@ def _halved(
         rows = np.flatnonzero((mine.solid[pair] == k) & np.isfinite(bend))
         if not len(rows):
             continue
-        # Of an end's flat triangles only edges along the rim are bent.
+        # In the flat triangles of an end only edges along the rim are curved.
         radius = np.abs(bend[rows])
         rim = np.minimum(*(np.linalg.norm(p[rows, :2], axis=1) for p in (a, b))) > radius * (1 - 1e-9)
         rows = rows[(bend[rows] > 0) | rim]

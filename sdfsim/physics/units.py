@@ -1,4 +1,4 @@
-"""Froude scaling: the units in which a scene has bodies of the model's size at the model's gravity."""
+"""Froude scaling: units in which a scene's bodies have the model's size and gravity the model's value."""
 
 import math
 
@@ -10,11 +10,12 @@ from sdfsim.physics.options import GRAVITY, LENGTH, STEP, SUBSTEPS
 from sdfsim.scene.scene import Scene
 
 EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
-# Times: how much wider a body may be than most that move. Their mean size sets the step, and one that is wider makes it
-# so long that the others turn out of all bounds in their first contact.
+# How many times wider a body may be than most moving bodies. Their mean size sets the step, and a wider body makes it
+# so long that the others spin too fast in their first contact.
 MOST_WIDER = 1e4
-# A stick that tumbles moves by its length while its thickness is what must not be crossed: from this aspect on the
-# inner steps of the solve get shorter, with its root. A heap of sticks 1:20 then stays within 1 % of their thickness.
+# A tumbling stick moves by its length, and must not cross a distance of its thickness. So above this aspect ratio the
+# inner steps of the solve get shorter, with its square root. Overlaps in a heap of 1:20 sticks then stay within 1 % of
+# their thickness.
 SLENDER, SHORTEST = 8.0, 4
 
 
@@ -27,9 +28,9 @@ def scene_units(
     length: float = LENGTH,
     mean: bool = False,
 ) -> Units:
-    """The units in which bodies of `length` fall under `gravity`, a step being `step` (as the contact solve has these,
-    where nothing is given): of `length` is the smallest body that moves, or their `mean`. `dt` s fixes the scale by the
-    wanted step instead. Raises SdfsimError for a step that is not positive, or bodies of sizes that no step serves."""
+    """The units in which the smallest moving body (or their `mean`) has the size `length`, gravity is `gravity` and a
+    step is `step`; the defaults are those of the contact solve. `dt` in s fixes the scale by the wanted step instead.
+    Raises SdfsimError for a step that is not positive, or for bodies of sizes that no step suits."""
     if dt is not None and not 0.0 < dt < np.inf:
         raise SdfsimError(f"dt: must be > 0 s and finite (got {dt:g})")
     strength = float(np.linalg.norm(scene.gravity)) or EARTH
@@ -47,7 +48,7 @@ def scene_units(
 
 
 def inner_steps(scene: Scene) -> int:
-    """How many inner steps the solve makes in a step of a scene: more where moving bodies are slender."""
+    """Number of inner steps of the solve in a step of a scene: more if moving bodies are slender."""
     boxes = [np.sort(np.ptp(scene.shapes[b.shape].sdf.bounds, axis=0)) for b in scene.bodies if b.motion == "dynamic"]
     aspect = max((box[2] / max(box[0], 1e-300) for box in boxes), default=1.0)
     if aspect <= SLENDER:
@@ -56,8 +57,8 @@ def inner_steps(scene: Scene) -> int:
 
 
 def _check_sizes(names: list[str], sizes: np.ndarray) -> None:
-    """Raises SdfsimError if a body of `sizes` [N] m is far wider than most. Of the two that are compared the less
-    ordinary one is to blame."""
+    """Raises SdfsimError if a body of `sizes` [N] m is far wider than most. The message names the more unusual of the
+    two bodies."""
     order = np.argsort(sizes, kind="stable")
     usual, widest = order[(len(order) - 1) // 2], order[-1]
     if not MOST_WIDER * sizes[usual] < sizes[widest] < np.inf:
@@ -65,6 +66,6 @@ def _check_sizes(names: list[str], sizes: np.ndarray) -> None:
     absurd, other = sorted((usual, widest), key=lambda k: -abs(np.log10(sizes[k])))
     raise SdfsimError(
         f"body {names[absurd]!r}: {sizes[absurd]:.3g} m wide beside body {names[other]!r} of {sizes[other]:.3g} m "
-        f"(at most {MOST_WIDER:g} times apart)",
-        "look at its scale, and at the size and units of its shape",
+        f"(at most {MOST_WIDER:g} times as wide)",
+        "check its scale, and the size and units of its shape",
     )

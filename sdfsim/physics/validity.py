@@ -1,4 +1,4 @@
-"""What a state and a scene must be for their motion to mean anything."""
+"""Limits within which states and scenes are valid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,18 +12,18 @@ from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.contact_geometry import check_pieces
 
-# Of |q|^2 - 1. The matrix R of a quaternion that keeps to it has |R'R - I| below 1e-5, and a positive determinant.
+# Largest |q|^2 - 1. Up to it the matrix R of a quaternion has |R'R - I| below 1e-5, and a positive determinant.
 UNIT = 2e-6
-# Model lengths from the origin. Double precision places a body to a ten millionth of its size up to here.
+# Model lengths from the origin. Up to here double precision places a body to a ten millionth of its size.
 FARTHEST = 1e9
-# Model units. Faster, a body passes ten thousand of its own lengths in a step.
+# Model units. A faster body moves by more than ten thousand of its own lengths in a step.
 FASTEST = 1e6
-# Of the nodes' largest extent: with a second one smaller than this they are a line.
+# Relative to the nodes' largest extent: if the second extent is smaller, they are a line.
 LINE = 1e-5
 
 
 def limits(dt: float) -> np.ndarray:
-    """[5] what the compiled step lets a state be at most in steps of `dt`, see `survey.broken`; model units."""
+    """[5] the largest values that the compiled step accepts in steps of `dt`, see `survey.broken`; model units."""
     return np.array([UNIT, FARTHEST, FASTEST, MOST_TURN / dt, FASTEST])
 
 
@@ -32,14 +32,14 @@ NO_LIMITS = np.full(5, np.inf)
 
 @dataclass(frozen=True)
 class Fault:
-    """A body whose state cannot be."""
+    """A body with an invalid state."""
 
     body: int
-    wrong: int  # what is: see `survey.broken`
-    value: np.ndarray  # of that, model units
+    wrong: int  # which part of the state is invalid: see `survey.broken`
+    value: np.ndarray  # its value, model units
 
     def described(self, units: Units, dt: float) -> str:
-        """What is wrong, in SI units, after a step of `dt` model units."""
+        """The fault in words, in SI units, after a step of `dt` model units."""
         name, unit, what = (
             ("orientation", 1.0, ""),
             ("position", units.length, "m from the origin, too far to be placed exactly"),
@@ -55,7 +55,7 @@ class Fault:
 
 
 def fault_of(body: int, wrong: int, state: Motion, before: np.ndarray, dt: float) -> Fault:
-    """What the compiled check has found at a body that was at `before` [3] a step of `dt` earlier."""
+    """The fault that the compiled check has found for a body that was at `before` [3] a step of `dt` earlier."""
     with np.errstate(over="ignore", invalid="ignore"):
         way = (state.position[body] - before) / dt
     values = (state.orientation, state.position, state.velocity, state.angular_velocity)
@@ -63,9 +63,9 @@ def fault_of(body: int, wrong: int, state: Motion, before: np.ndarray, dt: float
 
 
 def first_fault(state: Motion, dt: float, rows: np.ndarray | None = None, before: Motion | None = None) -> Fault | None:
-    """The first of the bodies `rows` [A] int64 (None: all) whose state cannot be, a step of `dt` after `before`; None
-    when all are sound. In model units."""
-    from sdfsim.physics.solver import survey  # numba takes its time to load
+    """The first of the bodies `rows` [A] int64 (None: all) with an invalid state, a step of `dt` after `before`; None
+    if all are valid. In model units."""
+    from sdfsim.physics.solver import survey  # numba is slow to load
 
     rows = np.arange(len(state.position)) if rows is None else rows
     found = Motion(*(np.ascontiguousarray(state.rows_of(name, rows)) for name in MOTION))
@@ -76,8 +76,8 @@ def first_fault(state: Motion, dt: float, rows: np.ndarray | None = None, before
 
 
 def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
-    """Raises SdfsimError if a body that has an end is too large for its surface to keep to where points are placed
-    exactly; a model unit is so many `metres`."""
+    """Raises SdfsimError if a finite body is so large that points on its surface cannot be placed exactly; a model unit
+    of length has `metres` m."""
     large = np.flatnonzero((bodies.size > FARTHEST) & np.isfinite(bodies.size))
     if len(large):
         size = float(bodies.size[large[0]]) * metres
@@ -89,8 +89,8 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
 
 
 def check_nodes(scene: Scene) -> None:
-    """Raises SdfsimError if a dynamic body's nodes are one place or one line, and do not tell how it is turned, or a
-    shape has more convex pieces than contacts can tell apart."""
+    """Raises SdfsimError if a dynamic body's nodes are one point or one line, so that they do not define its rotation,
+    or if a shape has more convex pieces than contacts can distinguish."""
     told = set()
     for shape in scene.shapes:
         check_pieces(f"shape {shape.name!r}", shape.pieces)
@@ -103,6 +103,6 @@ def check_nodes(scene: Scene) -> None:
         if extents[0] == 0 or len(extents) < 2 or extents[1] <= LINE * extents[0]:
             where = "in one place" if extents[0] == 0 else "on one line"
             raise SdfsimError(
-                f"body {body.name!r} moves: its {len(nodes)} surface nodes are {where}, which tells no turn",
+                f"body {body.name!r} moves: its {len(nodes)} surface nodes are {where}, so its rotation is not defined",
                 "sample nodes anew: nodes: 7 at its shape in the scene file",
             )

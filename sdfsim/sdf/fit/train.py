@@ -72,7 +72,7 @@ class FitOptions:
 
 RECIPES = {
     "default": FitOptions(),
-    # A surface from a few minutes of training is not exact enough for a full fit.
+    # A surface from a few minutes of reconstruction is not exact enough to be worth a full fit.
     "quick": FitOptions(steps=1500, settle=600, pool=200_000),
     # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
     "paper": FitOptions(
