@@ -275,8 +275,8 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
 
 
 def apart(joints: Joints, count: int) -> np.ndarray:
-    """[N + 1 + E] int64: the bodies that body b may not touch because of joints are entries `apart[b]` to `apart[b +
-    1]`; empty if there are none."""
+    """[N + 1 + E] int64: the bodies that body b may not touch, because of joints, are the entries from `apart[b]` to
+    before `apart[b + 1]`. Empty if there are none."""
     pairs = [(int(a), int(b)) for a, b in joints.body[~joints.collides] if a >= 0 and b >= 0]
     if not pairs:
         return np.zeros(0, np.int64)

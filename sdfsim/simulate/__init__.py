@@ -1,1 +1,1 @@
-"""A scene and a model become a motion: steps, and the runs that repeat them."""
+"""From a scene and a model to a motion: single steps, and runs of many steps."""

@@ -1,4 +1,4 @@
-"""Many scenes in one call: each a world of one set of bodies, which never meets the others."""
+"""Many scenes in one call: each is a world within one set of bodies, and worlds never meet."""
 
 import math
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ from sdfsim.simulate.steppers import stepper_of
 
 
 def side_by_side(scene: Scene, world: Sequence[int], units: Units) -> tuple[Bodies, State]:
-    """The bodies of a scene, each in its `world` [N] of 0, 1, ...; those in -1, behind all others, are in all of them.
-    In model units."""
+    """The bodies of a scene, each in its `world` [N] of 0, 1, ..., in model units. Bodies with -1, which come last, are
+    in all worlds."""
     bodies, state = from_scene(scene, units)
     return replace(bodies, world=np.array(world, dtype=np.int64)), state
 
@@ -25,7 +25,8 @@ def side_by_side(scene: Scene, world: Sequence[int], units: Units) -> tuple[Bodi
 def placed(
     state: State, position: np.ndarray, orientation: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray
 ) -> State:
-    """The first bodies as arrays [K, *] have them, in model units; those behind them, of all worlds, as they are."""
+    """The state with the first K bodies as in the arrays [K, *], in model units. The bodies after them, which are in
+    all worlds, stay as they are."""
 
     def of(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
         return np.concatenate([rows, known[len(rows) :]])
@@ -40,8 +41,8 @@ def placed(
 
 
 class Copies:
-    """`count` copies of the bodies of a scene that move, with their joints, each a world of its own; behind them the
-    static ones, which are in all. `bodies`, as `solver` moves them, are in the scene's `units`."""
+    """`count` copies of the moving bodies of a scene with their joints, each in a world of its own, followed by the
+    static bodies, which are in all worlds. `bodies`, which `solver` moves, are in the scene's `units`."""
 
     def __init__(self, scene: Scene, count: int) -> None:
         moving, fixed = ([k for k, b in enumerate(scene.bodies) if b.motion == kind] for kind in ("dynamic", "static"))
@@ -60,7 +61,7 @@ class Copies:
         self.solver = stepper_of(load_model())
 
     def begun(self, position: np.ndarray, orientation: np.ndarray, velocity: np.ndarray, spin: np.ndarray) -> State:
-        """A start of the bodies that move, [`total`, *] in SI units."""
+        """A start state of the moving bodies, [`total`, *] in SI units."""
         u = self.units
         state = placed(self.start, position / u.length, orientation, velocity / u.velocity, spin * u.time)
         if self.bodies.joints is None:
@@ -69,5 +70,5 @@ class Copies:
 
 
 def inner_of_frame(dt: float) -> int:
-    """Inner steps of the solve in a recorded step of `dt` model units."""
+    """Number of inner steps of the solve in a recorded step of `dt` model units."""
     return max(1, math.ceil(dt / (STEP / SUBSTEPS) - 0.01))

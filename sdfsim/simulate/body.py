@@ -1,4 +1,4 @@
-"""Bodies of a running simulation by name, and where they touch: metres, kilograms and seconds, NumPy arrays."""
+"""Bodies of a running simulation by name, and their contact points: metres, kilograms and seconds, NumPy arrays."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -17,7 +17,8 @@ Numbers = Sequence[float] | np.ndarray
 
 
 class LiveScene(ABC):
-    """A scene in motion, in model units. It records which bodies the user changes, to announce them to the stepper."""
+    """A scene in motion, in model units. It records which bodies the user changes, and announces them to the
+    stepper."""
 
     scene: Scene
     units: Units
@@ -31,14 +32,14 @@ class LiveScene(ABC):
 
     @property
     def state(self) -> State:
-        """All that a run goes on from: poses and velocities, forces that pull, contacts, who sleeps, joints with what
-        their motors are told, and the time. `restore` goes on from it, and `state.save("state.npz")` keeps it. It holds
-        neither `options`, gravity among them, nor what the scene says.
+        """Everything that is needed to continue a run: poses and velocities, pulling forces, contacts, sleep, joints
+        with the targets of their motors, and the time. `restore` continues from it, and `state.save("state.npz")`
+        writes it to a file. It contains neither `options` (such as gravity) nor the scene.
 
-        Give it another one to start from there, or to change bodies: `simulator.state = replace(simulator.state,
-        velocity=...)`; its arrays are not to be written into. Raises SimulationError if what was changed cannot be.
+        Set it to start from another state, or to change bodies: `simulator.state = replace(simulator.state,
+        velocity=...)`. Its arrays must not be written to. Raises SimulationError if the new state is invalid.
         """
-        self._accept()  # a state that is kept must know of every change, or what slept would sleep on
+        self._accept()  # a saved state must include every change, or sleeping bodies would sleep on
         return self._state
 
     @state.setter
@@ -47,10 +48,10 @@ class LiveScene(ABC):
         self._state, self._handed = state, True
 
     def _fits(self, state: State) -> None:
-        """Raises SdfsimError for what is no state of this scene."""
+        """Raises SdfsimError if `state` is not a state of this scene."""
         if not isinstance(state, State):
             told = f"state: must be a State, such as simulator.state was before (got a {type(state).__name__})"
-            raise SdfsimError(told, "what step() returns is in metres and seconds, and too little to go on from")
+            raise SdfsimError(told, "what step() returns is in metres and seconds, and not enough to continue from")
         given = len(state.position), 0 if state.joints is None else len(state.joints)
         known = len(self.bodies), 0 if self.bodies.joints is None else len(self.bodies.joints)
         if given != known:
@@ -59,32 +60,32 @@ class LiveScene(ABC):
 
     @property
     def now(self) -> State:
-        """The state, of which the stepper has not heard what was changed since the last step: many changes in a row
-        are announced at once."""
+        """The state, with changes since the last step that the stepper does not know yet: many changes are announced
+        together."""
         return self._state
 
     def change(self, row: int, **fields: np.ndarray | None) -> None:
-        """Replace fields of the state, of which only those of one body differ."""
+        """Replace fields of the state that differ only in the row of one body."""
         self._state = replace(self._state, **fields)
         self._changed.add(row)
 
     @abstractmethod
     def _accept(self) -> None:
-        """Check what the user has changed, and announce it to the stepper."""
+        """Check the user's changes, and announce them to the stepper."""
 
 
 @dataclass(frozen=True)
 class ContactPoint:
-    """One place where two bodies touch.
+    """A point where two bodies touch.
 
     Attributes:
         first, second: names of the bodies.
         point: [3] m, world, on the surface of the first.
         normal: [3] unit vector from the second to the first.
-        impulse: [3] N s on the first in the last inner step of the contact solve, opposite on the second.
-        force: [3] N, the mean in that inner step. Of a body that touches at many points only the sum of the forces and
-            their moment are told apart by physics; how they are spread over the points is one choice of many.
-        penetration: m, how deep they are in each other; below 0 where they are still apart.
+        impulse: [3] N s on the first body in the last inner step of the contact solve; the second gets the opposite.
+        force: [3] N, the mean in that inner step. If a body touches at many points, physics determines only the sum of
+            the forces and their moment; their distribution over the points is one choice of many.
+        penetration: m, depth of the overlap; below 0 if the bodies are still apart.
     """
 
     first: str
@@ -97,9 +98,10 @@ class ContactPoint:
 
 
 class BodyHandle:
-    """One body of a simulator, by its `name`: read it, set it, push and pull it. Changes act from the next step on."""
+    """One body of a simulator, by its `name`: read it, set it, push and pull it. Changes take effect from the next step
+    on."""
 
-    __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
+    __slots__ = ("_row", "_simulator", "name")  # so that a misspelt name does not make a new attribute
 
     def __init__(self, simulator: LiveScene, row: int) -> None:
         self._simulator, self._row = simulator, row
@@ -112,7 +114,7 @@ class BodyHandle:
 
     @property
     def position(self) -> np.ndarray:
-        """[3] m, the origin of the body's shape, as a scene file has it."""
+        """[3] m, the origin of the body's shape, world, as in a scene file."""
         return self.centre - self._arm(self._of("orientation"))
 
     @position.setter
@@ -135,7 +137,7 @@ class BodyHandle:
 
     @property
     def velocity(self) -> np.ndarray:
-        """[3] m/s, of the centre of mass."""
+        """[3] m/s, velocity of the centre of mass, world."""
         return self._of("velocity") * self._simulator.units.velocity
 
     @velocity.setter
@@ -153,24 +155,25 @@ class BodyHandle:
 
     @property
     def mass(self) -> float:
-        """kg; 0 for a body that does not move by itself."""
+        """kg; 0 for a body that is not dynamic."""
         return float(self._simulator.bodies.mass[self._row]) * self._simulator.units.mass
 
     @property
     def inertia(self) -> np.ndarray:
-        """[3, 3] kg m^2, about the centre of mass, in the shape's axes; of a body that moves by itself."""
+        """[3, 3] kg m^2, about the centre of mass, in the shape's axes; has no meaning for a body that is not
+        dynamic."""
         sim = self._simulator
         return sim.bodies.inertia[self._row] * sim.units.mass * sim.units.length**2
 
     @property
     def asleep(self) -> bool:
-        """Whether it sleeps: it rests, and costs nothing until something disturbs it."""
+        """Whether the body sleeps: it is at rest, and costs nothing until something disturbs it."""
         touch = self._simulator.state.touch
         return touch is not None and bool(touch.island[self._row] >= 0)
 
     def push(self, impulse: Numbers, at: Numbers | None = None) -> None:
-        """Change its velocities by an impulse [3] N s, now, that acts `at` [3] m, world, or at the centre of mass.
-        Raises SdfsimError if the body does not move by itself."""
+        """Change the body's velocities now by an impulse [3] N s that acts at the point `at` [3] m, world, or at the
+        centre of mass. Raises SdfsimError if the body is not dynamic."""
         self._must_move("be pushed")
         given = _vector("impulse", impulse)
         self.velocity = self.velocity + given / self.mass
@@ -183,17 +186,19 @@ class BodyHandle:
     def pull(
         self, force: Numbers = (0.0, 0.0, 0.0), at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)
     ) -> None:
-        """Let a force [3] N and a torque [3] N m act from now on, in world axes, until the next call or `reset`;
-        `pull()` ends both.
+        """Apply a force [3] N and a torque [3] N m, in world axes, from now until the next call or `reset`; `pull()`
+        ends both.
 
-        The force acts `at` [3] m, world, now, or at the centre of mass. Its moment about the centre of mass stays as it
-        is, however the body moves: pull again after a step to follow the point. The torque comes on top of it. Raises
-        SdfsimError if the body does not move by itself, or the model knows no forces.
+        The force acts at the point `at` [3] m, world, or at the centre of mass. Its moment about the centre of mass
+        stays the same however the body moves: call again after a step to follow the point. The torque is added to it.
+        Raises SdfsimError if the body is not dynamic, or if the model does not support forces.
         """
         self._must_move("be pulled")
         sim = self._simulator
         if not sim.stepper.forces:
-            raise SdfsimError("networks on surface nodes know no forces", "take the solver, or a network on top of it")
+            raise SdfsimError(
+                "networks on surface nodes do not support forces", "use the solver, or a network on top of it"
+            )
         given, moment = _vector("force", force), _vector("torque", torque)
         if at is not None:
             moment = moment + np.cross(_vector("at", at) - self.centre, given)

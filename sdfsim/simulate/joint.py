@@ -29,10 +29,10 @@ from sdfsim.simulate.body import LiveScene
 
 
 class JointHandle:
-    """One joint of a simulator, by its `name`: read it, and drive it, by `target` or by `effort`, which counts from the
-    next step on until you change it. Radians and N m of a hinge, metres and N of a slider."""
+    """One joint of a simulator, by its `name`: read it, and drive it by `target` or by `effort`, which take effect from
+    the next step until you change them. Radians and N m for a hinge, metres and N for a slider."""
 
-    __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
+    __slots__ = ("_row", "_simulator", "name")  # so that a misspelt name does not make a new attribute
 
     def __init__(self, simulator: LiveScene, row: int) -> None:
         self._simulator, self._row = simulator, row
@@ -40,50 +40,50 @@ class JointHandle:
 
     @property
     def angle(self) -> float:
-        """rad, of a hinge: of the first body against the second, turns added up; of a ball: between both axes. Raises
-        SdfsimError for any other joint."""
+        """rad; for a hinge, the angle of the first body relative to the second, with full turns added up; for a ball,
+        the angle between both axes. Raises SdfsimError for any other joint."""
         return self._coordinate("angle", "hinge", "ball")
 
     @property
     def position(self) -> float:
-        """m, of a slider: of the first body against the second; of a distance: its length. Raises SdfsimError for any
-        other joint."""
+        """m; for a slider, the position of the first body relative to the second; for a distance, its length. Raises
+        SdfsimError for any other joint."""
         return self._coordinate("position", "slider", "distance")
 
     @property
     def speed(self) -> float:
-        """rad/s or m/s: how fast the angle or position changes."""
+        """rad/s or m/s: the rate of change of the angle or position."""
         return float(self._state[SPEED]) * self._unit / self._simulator.units.time
 
     @property
     def force(self) -> np.ndarray:
-        """[3] N, world: what the joint did to the first body in the last inner step, its motor, spring, friction and
-        limits included; the opposite to the second."""
+        """[3] N, world: the force of the joint on the first body in the last inner step, including its motor, spring,
+        friction and limits; the second body gets the opposite."""
         u = self._simulator.units
         return self._state[PULL : PULL + 3] * u.mass * u.acceleration
 
     @force.setter
     def force(self, value: float) -> None:
-        raise SdfsimError(f"joint {self.name!r}: force is what the joint has done", "set `effort` to drive it")
+        raise SdfsimError(f"joint {self.name!r}: force is read-only", "set `effort` to drive it")
 
     @property
     def torque(self) -> np.ndarray:
-        """[3] N m, world: likewise the torque about the joint's anchor."""
+        """[3] N m, world: likewise, the torque about the joint's anchor."""
         return self._state[TWIST : TWIST + 3] * self._simulator.units.energy
 
     @torque.setter
     def torque(self, value: float) -> None:
-        raise SdfsimError(f"joint {self.name!r}: torque is what the joint has done", "set `effort` to drive it")
+        raise SdfsimError(f"joint {self.name!r}: torque is read-only", "set `effort` to drive it")
 
     @property
     def broken(self) -> bool:
-        """Whether it has had to bear more than it can."""
+        """Whether the joint is broken: its load was more than it can bear."""
         return bool(self._state[BROKEN])
 
     @property
     def target(self) -> float | None:
-        """What the motor aims at: rad/s or m/s where it keeps a speed, else rad or m; None where nobody has told it
-        yet, and while it gives an `effort`. None lets the motor go. Raises SdfsimError if there is no motor."""
+        """Target of the motor: rad/s or m/s if it keeps a speed, else rad or m; None if none is set, and while the
+        motor gives an `effort`. Setting None switches the motor off. Raises SdfsimError if there is no motor."""
         unit, does = self._aim, int(self._number[MOTOR])
         return float(self._told[TARGET]) * unit if does in (TO_SPEED, TO_PLACE) else None
 
@@ -96,7 +96,7 @@ class JointHandle:
         does = TO_SPEED if self._keeps_speed else TO_PLACE
         ends = self._joint.limits
         if does == TO_PLACE and ends is not None and not ends[0] <= aim <= ends[1]:
-            # One that is out of reach is a way to press against a limit.
+            # Only a warning: a target out of reach is a way to press against a limit.
             told = f"joint {self.name!r}: target {aim:g} is beyond the limits, {ends[0]:.4g} to {ends[1]:.4g}"
             warnings.warn(told, stacklevel=2)
         return self._tell({MOTOR: does}, aim / unit)
@@ -104,9 +104,9 @@ class JointHandle:
     @property
     def effort(self) -> float | None:
         """The torque in N m about a hinge's axis, or the force in N along a slider's, that acts on the first body from
-        now on, whatever the speed, until it is set again; None where the motor goes to its `target` or does nothing.
-        Setting `target` ends it, and so does None. It is no larger than `most` of the motor where there is one. Raises
-        SdfsimError for any other joint."""
+        now on, at any speed, until it is set again; None while the motor follows its `target` or does nothing. Setting
+        `target`, or None, ends it. It is limited to the motor's `most`, if there is a motor. Raises SdfsimError for any
+        other joint."""
         self._need("effort", "hinge", "slider")
         return float(self._told[TARGET]) * self._strength if self._number[MOTOR] == EFFORT else None
 
@@ -120,8 +120,8 @@ class JointHandle:
 
     @property
     def most(self) -> float:
-        """The largest torque in N m, or force in N, of the motor; 0 where there is none, which setting it changes.
-        Raises SdfsimError for what is no hinge or slider."""
+        """The largest torque in N m, or force in N, of the motor; 0 if there is none. Setting it adds a motor. Raises
+        SdfsimError for any joint but a hinge or slider."""
         self._need("most", "hinge", "slider")
         return float(self._number[MOST]) * self._strength
 
@@ -134,8 +134,8 @@ class JointHandle:
 
     @property
     def time(self) -> float:
-        """s, in which what is left of the way shrinks by a factor e. Raises SdfsimError if there is no motor that
-        goes to a place."""
+        """s, in which the distance to the target shrinks by a factor e. Raises SdfsimError if there is no motor that
+        goes to a position."""
         _ = self._aim
         if self._keeps_speed:
             raise SdfsimError(f"joint {self.name!r}: keeps a speed, which has no time", "see joints[].motor.position")
@@ -150,7 +150,7 @@ class JointHandle:
 
     @property
     def damping(self) -> float:
-        """N m s/rad of a hinge or a ball, else N s/m. Raises SdfsimError for what is fixed, or a rod."""
+        """N m s/rad for a hinge or a ball, else N s/m. Raises SdfsimError for a fixed joint or a rod."""
         self._need("damping", "hinge", "slider", "ball", "distance")
         return float(self._number[DAMPING]) * self._strength / self._unit * self._simulator.units.time
 
@@ -164,7 +164,7 @@ class JointHandle:
 
     @property
     def friction(self) -> float:
-        """N m of a hinge or a ball, N of a slider. Raises SdfsimError for any other joint."""
+        """N m for a hinge or a ball, N for a slider. Raises SdfsimError for any other joint."""
         self._need("friction", "hinge", "slider", "ball")
         return float(self._number[DRAG]) * self._strength
 
@@ -179,12 +179,12 @@ class JointHandle:
 
     @property
     def _state(self) -> np.ndarray:
-        """[STATE], with what has been changed."""
+        """[STATE], changes included."""
         return self._known(self._simulator.state)
 
     @property
     def _told(self) -> np.ndarray:
-        """[STATE], of which what users tell is up to date."""
+        """[STATE], in which the values that users set are up to date."""
         return self._known(self._simulator.now)
 
     def _known(self, state: State) -> np.ndarray:
@@ -194,14 +194,14 @@ class JointHandle:
 
     @property
     def _number(self) -> np.ndarray:
-        """[NUMBERS], as somebody has told them last."""
+        """[NUMBERS], as set last."""
         state, joints = self._simulator.now, self._simulator.bodies.joints
         self._known(state)
         assert joints is not None
         return (joints.number if state.drive is None else state.drive)[self._row]
 
     def _tell(self, numbers: dict[int, float], target: float | None = None) -> None:
-        """Change numbers of the joint and what its motor aims at; its bodies wake where that is something new."""
+        """Change numbers of the joint and the target of its motor. Its bodies wake if this changes anything."""
         simulator, row = self._simulator, self._row
         known, number = self._told.copy(), self._number.copy()
         if target is not None:
@@ -230,7 +230,7 @@ class JointHandle:
 
     @property
     def _strength(self) -> float:
-        """N m or N in one model unit of what drives or drags it."""
+        """One model unit of the joint's torque (N m) or force (N)."""
         return self._simulator.units.energy / self._unit
 
     @property
@@ -239,7 +239,7 @@ class JointHandle:
 
     @property
     def _aim(self) -> float:
-        """rad or m, or rad/s or m/s, in one model unit of the target."""
+        """One model unit of the target: rad or m, or rad/s or m/s."""
         if not self._number[MOST] > 0.0:
             hint = "give it one in the scene, joints[].motor, or set most; effort needs none"
             raise SdfsimError(f"joint {self.name!r}: has no motor", hint)

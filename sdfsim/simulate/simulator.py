@@ -45,18 +45,19 @@ if TYPE_CHECKING:
     from sdfsim.physics.solver.prepare import SharedShapes
     from sdfsim.scene.builder import SceneBuilder
 
-GLANCE = 0.1  # s between two looks at a run that goes on
+GLANCE = 0.1  # s between two progress reports
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
-# what a variant may change: how many numbers a vector has (0: a number), and the most that a number may be
+# what a variant may change: the length of the vector (0: a number), and the largest value of a number
 VARIED = {
     "position": (3, np.inf), "quat_xyzw": (4, np.inf), "velocity": (3, np.inf), "angular_velocity": (3, np.inf),
     "mass": (0, np.inf), "friction": (0, np.inf), "restitution": (0, 1.0),
 }  # fmt: skip
-CHUNKS = 16  # pieces that variants are cut into at most, so that cores end together
+CHUNKS = 16  # largest number of pieces that variants are cut into, so that all cores finish together
 
 
 class SimulationError(SdfsimError):
-    """The state broke: the message names the step and the body, `rollout` has everything up to the last good state."""
+    """The simulation reached an invalid state. The message names the step and the body; `rollout` has everything up to
+    the last good state."""
 
     def __init__(self, message: str, rollout: Rollout) -> None:
         hint = "try another model, or look for bodies that overlap at the start"
@@ -79,38 +80,35 @@ class Simulator(LiveScene):
         for state in simulator.steps(100):               # or `step(n)`: n steps at once
             print(state.time, ball.position, simulator.contact_points())
 
-    What there is, in the order in which you may need it:
+    Methods, in the order in which you may need them:
 
         run              all of the motion
         simulator[name]  a body: read it, set it, push it, pull it
-        step, steps      go on by n steps: the state after all of them, or after each
-        contact_points   where bodies touch, with forces and normals
-        joint            a joint by its name: its angle, its motor (`JointHandle`)
-        reset            back to the start
-        state, restore   keep a state, and go back to it
-        rollouts         many variants of the scene, on all cores
-        frames           a run in pieces, to be shown as it goes on
+        step, steps      make n steps: the state after all of them, or after each contact_points   contact points, with
+        forces and normals joint            a joint by its name: its angle, its motor (`JointHandle`) reset back to the
+        start state, restore   keep a state, and go back to it rollouts         many variants of the scene, on all cores
+        frames           a run in pieces, to show it while it runs
 
     Args:
-        scene: bodies, shapes, gravity; one written in Python, or the path of a file or the name of a sample, is loaded
+        scene: bodies, shapes, gravity. A scene written in Python, the path of a file or the name of a sample is loaded
             first.
-        model: bundled name, path or `Model`; None takes the scene's, else the default one.
+        model: bundled name, path or `Model`; None: the scene's model, else the default.
         device: "cpu", "cuda" or "auto".
-        seed: of torch's generator (nothing in a step draws from it today; it is recorded).
-        dt: s, the step; None lets the size of the bodies decide (the model owns the step in its own units).
-        free_flight: "exact", or "learned" for the own formulation of networks on surface nodes.
+        seed: seed of torch's generator (recorded; no step uses random numbers today).
+        dt: s, the step; None: by the size of the bodies (the model has a fixed step in its own units).
+        free_flight: "exact", or "learned": networks on surface nodes then predict it, as in the papers.
 
     Attributes:
-        state: bodies and how they move, model units; see `LiveScene`.
-        options: what is in play, model units; give it others to change that.
-        stepper: what makes the steps.
+        state: poses, velocities, contacts and more, model units; see `LiveScene`.
+        options: gravity, the step and which effects are on, model units; assign to it to change them.
+        stepper: the object that makes the steps.
         dt: s, the step in the scene's units.
         units: metres, seconds and kilograms per model unit.
-        outside_training: what of the scene the model has not seen in training, one line each.
+        outside_training: in what ways the scene is beyond the model's training, one line each.
 
     Raises:
-        SdfsimError: no such model or device, an invalid time step, a body that moves without mass or without nodes
-            enough to define its rotation, one that is too large, too far away or too fast.
+        SdfsimError: no such model or device, an invalid time step, a dynamic body without mass or without enough nodes
+            to define its rotation, or a body that is too large, too far away or too fast.
     """
 
     def __init__(
@@ -133,7 +131,9 @@ class Simulator(LiveScene):
         self._asked = {"dt": dt, "free_flight": free_flight}
         stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight)
         if jointed and not stepper.forces:
-            raise SdfsimError("networks on surface nodes know no joints", "take the solver, or set effects.joints: off")
+            raise SdfsimError(
+                "networks on surface nodes do not support joints", "use the solver, or set effects.joints: off"
+            )
         self.device = str(pick_device(device)) if stepper.on_surfaces else "cpu"
         self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed
@@ -156,8 +156,8 @@ class Simulator(LiveScene):
         self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
-        self._shared: SharedShapes | None = None  # with simulators of other scenes
-        self._si: tuple[State, Moment] | None = None  # a state that others differ from in some rows, and the same in SI
+        self._shared: SharedShapes | None = None  # shared with simulators of other scenes
+        self._si: tuple[State, Moment] | None = None  # a state, and the same in SI; later ones differ in some rows
         self._options = Options(
             gravity=gravity,
             dt=self.model.dt,
@@ -183,33 +183,34 @@ class Simulator(LiveScene):
             "python": platform.python_version(),
         }
         self.steps_done = 0
-        self._given = 0.0  # model energy that came from outside since the last frame
+        self._given = 0.0  # energy from outside since the last frame, model units
         if broken := first_fault(self.state, self._options.dt):
             raise SdfsimError(self._described(broken))
         self._good = self._start = self.state
 
     def steps(self, count: int) -> Iterator[Moment]:
-        """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError for a state that
-        cannot be; its `rollout` is one frame here, the last good state."""
+        """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError for an invalid
+        state; its `rollout` has one frame here, the last good state."""
         for _ in range(_whole(count)):
             self._advance(1)
             yield self.si_state()
 
     def step(self, count: int = 1) -> Moment:
-        """Advance by `count` steps; the state after them (SI units). Raises as `steps` does."""
+        """Advance by `count` steps, and return the state after them (SI units). Raises as `steps` does."""
         self._advance(_whole(count))
         return self.si_state()
 
     def frames(self, count: int, at_once: int | None = None) -> Iterator[Rollout]:
-        """Advance by `count` steps, yielding all frames since the last time as one rollout; raises as `steps` does, but
-        the `rollout` has the frames since the last time up to the last good state, which may be none.
+        """Advance by `count` steps, yielding new frames, several at a time, as a rollout. Raises as `steps` does, but
+        the error's `rollout` has the frames since the last one that was yielded, up to the last good state; there may
+        be none.
 
-        Steps are made `at_once` in one call of compiled code (None: as many as take about `GLANCE` seconds), which
-        changes no result.
+        `at_once` steps are made in one call of compiled code (None: as many as take about `GLANCE` seconds). This does
+        not change results.
         """
         made, some = 0, max(1, at_once or 1)
         if count and not self.steps_done:
-            self._advance(0, keep=True)  # what has to be compiled or loaded is no part of the time of a step
+            self._advance(0, keep=True)  # so that compiling and loading do not count for the time of a step
         while made < count:
             some = min(some, count - made)
             started = time.perf_counter()
@@ -236,7 +237,7 @@ class Simulator(LiveScene):
 
     @property
     def carry(self) -> Carry:
-        """What the stepper keeps of this run, made on first use."""
+        """What the stepper keeps from step to step; made on first use."""
         if self._carry is None:
             self._carry = self.stepper.init(self.bodies, self._state, self._options, self._shared)
             self._carry.checked = True
@@ -247,9 +248,9 @@ class Simulator(LiveScene):
         self.restore(self._start)
 
     def restore(self, state: State) -> None:
-        """Go on from a state that steps have led to, here or in another simulator of the same scene, as they would have
-        gone on there: to the last bit, and what slept sleeps on. For a state that you have changed set `state`. Raises
-        SdfsimError for a state that cannot be, or of another scene."""
+        """Continue from a state that steps have led to, in this or another simulator of the same scene. The motion
+        continues as it would have there, bit by bit, and sleeping bodies sleep on. For a state that you have changed,
+        set `state` instead. Raises SdfsimError for an invalid state, or a state of another scene."""
         self._fits(state)
         if broken := first_fault(state, self._options.dt):
             raise SdfsimError(self._described(broken))
@@ -260,27 +261,27 @@ class Simulator(LiveScene):
         self.steps_done = round(state.time / self._options.dt)
 
     def __getitem__(self, name: str) -> BodyHandle:
-        """A body by its name. Raises SdfsimError if there is none of that name."""
+        """A body by its name. Raises SdfsimError if no body has that name."""
         if name not in self._names:
             close = nearest(name, self._names)
-            raise SdfsimError(f"there is no body {name!r}{close}", f"there are {', '.join(self._names[:20])}")
+            raise SdfsimError(f"there is no body {name!r}{close}", f"bodies are {', '.join(self._names[:20])}")
         return BodyHandle(self, self._names.index(name))
 
     def joint(self, name: str) -> JointHandle:
-        """A joint by its name. Raises SdfsimError if there is none of that name."""
+        """A joint by its name. Raises SdfsimError if no joint has that name."""
         names = [joint.name for joint in self.scene.joints]
         if name not in names:
             told = nearest(name, names)
-            known = f"there are {', '.join(names[:20])}" if names else "the scene has no joints"
+            known = f"joints are {', '.join(names[:20])}" if names else "the scene has no joints"
             raise SdfsimError(f"there is no joint {name!r}{told}", known)
         return JointHandle(self, names.index(name))
 
     def contact_points(self) -> list[ContactPoint]:
-        """Where bodies touch in the present state, as the last step of the contact solve has left it. Raises
+        """The points where bodies touch in the present state, as the last step of the contact solve left them. Raises
         SdfsimError for networks on surface nodes, which have no impulses."""
         if not self.stepper.forces:
             raise SdfsimError(
-                "networks on surface nodes report no impulses", "take the solver, or a network on top of it"
+                "networks on surface nodes report no impulses", "use the solver, or a network on top of it"
             )
         from sdfsim.physics.solver.prepare import contact_points
 
@@ -302,24 +303,24 @@ class Simulator(LiveScene):
         self, variants: Sequence[Variant], seconds: float | None = None, steps: int | None = None,
         on_progress: Progress = silent,
     ) -> list[Rollout]:  # fmt: skip
-        """The scene from its start with some values changed, once for each variant, on all cores; the same as `run` of
-        a `Simulator` of each changed scene with the model, device, seed, step and free flight of this one.
+        """Simulate the scene from its start, once for each variant, with some values changed, on all cores. The results
+        are those of `run` of a `Simulator` for each changed scene, with the model, device, seed, step and free flight
+        of this one.
 
         Variants map names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity, mass, friction,
-        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. `on_progress` is called as some of them have
-        ended. Raises SdfsimError for no such body or field, or a value that it cannot have; SimulationError where a
-        state broke.
+        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. `on_progress` is called as variants finish.
+        Raises SdfsimError for an unknown body or field, or an invalid value, and SimulationError for an invalid state.
         """
         scenes = [varied(self.scene, variant) for variant in variants]
         same = {"device": self.device, "seed": self.seed, **self._asked}
         return run_all(scenes, self.model, seconds, steps, on_progress, **same)
 
     def run(self, seconds: float | None = None, steps: int | None = None, on_progress: Progress = silent) -> Rollout:
-        """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
-        `on_progress` is called some times a second with the share that is done, 0 to 1, and a line that tells it.
+        """Simulate for `seconds` (default: the scene's duration; see `steps_in`) or `steps`, and keep all frames.
+        `on_progress` is called a few times a second with the share that is done, 0 to 1, and a line of text.
 
-        Raises SdfsimError for a length of time that is negative or not finite; SimulationError where the state broke,
-        with what was computed in its `rollout`.
+        Raises SdfsimError if `seconds` is negative or not finite, and SimulationError for an invalid state; its
+        `rollout` has the frames before.
         """
         if steps is None:
             steps = self.steps_in(self.scene.duration if seconds is None else seconds)
@@ -334,13 +335,13 @@ class Simulator(LiveScene):
         return join(parts)
 
     def steps_in(self, seconds: float) -> int:
-        """The number of steps that comes nearest to `seconds`: none for 0 s, else at least one. Raises SdfsimError
-        if that is negative or not finite."""
+        """The number of steps nearest to `seconds`: none for 0 s, else at least one. Raises SdfsimError if `seconds` is
+        negative or not finite."""
         check_seconds(seconds)
         return max(1, round(seconds / self.dt)) if seconds else 0
 
     def initial_rollout(self) -> Rollout:
-        """The current state as a rollout of one frame; raises as `steps` does."""
+        """The current state as a rollout of one frame. Raises as `steps` does."""
         self._accept()
         state, (points, pairs, depth) = self._state, self.stepper.touching(self._state, self._carry)
         counts = dict.fromkeys((*COUNTS, *PHASES), 0.0) if self._carry is None else self._carry.counts
@@ -357,7 +358,7 @@ class Simulator(LiveScene):
         return self._rollout(frames, 0.0)
 
     def si_state(self) -> Moment:
-        """Motion and time of the current state, in metres and seconds; to go back to it later keep `state`."""
+        """Motion and time of the current state, in metres and seconds. To return to it later, keep `state` instead."""
         u, state = self.units, self.state
 
         def whole(state: State) -> Moment:
@@ -373,7 +374,7 @@ class Simulator(LiveScene):
         return self._si[1].with_rows(rows, moved, time=state.time * u.time)
 
     def _advance(self, count: int, *, keep: bool = False) -> None:
-        """Make `count` steps, all in one call where the stepper can."""
+        """Make `count` steps, in one call if the stepper can."""
         self._accept(keep=keep)
         after, carry = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep)
         self._state = self._good = after
@@ -384,8 +385,9 @@ class Simulator(LiveScene):
             raise self._broke(self._described(carry.fault), carry.frames if keep else None)
 
     def _accept(self, *, keep: bool = False) -> None:
-        """Check what the user has changed before anything is computed from it, and announce it to the stepper. Raises
-        SimulationError for a state that cannot be; its rollout has no frame if the caller does `keep` those before."""
+        """Check the user's changes before anything is computed from them, and announce them to the stepper. Raises
+        SimulationError for an invalid state; its rollout has no frames if the caller keeps the earlier ones
+        (`keep`)."""
         if not (self._handed or self._changed):
             return
         state, good, changed = self._state, self._good, np.zeros(len(self.bodies), bool)
@@ -416,7 +418,7 @@ class Simulator(LiveScene):
         return SimulationError(message, known)
 
     def _rollout(self, frames: Frames, milliseconds: float) -> Rollout:
-        """Frames up to the present step in SI units, each of which took so many milliseconds."""
+        """Frames up to the present step in SI units, each of which took `milliseconds`."""
         u, k = self.units, len(frames.depth)
         given = frames.energy[:, 2].copy()
         if k:
@@ -449,12 +451,12 @@ class Simulator(LiveScene):
 
 def _whole(count: int) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
-        raise SdfsimError(f"steps: must be a whole number >= 0 (got {count!r})", "steps_in(seconds) tells how many")
+        raise SdfsimError(f"steps: must be a whole number >= 0 (got {count!r})", "steps_in(seconds) gives the number")
     return int(count)
 
 
 def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
-    """[N] bool, the bodies that move, are pulled or are driven otherwise in the two states."""
+    """[N] bool, the bodies whose motion, pulling force or motors differ between the two states."""
     found = np.zeros(len(bodies), bool)
     for name in MOTION:
         found |= np.any(getattr(state, name) != getattr(other, name), axis=-1)
@@ -469,8 +471,8 @@ def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
 
 
 def varied(scene: Scene, variant: Variant) -> Scene:
-    """The scene with some values changed, of the fields of `VARIED` in SI units. An inertia of its own grows with the
-    mass. Raises SdfsimError for no such body or field, or a value that it cannot have."""
+    """The scene with some of the fields `VARIED` changed, in SI units. A body's own inertia scales with its mass.
+    Raises SdfsimError for an unknown body or field, or an invalid value."""
     known = {body.name for body in scene.bodies}
     for name in variant:
         if name not in known:
@@ -483,7 +485,7 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
     for name, given in fields.items():
         where = f"variant: body {body.name!r}: {name}"
         if name not in VARIED:
-            raise SdfsimError(f"{where}: no such field{nearest(name, VARIED)}; there are {', '.join(VARIED)}")
+            raise SdfsimError(f"{where}: no such field{nearest(name, VARIED)}; fields are {', '.join(VARIED)}")
         value, (count, most) = np.asarray(given, dtype=np.float64), VARIED[name]
         if value.shape != ((count,) if count else ()) or not np.isfinite(value).all():
             raise SdfsimError(f"{where}: must be {count or 1} finite numbers (got {given!r})")
@@ -509,9 +511,9 @@ def run_all(
     scenes: Sequence[Scene], model: Model | None = None, seconds: float | None = None, steps: int | None = None,
     on_progress: Progress = silent, **options: Any,
 ) -> list[Rollout]:  # fmt: skip
-    """`run` of a `Simulator` of every scene, made with these options, on all cores: in threads where the steps are
-    compiled code that needs nothing of Python and has no threads of its own, else in processes. Raises as these do."""
-    from sdfsim.physics.solver.prepare import CROWD, SharedShapes  # numba takes its time to load
+    """`run` of a `Simulator` for every scene, made with these options, on all cores: in threads if the steps are
+    compiled code that does not need Python and has no threads of its own, else in processes. Raises as these do."""
+    from sdfsim.physics.solver.prepare import CROWD, SharedShapes  # numba is slow to load
 
     model = model or load_model()
     few = all(sum(b.motion == "dynamic" for b in scene.bodies) < CROWD for scene in scenes)
@@ -540,6 +542,6 @@ def _run_each(
 
 
 def check_seconds(seconds: float) -> None:
-    """Raises SdfsimError if `seconds` is no length of time."""
+    """Raises SdfsimError if `seconds` is negative or not finite."""
     if not 0.0 <= seconds < np.inf:
         raise SdfsimError(f"seconds: must be >= 0 and finite (got {seconds:g})")

@@ -1,9 +1,10 @@
-"""What takes a state to the next one: free flight alone, the contact solve, and the networks, all by one contract.
+"""Steppers take a state to the next one: free flight alone, the contact solve, and the networks, all with one
+interface.
 
 `stepper_of` makes a stepper of a model. `init` gives a `Carry` for the bodies and the start of a run, `advance` makes
-one step or many in one call, and `announce` reports what the user has changed between steps. Each stage sees only what
-is in play: an effect that is off is not computed, a body without contact is not in a network's graph, and a body that
-sleeps costs nothing until something moves beside it.
+one step or many in one call, and `announce` reports what the user has changed between steps. Each stage computes only
+what is needed: an effect that is off is not computed, a body without contact is not in a network's graph, and a
+sleeping body costs nothing until something moves beside it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from sdfsim.physics.validity import NO_LIMITS, Fault, first_fault, limits
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
 
-if TYPE_CHECKING:  # numba and torch take their time to load
+if TYPE_CHECKING:  # numba and torch are slow to load
     import torch
 
     from sdfsim.learned.families import Family
@@ -41,12 +42,12 @@ if TYPE_CHECKING:  # numba and torch take their time to load
     from sdfsim.physics.solver.record import Edges
 
 FreeFlight = Literal["exact", "learned"]
-LONGEST = 0.01  # s, an inner step of the contact solve
+LONGEST = 0.01  # s, the longest inner step of the contact solve that its laws were checked with
 COUNTS = {
     "pairs": "pairs of bodies that the broad phase let through",
-    "contacts": "contact points that the solve held",
-    "nodes": "nodes of the graph that the network saw",
-    "edges": "edges of that graph",
+    "contacts": "contact points in the solve",
+    "nodes": "nodes in the network's graph",
+    "edges": "edges in that graph",
     "free": "dynamic bodies in free flight",
     "active": "dynamic bodies awake that contacts moved",
     "asleep": "dynamic bodies asleep",
@@ -56,37 +57,37 @@ PHASES = {"flight_ms": "free flight", "contact_ms": "contact solve", "network_ms
 
 @dataclass(frozen=True)
 class Frames(Motion):
-    """What a recording keeps of each of K steps, model units."""
+    """The data that a recording keeps of each of K steps, model units."""
 
-    energy: np.ndarray  # [K, 3] kinetic and potential; what pulls have given in the step
+    energy: np.ndarray  # [K, 3] kinetic and potential energy; work of pulls in the step
     depth: np.ndarray  # [K] the deepest penetration
-    touching: np.ndarray  # [K] int64, points where bodies touch
+    touching: np.ndarray  # [K] int64, number of points where bodies touch
     pair: np.ndarray  # [sum(touching), 2] int64, the bodies that touch there
     point: np.ndarray  # [sum(touching), 3]
     counts: dict[str, np.ndarray]  # [K] each, see `COUNTS` and `PHASES`
-    # [K, J, 7] of each joint its angle, position or length; force and torque on its first body, at its anchor
+    # [K, J, 7] for each joint its angle, position or length; force and torque on its first body, at its anchor
     joint: np.ndarray
 
 
 @dataclass
 class Carry:
-    """What a stepper keeps of one run from step to step, beside the state. None of it changes a result."""
+    """What a stepper keeps from step to step, besides the state. None of it changes results."""
 
     bodies: Bodies
     options: Options
-    checked: bool = False  # whether `advance` ends where a state cannot be
+    checked: bool = False  # whether `advance` ends at an invalid state
     counts: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*COUNTS, *PHASES), 0.0))  # of a step
     done: int = 0  # steps that the latest `advance` has made
-    fault: Fault | None = None  # of the state after these, where that cannot be
-    given: float = 0.0  # model energy that pulls have given in these
-    frames: Frames | None = None  # of these, where they were asked for
-    scene: Compiled | None = None  # the bodies for compiled code, if the stepper calls any
-    # Weights of a network on the solve, for compiled code; the bodies as tensors, for a network on surface nodes. Both
-    # also depend on the options.
+    fault: Fault | None = None  # the fault of the state after these, if it is invalid
+    given: float = 0.0  # work of pulls in these steps, model units
+    frames: Frames | None = None  # frames of these steps, if they were asked for
+    scene: Compiled | None = None  # the bodies for compiled code, if the stepper uses any
+    # The weights of a network on the solve, for compiled code, and the bodies as tensors, for a network on surface
+    # nodes. Both also depend on the options.
     weights: ImpulseNetwork | None = None
     tensors: BodyTensors | None = None
-    edges: Edges | None = None  # what contacts did in the latest step, where `options.record`
-    near: Contacts | Pairs | None = None  # where a network on surface nodes saw bodies near each other
+    edges: Edges | None = None  # what contacts did in the latest step, if `options.record`
+    near: Contacts | Pairs | None = None  # where a network on surface nodes found bodies near each other
 
     @contextmanager
     def timed(self, phase: str) -> Iterator[None]:
@@ -98,14 +99,14 @@ class Carry:
 
 @dataclass(frozen=True)
 class Stepper:
-    """The contract of all steppers. This class alone lets all bodies fly freely."""
+    """The interface of all steppers. This class itself lets all bodies fly freely."""
 
     model: Model
     mean: bool = False  # whether model units follow the mean size of the bodies that move, not the smallest
 
     on_surfaces: ClassVar[bool] = False  # whether it works on surface nodes: on CUDA too, in steps of its own length
     forces: ClassVar[bool] = True  # whether bodies can be pulled, and contacts report impulses
-    sleeps: ClassVar[bool] = False  # whether it freezes what rests
+    sleeps: ClassVar[bool] = False  # whether it freezes bodies at rest
     network: ClassVar[bool] = False  # whether a network takes part
 
     @property
@@ -119,11 +120,11 @@ class Stepper:
         return scene_units(scene, dt, **known, mean=self.mean)
 
     def surface(self, shape: Shape) -> Shape:
-        """The shape with the surface nodes, and the faces between them, that it works on."""
+        """The shape with the surface nodes, and the faces between them, that the stepper uses."""
         return shape
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
-        """A line for each way in which scenes go beyond what it was trained or checked on."""
+        """A line for each way in which scenes are beyond what the stepper was trained or checked on."""
         return outside_training(scenes, self.model, units)
 
     def distrusted(self) -> Stepper:
@@ -131,7 +132,7 @@ class Stepper:
         return self
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
-        """A start state, completed with what the first step needs."""
+        """A start state, completed with everything that the first step needs."""
         return state
 
     def init(self, bodies: Bodies, state: State, options: Options, shared: SharedShapes | None = None) -> Carry:
@@ -144,15 +145,15 @@ class Stepper:
 
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
         """The state after the user has changed pose, velocities or load of the bodies `changed` [N] bool, or gravity.
-        Data that is precomputed from static bodies is made again if one of them has changed."""
+        Data precomputed from static bodies is made again if one of them has changed."""
         scene = carry.scene
         if scene is not None and (changed & ~(scene.world.moves | scene.world.scripted)).any():
             scene.place(state)
         return state
 
     def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
-        """Make `n` steps, and `keep` their frames. A `checked` carry ends them at the first state that cannot be. The
-        counts of the carry are those of the last step that is kept."""
+        """Make `n` steps, and `keep` their frames. A `checked` carry ends them at the first invalid state. The counts
+        of the carry are those of the last step that is kept."""
         bodies, dt, rows, frames = carry.bodies, carry.options.dt, carry.bodies.movers, []
         carry.done, carry.fault, carry.given, carry.frames = 0, None, 0.0, None
         for _ in range(n):
@@ -176,7 +177,7 @@ class Stepper:
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         """Points [C, 3] where bodies touch, pairs of bodies [C, 2], and the deepest penetration, model units; before
-        the first step there is no carry."""
+        the first step `carry` is None."""
         return np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64), 0.0
 
     def _step(self, state: State, carry: Carry) -> State:
@@ -192,7 +193,7 @@ class Solver(Stepper):
     sleeps = True
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
-        """It has no training: a line if its inner step is longer than any that its laws were checked with."""
+        """The solve has no training. A line if its inner step is longer than any that its laws were checked with."""
         inner = self.model.dt * units.time / (self.model.inner or SUBSTEPS)
         if inner <= LONGEST:
             return []
@@ -237,14 +238,14 @@ class Solver(Stepper):
 
     def _step(self, state: State, carry: Carry) -> State:
         with carry.timed("contact_ms"):
-            return self._steps(state, carry, 1, NO_LIMITS).state  # `Stepper.advance` looks at what comes of it
+            return self._steps(state, carry, 1, NO_LIMITS).state  # `Stepper.advance` checks the result
 
 
 @dataclass(frozen=True)
 class OnSolver(Solver):
-    """The *impulse* network: it corrects what the contact solve makes of a step."""
+    """The *impulse* network, which corrects the step of the contact solve."""
 
-    trust: float = 1.0  # in what the network adds to the solve; 0 where a scene is beyond its training
+    trust: float = 1.0  # factor on what the network adds to the solve; 0 if a scene is beyond its training
 
     network = True
     unknown, advance = Stepper.unknown, Stepper.advance
@@ -253,7 +254,7 @@ class OnSolver(Solver):
         return replace(self, trust=0.0)
 
     def _step(self, state: State, carry: Carry) -> State:
-        # No network has seen forces or joints in its training.
+        # No network was trained with forces or joints.
         asked = self.trust > 0.0 and state.load is None and state.joints is None
         carry.options = carry.options._replace(record=asked)
         solved, edges = super()._step(state, carry), cast("Edges", carry.edges)
@@ -272,8 +273,8 @@ class OnSolver(Solver):
 
 @dataclass(frozen=True)
 class OnSurfaces(Stepper):
-    """The networks on surface nodes: a published step of the bodies that are near another, free flight of the others,
-    which they may predict too (`learned`)."""
+    """The networks on surface nodes: the step of the papers for bodies that are near another, free flight for the
+    others, which the networks may predict too (`learned`)."""
 
     family: Family = field(kw_only=True)
     contact: bool = True
@@ -288,7 +289,7 @@ class OnSurfaces(Stepper):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights of the network are."""
+        """The device of the network's weights."""
         return next(iter(self.model.network.state_dict().values())).device
 
     def surface(self, shape: Shape) -> Shape:
@@ -298,11 +299,11 @@ class OnSurfaces(Stepper):
         return with_history(state, bodies, options)
 
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
-        """The earlier positions of bodies that were changed follow from their velocities."""
+        """The earlier positions of changed bodies are computed from their velocities."""
         return with_history(super().announce(state, carry, changed), carry.bodies, carry.options, changed)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
-        """The edges were found at the start of the step; their points are given for the poses of `state`."""
+        """The edges were found at the start of the step; their points are returned for the poses of `state`."""
         if carry is None or carry.near is None or not len(near := carry.near):
             return super().touching(state, carry)
         from sdfsim.learned.near import where
@@ -331,7 +332,7 @@ class OnSurfaces(Stepper):
         from sdfsim.learned.tensors import state_tensors
 
         options, family, tensors = carry.options, self.family, self._tensors(carry)
-        if state.earlier_position is None:  # of a stepper that needs none
+        if state.earlier_position is None:  # from a stepper that needs no earlier positions
             state = self.began(state, carry.bodies, options)
         free = super()._step(state, carry)
         with torch.no_grad():
@@ -365,7 +366,7 @@ class OnSurfaces(Stepper):
 
 
 def _given(before: State, after: State, rows: np.ndarray, dt: float) -> float:
-    """The work of pulling forces and torques at the bodies `rows` in a step."""
+    """The work of pulling forces and torques on the bodies `rows` in a step."""
     if before.load is None:
         return 0.0
     force, torque = before.load[rows, :3], before.load[rows, 3:]
@@ -387,7 +388,7 @@ def energies_of(bodies: Bodies, state: State, gravity: np.ndarray) -> tuple[floa
 
 
 def stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: Bodies, options: Options) -> Frames:
-    """The frames of single steps: each the state after it, what pulls gave, counts, and where bodies touch."""
+    """The frames of single steps: for each the state after it, the work of pulls, counts, and where bodies touch."""
     states = [state for state, *_ in kept]
     arrays = {
         name: np.stack([getattr(s, name) for s in states]) if states else getattr(like, name)[None][:0]
@@ -415,13 +416,11 @@ def joint_frame(state: State) -> np.ndarray:
 
 
 def stepper_of(model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact") -> Stepper:
-    """How a model steps scenes with `contact` or without. Only networks on surface nodes
-    know "learned" free flight; raises SdfsimError for any other model."""
+    """The stepper of a model, for scenes with `contact` or without. Only networks on surface nodes have "learned" free
+    flight; raises SdfsimError for it with any other model."""
     learned, on_surfaces = free_flight == "learned", model.kind in SURFACE
     if learned and not on_surfaces:
-        raise SdfsimError(
-            "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
-        )
+        raise SdfsimError("only networks on surface nodes have free_flight 'learned'", "give a model of that kind")
     if not contact and not learned:
         return Stepper(model, mean=on_surfaces)
     if on_surfaces:

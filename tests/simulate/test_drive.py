@@ -153,8 +153,8 @@ def test_a_target_beyond_the_limits_is_told():
         (lambda j: setattr(j, "most", -1), "most: must be a finite number of at least 0"),
         (lambda j: setattr(j, "time", 0), "time: must be above 0"),
         (lambda j: setattr(j, "friction", True), "friction: must be a finite number of at least 0"),
-        (lambda j: setattr(j, "torque", 2.0), "torque is what the joint has done\nhint: set `effort`"),
-        (lambda j: setattr(j, "force", 2.0), "force is what the joint has done\nhint: set `effort`"),
+        (lambda j: setattr(j, "torque", 2.0), "torque is read-only\nhint: set `effort`"),
+        (lambda j: setattr(j, "force", 2.0), "force is read-only\nhint: set `effort`"),
         (lambda j: j.position, "is a hinge, which has no position\nhint: read angle"),
     ],
 )
