@@ -1,7 +1,7 @@
-"""The contact solve: scenes as it wants them (`prepare`), and the step, compiled (all other files).
+"""The contact solve: preparation of scenes (`prepare`), and the compiled step (all other files).
 
-Compiled code is kept in the user's cache folder, under a hash of the files: numba looks only at the file that a
-function is in, and would go on with what another one held when it was compiled.
+Compiled code is cached in the user's cache folder, under a hash of all files: numba checks only the file that a
+function is in, and would use outdated code if another file changed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ def _cache() -> Path:
 
 @contextmanager
 def kept() -> Iterator[None]:
-    """What is compiled of functions defined in the block is kept: modules that have some are imported in it."""
+    """Cache the compiled code of functions that are defined in the block: modules with such functions are imported
+    inside it."""
     settings: Any = config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = before or str(_cache())
@@ -41,8 +42,8 @@ def kept() -> Iterator[None]:
 
 
 def _without_blas() -> None:
-    """Load numba's arrays without SciPy's BLAS, which numba loads to see whether it is there: it takes a tenth of a
-    second, and no kernel asks for it. Who does asks for it again."""
+    """Load numba's arrays without SciPy's BLAS, which numba loads only to check for it. That takes a tenth of a second,
+    and no kernel needs it. Code that does need it loads it later."""
     linalg: Any = import_module("numba.np.linalg")
     asked = getattr(linalg, "ensure_blas", None)
     if asked is None or "numba.np.arraymath" in sys.modules:

@@ -1,4 +1,4 @@
-"""One step, compiled: pairs that may meet once, then inner steps of contact, impulses and motion."""
+"""One step, compiled: first the pairs that may meet, then inner steps of contacts, impulses and motion."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ from sdfsim.physics.solver.vectors import (
 
 @njit(**FAST, inline="always")
 def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, step):
-    """Advance `motion` by one step of a script, in place, and what is known of the joints that hold bodies; time is
-    that of the bodies that go, however many others there are.
+    """Advance `motion`, and the state of joints in `held`, by one step of a script, in place. The time depends on the
+    bodies that are awake, however many others there are.
 
-    All structures but `manifolds` and `held` are references. For what may be None see `run_steps`.
+    All structures except `manifolds` and `held` are references. `run_steps` says which arguments may be None.
 
     Returns:
-        The manifolds at its end; what contacts did, where it is to be noted; and counts: pairs looked at, contacts of
-        the last inner step, bodies that contacts moved.
+        The manifolds at the end of the step; what contacts did, if it is to be recorded; and counts: pairs tested,
+        contacts of the last inner step, bodies that contacts moved.
     """
     joints = reference(held)
     matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
@@ -110,7 +110,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
                 moved = _move(world, motion, matrix, rules, work.wrench, change, shift, work.part[b], trial, frame, b)
                 work.gone[b] += moved
                 if held is not None:
-                    if joints.calm[b]:  # of what only joints hold
+                    if joints.calm[b]:  # for bodies that only joints hold
                         motion.touching[b] = False
                 work.met[b] = work.met[b] or motion.touching[b]
     if note is not None:
@@ -128,7 +128,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
         end_step(world, work, motion, rules, joints)
     if rules.options.sleep:
         put_to_sleep(world, motion, rules, reference(manifolds), joints)
-    met = 0  # of those that are awake still
+    met = 0  # of bodies that are still awake
     for b in world.going:
         met += work.met[b] and motion.island[b] < 0
     return manifolds, edges, (len(near.start), contacts, met)
@@ -136,8 +136,8 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
 
 @njit(**BARE)
 def _shifted(world, work, motion, rules, part):
-    """Velocities at an instant become those of the inner step before it, which contacts are solved with (part -0.5),
-    and back: bodies that nothing held in the last inner step then move exactly as in free flight."""
+    """Convert velocities at an instant to those of the inner step before it, with which contacts are solved (part
+    -0.5), or back (part 0.5). So bodies without contact in the last inner step move exactly as in free flight."""
     for b in world.going:
         if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
             v, w = pull_of(world, work.matrix, work.wrench, rules, part, b)
@@ -148,7 +148,7 @@ def _shifted(world, work, motion, rules, part):
 
 @njit(**BARE)
 def _prepare(world, motion, matrix, inverse, wrench, rules, free, b):
-    """Inverse inertia in world axes, and what gravity, pulls and the gyroscopic torque make of the velocities."""
+    """Inverse inertia in world axes, and the change of velocities by gravity, pulls and the gyroscopic torque."""
     v, w = pull_of(world, matrix, wrench, rules, 1.0, b)
     for x in range(3):
         free[b, x], free[b, 3 + x] = v[x], w[x]
@@ -163,7 +163,7 @@ def _prepare(world, motion, matrix, inverse, wrench, rules, free, b):
         return
     w = get(motion.angular, b)
     momentum = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, w)))
-    # Explicit at the middle of the inner step: keeps energy to third order.
+    # Explicit at the middle of the inner step: conserves energy to third order.
     half = turn(inverse, b, cross(momentum, w))
     middle = along(w, half, 0.5 * rules.substep_dt)
     later = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, middle)))
@@ -174,7 +174,7 @@ def _prepare(world, motion, matrix, inverse, wrench, rules, free, b):
 
 @njit(**BARE)
 def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, frame, b):
-    """Move a body by one inner step; returns how far at most any of its points has gone."""
+    """Move a body by one inner step. Returns a bound of how far any of its points has moved."""
     span = rules.substep_dt * part
     v, w, turned = get(motion.velocity, b), get(motion.angular, b), (0.0, 0.0, 0.0)
     if world.moves[b]:
@@ -186,7 +186,7 @@ def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, fram
         put(motion.velocity, b, v)
         v = add(v, (shift[b, 0], shift[b, 1], shift[b, 2]))
         if rules.options.rotation:
-            # What the gyroscopic torque adds comes with the exact motion below, which keeps angular momentum.
+            # The gyroscopic torque is part of the exact motion below, which conserves angular momentum.
             w = add(add(w, spun), (change[b, 3], change[b, 4], change[b, 5]))
             turned = (shift[b, 3], shift[b, 4], shift[b, 5])
         else:
@@ -200,7 +200,7 @@ def _move(world, motion, matrix, rules, wrench, change, shift, part, trial, fram
         turned = add(w, turned)
         way = norm(turned)
     _turn_on(motion, matrix, scale(turned, span), b)
-    if way == 0.0:  # a plane reaches to infinity, and may be led along
+    if way == 0.0:  # a plane reaches to infinity, and may be scripted
         return norm(v) * rules.substep_dt
     return (norm(v) + way * world.radius[b]) * rules.substep_dt
 

@@ -1,4 +1,4 @@
-"""Which bodies are near each other, compiled: sweep and prune, and the contacts that are known of them."""
+"""Which bodies are near each other, compiled: sweep and prune, and their known contacts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sdfsim.physics.solver.world import COLUMNS, POINTS, Manifolds
 
 @njit(**BARE)
 def swept(world, work, motion, rules, span):
-    """How far any point of a body may go, and the box around all that it may reach."""
+    """For each body, how far any of its points may move, and the box around everything that it may reach."""
     ways, low, high, matrix = work.ways, work.low, work.high, work.matrix
     fall = norm(vector(rules.options.gravity)) * span
     for b in world.going:
@@ -36,7 +36,7 @@ def swept(world, work, motion, rules, span):
 
 @njit(**BARE)
 def stirs(world, motion, b):
-    """Whether a body is awake, or led along."""
+    """Whether a body is awake, or scripted and moving."""
     if world.scripted[b]:
         return norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0
     return world.moves[b] and motion.island[b] < 0
@@ -44,7 +44,7 @@ def stirs(world, motion, b):
 
 @njit(**BARE)
 def frozen(world, motion, a, b):
-    """Whether nothing happens between two bodies, the first of which moves, until either is woken."""
+    """Whether two bodies, the first of which is dynamic, do not interact until one of them wakes."""
     return motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
 
 
@@ -68,14 +68,15 @@ def _overlap(low, high, a, other_low, other_high, b):
 
 @njit(**FAST)
 def near_pairs(world, motion, low, high):
-    """[P, 2] bodies whose boxes overlap, in a fixed order: sweep and prune along the axis on which they spread most."""
+    """[P, 2] pairs of bodies whose boxes overlap, in a fixed order: sweep and prune along the axis of largest
+    spread."""
     going, count = np.empty(len(world.going), np.int64), 0
     for b in world.going:
         if world.shape[b] >= 0 and math.isfinite(world.radius[b]):
             going[count] = b
             count += 1
     found = np.empty((max(64, 4 * count), 2), np.int64)
-    pairs = np.int64(0)  # a literal would be a type of its own, for which all is compiled once more
+    pairs = np.int64(0)  # a literal has a type of its own, for which everything would be compiled again
     axis, widest = 0, -1.0
     for k in range(3):
         least, most = math.inf, -math.inf
@@ -122,13 +123,13 @@ def near_pairs(world, motion, low, high):
 
 @njit(**FAST)
 def order_of(key):
-    """Where the least of an array [N] of floats is, and so on; of like ones the first comes first."""
+    """Stable argsort of an array [N] of floats."""
     return np.argsort(key, kind="mergesort")
 
 
 @njit(**BARE)
 def _first_above(world, top):
-    """The first of the static bodies, in their order, that begins above `top` along `axis`."""
+    """The first static body, in their order, that begins above `top` along `axis`."""
     first, last = 0, len(world.still)
     while first < last:
         middle = (first + last) // 2
@@ -152,7 +153,7 @@ def _append(found, count, a, b):
 
 @njit(**FAST)
 def carried(world, motion, pairs, old):
-    """The manifolds of `pairs` with what is known of them, and those of bodies that sleep."""
+    """The manifolds of `pairs`, with the contact points that are known, and those of sleeping bodies."""
     n = len(world.shape)
     key, asleep = np.empty(len(old.count)), np.zeros(len(old.count), np.bool_)
     for k in range(len(old.count)):

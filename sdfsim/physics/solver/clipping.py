@@ -1,4 +1,4 @@
-"""Where two convex solids touch, compiled: the faces that look at each other, clipped against each other."""
+"""Where two convex solids touch, compiled: the faces that face each other, clipped against each other."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from sdfsim.physics.solver.convex import (
 )
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, get, put, scale, turn, turn_back
 
-RIM = 24  # points of the true circle that bound the contact of a drum's end
-MOST = 160  # corners of a clipped face
-CHOSEN = 4  # of them that carry a contact
-STEEP = 0.1  # cosine between a face and the normal, below which the face does not bound the contact
-LEVEL = 1e-3  # slope of a drum's end against the normal, below which its circle is cut at fixed places
-ASIDE = 0.002  # of the thickness: edges that are no farther aside touch there
-TIED = 1e-4  # of the thickness: points whose depths differ by less are equally deep
-CLOSE = 1e-3  # of the contact's extent: points that are nearer are one
+RIM = 24  # points on the circle of a drum's end that bound its contact
+MOST = 160  # largest number of corners of a clipped face
+CHOSEN = 4  # of them, those that carry the contact
+STEEP = 0.1  # cosine between a face's normal and the contact's, below which the face does not bound the contact
+LEVEL = 1e-3  # slope of a drum's end relative to the normal, below which its circle is cut at fixed points
+ASIDE = 0.002  # relative to the thickness: edges touch along their length if they are no farther aside
+TIED = 1e-4  # relative to the thickness: points whose depths differ by less count as equally deep
+CLOSE = 1e-3  # relative to the contact's extent: nearer points are one
 
 
 class Polygons(NamedTuple):
-    """Room for the faces of one pair, [MOST, 3]: two coordinates across the normal and the height along it."""
+    """Buffers for the faces of one pair, [MOST, 3]: two coordinates across the normal and the height along it."""
 
     first: np.ndarray
     second: np.ndarray
@@ -53,8 +53,8 @@ def polygons_room():
 
 @njit(**BARE)
 def feature(convex, p, size, matrix, body, d, out):
-    """The corners of the face, edge or corner of a piece's core that looks along d, to `out` [MOST, 3] (world axes,
-    from the body's origin). Returns how many, and the outward normal of a face."""
+    """Write the corners of the face, edge or corner of a piece's core that faces along d to `out` [MOST, 3] (world
+    axes, from the body's origin). Returns their number, and the outward normal of a face."""
     kind, local = convex.table[p, KIND], turn_back(matrix, body, d)
     a, b, c = convex.table[p, SIZE], convex.table[p, SIZE + 1], convex.table[p, SIZE + 2]
     if kind == HULL:
@@ -116,7 +116,7 @@ def feature(convex, p, size, matrix, body, d, out):
 
 @njit(**BARE)
 def across(n):
-    """Two unit vectors across n, the same for -n: which of two bodies is the first must not matter."""
+    """Two unit vectors across n, the same for -n: the order of the two bodies must not matter."""
     if n[0] < 0.0 or (n[0] == 0.0 and (n[1] < 0.0 or (n[1] == 0.0 and n[2] < 0.0))):
         n = scale(n, -1.0)
     axis = (1.0, 0.0, 0.0) if abs(n[0]) < 0.6 else (0.0, 1.0, 0.0)
@@ -127,17 +127,17 @@ def across(n):
 
 @njit(**INLINED)
 def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, room):
-    """The points at which two pieces touch or may soon, of which up to CHOSEN bound the contact; to room.clipped (its
-    places are on the first, world axes from the second's origin) and room.gap.
+    """Find the points at which two pieces touch or may soon touch, and pick up to CHOSEN that bound the contact. Writes
+    room.clipped (points on the first piece, world axes from the second's origin) and room.gap.
 
     Args:
-        plane: whether the second is the half space below its origin, whose normal is n.
-        held: whether n is not that of least distance, so that there may be no point.
-        gap, n, own, his: what `closest` found; of a plane, or where it is held, only the gap counts.
+        plane: whether the second body is the half space below its origin, with normal n.
+        held: whether n is given and not that of least distance, so that there may be no point.
+        gap, n, own, his: what `closest` found; for a plane, or if n is held, only the gap counts.
 
     Returns:
-        How many were picked, and by which factor friction acts nearer to their middle than the points are: a face that
-        presses evenly resists being turned by the mean distance from its middle.
+        The number of picked points, and the factor by which friction acts nearer to their middle than the points are: a
+            face that presses evenly resists turning with the mean distance from its middle as lever arm.
     """
     u, w = across(n)
     mine = pair.size * rounding(convex, pair.first)
@@ -183,7 +183,7 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
     count = kept
     extent = _extent(room, count)
     if not held and least > gap + 1e-6 * extent + 1e-9 * abs(gap):
-        # Corners or edges meet between the corners of what was clipped.
+        # Corners or edges meet between the corners of the clipped polygon.
         at = along(own, n, mine)
         put(room.clipped, count, (dot(at, u), dot(at, w), dot(at, n)))
         room.gap[count] = least = gap
@@ -208,14 +208,14 @@ def _project(points, count, offset, n, u, w):
 
 @njit(**BARE)
 def _height(points, normal, n, u, w, x, y):
-    """How high the plane of a face is at (x, y)."""
+    """Height of the plane of a face at (x, y)."""
     slope = dot(normal, n)
     return points[0, 2] - ((x - points[0, 0]) * dot(normal, u) + (y - points[0, 1]) * dot(normal, w)) / slope
 
 
 @njit(**BARE)
 def _clip(room, subject, count, bounds, sides):
-    """The part of a face or edge that lies over another face, to room.clipped (Sutherland and Hodgman 1974)."""
+    """Write the part of a face or edge that lies over another face to room.clipped (Sutherland and Hodgman 1974)."""
     area = 0.0
     for i in range(sides):
         j = (i + 1) % sides
@@ -231,7 +231,7 @@ def _clip(room, subject, count, bounds, sides):
         kept = 0
         for k in range(count):
             if open_line and k == count - 1 and count > 1:
-                # An edge has no way back from its end to its start.
+                # An edge is not closed: no side leads from its end back to its start.
                 d = dx * (room.clipped[k, 1] - py) - dy * (room.clipped[k, 0] - px)
                 if d >= 0.0 and kept < MOST:
                     put(room.spare, kept, get(room.clipped, k))
@@ -260,21 +260,21 @@ def _clip(room, subject, count, bounds, sides):
 
 @njit(**BARE)
 def _common(room, round_off, aside):
-    """The two ends of the part that two edges have in common, where they are no farther than `aside` from each other
-    across the normal; none where they only cross."""
+    """The two ends of the common part of two edges, if they are no farther than `aside` from each other across the
+    normal; none if they only cross."""
     first, second = room.first, room.second
     dx, dy = first[1, 0] - first[0, 0], first[1, 1] - first[0, 1]
     ex, ey = second[1, 0] - second[0, 0], second[1, 1] - second[0, 1]
     long, other = math.sqrt(dx * dx + dy * dy), math.sqrt(ex * ex + ey * ey)
     if long == 0.0 or other == 0.0:
         return 0
-    # Along the first edge from 0 to 1.
+    # Parameter along the first edge, from 0 to 1.
     start = ((second[0, 0] - first[0, 0]) * dx + (second[0, 1] - first[0, 1]) * dy) / (long * long)
     end = ((second[1, 0] - first[0, 0]) * dx + (second[1, 1] - first[0, 1]) * dy) / (long * long)
     if start == end:
         return 0
     low, high = max(0.0, min(start, end)), min(1.0, max(start, end))
-    # How far the second edge is aside grows evenly along the first.
+    # The distance aside of the second edge changes linearly along the first.
     px, py = second[0, 0] - first[0, 0], second[0, 1] - first[0, 1]
     off = (dx * py - dy * px) / long
     slope = (dx * ey - dy * ex) / long / (end - start)
@@ -283,7 +283,7 @@ def _common(room, round_off, aside):
         low, high = max(low, min(one, two)), min(high, max(one, two))
     elif abs(off) > aside:
         return 0
-    # Across the second edge its surface is level: that is where the first one's places are over it.
+    # Across the second edge its surface is level, so heights above it are taken at the first edge's points.
     foot, share = -(px * ex + py * ey) / (other * other), (dx * ex + dy * ey) / (other * other)
     if share != 0.0:
         one, two = -foot / share, (1.0 - foot) / share
@@ -311,7 +311,8 @@ def _extent(room, count):
 
 @njit(**BARE)
 def _pick(room, count, extent, deep):
-    """The deepest point, the farthest from it, and the farthest to either side of their line; ties by place."""
+    """Pick the deepest point, the farthest from it, and the farthest to either side of their line; ties are broken by
+    position."""
     if count == 0:
         return 0
     best, outer = 0, -math.inf
@@ -349,7 +350,7 @@ def _pick(room, count, extent, deep):
 
 @njit(**BARE)
 def _arm(room, count, least, extent):
-    """The mean distance of a face's or an edge's points from its middle; 0 where it is neither."""
+    """The mean distance of the points of a face or an edge from its middle; 0 for a single point."""
     within = least + 1e-3 * extent
     kept = 0
     for i in range(count):
@@ -396,7 +397,8 @@ def _root_sum(s, h):
 
 @njit(**BARE)
 def _shrink(room, picked, arm):
-    """By which factor the picked points are to be drawn to their middle, so that their mean distance is `arm`."""
+    """The factor by which to move the picked points towards their middle, so that their mean distance from it is
+    `arm`."""
     x = y = 0.0
     for i in range(picked):
         x, y = x + room.clipped[room.picked[i], 0], y + room.clipped[room.picked[i], 1]

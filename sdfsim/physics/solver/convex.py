@@ -1,8 +1,8 @@
-"""Convex solids, compiled: their supports, how far apart two are, and along which normal.
+"""Convex solids, compiled: their support points, and the distance and normal between two of them.
 
-Closest points by GJK (Gilbert, Johnson and Keerthi 1988). Solids that overlap are moved apart along the normal that is
-known, and the closest points of the two as they then lie give the next one. Each round is a full answer for its normal,
-and rounds end where the overlap is least nearby: so a contact keeps the side that it came from.
+Closest points by GJK (Gilbert, Johnson and Keerthi 1988). Overlapping solids are moved apart along the known normal,
+and their closest points then give the next normal. Each round is a complete answer for its normal. Rounds end at the
+nearest local minimum of the overlap, so a contact keeps the side that it came from.
 """
 
 from __future__ import annotations
@@ -32,42 +32,43 @@ from sdfsim.physics.solver.vectors import (
 
 POINT, SEGMENT, BLOCK, DRUM, HULL = range(5)
 # Columns of the table of convex pieces: kind; sizes (point: radius; segment: radius, half length; block: half extents;
-# drum: radius, half height); a ball around all of it; its thickness, the least distance of two parallel planes.
+# drum: radius, half height); a ball around the piece; its thickness, the least distance of two parallel planes around
+# it.
 KIND, SIZE, BALL, THICKNESS, WIDTH = 0, 1, 4, 8, 9
 
-TOUCHING = (
-    1e-4  # of the thickness: only solids that are farther apart are asked as they lie, else rounding turns normals
-)
-APART = 1e-3  # of the thickness: so far apart overlapping solids are moved
-# Cosine of a normal with that of a face, from which on the two are one, and of the thickness: if they show as much.
+TOUCHING = 1e-4  # relative to the thickness: nearer solids are moved apart first, as rounding would turn their normals
+APART = 1e-3  # relative to the thickness: overlapping solids are moved this far apart
+# Cosine between a normal and that of a face, above which the face's is taken; and, relative to the thickness, the
+# difference of depth at which two normals count as equally good.
 ALONG, AS_MUCH = 1.0 - 1e-9, 1e-9
-EXACT = 1e-14  # squared distances are found to this part
-FEW = 48  # vertices that are looked at in turn; of more, neighbours of neighbours
-STEPS, ROUNDS = 48, 16  # of GJK, and of normals
+EXACT = 1e-14  # relative precision of squared distances
+FEW = 48  # vertices that are all tested; in larger hulls the search climbs from neighbour to neighbour
+STEPS, ROUNDS = 48, 16  # largest numbers of GJK steps, and of rounds for normals
 
 
 class Convex(NamedTuple):
     """The convex pieces of S shapes; arrays end to end."""
 
-    start: np.ndarray  # [S + 1] int64, shape s has pieces start[s] : start[s + 1]; none where it is not convex
+    start: np.ndarray  # [S + 1] int64, shape s has pieces start[s] : start[s + 1]; none if it is not convex
     table: np.ndarray  # [P, WIDTH] float64
     vertex_start: np.ndarray  # [P + 1] int64
     vertex: np.ndarray  # [V, 3] float64, of hulls, in the shape's frame
     face_start: np.ndarray  # [P + 1] int64
     face: np.ndarray  # [F, 3] float64, outward unit normals
     loop_start: np.ndarray  # [F + 1] int64
-    loop: np.ndarray  # [L] int64, the vertices of a face in turn
+    loop: np.ndarray  # [L] int64, the vertices around each face
     beside_start: np.ndarray  # [V + 1] int64
     beside: np.ndarray  # int64, the vertices at the other ends of a vertex's edges
     around_start: np.ndarray  # [V + 1] int64
-    around: np.ndarray  # int64, the faces that meet in a vertex
+    around: np.ndarray  # int64, the faces that meet at a vertex
 
 
 class Simplex(NamedTuple):
-    """Room for GJK: up to four corners of the difference of two solids, and where each comes from."""
+    """Buffers for GJK: up to four corners of the difference of two solids, and the point of the first solid for
+    each."""
 
-    corner: np.ndarray  # [4, 3] of the first less the second
-    own: np.ndarray  # [4, 3] of the first
+    corner: np.ndarray  # [4, 3] point of the first minus point of the second
+    own: np.ndarray  # [4, 3] point of the first
     weight: np.ndarray  # [4]
     trial: np.ndarray  # [4]
 
@@ -79,13 +80,13 @@ def simplex_room():
 
 @njit(**BARE)
 def rounding(convex, p):
-    """By how much a piece is larger than its core on all sides."""
+    """By how much a piece extends beyond its core on all sides."""
     return convex.table[p, SIZE] if convex.table[p, KIND] <= SEGMENT else 0.0
 
 
 @njit(**INLINED)
 def outermost(convex, p, d):
-    """The vertex of a hull that is farthest along d: of the best of a few, always the neighbour that is farther."""
+    """The vertex of a hull that is farthest along d: from the best of a few, climb to neighbours that are farther."""
     first, last = convex.vertex_start[p], convex.vertex_start[p + 1]
     best, most = first, -math.inf
     for v in range(first, last, 1 + (last - first - 1) // FEW):
@@ -106,7 +107,8 @@ def outermost(convex, p, d):
 
 @njit(**BARE)
 def outside(convex, p, place):
-    """How far a place, in its own frame, is outside of a hull at least: beyond the plane of a face."""
+    """A lower bound of how far a point, in the hull's frame, is outside: its largest height above the plane of a
+    face."""
     most = -math.inf
     for f in range(convex.face_start[p], convex.face_start[p + 1]):
         n = get(convex.face, f)
@@ -135,12 +137,12 @@ def core(convex, p, d):
 
 @njit(**INLINED)
 def farthest(convex, p, size, matrix, body, d):
-    """The point of the core of a body's piece that is farthest along d; both along world axes, from its origin."""
+    """The point of the core of a body's piece that is farthest along d; world axes, from the body's origin."""
     return turn(matrix, body, scale(core(convex, p, turn_back(matrix, body, d)), size))
 
 
 class Pair(NamedTuple):
-    """Two pieces as they lie."""
+    """Two pieces in their present poses."""
 
     first: int  # the pieces
     second: int
@@ -148,12 +150,12 @@ class Pair(NamedTuple):
     b: int | np.int64
     size: float  # the scales of the bodies
     other: float
-    offset: tuple  # from the origin of the second body's shape to that of the first, world axes
+    offset: tuple  # from the origin of the second body's shape to the first's, world axes
 
 
 @njit(**BARE)
 def separation(convex, matrix, pair, n):
-    """How far two cores are apart along the unit vector n, from the second to the first; below 0 where they overlap."""
+    """Distance of two cores along the unit vector n, from the second to the first; below 0 if they overlap."""
     mine = farthest(convex, pair.first, pair.size, matrix, pair.a, scale(n, -1.0))
     theirs = farthest(convex, pair.second, pair.other, matrix, pair.b, n)
     return dot(n, sub(add(pair.offset, mine), theirs))
@@ -161,13 +163,13 @@ def separation(convex, matrix, pair, n):
 
 @njit(**BARE)
 def closest(convex, matrix, pair, n, known, enough, room):
-    """Distance of two solids, the unit normal from the second to the first, and the closest point of either (on its
-    surface, from the second's origin). Solids that overlap have the least depth near the normal n.
+    """Distance of two solids, the unit normal from the second to the first, and the closest point of each (on its
+    surface, from the second's origin). For overlapping solids this is the least depth near the normal n.
 
     Args:
-        known: whether they were last seen to touch along n, or nearly. If not, n does not count, and where they overlap
-            the least depth is looked for from several normals.
-        enough: two that are seen to be farther apart may get a distance that is too small, and no closest points.
+        known: whether they last touched along n, or nearly. If not, n is ignored, and if they overlap the least depth
+            is searched from several normals.
+        enough: if they are farther apart than this, the distance may be too small, and no closest points are given.
     """
     thick = min(pair.size * convex.table[pair.first, THICKNESS], pair.other * convex.table[pair.second, THICKNESS])
     if known:
@@ -188,14 +190,14 @@ def closest(convex, matrix, pair, n, known, enough, room):
                 continue
             start = scale(v, 1.0 / length)
         found = _least_deep(convex, matrix, pair, start, thick, enough, room)
-        if found[0] > best[0] + AS_MUCH * thick:  # of two that are as good the one that was found in fewer rounds
+        if found[0] > best[0] + AS_MUCH * thick:  # of two equally good normals take the one found in fewer rounds
             best = found
     return best
 
 
 @njit(**BARE)
 def _least_deep(convex, matrix, pair, n, thick, enough, room):
-    """`closest` from a normal on."""
+    """`closest`, starting from a normal."""
     mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
     own, his = pair.offset, (0.0, 0.0, 0.0)
     s = separation(convex, matrix, pair, n)
@@ -223,8 +225,8 @@ def _least_deep(convex, matrix, pair, n, thick, enough, room):
 
 @njit(**BARE)
 def _squared(convex, matrix, pair, n, s, thick):
-    """A normal along which two cores are s apart, and s; or that of a face of a box or drum that rounding parts from
-    it."""
+    """A normal and the distance s of two cores along it; a normal that differs from that of a face only by rounding is
+    replaced by the face's."""
     for side in range(2):
         p, body = (pair.first, pair.a) if side == 0 else (pair.second, pair.b)
         kind = convex.table[p, KIND]
@@ -241,11 +243,12 @@ def _squared(convex, matrix, pair, n, s, thick):
 
 @njit(**BARE)
 def _gjk(convex, matrix, pair, offset, v, room):
-    """The shortest vector from the second solid's core to the first's, which lies by `offset` from it, as long as is
-    proved, and where it ends on the first; v is a guess of its direction. Zero where the cores overlap."""
+    """The shortest vector from the second solid's core to the first's, which is moved by `offset`, with its proven
+    length, and its end on the first; v is a guess of its direction. Zero if the cores overlap."""
     corner, own, weight = room.corner, room.own, room.weight
     count, there, least = 0, (0.0, 0.0, 0.0), math.inf
-    # Along a rim corners come so near each other that rounding turns v in the end: the v that proves most counts.
+    # Along a rim corners come so close to each other that rounding finally turns v: the v with the best proven bound
+    # counts.
     surely, best = -math.inf, v
     for step in range(STEPS):
         a = add(offset, farthest(convex, pair.first, pair.size, matrix, pair.a, scale(v, -1.0)))
@@ -270,7 +273,7 @@ def _gjk(convex, matrix, pair, offset, v, room):
         for i in range(count):
             new, on = along(new, get(corner, i), weight[i]), along(on, get(own, i), weight[i])
         length = dot(new, new)
-        if length >= least:  # rounding has the better of it
+        if length >= least:  # rounding errors dominate
             break
         v, there, least = new, on, length
     return scale(best, max(surely, 0.0) / norm(best)), there
@@ -278,8 +281,8 @@ def _gjk(convex, matrix, pair, offset, v, room):
 
 @njit(**INLINED)
 def _nearest_part(corner, own, weight, trial, count):
-    """Leave of a simplex the corners between which the place nearest to the origin lies, with their weights; how many
-    these are. None where the origin is inside."""
+    """Reduce a simplex to the corners between which the point nearest to the origin lies, with their weights. Returns
+    their number; 0 if the origin is inside."""
     if count == 1:
         weight[0] = 1.0
         return 1
@@ -333,7 +336,7 @@ def _inside(corner):
 
 @njit(**BARE)
 def _on_line(corner, i, j, weight):
-    """Weights of two corners for the place between them that is nearest to the origin."""
+    """Weights of two corners for the point between them that is nearest to the origin."""
     a, b = get(corner, i), get(corner, j)
     side = sub(b, a)
     way, square = -dot(a, side), dot(side, side)
@@ -347,7 +350,7 @@ def _on_line(corner, i, j, weight):
 
 @njit(**BARE)
 def _on_face(corner, i, j, k, weight):
-    """Weights of three corners for the place between them that is nearest to the origin."""
+    """Weights of three corners for the point between them that is nearest to the origin."""
     a, b, c = get(corner, i), get(corner, j), get(corner, k)
     n = cross(sub(b, a), sub(c, a))
     square = dot(n, n)
@@ -356,7 +359,7 @@ def _on_face(corner, i, j, k, weight):
         total = u + v + w
         weight[i], weight[j], weight[k] = u / total, v / total, w / total
         return
-    # Beyond an edge: the nearest place is on one of the three.
+    # Beyond an edge: the nearest point is on one of the three.
     least, first, second, share = math.inf, i, j, 0.0
     for e in range(3):
         p, q = (i, j) if e == 0 else ((j, k) if e == 1 else (k, i))
@@ -382,7 +385,7 @@ def _middle_to_middle(convex, matrix, pair):
 
 @njit(**BARE)
 def _along_face(convex, matrix, pair, n):
-    """Of n and the normals of the faces of either piece the one along which the two overlap least."""
+    """The normal along which the two overlap least, among n and the normals of the faces of both pieces."""
     best, most = n, separation(convex, matrix, pair, n)
     for side in range(2):
         p, body = (pair.first, pair.a) if side == 0 else (pair.second, pair.b)
@@ -402,7 +405,7 @@ def _along_face(convex, matrix, pair, n):
 
 @njit(**BARE)
 def get_ball(convex, p):
-    """The middle of the ball around a piece, in its own frame."""
+    """The centre of the ball around a piece, in the piece's frame."""
     return convex.table[p, BALL], convex.table[p, BALL + 1], convex.table[p, BALL + 2]
 
 
@@ -416,7 +419,7 @@ def _axes(convex, p):
 
 @njit(**BARE)
 def _axis(convex, p, e):
-    """The normal of a face; of a drum also two directions across it."""
+    """The normal of a face; for a drum also two directions across its axis."""
     if convex.table[p, KIND] == HULL:
         faces = convex.face_start[p + 1] - convex.face_start[p]
         return get(convex.face, convex.face_start[p] + e * max(1, faces // 64))

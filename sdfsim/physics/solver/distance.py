@@ -1,6 +1,6 @@
 """Signed distances of all kinds of shapes, compiled: closed forms, and grids of bricks.
 
-Lengths are those of the shape at scale 1, places are in its own frame.
+Lengths are at scale 1 of the shape, points are in its own frame.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ from sdfsim.physics.solver.vectors import BARE, ENTRY, INLINED, along, dot, get,
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
 TINY = 1e-12
-EVEN = 1e-9  # of the size: on an edge of a closed form the face that comes first has the normal, and not rounding
+EVEN = 1e-9  # relative to the size: on an edge of a closed form the first face gives the normal, not rounding
 
 
-# Columns of the table of shapes: kind; sizes (sphere: radius; capsule and cylinder: radius, half height, of a capsule
-# without its caps; box: half extents; then 0); thickness of the thinnest walls; of a grid the first sample, the cell,
-# bricks along each side, and where its samples and brick numbers begin.
+# Columns of the table of shapes: kind; sizes (sphere: radius; capsule and cylinder: radius and half height, for a
+# capsule without its caps; box: half extents; else 0); thickness of the thinnest walls; for a grid its first sample,
+# cell size, number of bricks along each side, and where its samples and brick numbers begin.
 KIND, SIZE, THICKNESS, LOW, CELL, BRICKS, COARSE, BRICK = 0, 1, 4, 5, 8, 9, 12, 13
-# And of a shape of several patches: the first place with a label, the distance between two, how many there are along
-# each side, and where they begin; -1 where there is one patch only.
+# And for a shape of several patches: the first labelled point, the distance between two, their number along each side,
+# and where the labels begin; -1 if there is one patch only.
 PATCH_LOW, PATCH_CELL, PATCHES, PATCH, FIELDS = 14, 17, 18, 21, 22
 
 
 class Shapes(NamedTuple):
-    """S shapes; arrays end to end where their number differs from shape to shape."""
+    """S shapes; arrays whose length differs from shape to shape are stored end to end."""
 
     table: np.ndarray  # [S, FIELDS] float64
     brick: np.ndarray  # int64, where in `sample` the 9^3 distances of a brick begin; -1 for bricks far from the surface
     sample: np.ndarray  # float32 distances, at the corners of bricks and in bricks
     node: np.ndarray  # [K, 3] surface nodes, leaf by leaf
-    cover: np.ndarray  # [K] how far the surface around a node goes that is nearer to it than to others
+    cover: np.ndarray  # [K] radius of the part of the surface that is nearer to this node than to others
     leaf_node: np.ndarray  # [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1]
     leaf_ball: np.ndarray  # [L, 4] centre and radius of a ball around these
     clump_start: np.ndarray  # [S + 1] int64, shape s has clumps clump_start[s] : clump_start[s + 1]
-    clump_leaf: np.ndarray  # [C + 1] int64 likewise of the leaves that they hold
+    clump_leaf: np.ndarray  # [C + 1] int64, likewise the leaves of clumps
     clump_ball: np.ndarray  # [C, 4]
-    leaf_patch: np.ndarray  # [L] int64, the patch of the surface that a leaf's nodes are of
-    label: np.ndarray  # int16, the patches that are nearest to places all over
+    leaf_patch: np.ndarray  # [L] int64, the patch of the surface to which a leaf's nodes belong
+    label: np.ndarray  # int16, the nearest patch at points all over the shape
     solids: Convex  # the convex pieces of the shapes
 
 
@@ -66,7 +66,7 @@ def distance(table, brick, sample, s, p):
 
 @njit(**BARE)
 def distance_alone(table, brick, sample, s, p):
-    """Signed distance alone, of a grid in two thirds of the time."""
+    """Signed distance without the gradient; for a grid in two thirds of the time."""
     if table[s, KIND] == GRID:
         return _grid_alone(table, brick, sample, s, p)
     d, _ = distance(table, brick, sample, s, p)
@@ -75,7 +75,7 @@ def distance_alone(table, brick, sample, s, p):
 
 @njit(**ENTRY)
 def distances(table, brick, sample, s, p):
-    """Signed distances [P] and unit gradients [P, 3] of shape s at places [P, 3]."""
+    """Signed distances [P] and unit gradients [P, 3] of shape s at points [P, 3]."""
     d, n = np.empty(len(p)), np.empty((len(p), 3))
     for i in range(len(p)):
         d[i], normal = distance(table, brick, sample, s, get(p, i))
@@ -138,14 +138,15 @@ def _cylinder(p, radius, half):
 
 @njit(**INLINED)
 def _grid(table, brick, sample, s, p):
-    """Trilinear in the brick around p, or between the corners of bricks; the distance to the box adds beyond it."""
+    """Trilinear in the brick around p, or between the corners of bricks; outside the grid's box the distance to it is
+    added."""
     corners, part, beyond = _around(table, brick, sample, s, p)
     d, slope = _trilinear(corners, part)
     length = norm(slope)
     normal = (0.0, 0.0, 1.0) if length < TINY else scale(slope, 1.0 / length)
     far = dot(beyond, beyond)
     if far > 0.0:
-        # The solid lies within the box, which is convex: it is no nearer than this.
+        # The solid is within the box, which is convex, so it is at least this far away.
         d = max(d, 0.0)
         normal = along(beyond, normal, d)
         d = math.sqrt(far + d * d)
@@ -155,7 +156,7 @@ def _grid(table, brick, sample, s, p):
 
 @njit(**BARE)
 def _grid_alone(table, brick, sample, s, p):
-    """The distance of `_grid`."""
+    """The distance of `_grid` without the gradient."""
     corners, part, beyond = _around(table, brick, sample, s, p)
     d, _ = _trilinear(corners, part)
     far = dot(beyond, beyond)
@@ -164,7 +165,8 @@ def _grid_alone(table, brick, sample, s, p):
 
 @njit(**INLINED)
 def _around(table, brick, sample, s, p):
-    """The eight samples around p, or around the nearest place of the grid; where between them; and how far beyond."""
+    """The eight samples around p (or around the nearest point of the grid), the position between them, and the distance
+    beyond the grid."""
     cell = table[s, CELL]
     nx, ny, nz = int(table[s, BRICKS]), int(table[s, BRICKS + 1]), int(table[s, BRICKS + 2])
     a = 1.0 / cell
@@ -192,7 +194,7 @@ def _around(table, brick, sample, s, p):
 
 @njit(**INLINED)
 def _trilinear(corners, part):
-    """The interpolant between eight corners and its slope a cell."""
+    """The interpolant between eight corners, and its slope per cell."""
     a000, a001, a010, a011, a100, a101, a110, a111 = corners
     u, v, w = part
     a = a000 + w * (a001 - a000)

@@ -26,16 +26,16 @@ from sdfsim.physics.solver.vectors import (
 
 @njit(**ENTRY)
 def nodes_within(shapes, world, work, motion, rules, node, start):
-    """Nodes that are within `rules.contact_margin` of another body's surface, or will be by the end of the step as they
-    go: the contact edges of the paper (section 3).
+    """Nodes that are within `rules.contact_margin` of another body's surface, or will be by the end of the step at
+    their present speed: the contact edges of the paper (section 3).
 
     Args:
         node: [M, 3] surface nodes about the centres of mass, in the bodies' axes.
         start: [N + 1] int64, body b owns nodes start[b] : start[b + 1].
 
     Returns:
-        [E, 3] int64 the owner, its node and the other body; [E, 7] the distance, the other's outward normal there and
-        the node seen from the other's centre of mass (world axes).
+        [E, 3] int64, the owner, its node and the other body; [E, 7], the distance, the other's outward normal there,
+        and the node relative to the other's centre of mass (world axes).
     """
     span = rules.substep_dt * rules.options.substeps
     for b in world.going:

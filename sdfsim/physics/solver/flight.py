@@ -1,4 +1,4 @@
-"""Free flight, compiled: what pulls at bodies, and rotation without torque."""
+"""Free flight, compiled: forces that pull at bodies, and rotation without torque."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 
 @njit(**BARE)
 def pull_of(world, matrix, wrench, rules, part, b):
-    """What gravity and what pulls at a body add to its velocities in a part of an inner step."""
+    """Change of a body's velocities by gravity and pulls in a part of an inner step."""
     span = rules.substep_dt * part
     weight = scale(vector(rules.options.gravity), span)
     pulled = False
@@ -42,7 +42,8 @@ def pull_of(world, matrix, wrench, rules, part, b):
 
 @njit(**BARE)
 def torque_free(world, orientation, angular, matrix, span, trial, frame, b):
-    """Rotation without torque: angular momentum is kept exactly, the pose to fourth order (Runge-Kutta-Munthe-Kaas)."""
+    """Rotation without torque: angular momentum is conserved exactly, the pose is exact to fourth order
+    (Runge-Kutta-Munthe-Kaas)."""
     w = get(angular, b)
     speed = norm(w)
     if speed == 0.0:

@@ -1,4 +1,4 @@
-"""Sequential impulses, compiled: what contacts do to velocities in one inner step, island by island."""
+"""Sequential impulses, compiled: the effect of contacts on velocities in one inner step, island by island."""
 
 from __future__ import annotations
 
@@ -38,35 +38,37 @@ from sdfsim.physics.solver.world import (
     VOID,
 )
 
-# Columns of a row: its direction, how it turns the first and the second body, what a unit of impulse makes of their
-# angular velocities, the inverse of what it makes of the relative velocity, the wanted change, the impulse so far.
+# Columns of a row: its direction; its lever arms for the first and the second body; the change of their angular
+# velocities by a unit impulse; the effective mass (the inverse of the change of the relative velocity by a unit
+# impulse); the wanted change; the impulse so far.
 AXIS, ARM, OTHER, SPIN, COUNTER, MASS, WANTED, IMPULSE, WIDTH = 0, 3, 6, 9, 12, 15, 16, 17, 18
-TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when what starts in contact is met
-AT_REST = 1e-9  # squared: slower tangential motion has no direction
-# No island may gain more energy than so many times what its pushes out of penetration would give each contact alone,
-# this share of what its contacts bring with them, and what lifts it by so many slops: a stack lifts all that is above.
-# Of two bodies so many contacts count: the many points of a hollow shape may gain no more than the corners of a box.
+TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when bodies in contact meet
+AT_REST = 1e-9  # squared speed: slower tangential motion has no direction
+# Limits of the energy that an island may gain: a multiple of what resolving its penetrations would give each contact
+# alone; a share of the energy that its contacts bring with them; and the energy that lifts it by some slops (a stack
+# lifts everything above). At most this many contacts of two bodies count: the many points of a hollow shape may gain no
+# more than the corners of a box.
 SPARE, ROUNDING, LIFT, FEW = 4.0, 0.01, 10.0, 4
-# What comes nearer than this part of a thickness in an inner step bounces before it has touched, else after: thin
-# things would be deep in each other.
+# Bodies that approach by more than this part of their thickness in an inner step rebound before they have touched, else
+# after: thin bodies would overlap deeply.
 THIN = 0.005
-# Sweeps carry a load to what is lighter the more slowly, the larger the ratio of masses is: an island is swept as many
-# times more often as its ratio is times this one, up to so many times.
+# The larger the ratio of masses, the more slowly sweeps carry a load to lighter bodies. The number of sweeps of an
+# island is multiplied by its ratio divided by the first number, at most by the second.
 EVEN, OFTEN = 30.0, 30.0
-MANY = 64  # islands of contacts from which on threads are worth their while
+MANY = 64  # islands of contacts, from which on threads pay off
 
 
 class System(NamedTuple):
-    """The equations of C contact points."""
+    """The equations for C contact points."""
 
     where: np.ndarray  # [C, 4] int64: manifold, point, first and second body
     row: np.ndarray  # [C, 3, WIDTH]: along the normal and two tangents
     friction: np.ndarray  # [C] product of friction
-    wanted: np.ndarray  # [C] speed that resolves penetration and is then forgotten
-    pushed: np.ndarray  # [C] impulse that has given it so far
-    # [C, 4]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
-    # speed along it without contact; the speed that resolves penetration and stays; and the point's share of what
-    # the points of two bodies may gain
+    wanted: np.ndarray  # [C] speed that resolves penetration and does not last
+    pushed: np.ndarray  # [C] impulse for it so far
+    # [C, 4]: the wanted change along the normal without rebound and without resolving penetration; the speed along it
+    # without contact; the lasting speed that resolves penetration; and the point's share of the energy that the points
+    # of two bodies may gain
     calm: np.ndarray
     start: np.ndarray  # [I + 1] int64, island i has the contacts order[start[i] : start[i + 1]]
     order: np.ndarray  # [C] int64
@@ -74,7 +76,7 @@ class System(NamedTuple):
 
 @njit(**FAST)
 def solve_contacts(world, work, motion, rules, manifolds, threads):
-    """Solve for the impulses of all contacts; they go to the manifolds, and to `change` and `shift` of `work`.
+    """Solve for the impulses of all contacts, and write them to the manifolds, and to `change` and `shift` of `work`.
 
     Returns:
         The equations that were solved.
@@ -95,7 +97,7 @@ def solve_contacts(world, work, motion, rules, manifolds, threads):
 
 @njit(**BARE)
 def remembered(manifolds, system):
-    """Impulses go to the manifolds."""
+    """Write impulses to the manifolds."""
     for c in range(len(system.where)):
         point = manifolds.point[system.where[c, 0], system.where[c, 1]]
         point[NORMAL_IMPULSE] = system.row[c, 0, IMPULSE]
@@ -142,15 +144,15 @@ def _equations(world, work, motion, rules, manifolds):
                 point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
                 continue
             _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
-            # Newton's rule for all that meets in one impact: without friction, and with e = 1, energy is kept.
+            # Newton's rule for all contacts of one impact: without friction and with e = 1, energy is conserved.
             target, rebounds = 0.0, bounce > 0.0 and abs(approach) > rules.slow
             if rebounds:
-                # What bounces before it has touched has the speed that it will have here on its way back.
+                # Bodies that rebound before they have touched get the speed that they will have here on their way back.
                 pull = (dot(free_fall, n) - approach) / rules.substep_dt
                 fall = 2.0 * pull * max(gap, 0.0) * (1.0 - bounce * bounce)
                 square = bounce * bounce * approach * approach + (fall if early else 0.0)
                 target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
-            # An impact is over before a body has turned: what the gyroscopic torque makes of it comes after.
+            # An impact is over before a body has turned: the gyroscopic torque acts after it.
             before = dot(free_fall, n) if rebounds else dot(then, n)
             deep = push = rest = 0.0
             if gap > TOUCH:
@@ -200,14 +202,15 @@ def _equations(world, work, motion, rules, manifolds):
 
 @njit(**BARE)
 def met_half_way(between, arm, other):
-    """Both ends of a contact moved half way to one another: an impulse at one place keeps angular momentum."""
+    """Move both ends of a contact half way towards each other: an impulse at one point conserves angular momentum."""
     apart = add(between, sub(arm, other))
     return along(arm, apart, -0.5), along(other, apart, 0.5)
 
 
 @njit(**BARE)
 def _drawn_in(matrix, point, m, count, k, a, b, between):
-    """Where friction acts of a point that bounds a face: nearer to the middle of those of the same two patches."""
+    """Where friction acts for a point that bounds a face: nearer to the middle of the points of the same two
+    patches."""
     middle, opposite, alike = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
     for e in range(count):
         if point[m, e, KEY] == point[m, k, KEY]:
@@ -222,14 +225,14 @@ def _drawn_in(matrix, point, m, count, k, a, b, between):
 
 @njit(**BARE)
 def _within(one, other, most):
-    """By which factor a tangential impulse is to be shortened to lie within the cone of friction."""
+    """The factor by which to shorten a tangential impulse so that it is within the cone of friction."""
     length = math.sqrt(one * one + other * other)
     return 1.0 if length <= most else most / length
 
 
 @njit(**BARE)
 def _relative(velocity, angular, a, b, arm, other):
-    """How fast the point of the first body moves from that of the second."""
+    """Velocity of the point of the first body relative to that of the second."""
     one = add(get(velocity, a), cross(get(angular, a), arm))
     two = add(get(velocity, b), cross(get(angular, b), other))
     return sub(one, two)
@@ -244,7 +247,7 @@ def _coming(free, a, b, arm, other):
 
 @njit(**BARE)
 def _turning(free, a, b, arm, other):
-    """What the gyroscopic torque adds to the relative velocity."""
+    """Change of the relative velocity by the gyroscopic torque."""
     return sub(cross((free[a, 6], free[a, 7], free[a, 8]), arm), cross((free[b, 6], free[b, 7], free[b, 8]), other))
 
 
@@ -282,9 +285,10 @@ def _solve_many(mass, rules, system, change, shift):
 
 @njit(**BARE)
 def _solve(mass, rules, system, change, shift, island):
-    """One island; where it would gain energy from nothing, again with half of what rebounds and pushes, then without.
+    """Solve one island. If it would gain energy from nothing, solve it again with half of the rebounds and pushes, then
+    without.
 
-    Contacts that contradict each other, as of bodies that are wedged into one another, would else throw them apart.
+    Otherwise contradictory contacts, as of bodies that are wedged into each other, would throw them apart.
     """
     where, row, order = system.where, system.row, system.order
     lively = deep = False
@@ -308,7 +312,7 @@ def _solve(mass, rules, system, change, shift, island):
                 change[where[c, 2], x] = change[where[c, 3], x] = 0.0
             for e in range(3):
                 row[c, e, IMPULSE] = 0.0
-            # The first time half of the difference is left, then none.
+            # The first time half of the difference remains, then none.
             row[c, 0, WANTED] = system.calm[c, 0] + share * (row[c, 0, WANTED] - system.calm[c, 0])
             if system.calm[c, 2] > 0.0:
                 system.wanted[c] = (1.0 - share) * system.calm[c, 2]
@@ -318,7 +322,7 @@ def _solve(mass, rules, system, change, shift, island):
 
 @njit(**BARE)
 def _sweeps(mass, rules, system, island):
-    """How often an island is swept at most; the teacher sweeps all alike."""
+    """Largest number of sweeps of an island; PyBullet sweeps all islands equally often."""
     heaviest, lightest = math.inf, 0.0  # inverse masses
     for o in range(system.start[island], system.start[island + 1]):
         for x in (2, 3):
@@ -331,7 +335,7 @@ def _sweeps(mass, rules, system, island):
 
 @njit(**BARE)
 def _gains(rules, system, change, island):
-    """Whether contacts have given an island more energy than they may: impulses times mean velocities, added up."""
+    """Whether contacts have given an island more energy than allowed: the sum of impulses times mean velocities."""
     where, row = system.where, system.row
     work = spare = 0.0
     lift = 2.0 * norm(vector(rules.options.gravity)) * LIFT * rules.slop
@@ -347,7 +351,7 @@ def _gains(rules, system, change, island):
 
 @njit(**BARE)
 def _resolve_penetration(mass, rules, system, shift, island, rounds):
-    """Part what is deep in each other, by velocities that move bodies once and are forgotten."""
+    """Separate bodies that overlap deeply, by velocities that move them once and do not last."""
     where, row, order = system.where, system.row, system.order
     for _ in range(rounds):
         worst = 0.0
@@ -366,7 +370,7 @@ def _resolve_penetration(mass, rules, system, shift, island, rounds):
 
 @njit(**BARE)
 def _balance(mass, rules, system, change, island, rounds):
-    """All normals, then all friction, until no impulse changes a velocity by more than `exact`."""
+    """Relax all normals, then all friction, until no impulse changes a velocity by more than `exact`."""
     where, row, order, friction = system.where, system.row, system.order, system.friction
     first, last = system.start[island], system.start[island + 1]
     for _ in range(rounds):
@@ -388,7 +392,7 @@ def _balance(mass, rules, system, change, island, rounds):
 
 @njit(**INLINED)
 def _relax(where, row, mass, change, c, first, last, least, most):
-    """Bring rows of a contact to their wanted velocities, as far as limits allow; returns by how much that changed."""
+    """Bring rows of a contact to their wanted velocities, as far as limits allow. Returns the change of velocity."""
     a, b = where[c, 2], where[c, 3]
     v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
     u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
@@ -412,13 +416,13 @@ def _relax(where, row, mass, change, c, first, last, least, most):
 
 @njit(**INLINED)
 def _relax_friction(where, row, mass, change, c, most):
-    """Bring both tangential rows of a contact to rest, as far as the cone of friction allows; returns by how much that
-    changed."""
+    """Bring both tangential rows of a contact to rest, as far as the cone of friction allows. Returns the change of
+    velocity."""
     a, b = where[c, 2], where[c, 3]
     v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
     u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
     first, second = row[c, 1, IMPULSE], row[c, 2, IMPULSE]
-    # One mass for both, so that friction ends up against the slip and not aside.
+    # One effective mass for both, so that friction is opposite to the slip.
     lesser = min(row[c, 1, MASS], row[c, 2, MASS])
     between = sub(v, u)
     one = first + lesser * (row[c, 1, WANTED] - _along_row(row, c, 1, between, w, z))
@@ -445,13 +449,14 @@ def _three(row, c, e, column):
 
 @njit(**BARE)
 def _along_row(row, c, e, between, w, z):
-    """The relative velocity along a row, of the difference of two bodies' velocities and of their angular ones."""
+    """The relative velocity along a row, from the difference of two bodies' velocities and from their angular
+    velocities."""
     return dot(_three(row, c, e, AXIS), between) + dot(_three(row, c, e, ARM), w) + dot(_three(row, c, e, OTHER), z)
 
 
 @njit(**BARE)
 def _speed(where, row, change, c, e):
-    """What `change` makes of the relative velocity along a row."""
+    """The effect of `change` on the relative velocity along a row."""
     a, b = where[c, 2], where[c, 3]
     total = 0.0
     for x in range(3):

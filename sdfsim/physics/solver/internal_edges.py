@@ -1,9 +1,9 @@
-"""Edges inside of a surface that several bodies or pieces make up, compiled: they are no walls.
+"""Internal edges of a surface that consists of several bodies or pieces, compiled: bodies must not catch on them.
 
-What slides over a floor of tiles meets the side of the next tile, deeper sideways than it has sunk in, or has a gap to
-its edge that closes. That side is covered. A body cannot be a wall where all of it lies below the plane on which one
-stands: it can only support along that plane's normal, and this is what such contacts get. (Jolt and Box3D remove such
-edges by where they lie in a mesh; here tiles may be bodies of their own.)
+A body that slides over a floor of tiles may hit the side of the next tile if it has sunk in slightly, or if its gap to
+the next edge closes. But that side is covered. A body that is completely below the plane on which another stands cannot
+be a wall: it can only support along that plane's normal, so such contacts get this normal. (Jolt and Box3D remove such
+edges by their position in a mesh; here tiles may be separate bodies.)
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from sdfsim.physics.solver.surface_distance import KEYS
 from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, sub, turn, turn_back
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
-ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two are one
-STEEPEST = -0.1  # below it they face each other
-ROUGH = 0.5  # cells, by which a grid is off at an edge at most
-LEVEL = 4.0  # slops: so much higher than the support a body may reach and be no wall
+ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
+STEEPEST = -0.1  # cosine below which they face each other
+ROUGH = 0.5  # cells: largest error of a grid at an edge
+LEVEL = 4.0  # slops: a body that is higher than the support by no more than this is not a wall
 
 
 @njit(**BARE, inline="always")
 def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
-    """Give contacts with what lies below a support, and beside it, the support's normal, or void them."""
+    """Give contacts with bodies that are beside a support and below its plane the support's normal, or void them."""
     latest, following = work.latest, near.following
     pairs = len(near.start)
     several = False
@@ -39,7 +39,7 @@ def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
                 body = manifolds.pair[p, side]
                 following[2 * p + side] = latest[body]
                 if not world.moves[body]:
-                    continue  # what does not move stands on nothing
+                    continue  # a body that does not move needs no support
                 several = several or latest[body] >= 0 or manifolds.point[p, 0, KEY] != 0.0
                 latest[body] = 2 * p + side
     if not several:
@@ -90,12 +90,12 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
 
 @njit(**BARE)
 def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
-    """Whether the body that is first (side 0) or second (1) of pair p stands on something with another normal, above
-    all of what it meets at point k; and this normal, towards the body."""
+    """Whether the first (side 0) or second (1) body of pair p stands on something with another normal, and above
+    everything that it meets at point k; and this normal, towards the body."""
     body, other = manifolds.pair[p, side], manifolds.pair[p, 1 - side]
     n = _normal(manifolds, p, k, side)
     if shapes.solids.start[world.shape[other] + 1] == shapes.solids.start[world.shape[other]]:
-        return False, n  # nobody knows how far it reaches
+        return False, n  # its extent is not known
     key = manifolds.point[p, k, KEY]
     link = work.latest[body]
     while link >= 0:
@@ -108,7 +108,7 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
             facing = dot(n, m)
             if facing > ASLANT or facing < STEEPEST or manifolds.point[q, e, GAP] > rules.slop:
                 continue
-            # The plane of the support, and how far the other body's piece reaches above it.
+            # The plane of the support, and how far the other body's piece extends above it.
             ground = manifolds.pair[q, 1 - own]
             column = SECOND if own == 0 else FIRST
             foot = turn(
@@ -135,7 +135,7 @@ def _normal(manifolds, p, k, side):
 
 @njit(**BARE)
 def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
-    """Whether another body reaches to the place where a contact touches the body that is met."""
+    """Whether another body extends to the point where a contact touches the other body of the pair."""
     other, column = manifolds.pair[p, 1 - side], SECOND if side == 0 else FIRST
     point = manifolds.point[p, k]
     place = turn(work.matrix, other, (point[column], point[column + 1], point[column + 2]))
@@ -156,7 +156,7 @@ def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
 
 @njit(**BARE)
 def _reach(shapes, world, work, motion, body, key, side, m):
-    """How far the piece of a body that a contact is of reaches along m."""
+    """How far the piece of a body to which a contact belongs extends along m."""
     s, convex = world.shape[body], shapes.solids
     pieces = convex.start[s + 1] - convex.start[s]
     number = int(key) % KEYS if side == 0 else int(key) // KEYS

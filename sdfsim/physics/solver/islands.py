@@ -1,4 +1,4 @@
-"""Islands, compiled: bodies that move and contacts join; each is solved, and falls asleep, by itself."""
+"""Islands, compiled: dynamic bodies that contacts join. Each island is solved, and falls asleep, on its own."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def root(parent, b):
 
 @njit(**BARE)
 def join(parent, a, b):
-    """Bodies a and b belong together."""
+    """Join the sets of bodies a and b."""
     one, other = root(parent, a), root(parent, b)
     parent[max(one, other)] = min(one, other)
 
 
 @njit(**FAST)
 def islands_of(world, parent, number, where):
-    """Contacts ordered by island: bodies that move, joined by contacts."""
+    """Contacts ordered by island: dynamic bodies that contacts join."""
     for c in range(len(where)):
         for e in range(2, 4):
             parent[where[c, e]], number[where[c, e]] = where[c, e], -1
