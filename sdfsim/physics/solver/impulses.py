@@ -55,7 +55,7 @@ THIN = 0.005
 # The larger the ratio of masses, the more slowly sweeps carry a load to lighter bodies. The number of sweeps of an
 # island is multiplied by its ratio divided by the first number, at most by the second.
 EVEN, OFTEN = 30.0, 30.0
-MANY = 64  # islands of contacts, from which on threads pay off
+MANY = 64  # number of islands from which threads pay off
 
 
 class System(NamedTuple):

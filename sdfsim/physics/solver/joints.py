@@ -1,9 +1,10 @@
-"""Joints, compiled: the rows that hold bodies together are solved exactly, beside contacts and what else is bounded.
+"""Joints, compiled: the rows that hold bodies together are solved exactly, together with contacts and other bounded
+rows.
 
-In an inner step, impulses act along the rows where bodies are at its start, and are such that the rows hold where
-bodies are at its end (SHAKE, with the exact free rotation in between): this keeps energy as the step without joints
-does, and nothing drifts. What bounds them (limits, motors, friction, contacts) is solved in turn, each seeing through
-the joints.
+In an inner step, impulses act along the rows at the poses of its start, and are such that the rows hold at the poses of
+its end (SHAKE, with the exact free rotation in between). This conserves energy as well as the step without joints does,
+and nothing drifts. Bounded rows (limits, motors, friction, contacts) are solved one after the other; each takes the
+joints into account.
 """
 
 from __future__ import annotations
@@ -84,35 +85,36 @@ from sdfsim.physics.solver.vectors import (
 )
 
 ROWS = 6
-STRETCH = 1e-7  # model lengths (and rad): rows that hold worse are mended by moving bodies
-REACH = 0.05  # by at most so much in an inner step
-HOLDS = 1e-11  # model lengths (and rad): better need no row hold
-ROUNDS = 6  # of the search for impulses after which rows hold
-BREAKS = 4  # times that joints may break in one inner step
-SOFTEN = 1e-10  # of what a unit of impulse does along a row: where rows say the same twice, both are satisfied
-GIVES = 0.2  # the share of what is beyond a limit that an inner step resolves
-AHEAD = 0.05  # model lengths (and rad): limits that are nearer are looked at
-EXACT = 0.01  # of the precision that impulses of contacts alone are solved to
-DENSE = 240  # bounded rows of an island up to which each sees what it does through all joints
+STRETCH = 1e-7  # model lengths (and rad): rows with a larger error are repaired by moving bodies
+REACH = 0.05  # by at most this much in an inner step
+HOLDS = 1e-11  # model lengths (and rad): rows need not hold more exactly
+ROUNDS = 6  # rounds of the search for impulses after which rows hold
+BREAKS = 4  # rounds in which joints may break in one inner step
+SOFTEN = 1e-10  # relative to the effect of a unit impulse along a row: makes redundant rows solvable
+GIVES = 0.2  # share of an overrun limit that an inner step resolves
+AHEAD = 0.05  # model lengths (and rad): nearer limits are taken into account
+EXACT = 0.01  # relative to the precision to which contacts without joints are solved
+DENSE = 240  # largest number of bounded rows of an island for which all effects through the joints are stored
 
 
 class Graph(NamedTuple):
-    """The bodies that move and the joints are K nodes of a graph, in the order in which they are eliminated; the nodes
+    """The dynamic bodies and the joints as K nodes of a graph, in the order in which they are eliminated. The nodes
     from comp[c] to comp[c + 1] are connected."""
 
     comp: np.ndarray  # [C + 1] int64
     node: np.ndarray  # [K] int64: a body, or -1 - j for joint j
-    of_body: np.ndarray  # [N] int64, the node of a body, -1 for those that no joint holds or that do not move
-    of_comp: np.ndarray  # [N] int64, likewise what it is connected to, a number
-    entry: np.ndarray  # [J, 2] int64, the block where a joint meets its body, -1 where that does not move
+    of_body: np.ndarray  # [N] int64, the node of a body; -1 if no joint holds it or it does not move
+    of_comp: np.ndarray  # [N] int64, likewise the number of its connected component
+    entry: np.ndarray  # [J, 2] int64, the block of a joint and its body; -1 if the body does not move
     below: np.ndarray  # [K + 1] int64, the blocks below the diagonal of a column
-    row: np.ndarray  # [F] int64, the node whose row a block is in
+    row: np.ndarray  # [F] int64, the node of a block's row
     start: np.ndarray  # [K + 1] int64, the targets of a column
-    target: np.ndarray  # [U] int64, block that a pair of blocks of a column adds to; -1 - k for the diagonal of node k
+    target: np.ndarray  # [U] int64, the block to which a pair of a column's blocks adds; -1 - k: diagonal of node k
 
 
 class Factors(NamedTuple):
-    """The matrix of masses and rows: diagonal, inverse [K, 6, 6]; block, low [F, 6, 6]; and a right side x [K, 6]."""
+    """The matrix of masses and rows: diagonal, inverse [K, 6, 6]; block, low [F, 6, 6]; and the right-hand side x [K,
+    6]."""
 
     diagonal: np.ndarray
     inverse: np.ndarray
@@ -122,35 +124,34 @@ class Factors(NamedTuple):
 
 
 class Each(NamedTuple):
-    """What each of J joints is and does."""
+    """The constants and the state of J joints."""
 
     body: np.ndarray  # [J, 2] int64, -1 for the world
     kind: np.ndarray  # [J] int64
     anchor: np.ndarray  # [J, 2, 3] from the centres of mass, in the bodies' axes
-    axes: np.ndarray  # [J, 2, 3, 3] the joint's three axes in those of the bodies
+    axes: np.ndarray  # [J, 2, 3, 3] the joint's three axes in body axes
     number: np.ndarray  # [J, NUMBERS]
     state: np.ndarray  # [J, STATE]
     axis: np.ndarray  # [J, 1, 12] the row along which it moves
 
 
 class Rows(NamedTuple):
-    """The rows of joints that hold, as they are in an inner step."""
+    """The rows that joints hold, in an inner step."""
 
-    line: np.ndarray  # [J, ROWS, 12] how a row reads the velocities of both bodies
-    active: np.ndarray  # [J, ROWS] int64: 0 for none, 1 for one that holds, 2 for a spring
-    # [J, ROWS]: by how much a unit of impulse gives way; what a row is to read; its impulse; by how much it does not
-    # hold before and after the inner step
+    line: np.ndarray  # [J, ROWS, 12] coefficients of a row for the velocities of both bodies
+    active: np.ndarray  # [J, ROWS] int64: 0 unused, 1 for a row that holds, 2 for a spring
+    # [J, ROWS]: compliance; wanted value of the row; its impulse; its error before and after the inner step
     soft: np.ndarray
     wanted: np.ndarray
     impulse: np.ndarray
     error: np.ndarray
     later: np.ndarray
-    eased: np.ndarray  # [1, 24], its latter half: what a unit of impulse makes of velocities, for a moment
+    eased: np.ndarray  # [1, 24], in its second half temporarily the effect of a unit impulse on velocities
 
 
 class Trial(NamedTuple):
-    """Where bodies would be: position [N, 3], orientation [N, 4], velocity and angular [N, 3], frame [N, 3, 3]; and
-    amid it turned [1, 4] and tried [1, 3, 3] of one."""
+    """Trial poses of bodies: position [N, 3], orientation [N, 4], velocity and angular [N, 3], frame [N, 3, 3]; turned
+    [1, 4] and tried [1, 3, 3] are buffers for one body."""
 
     position: np.ndarray
     orientation: np.ndarray
@@ -162,18 +163,18 @@ class Trial(NamedTuple):
 
 
 class Held(NamedTuple):
-    """All joints of a scene, with room for what an inner step makes of them."""
+    """All joints of a scene, with buffers for an inner step."""
 
     graph: Graph
     factors: Factors
     each: Each
     rows: Rows
     trial: Trial
-    reply: np.ndarray  # [N, 6] what an impulse makes of velocities through the joints
-    calm: np.ndarray  # [N] bool, whether joints hold a body that nothing else touches
+    reply: np.ndarray  # [N, 6] effect of an impulse on velocities through the joints
+    calm: np.ndarray  # [N] bool, whether a body is held by joints and touched by nothing else
 
 
-# Kinds of bounded rows: of contacts, normal and tangential (two rows); of joints, limits, motors with friction, and the
+# Kinds of bounded rows. Contacts: normal and tangential (two rows). Joints: limits, motors with friction, and the
 # friction of a ball (three rows).
 NORMAL_ROW, TANGENT_ROW, STOP_ROW, DRIVE_ROW, GRIP_ROW = range(5)
 
@@ -184,20 +185,21 @@ class Bounded(NamedTuple):
     kind: np.ndarray  # [R] int64
     of: np.ndarray  # [R] int64, the contact or the joint
     body: np.ndarray  # [R, 2] int64
-    # [R, 24] how a row reads velocities of both bodies, and what a unit of impulse makes of these without the joints
+    # [R, 24] coefficients of a row for the velocities of both bodies, and the effect of a unit impulse on these without
+    # joints
     row: np.ndarray
-    want: np.ndarray  # [R] the wanted change of what it reads
+    want: np.ndarray  # [R] the wanted change of the row's velocity
     impulse: np.ndarray  # [R]
-    # [R] what it reads without any impulse; the impulses of a motor and of friction at most. Of a tangent grip is the
-    # coefficient of friction; of a limit strong is what is to be left of the way to it after the inner step (infinite
-    # where it rebounds), and grip 1 for the lower one and -1 for the higher.
+    # [R] the row's velocity without any impulse; the largest impulses of a motor and of friction. For a tangent, grip
+    # is the coefficient of friction. For a limit, strong is the distance to it that must be left after the inner step
+    # (infinite if it rebounds), and grip is 1 for the lower limit and -1 for the upper.
     base: np.ndarray
     strong: np.ndarray
     grip: np.ndarray
-    give: np.ndarray  # [R] what a unit of impulse does along its row, through the joints where that is known
+    give: np.ndarray  # [R] effect of a unit impulse along its own row, through the joints if that is known
     now: np.ndarray  # [R] the change so far
     known: np.ndarray  # [R] the impulses before
-    see: np.ndarray  # [R, R] or [0, 0]: what a unit of impulse does along all rows, through the joints
+    see: np.ndarray  # [R, R] or [0, 0]: effect of a unit impulse along all rows, through the joints
 
 
 @njit(**BARE)
@@ -210,7 +212,7 @@ def asleep(island, graph, c):
 
 @njit(**BARE)
 def _in_world(matrix, b, v):
-    """A vector [3] in the axes of body b (below 0 for the world) along those of the world."""
+    """A vector [3] from the axes of body b (below 0: the world) to those of the world."""
     return vector(v) if b < 0 else turn(matrix, b, vector(v))
 
 
@@ -241,7 +243,7 @@ def _unit(k):
 
 @njit(**BARE)
 def _errors(each, position, matrix, j, out):
-    """By how much the rows of a joint do not hold."""
+    """The errors of the rows of a joint."""
     kind = each.kind[j]
     arm, other = _arms(each, matrix, j)
     way = _between(position, each.body, j, arm, other)
@@ -272,7 +274,7 @@ def _errors(each, position, matrix, j, out):
 
 @njit(**BARE)
 def _write(row, pull, arm, other):
-    """A row [12] along a direction at two places."""
+    """Write a row [12] along a direction at two points."""
     one, two = cross(arm, pull), cross(other, pull)
     for x in range(3):
         row[x], row[3 + x], row[6 + x], row[9 + x] = pull[x], one[x], -pull[x], -two[x]
@@ -280,7 +282,7 @@ def _write(row, pull, arm, other):
 
 @njit(**BARE)
 def _write_turn(row, axis):
-    """A row [12] about an axis."""
+    """Write a row [12] about an axis."""
     for x in range(3):
         row[x] = row[6 + x] = 0.0
         row[3 + x], row[9 + x] = axis[x], -axis[x]
@@ -321,7 +323,7 @@ def _coordinate(each, position, matrix, j):
 
 @njit(**BARE)
 def _rows(each, lines, position, matrix, j):
-    """The rows that hold, as bodies are now."""
+    """Write the rows that hold, at the present poses."""
     kind, line, active = each.kind[j], lines.line, lines.active
     arm, other = _arms(each, matrix, j)
     for e in range(ROWS):
@@ -361,7 +363,7 @@ def _rows(each, lines, position, matrix, j):
 
 @njit(**BARE)
 def _reads(row, motion, a, b):
-    """What a row [12] says of the velocities of both bodies."""
+    """The velocity of a row [12], from the velocities of both bodies."""
     total = 0.0
     for x in range(3):
         if a >= 0:
@@ -373,7 +375,7 @@ def _reads(row, motion, a, b):
 
 @njit(**BARE)
 def _reads_six(row, change, a, b):
-    """Likewise of [N, 6]."""
+    """Likewise from changes [N, 6]."""
     total = 0.0
     for x in range(6):
         if a >= 0:
@@ -385,8 +387,8 @@ def _reads_six(row, change, a, b):
 
 @njit(**BARE)
 def _eased(world, work, rules, row, a, b, out):
-    """Write what a unit of impulse along a row [12] makes of both bodies' velocities by themselves, behind the first 12
-    numbers of `out` [24]; returns what that does along the row."""
+    """Write the effect of a unit impulse along a row [12] on both bodies' velocities, without joints, after the first
+    12 numbers of `out` [24]. Returns its effect along the row."""
     total = 0.0
     for s in range(2):
         body, first = (a, 0) if s == 0 else (b, 6)
@@ -404,7 +406,7 @@ def _eased(world, work, rules, row, a, b, out):
 
 @njit(**BARE)
 def _springs(world, work, motion, rules, each, lines, j):
-    """Springs and damping as soft rows: a force in the middle of what it is before and after the inner step."""
+    """Springs and damping as soft rows, with the mean of the forces before and after the inner step."""
     number, state, kind, h = each.number, each.state, each.kind[j], rules.substep_dt
     stiff, damping = number[j, STIFFNESS], number[j, DAMPING]
     if stiff <= 0.0 and damping <= 0.0:
@@ -429,8 +431,8 @@ def _springs(world, work, motion, rules, each, lines, j):
 
 @njit(**FAST)
 def assemble(world, work, motion, rules, held, springs):
-    """Write the rows of all joints that are awake, and factor what they make of velocities. Where rows do not hold,
-    bodies are moved. `springs`: whether these are among them."""
+    """Write the rows of all joints that are awake, and factor their matrix. Bodies are moved if rows do not hold.
+    `springs`: whether to include springs."""
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
     for c in range(len(graph.comp) - 1):
         if asleep(motion.island, graph, c):
@@ -461,7 +463,7 @@ def assemble(world, work, motion, rules, held, springs):
 
 @njit(**BARE)
 def _mend(world, work, motion, rules, graph, factors, lines, c):
-    """Move bodies so that rows hold: as little as their masses ask for."""
+    """Move bodies so that rows hold, by the smallest change in the metric of their masses."""
     for k in range(graph.comp[c], graph.comp[c + 1]):
         for e in range(6):
             factors.x[k, e] = 0.0
@@ -555,7 +557,7 @@ def _factor(world, work, motion, rules, graph, factors, each, lines, c):
 
 @njit(**BARE)
 def _invert(diagonal, inverse, k):
-    """Gauss and Jordan without pivots: the blocks are definite."""
+    """Gauss-Jordan elimination without pivoting: the blocks are definite."""
     a = inverse[k]
     for x in range(6):
         for y in range(6):
@@ -595,7 +597,7 @@ def _subtract(out, t, low, p, block, q):
 
 @njit(**BARE)
 def _substitute(graph, factors, c, first):
-    """Solve for the right side `x`, which is 0 before node `first`."""
+    """Solve for the right-hand side `x`, which is 0 before node `first`."""
     x, low, last = factors.x, factors.low, graph.comp[c + 1]
     for k in range(first, last):
         for p in range(graph.below[k], graph.below[k + 1]):
@@ -611,7 +613,7 @@ def _substitute(graph, factors, c, first):
 
 @njit(**BARE)
 def _take_off(x, k, block, of):
-    """Take from row k of x [K, 6] what a block [6, 6] makes of another row."""
+    """Subtract from row k of x [K, 6] the product of a block [6, 6] with another row."""
     for i in range(6):
         total = 0.0
         for u in range(6):
@@ -621,8 +623,8 @@ def _take_off(x, k, block, of):
 
 @njit(**BARE)
 def _project(world, work, motion, graph, factors, each, lines, c, change, whole):
-    """Let the rows hold: what `change` lacks is added. `whole`: of all velocities, as the rows want them; else of the
-    change alone, which is to be none along them."""
+    """Add to `change` so that the rows hold. `whole`: for the full velocities, with the values that the rows want; else
+    for the change alone, which must be zero along the rows."""
     free = work.free
     for k in range(graph.comp[c], graph.comp[c + 1]):
         n = graph.node[k]
@@ -653,8 +655,8 @@ def _project(world, work, motion, graph, factors, each, lines, c, change, whole)
 
 @njit(**BARE)
 def _bend(world, work, motion, rules, graph, each, lines, trial, c):
-    """Move the bodies as far as the inner step would, and let rows turn by as much as they do not hold there; returns
-    the largest error."""
+    """Move the bodies on trial by the inner step, and correct the wanted values of the rows by their errors there.
+    Returns the largest error."""
     h = rules.substep_dt
     for k in range(graph.comp[c], graph.comp[c + 1]):
         n = graph.node[k]
@@ -708,8 +710,8 @@ def _tried(world, work, motion, rules, trial, b):
 
 @njit(**BARE)
 def _limited(world, work, motion, rules, graph, each, c, rows, count, steady):
-    """Write the bounded rows of joints behind `count` others; returns how many there are then. `steady`: only limits
-    that hold, as they are after an inner step."""
+    """Write the bounded rows of joints after `count` others. Returns the new number of rows. `steady`: only limits that
+    hold, as after an inner step."""
     h, number, state = rules.substep_dt, each.number, each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] >= 0:
@@ -785,7 +787,7 @@ def _begin(world, work, motion, rules, each, rows, r, kind, j, aim, base):
 
 @njit(**BARE)
 def _touched(inverse_mass, system, island, rows):
-    """Write the rows of an island's contacts; returns how many."""
+    """Write the rows of an island's contacts. Returns their number."""
     count = 0
     for o in range(system.start[island], system.start[island + 1]):
         c = system.order[o]
@@ -832,7 +834,7 @@ def _give(moves, rows, r, impulse, change):
 
 @njit(**BARE)
 def _see(world, work, motion, graph, factors, reply, rows, count):
-    """What a unit of impulse along each row does along all, through the joints."""
+    """The effect of a unit impulse along each row on all rows, through the joints."""
     for r in range(count):
         for s in range(2):
             b = rows.body[r, s]
@@ -886,7 +888,7 @@ def _see(world, work, motion, graph, factors, reply, rows, count):
 
 @njit(**BARE)
 def _step(moves, rows, count, r, total, change):
-    """Give a row its impulse; returns by how much that changes what it reads."""
+    """Give a row its impulse. Returns the change of the row's velocity."""
     step = total - rows.impulse[r]
     if step == 0.0:
         return 0.0
@@ -901,13 +903,13 @@ def _step(moves, rows, count, r, total, change):
 
 @njit(**BARE)
 def _short(rows, r, change):
-    """What a row lacks of the change that it wants."""
+    """What a row lacks of its wanted change."""
     return rows.want[r] - (rows.now[r] if len(rows.see) else _read(rows, r, change))
 
 
 @njit(**BARE)
 def _driven(now, aim, give, most, grip):
-    """The impulse of a motor with friction: `now` is the speed without it."""
+    """The impulse of a motor with friction; `now` is the speed without it."""
     sign = 1.0 if aim >= 0.0 else -1.0
     now, aim = sign * now, sign * aim
     reach = (aim - now) / give
@@ -921,7 +923,7 @@ def _driven(now, aim, give, most, grip):
 
 @njit(**BARE)
 def _sweep(moves, cone, rows, count, change):
-    """All bounded rows in turn, friction of contacts last; returns the largest change."""
+    """Relax all bounded rows one after the other, friction of contacts last. Returns the largest change."""
     worst = 0.0
     for r in range(count):
         kind = rows.kind[r]
@@ -963,7 +965,7 @@ def _sweep(moves, cone, rows, count, change):
 
 @njit(**BARE)
 def _all_rows(world, work, motion, rules, system, graph, each, comps, lo, hi, island, rows):
-    """The bounded rows of an island, and what was known of their impulses, given to the bodies."""
+    """Write the bounded rows of an island, and apply their known impulses to the bodies."""
     count = _touched(world.inverse_mass, system, island, rows)
     for i in range(lo, hi):
         count = _limited(world, work, motion, rules, graph, each, comps[i], rows, count, False)
@@ -1049,7 +1051,7 @@ def _room(count):
 
 @njit(**FAST)
 def _solve_island(world, work, motion, rules, system, held, comps, lo, hi, island):
-    """An island that joints hold together: as `impulses._solve`, through the joints."""
+    """Solve an island with joints: as `impulses._solve`, through the joints."""
     graph, factors, each, lines = held.graph, held.factors, held.each, held.rows
     contacts = system.start[island + 1] - system.start[island]
     most = 3 * contacts
@@ -1113,7 +1115,7 @@ def _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island,
                 _factor(world, work, motion, rules, graph, factors, each, lines, comps[i])
         if not broke:
             break
-        # What broke has not held: all impulses are found once more.
+        # Broken joints no longer hold: find all impulses again.
         _clear(graph, system, island, comps, lo, hi, work.change)
         if len(rows.see):
             _see(world, work, motion, graph, factors, held.reply, rows, count)
@@ -1133,7 +1135,7 @@ def _seen(rows, count):
 
 @njit(**BARE)
 def _told(world, work, motion, rules, graph, each, lines, calm, c, touched):
-    """Write down what the rows that hold have done."""
+    """Record the forces and torques of the rows that hold."""
     h, state = rules.substep_dt, each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
         n = graph.node[k]
@@ -1161,7 +1163,7 @@ def _told(world, work, motion, rules, graph, each, lines, calm, c, touched):
 
 @njit(**BARE)
 def _add_pull(matrix, each, j, row, force):
-    """Add what a row [12] does to the force and the torque on the first body, about its anchor."""
+    """Add the effect of a row [12] to the force and the torque on the first body, about its anchor."""
     arm, _ = _arms(each, matrix, j)
     pull = vector(row)
     twist = sub((row[3], row[4], row[5]), cross(arm, pull))
@@ -1172,7 +1174,7 @@ def _add_pull(matrix, each, j, row, force):
 
 @njit(**BARE)
 def _tell(world, work, motion, rules, each, rows, r):
-    """Write down what a bounded row of a joint has done."""
+    """Record the impulse of a bounded row of a joint."""
     j, kind, impulse, h, state = rows.of[r], rows.kind[r], rows.impulse[r], rules.substep_dt, each.state
     _add_pull(work.matrix, each, j, rows.row[r], impulse / h)
     if kind == STOP_ROW:
@@ -1193,7 +1195,7 @@ def _tell(world, work, motion, rules, each, rows, r):
 
 @njit(**BARE)
 def _broken(graph, each, lines, c):
-    """Joints that bear more than they can are none any more; whether there are new ones."""
+    """Break the joints that bear more than they can. Returns whether any broke."""
     found = False
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] < 0:
@@ -1212,11 +1214,11 @@ def _broken(graph, each, lines, c):
 
 @njit(**FAST)
 def _islands(world, work, motion, graph, where):
-    """Contacts and connected joints ordered by island: bodies that move, joined by both.
+    """Contacts and connected joints ordered by island: dynamic bodies that either joins.
 
     Returns:
-        start [I + 1] and order [C] of contacts, and the same of what joints connect, of which those that sleep are left
-        out.
+        start [I + 1] and order [C] of contacts, and the same for the components that joints connect; sleeping
+        components are left out.
     """
     parent, number, connected = work.parent, work.number, len(graph.comp) - 1
     for k in range(len(graph.node)):
@@ -1261,7 +1263,7 @@ def _islands(world, work, motion, graph, where):
 
 @njit(**FAST)
 def _sorted(label, count):
-    """Where each label begins, and the numbers of those that have it; -1 is none."""
+    """Where each label begins, and the indices of the entries that have it; -1 is no label."""
     start = np.zeros(count + 1, np.int64)
     for c in range(len(label)):
         if label[c] >= 0:
@@ -1280,7 +1282,7 @@ def _sorted(label, count):
 
 @njit(**FAST, inline="always")
 def solve_with_joints(world, work, motion, rules, manifolds, held):
-    """Solve for the impulses of all contacts and joints, as `impulses.solve_contacts`, which it returns what of."""
+    """Solve for the impulses of all contacts and joints, in place of `impulses.solve_contacts`. Returns the same."""
     graph = held.graph
     found = _equations(world, work, motion, rules, manifolds)
     start, order, begin, comps = _islands(world, work, motion, graph, found.where)
@@ -1297,7 +1299,7 @@ def solve_with_joints(world, work, motion, rules, manifolds, held):
 
 @njit(**BARE)
 def _ready(world, work, rules, graph, c, share):
-    """Inverse inertias of bodies in world axes as they lie, and what pulls at them in a share of an inner step."""
+    """Inverse inertias of bodies in world axes, and the effect of pulls on them in a share of an inner step."""
     for k in range(graph.comp[c], graph.comp[c + 1]):
         b = graph.node[k]
         if b < 0:
@@ -1317,7 +1319,7 @@ def _ready(world, work, rules, graph, c, share):
 
 @njit(**BARE)
 def _resting(touching, graph, c):
-    """Whether contacts have a say in what joints connect: its velocities are then those of a whole inner step."""
+    """Whether contacts act on a component: its velocities are then those of a whole inner step."""
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] >= 0 and touching[graph.node[k]]:
             return True
@@ -1326,7 +1328,7 @@ def _resting(touching, graph, c):
 
 @njit(**BARE)
 def _kick(world, work, motion, rules, graph, each, lines, c, share):
-    """A share of what springs, damping, motors and friction have given in the last inner step, to velocities."""
+    """Add to velocities a share of the impulses of springs, damping, motors and friction in the last inner step."""
     state = each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] >= 0:
@@ -1344,7 +1346,7 @@ def _kick(world, work, motion, rules, graph, each, lines, c, share):
                 row = lines.line[j, 3 + e]
                 _write_turn(row, _unit(e))
             eased = _eased(world, work, rules, row, a, b, lines.eased[0])
-            if each.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # of which the motor's work is told
+            if each.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # for which the motor's work is recorded
                 before = _reads(row, motion, a, b)
                 state[j, GIVEN] += share * state[j, DRIVE + 1] * (before + 0.5 * impulse * eased)
             for s in range(2):
@@ -1357,8 +1359,8 @@ def _kick(world, work, motion, rules, graph, each, lines, c, share):
 
 @njit(**FAST, inline="always")
 def begin_step(world, work, motion, rules, held):
-    """Velocities at an instant become those of the inner step before it, see `advance._shifted`. Where nothing is known
-    of impulses they are found first."""
+    """Convert velocities at an instant to those of the inner step before it, see `advance._shifted`. Unknown impulses
+    are found first."""
     graph, each, lines = held.graph, held.each, held.rows
     fresh = False
     for j in range(len(each.body)):
@@ -1379,7 +1381,7 @@ def begin_step(world, work, motion, rules, held):
 
 @njit(**FAST)
 def _find_first(world, work, motion, rules, held):
-    """The impulses of joints that nothing is known of, as if there were no contact."""
+    """Find the unknown impulses of joints, as if there were no contact."""
     graph, each = held.graph, held.each
     from_contacts = System(
         np.empty((0, 4), np.int64), np.empty((0, 3, WIDTH)), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 4)),
@@ -1414,7 +1416,7 @@ def _hold_steady(world, work, motion, rules, held, one, bounded, count):
 
 @njit(**FAST, inline="always")
 def end_step(world, work, motion, rules, held):
-    """Velocities of the last inner step become those at its end, which joints let be."""
+    """Convert velocities of the last inner step to those at its end, as joints allow."""
     graph, each, lines = held.graph, held.each, held.rows
     one = np.empty(1, np.int64)
     for c in range(len(graph.comp) - 1):
@@ -1448,7 +1450,7 @@ def end_step(world, work, motion, rules, held):
 
 @njit(**BARE)
 def kept_together(held, part):
-    """What joints connect goes the same part of an inner step."""
+    """Bodies that joints connect move by the same part of an inner step."""
     graph = held.graph
     for c in range(len(graph.comp) - 1):
         least = 1.0
@@ -1462,7 +1464,7 @@ def kept_together(held, part):
 
 @njit(**BARE)
 def roused(world, motion, held):
-    """Wake what sleeps on a joint to a body that is led along; whether there was any."""
+    """Wake sleeping bodies that a joint holds to a scripted moving body. Returns whether there were any."""
     each = held.each
     found = False
     for j in range(len(each.body)):
@@ -1483,14 +1485,14 @@ def roused(world, motion, held):
 
 @njit(**BARE)
 def rest_held(each):
-    """A step in which all that joints hold sleeps."""
+    """A step in which all bodies with joints sleep."""
     for j in range(len(each.body)):
         each.state[j, GIVEN] = each.state[j, SPEED] = 0.0
 
 
 @njit(**BARE)
 def given(each):
-    """What motors have given in a step."""
+    """The work of motors in a step."""
     total = 0.0
     for j in range(len(each.body)):
         total += each.state[j, GIVEN]
@@ -1499,7 +1501,7 @@ def given(each):
 
 @njit(**BARE)
 def stored(each):
-    """The energy of springs."""
+    """The energy in springs."""
     total = 0.0
     for j in range(len(each.body)):
         if each.number[j, STIFFNESS] > 0.0 and not each.state[j, BROKEN] > 0.0:

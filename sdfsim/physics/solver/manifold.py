@@ -1,4 +1,4 @@
-"""Contacts that persist, compiled: points carried along, and new ones that take their place."""
+"""Persistent contacts, compiled: old points are carried along, and new ones replace them."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from sdfsim.physics.solver.world import (
     VOID,
 )
 
-FOUND = 128  # contact points that a pair may find in one look
-CANDIDATES = 256  # leaves of nodes that may touch, of which
-SIDE = 40  # at most become points
-EACH = 4  # points of a manifold that are of the same two patches
-ALIKE = 0.9  # cosine between normals that are taken for one
-EVEN = 1e-9  # by how much two lengths or their squares differ at least, for one to come before the other
+FOUND = 128  # contact points that may be found for a pair at once
+CANDIDATES = 256  # leaves of nodes that may touch
+SIDE = 40  # of them, at most this many become points
+EACH = 4  # points of a manifold for the same two patches
+ALIKE = 0.9  # cosine between normals, above which they count as equal
+EVEN = 1e-9  # two lengths, or their squares, count as equal if they differ by less
 TOUCHES = 1e6  # more than any squared distance between points of a pair
-OUTWARD = 1e-3  # how much deeper another point must be to be preferred to one that is farther out by a length
+OUTWARD = 1e-3  # how much deeper a point must be to be preferred to one that is farther out by one length
 
 
 class Scratch(NamedTuple):
-    """Room for what is found of one pair: compiled code allocates slowly."""
+    """Buffers for the points of one pair: compiled code allocates slowly."""
 
     found: np.ndarray  # [FOUND, COLUMNS] new points
-    every: np.ndarray  # [FOUND + POINTS, COLUMNS] with those that were known
-    # depth, node, leaf, key, normal, place, used: [CANDIDATES] and [CANDIDATES, 3] of nodes that may become points
+    every: np.ndarray  # [FOUND + POINTS, COLUMNS] new and known points
+    # depth, node, leaf, key, normal, place, used: [CANDIDATES] or [CANDIDATES, 3], nodes that may become points
     depth: np.ndarray
     node: np.ndarray
     leaf: np.ndarray
@@ -49,8 +49,8 @@ class Scratch(NamedTuple):
     normal: np.ndarray
     place: np.ndarray
     used: np.ndarray
-    pick: np.ndarray  # [SIDE] int64, which of them do
-    # away, alike: [FOUND + POINTS] how far from those chosen a point is, and how many of these are of its kind
+    pick: np.ndarray  # [SIDE] int64, the ones that do
+    # away, alike: [FOUND + POINTS] distance of a point from the chosen ones, and the number of these of its kind
     away: np.ndarray
     alike: np.ndarray
     simplex: Simplex
@@ -71,7 +71,7 @@ def scratch_room():
 
 @njit(**BARE)
 def points_of(manifolds, pairs):
-    """How many points the manifolds of the first so many pairs have."""
+    """Number of points in the manifolds of the first `pairs` pairs."""
     total = 0
     for m in range(pairs):
         total += manifolds.count[m]
@@ -80,14 +80,14 @@ def points_of(manifolds, pairs):
 
 @njit(**BARE)
 def moved(shapes, world, motion, matrix, rules, manifolds, p, count):
-    """Old points at the present poses; those that have parted or slid too far are dropped."""
+    """Move old points to the present poses, and drop those that have parted or slid too far."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     point = manifolds.point
     kept = 0
     for k in range(count):
         n = (point[p, k, NORMAL], point[p, k, NORMAL + 1], point[p, k, NORMAL + 2])
         for side in range(2):
-            # The point of a ball that is touched is where the normal says, however it has rolled.
+            # The contact point of a ball follows from the normal, however the ball has rolled.
             body = a if side == 0 else b
             if shapes.table[world.shape[body], KIND] == SPHERE:
                 radius = shapes.table[world.shape[body], SIZE] * world.scale[body] * (-1.0 if side == 0 else 1.0)
@@ -110,7 +110,7 @@ def moved(shapes, world, motion, matrix, rules, manifolds, p, count):
 
 @njit(**BARE)
 def write(found, count, side, mine, theirs, normal, gap, key):
-    """A new point, as found by the body that is first (0) or second (1) of its pair."""
+    """Write a new point, found from the first (side 0) or second (1) body of its pair."""
     for x in range(3):
         found[count, (FIRST if side == 0 else SECOND) + x] = mine[x]
         found[count, (SECOND if side == 0 else FIRST) + x] = theirs[x]
@@ -125,9 +125,10 @@ def write(found, count, side, mine, theirs, normal, gap, key):
 
 @njit(**BARE)
 def merged(rules, point, p, known, scratch, count, rounded):
-    """Old and new points of a pair in one manifold, spread far; of points that nearly coincide the new ones.
+    """Merge old and new points of a pair into one manifold of points far apart; of nearly coincident points the new
+    ones are kept.
 
-    Returns how many there are.
+    Returns their number.
     """
     found, every, away, alike = scratch.found, scratch.every, scratch.away, scratch.alike
     for e in range(count):
@@ -154,7 +155,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
             for x in range(NORMAL_IMPULSE, KEY):
                 every[twin, x] = point[p, k, x]
             every[twin, TORSION] = point[p, k, TORSION]
-    # The deepest first, then always the one that is farthest from those chosen, of what touches before all others.
+    # First the deepest, then always the one farthest from those chosen; points that touch come before all others.
     chosen, lowest = -1, 1e300
     for e in range(total):
         away[e], alike[e] = 1e300, 0
@@ -175,8 +176,8 @@ def merged(rules, point, p, known, scratch, count, rounded):
             if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
                 alike[e] += 1
             away[e] = min(away[e], gone + 0.01 * turned)
-            # What touches, or is about to, comes first: a corner that is far out and above would take the place of what
-            # bears. What rolls on would sink in if the node that comes next had to wait until it touches.
+            # Points that touch, or are about to, come first: a corner that is far out but above would replace a point
+            # that carries load. A rolling body would sink in if its next node had to wait until it touches.
             if away[e] > rules.apart * rules.apart and alike[e] < EACH:
                 far = away[e] + (TOUCHES if every[e, GAP] <= rules.slop else 0.0)
                 if far > farthest + EVEN:
@@ -187,8 +188,8 @@ def merged(rules, point, p, known, scratch, count, rounded):
 
 @njit(**BARE)
 def renewed(rules, point, p, known, scratch, count):
-    """New points in place of all that were known of a pair; one that lies where one was goes on with its impulses.
-    Returns how many there are."""
+    """Replace all known points of a pair by the new ones; a new point at the place of an old one takes over its
+    impulses. Returns their number."""
     found, every = scratch.found, scratch.every
     for k in range(known):
         for x in range(COLUMNS):
@@ -214,14 +215,14 @@ def renewed(rules, point, p, known, scratch, count):
         if twin >= 0:
             for x in range(NORMAL_IMPULSE, KEY):
                 point[p, e, x] = every[twin, x]
-            every[twin, KEY] = -1.0  # each goes on once
+            every[twin, KEY] = -1.0  # each is taken over once
     return count
 
 
 @njit(**BARE)
 def thinned(scratch, count):
-    """Of many points as many as a manifold holds: the deepest, then always the one that is farthest from those chosen.
-    They come first in `found`."""
+    """Choose as many points as a manifold holds: the deepest, then always the one farthest from those chosen. They are
+    moved to the front of `found`."""
     found, away = scratch.found, scratch.away
     for e in range(count):
         away[e] = 1e300

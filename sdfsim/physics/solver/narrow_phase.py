@@ -1,7 +1,8 @@
 """Where bodies that are near each other touch, compiled.
 
-Three ways, by what the two shapes are: solids that are convex, or made of convex pieces, as such (`convex`); round ones
-by the distance at their core; all others by the surface of either in the distances of the other.
+There are three ways, depending on the two shapes. Solids that are convex, or made of convex pieces, collide as such
+(`convex`). Round ones use the distance at their core. All others use points on the surface of each in the distance of
+the other.
 """
 
 from __future__ import annotations
@@ -65,34 +66,35 @@ from sdfsim.physics.solver.vectors import (
 )
 from sdfsim.physics.solver.world import COLUMNS, FIRST, KEY, NORMAL, NORMAL_IMPULSE, SECOND, TORSION
 
-MANY = 192  # pairs from which on threads are worth their while, also beside other programs
-SHARES = 16  # of the pairs, each with its own scratch, that threads take in turn
-FLAT = 0.95  # cosine between the normals of a face at least
-# The mean distance of a face from its middle, in that of its corners: 0.54 of a square, 0.67 of a disc, 0.5 of a bar.
+MANY = 192  # number of pairs from which threads pay off, even beside other programs
+SHARES = 16  # groups of pairs, each with its own scratch, that threads take in turn
+FLAT = 0.95  # least cosine between the normals of one face
+# Mean distance of a face's points from its middle, relative to that of its corners: 0.54 for a square, 0.67 for a disc,
+# 0.5 for a bar.
 FACE = 0.58
-PROBES = 12  # on the way from the middle of a face to its corner
-SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is looked at
+PROBES = 12  # probes on the way from the middle of a face to its corner
+SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is tested
 
 
 class Near(NamedTuple):
-    """What of the bodies of P pairs may touch, until bodies are looked for again."""
+    """The parts of the bodies of P pairs that may touch, until the next search for near bodies."""
 
-    # start, count: [P, 2] the place of the first and how many are near: of solids pairs of pieces (side 0), of surfaces
-    # the leaves of nodes of either body
+    # start, count: [P, 2] index of the first near part, and their number: for solids, pairs of pieces (side 0); for
+    # surfaces, leaves of nodes of each body
     start: np.ndarray
     count: np.ndarray
     leaf: np.ndarray  # [L] which
-    away: np.ndarray  # [L] how far each is at least, once the ways of both bodies since then are taken off
-    axis: np.ndarray  # [L, 3] the normal of a pair of pieces, from the second to the first; 0 where it is not known
-    looked: np.ndarray  # [P] the ways of both bodies when new points were last looked for; -inf for never
-    away_all: np.ndarray  # [P] the least of `away`; -inf where it is not known
-    # Of leaves: the node that was deepest when they were last looked into, -1 for never; how far each of their nodes is
-    # at least, likewise; and where the surface led to from there.
+    away: np.ndarray  # [L] lower bound of its distance, from which the motion of both bodies since then is subtracted
+    axis: np.ndarray  # [L, 3] the normal of a pair of pieces, from the second to the first; 0 if it is not known
+    looked: np.ndarray  # [P] motion of both bodies when new points were last searched; -inf for never
+    away_all: np.ndarray  # [P] the least of `away`; -inf if it is not known
+    # For leaves: the deepest node when they were last searched, -1 for never; likewise a lower bound of the distance of
+    # each of their nodes; and the point on the surface to which the descent from there led.
     deepest: np.ndarray  # [L] int32
-    node_away: np.ndarray  # [L * the most nodes of a leaf]
+    node_away: np.ndarray  # [L * largest number of nodes of a leaf]
     placed: np.ndarray  # [L] bool, whether it is known
-    place: np.ndarray  # [L, 3] on the own surface, in its frame
-    held: np.ndarray  # [L] bool, whether a pair of pieces has the normal of what supports, see `internal_edges`
+    place: np.ndarray  # [L, 3] on the body's own surface, in its frame
+    held: np.ndarray  # [L] bool, whether a pair of pieces has the normal of a support, see `internal_edges`
     following: np.ndarray  # [2 P] int64 for finding the contacts of a body
 
 
@@ -100,10 +102,10 @@ class Near(NamedTuple):
 def broad_phase(shapes, world, work, motion, rules, span, old, surfaces, threads):
     """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
 
-    Of `work` it sets how far each body may go until it must be looked around again, and who has somebody near.
+    Sets in `work` how far each body may move until the next search, and which bodies have others near.
 
     Returns:
-        The manifolds of these pairs, with the points of `old`, and those of bodies that sleep; what is near.
+        The manifolds of these pairs, with the points of `old`, and those of sleeping bodies; and `Near`.
     """
     swept(world, work, motion, rules, span)
     pairs = near_pairs(world, motion, work.low, work.high)
@@ -117,7 +119,7 @@ def broad_phase(shapes, world, work, motion, rules, span, old, surfaces, threads
 
 @njit(**BARE)
 def pair_kind(shapes, s, t):
-    """How two shapes are looked at."""
+    """The way in which two shapes are tested."""
     table, start = shapes.table, shapes.solids.start
     one, other = is_round(table, s), is_round(table, t)
     first, second = start[s + 1] > start[s], start[t + 1] > start[t]
@@ -126,14 +128,14 @@ def pair_kind(shapes, s, t):
             long = table[s, KIND] == CAPSULE or table[t, KIND] == CAPSULE
             edged = table[s, KIND] == BOX or table[s, KIND] == CYLINDER
             edged = edged or table[t, KIND] == BOX or table[t, KIND] == CYLINDER
-            return SOLIDS if long and edged else ROUND  # a line along a face, else places on a core
+            return SOLIDS if long and edged else ROUND  # a line may lie along a face; else points on a core are enough
         return SOLIDS if first and second else SURFACES
     return SOLIDS if (first or table[s, KIND] == PLANE) and (second or table[t, KIND] == PLANE) else SURFACES
 
 
 @njit(**FAST, inline="always")
 def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, threads):
-    """What of P pairs is nearer than the bodies may go; [N] `ways` of each."""
+    """The parts of P pairs that are nearer than the bodies may move; `ways` [N] says how far each body may move."""
     count = len(pairs)
     start = np.zeros((count, 2), np.int64)
     total = 0
@@ -159,7 +161,7 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, thre
     for p in range(count):
         near.looked[p] = near.away_all[p] = -math.inf
     parts = reference(near)
-    if threads is not None:  # known when it is compiled
+    if threads is not None:  # known at compile time
         if len(pairs) >= MANY:
             _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts, surfaces)
             return near
@@ -171,7 +173,7 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, thre
 @njit(parallel=True, **FAST)
 def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near, surfaces):
     for i in prange(len(pairs)):
-        p = np.int64(i)  # that of a parallel loop is unsigned, for which all would be compiled once more
+        p = np.int64(i)  # the index of a parallel loop is unsigned, for which everything would be compiled again
         _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces)
 
 
@@ -184,7 +186,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces):
         _near_pieces(shapes, world, motion, matrix, a, b, most, near, p)
         return
     if way == ROUND:
-        # One query tells whether the ball around either may touch the other; 1 stands for yes.
+        # One query says whether the ball around either may touch the other; 1 means yes.
         one = a if is_round(shapes.table, world.shape[a]) else b
         other = b if one == a else a
         w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
@@ -200,13 +202,13 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces):
 
 @njit(**BARE)
 def _near_leaves(shapes, world, motion, matrix, pairs, most, near, p):
-    """The leaves of either surface that are near the other."""
+    """The leaves of each surface that are near the other body."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     for side in range(2):
         one, other = pairs[p, side], pairs[p, 1 - side]
         s, t = world.shape[one], world.shape[other]
         if is_round(table, s):
-            continue  # the other's surface is met by its distance, which is exact wherever it is asked
+            continue  # the other body's own distance is exact, so points of this body are not needed
         w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         k, own = world.scale[other], world.scale[one]
         at = near.start[p, side]
@@ -263,11 +265,11 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
 
 @njit(**BARE, inline="always")
 def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, surfaces, threads):
-    """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
+    """Update all manifolds to the present poses: move or drop old points, and find new ones.
 
     `gone` [N] is how far any point of a body may have moved since `near` was made.
     """
-    if threads is not None:  # known when it is compiled
+    if threads is not None:  # known at compile time
         if len(near.start) >= MANY:
             _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, surfaces)
             return
@@ -292,7 +294,7 @@ def _collide_share(shapes, world, motion, matrix, rules, manifolds, near, gone, 
 
 @njit(**BARE)
 def _collide_some(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, first, step, surfaces):
-    """Every so many pairs, from the first on."""
+    """Every `step`-th pair, starting with `first`."""
     for p in range(first, len(near.start), step):
         _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p, surfaces)
 
@@ -330,7 +332,7 @@ def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, wen
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     known = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
     manifolds.count[p] = known
-    # Numbers of one type, or all would be compiled once more.
+    # Numbers of one type, or everything would be compiled again.
     none, one = np.int64(0), np.int64(1)
     count, look = none, rules.search_margin + 2.0 * rules.options.margin + _approach_margin(world, motion, rules, a, b)
     for side in range(2):
@@ -346,8 +348,9 @@ def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, wen
 
 @njit(**INLINED)
 def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, anew):
-    """Where friction acts of points that bound a flat manifold, in parts of the way from its middle to each: the mean
-    of what touches on this way. A full face, legs and a rim differ. Unless `anew`, only of those that are new."""
+    """Where friction acts for the points that bound a flat manifold, as a part of the way from its middle to each
+    point: the mean of the places that touch on this way. This distinguishes a full face, legs and a rim. Unless `anew`,
+    only for new points."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     point, count = manifolds.point[p], manifolds.count[p]
     middle, flat = (0.0, 0.0, 0.0), count >= 3
@@ -382,7 +385,7 @@ def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, anew):
 
 @njit(**BARE)
 def _half_way(motion, matrix, point, a, b, k):
-    """The place half way between the two surfaces at a contact: the same whichever body is first."""
+    """The point half way between the two surfaces at a contact; it does not depend on the order of the bodies."""
     mine = add(get(motion.position, a), turn(matrix, a, (point[k, FIRST], point[k, FIRST + 1], point[k, FIRST + 2])))
     other = (point[k, SECOND], point[k, SECOND + 1], point[k, SECOND + 2])
     return scale(add(add(mine, get(motion.position, b)), turn(matrix, b, other)), 0.5)
@@ -390,7 +393,7 @@ def _half_way(motion, matrix, point, a, b, k):
 
 @njit(**BARE)
 def _both_touch(shapes, world, motion, matrix, rules, a, b, place):
-    """Whether a place is on the surface of either body."""
+    """Whether a point is on the surfaces of both bodies."""
     for body in (a, b):
         here = turn_back(matrix, body, sub(place, get(motion.position, body)))
         here = scale(add(here, get(world.com, body)), 1.0 / world.scale[body])
@@ -402,7 +405,7 @@ def _both_touch(shapes, world, motion, matrix, rules, a, b, place):
 
 @njit(**BARE)
 def _approach_margin(world, motion, rules, a, b):
-    """How much farther than usual a pair looks for points: as far as any of its points may come nearer."""
+    """How much farther than usual points of a pair are searched: as far as any of its points may come nearer."""
     if rules.ahead == 0.0:
         return 0.0
     speed = (
@@ -416,7 +419,7 @@ def _approach_margin(world, motion, rules, a, b):
 
 @njit(**BARE)
 def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p):
-    """The points at which the convex pieces of two bodies touch or may soon; how many."""
+    """Find the points at which the convex pieces of two bodies touch or may soon touch. Returns their number."""
     convex, found, polygons = shapes.solids, scratch.found, scratch.polygons
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
@@ -454,20 +457,20 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
 
 @njit(**BARE)
 def _lowest_point(convex, matrix, pair, up):
-    """The point of a piece that is lowest along the normal of a plane."""
+    """The lowest point of a piece along the normal of a plane."""
     low = farthest(convex, pair.first, pair.size, matrix, pair.a, scale(up, -1.0))
     return along(add(pair.offset, low), up, -pair.size * rounding(convex, pair.first))
 
 
 @njit(**BARE)
 def _above(convex, matrix, pair, up):
-    """How high the lowest point of a piece is above a plane."""
+    """Height of the lowest point of a piece above a plane."""
     return dot(up, _lowest_point(convex, matrix, pair, up))
 
 
 @njit(**BARE)
 def _known_normal(near, at, manifolds, p, key):
-    """Whether a normal of a pair of pieces is known, and it: of when it was last looked at, or of a contact."""
+    """Whether a normal of a pair of pieces is known, and the normal: from the last test, or from a contact."""
     n = get(near.axis, at)
     if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
         return True, n
@@ -480,7 +483,7 @@ def _known_normal(near, at, manifolds, p, key):
 
 @njit(**BARE)
 def _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, count):
-    """The picked corners of a contact as points of a manifold."""
+    """Write the picked corners of a contact as points of a manifold."""
     a, b = pair.a, pair.b
     for k in range(picked):
         corner = polygons.picked[k]
@@ -519,10 +522,9 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
 
 @njit(**BARE)
 def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh, room, surfaces):
-    """The least distance of pair p with its two bodies at `place` and `frame`, of the parts that were near; `least`
-    where all are farther, and any that is less than `enough`. `went` is how much nearer two points may have come since
-    `near` was made; whether the poses are those of the bodies, so that `near` may take up how far parts are
-    (`refresh`)."""
+    """The least distance of pair p, over the parts that were near, with its two bodies at `place` and `frame`; `least`
+    if all are farther, and possibly any distance below `enough`. `went` is how much nearer two points may have come
+    since `near` was made. `refresh`: whether these are the present poses, so that distances may be stored in `near`."""
     table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, shapes.solids
     s, t = shape[pairs[p, 0]], shape[pairs[p, 1]]
     way = pair_kind(shapes, s, t)
@@ -533,7 +535,7 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
             if near.away[at] - went >= least or near.held[at]:
                 continue
             i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
-            # Numbers of one type, or all would be compiled once more.
+            # Numbers of one type, or everything would be compiled again.
             one, other = np.int64(0), np.int64(1)
             pair = Pair(convex.start[s] + i, convex.start[t] + j, one, other, scales[0], scales[1], offset)
             if plane:
@@ -569,7 +571,7 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
 
 @njit(**BARE)
 def _nearest_node(shapes, s, t, place, frame, scales, coms, side, near, p, went, least, enough, refresh):
-    """`nearest` of the nodes of one body's near leaves to the other."""
+    """`nearest` for the nodes of one body's near leaves and the other body."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     w, c = map_between(place, frame, scales, coms, side, 1 - side)
     k = scales[1 - side]
@@ -580,7 +582,7 @@ def _nearest_node(shapes, s, t, place, frame, scales, coms, side, near, p, went,
             if near.away[i] - went < least:
                 near.away[i] = went + beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
                 front = i if near.away[i] < near.away[front] else front
-    # The nearest leaf first: the others are then seldom near enough to be looked into.
+    # The nearest leaf first: the others are then seldom near enough to be searched.
     for n in range(first - 1, last):
         i = front if n < first else n
         if n == front or near.away[i] - went >= least:
@@ -590,7 +592,7 @@ def _nearest_node(shapes, s, t, place, frame, scales, coms, side, near, p, went,
             there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
             for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
                 p_u = get(shapes.node, u)
-                if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
+                if d - scales[side] * norm(sub(p_u, there)) < least:  # else it is too near to a far node
                     d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
                     least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
             if least < enough:

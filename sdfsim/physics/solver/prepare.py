@@ -1,4 +1,4 @@
-"""The explicit contact solve as a model: scenes as the compiled step wants them, and that step."""
+"""The contact solve as a model: prepares scenes for the compiled step, and calls it."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 # inner steps below the usual 4 ms, which scenes of slender bodies have.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
 ROUNDS, TEACHERS = 100, 50  # of sequential impulses in an inner step at most, and of the teacher
-CROWD = 64  # bodies that move, from which on pairs may be looked at in threads
-TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
+CROWD = 64  # number of dynamic bodies from which threads may test pairs
+TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
 NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 0, 6)))
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
 
 
 class SharedShapes:
-    """Compiled shapes for many scenes, in threads too: of scenes with the same shapes, or with some of them, the first
-    ones compile them."""
+    """Compiled shapes that many scenes share, also in threads: scenes with the same shapes, or some of them, reuse
+    those of earlier scenes."""
 
     def __init__(self) -> None:
         self._lock = Lock()
-        # Of scenes in which shapes meet as surfaces, and of others, which need none.
+        # Separate for scenes in which shapes meet as surfaces, and for others, which need no surfaces.
         self._known: dict[bool, tuple[tuple[ContactGeometry, ...], kinds.Shapes]] = {}
 
     def of(self, contact: Sequence[ContactGeometry]) -> tuple[kinds.Shapes, np.ndarray]:
-        """Compiled shapes, and where each [S] int64 of a scene is among them."""
+        """Compiled shapes, and the index [S] int64 of each shape of a scene among them."""
         with self._lock:
             met = meet_as_surfaces(contact)
             known, shapes = self._known.get(met, ((), None))
@@ -70,8 +70,7 @@ class SharedShapes:
 
 
 class Compiled:
-    """One scene, its bodies in model units, as the compiled step wants it; with others that have some of its shapes it
-    can share them."""
+    """One scene in the form that the compiled step needs, in model units. Scenes can share shapes."""
 
     def __init__(self, bodies: Bodies, state: State, shared: SharedShapes | None = None) -> None:
         self.bodies = bodies
@@ -80,11 +79,11 @@ class Compiled:
         self.place(state)
 
     def place(self, state: State) -> None:
-        """Scenery lies where `state` has it."""
+        """Place static bodies as in `state`."""
         self.world = compiled_world(replace(self.bodies, shape=self._shape), state, self.shapes)
         self.threads = True if np.count_nonzero(self.world.moves) >= CROWD else None
         if self.threads:
-            numba.get_num_threads()  # starts them: code that was kept takes it that they run
+            numba.get_num_threads()  # starts the threads: cached code relies on that
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n, 3, 3)),
@@ -95,26 +94,26 @@ class Compiled:
             scratch=scratch_room(),
         )  # fmt: skip
         self.held = held_by(self.bodies)
-        # Threads are not for one kind of pairs alone.
+        # Threads are used for all kinds of pairs alike.
         self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
-        self._announced: set[bool] = set()  # with and without what contacts did
+        self._announced: set[bool] = set()  # with and without recording what contacts did
         self._load: np.ndarray | None = None
-        self._options: Options | None = None  # what `_rules` are of
-        self._latest: State | None = None  # what `_motion` and `_manifolds` are the arrays of
+        self._options: Options | None = None  # the options from which `_rules` were made
+        self._latest: State | None = None  # the state whose arrays are `_motion` and `_manifolds`
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules, steps: int = 1,
         script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, note: bool = False, keep: bool = False,
     ) -> tuple[Any, ...]:  # fmt: skip
-        """So many steps: `motion` is written to. `note`: whether what contacts did is wanted. Returns what `run_steps`
-        does, and last what is kept of each."""
+        """Make `steps` steps and write to `motion`. `note`: whether to record what contacts did. Returns what
+        `run_steps` does, and last the `Kept` of each step."""
         n, count = steps if keep else 0, len(self.bodies)
         joints = 0 if self.held is None else len(self.held.each.body)
         kept = Kept(
             np.empty((n, count, 3)), np.empty((n, count, 4)), np.empty((n, count, 3)), np.empty((n, count, 3)),
             np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, joints, 7)),
         )  # fmt: skip
-        # An integer of another kind would be compiled for anew.
+        # An integer of another type would cause another compilation.
         arguments = (
             self.shapes, self.world, self.work, motion, rules, manifolds, self.held, self.surfaces, self.threads,
             note or None, script, most, kept, TOUCHING, int(steps),
@@ -125,8 +124,8 @@ class Compiled:
         return *run_steps(*arguments), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
-        """Make so many steps of the contact solve from `state`, fewer where one leads to a state that is more than
-        `most` lets it be (see `survey.broken`); `keep` what a recording wants of each."""
+        """Make `steps` steps of the contact solve from `state`, or fewer if one leads to a state beyond the limits
+        `most` (see `survey.broken`). `keep`: keep of each what a recording needs."""
         if (moved := self._moved_since(state)) is not None:
             rows, changed = moved
             arrays = (self._motion.position, self._motion.orientation, self._motion.velocity, self._motion.angular)
@@ -149,7 +148,7 @@ class Compiled:
             self._options, self._rules = options, compiled_rules(options)
         rules, motion = self._rules, self._motion
         script, time = _script(self.bodies.tracks, state.time, rules, steps)
-        self._latest = None  # where the rest of this does not come to its end
+        self._latest = None  # in case the rest raises an error
         manifolds, edges, counts, done, body, wrong, before, given, pair, point, kept = self.run(
             motion, self._manifolds, rules, steps, script, most, note=options.record, keep=keep
         )
@@ -159,7 +158,7 @@ class Compiled:
             fault = fault_of(body, wrong, found, np.array(before), options.dt)
             if not done:
                 return Steps(state, edges, (0, 0, 0, 0), 0, fault, 0.0, kept, pair, point)
-            # The motion is beyond the last good state, which the same steps but one lead to once more.
+            # The motion is one step beyond the last good state: repeat all steps but the last.
             again = self.advance(state, options, done, NO_LIMITS)
             return replace(again, fault=fault, kept=kept, pair=pair, point=point)
         self._manifolds, rows = manifolds, self.world.going
@@ -177,13 +176,14 @@ class Compiled:
         known = state.joints
         if self.held is not None and state.joints is not None:
             known = self.held.each.state.copy()
-            known[:, joint_columns.TARGET] = state.joints[:, joint_columns.TARGET]  # as `driven` was told it
+            known[:, joint_columns.TARGET] = state.joints[:, joint_columns.TARGET]  # as `driven` received it
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         asleep = int((motion.island[rows] >= 0).sum())
         return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
 
     def _moved_since(self, state: State) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
-        """Rows of a state that differs from the latest one in these alone, such as a network makes it; else None."""
+        """The rows in which a state differs from the latest one, if only these differ, as after a network's step; else
+        None."""
         latest, parts = self._latest, state.parts
         if state is latest or latest is None or parts is None or parts[0] is not self._before:
             return None
@@ -192,7 +192,7 @@ class Compiled:
 
 
 def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool, note: bool) -> None:
-    """See that the step is compiled for scenes with these in them."""
+    """Make sure that the step is compiled for scenes with these features."""
     words = {"joints": joints, "hollow shapes": surfaces and not threads, "many bodies": threads, "a network": note}
     given = [word for word, some in words.items() if some]
     what = "the contact step" + (f" for scenes with {', '.join(given)}" if given else "")
@@ -202,26 +202,26 @@ def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool, not
 
 @dataclass(frozen=True)
 class Steps:
-    """What several steps of the contact solve have led to."""
+    """The result of several steps of the contact solve."""
 
     state: State  # the last good one
-    edges: Edges  # what contacts did in the last step, where that is recorded
-    counts: tuple[int, ...]  # of the last step: pairs looked at, contacts, bodies that contacts moved, those asleep
+    edges: Edges  # what contacts did in the last step, if that is recorded
+    counts: tuple[int, ...]  # of the last step: pairs tested, contacts, bodies that contacts moved, sleeping bodies
     done: int  # how many steps were made
-    fault: Fault | None  # of the state after them, which is not kept
-    given: float  # what pulls have given
+    fault: Fault | None  # fault of the state after them, which is not kept
+    given: float  # work of pulls
     kept: Kept  # of each step
-    pair: np.ndarray  # [C, 2] int64, bodies that touched in a step that is kept, one step after the other
-    point: np.ndarray  # [C, 3] where they did
+    pair: np.ndarray  # [C, 2] int64, bodies that touched in the kept steps, one step after the other
+    point: np.ndarray  # [C, 3] the points where they touched
 
 
 def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
-    """Where paths lead in so many steps, and the time after them. What stands on a tray that is sped up slips if the
-    tray's velocity jumps once a step and not in each inner step."""
+    """Poses and velocities of paths for `steps` steps, and the time after them. Velocities change in each inner step:
+    if they jumped once a step, bodies on an accelerating tray would slip."""
     inner, count = rules.substep_dt, rules.options.substeps
     times = [time]
     for _ in range(steps):
-        times.append(times[-1] + inner * count)  # as single steps add up, to the last bit
+        times.append(times[-1] + inner * count)  # added up as single steps do, bit by bit
     if tracks is None:
         return NO_SCRIPT, times[-1]
     instants = [t + inner * k for t in times[:-1] for k in range(count)]
@@ -233,7 +233,7 @@ def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: in
 
 
 def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
-    """Copies of a state as the compiled step writes to them."""
+    """Copies of a state's arrays, for the compiled step to write to."""
     poses = (state.position, state.orientation, state.velocity, state.angular_velocity)
     position, orientation, *velocities = (np.array(array, dtype=np.float64, order="C") for array in poses)
     touch = state.touch
@@ -253,11 +253,11 @@ def _touch(motion: compiled.Motion, manifolds: compiled.Manifolds) -> Touch:
 
 
 def disturbed(bodies: Bodies, state: State, changed: np.ndarray, *, gravity: bool = False) -> State:
-    """The state after somebody has changed the bodies `changed` [N] bool, or the `gravity` of all: they are awake, and
-    so are those that slept with them or on them."""
+    """The state after a user has changed the bodies `changed` [N] bool, or `gravity`: these bodies are woken, and so
+    are those that slept with them or on them."""
     touch = state.touch
     if bodies.joints is not None and state.joints is not None and changed.any():
-        # Nothing is known of the impulses of joints at what was changed, nor of what they connect.
+        # Impulses of joints at changed bodies, and at all bodies connected to them, are no longer known.
         place = jointed.coordinates(
             bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
         )
@@ -284,7 +284,7 @@ def contact_points(state: State) -> Touching:
 def nodes_near(
     scene: Compiled, state: State, gravity: np.ndarray, reach: float, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where surface nodes come within `reach` of other bodies in a step of `dt` under `gravity` [3], model units; see
+    """Surface nodes that come within `reach` of other bodies in a step of `dt` under `gravity` [3], model units; see
     `edges.nodes_within`."""
     rules = compiled_rules(Options(gravity, dt, 1))._replace(contact_margin=reach)
     motion, bodies = taken_up(state)[0], scene.bodies
@@ -292,7 +292,7 @@ def nodes_near(
 
 
 def compiled_rules(options: Options) -> compiled.Rules:
-    """The options of a run as the compiled step wants them."""
+    """The options of a run in the form that the compiled step needs."""
     inner = options.dt / options.substeps
     return compiled.Rules(
         options,
@@ -305,7 +305,7 @@ def compiled_rules(options: Options) -> compiled.Rules:
 
 
 def _manifolds(touch: Touch | None) -> compiled.Manifolds:
-    """The contacts that are known."""
+    """The known contacts."""
     if touch is None:
         return compiled.Manifolds(
             np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros((0, compiled.POINTS, compiled.COLUMNS))
@@ -314,12 +314,13 @@ def _manifolds(touch: Touch | None) -> compiled.Manifolds:
 
 
 def meet_as_surfaces(shapes: Sequence[ContactGeometry]) -> bool:
-    """Whether any is: where all are convex, or made of convex pieces, they collide as solids."""
+    """Whether any of the shapes collides as a surface. Shapes that are convex, or made of convex pieces, collide as
+    solids."""
     return any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
 
 
 def compiled_shapes(shapes: Sequence[ContactGeometry]) -> kinds.Shapes:
-    """The shapes of a scene, baked where they have no closed form."""
+    """The shapes of a scene; those without a closed form are baked."""
     table = np.zeros((len(shapes), kinds.FIELDS))
     table[:, kinds.CELL], table[:, kinds.PATCH] = 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
@@ -351,7 +352,7 @@ def _joined(surfaces: list[ContactSurface]) -> tuple[np.ndarray, ...]:
     """The node arrays of `kinds.Shapes`."""
 
     def ends(name: str) -> np.ndarray:
-        """Where parts begin, as if all lay end to end."""
+        """Where parts begin when all are stored end to end."""
         parts = [getattr(surface, name) for surface in surfaces]
         first = np.cumsum([0, *(part[-1] for part in parts)])
         return np.concatenate([[0], *(part[1:] + at for part, at in zip(parts, first, strict=False))]).astype(np.int64)
@@ -402,9 +403,10 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         "shape", "scale", "com", "radius", "inverse_mass", "inertia", "friction", "restitution", "moves", "group",
         "world", "bounds",
     )  # fmt: skip
-    # Copies: who changes a world, as a fit of coefficients does, must not change the bodies that it was made of.
+    # Copies: code that changes a world, such as a fit of coefficients, must not change the bodies that it was made
+    # from.
     array = {name: getattr(bodies, name).copy() for name in names}
-    array["allowed"] = bodies.allowed  # as large as pairs of groups are many, and never changed
+    array["allowed"] = bodies.allowed  # not copied: its size grows with the pairs of groups, and it never changes
     bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
     inertia = array["inertia"]
     moves = array["moves"]
@@ -438,7 +440,7 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
 
 
 def held_by(bodies: Bodies) -> Held | None:
-    """The joints of a scene, with room for what an inner step makes of them; None where there is none."""
+    """The joints of a scene, with buffers for an inner step; None if there are none."""
     joints = bodies.joints
     if joints is None or not len(joints):
         return None

@@ -1,4 +1,4 @@
-"""What contacts did in a whole step, for networks that go on from there: one edge for each place where bodies met."""
+"""What contacts did in a whole step, as input for networks: one edge for each place where bodies met."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sdfsim.physics.solver.world import GAP, NORMAL, NORMAL_IMPULSE, TANGENTIAL
 
 # Columns of an edge: from the centres of mass of both bodies to the contact, the normal from the second body to the
 # first, the impulse on the first body (all along world axes), the distance when it was first met, the part of the step
-# that was over by then, and the weight of its place.
+# that had passed by then, and the weight of its place.
 ARM, OTHER, AXIS, GIVEN, APART, WHEN, WEIGHT, WIDTH = 0, 3, 6, 9, 12, 13, 14, 15
-ALIKE = 0.9  # cosine between normals, and
-CLOSE = 0.1  # model lengths between contacts of two bodies, that are taken for one
+ALIKE = 0.9  # contacts of two bodies are merged if the cosine between their normals is above this,
+CLOSE = 0.1  # and their distance, in model lengths, below this
 
 
 class Edges(NamedTuple):
@@ -35,7 +35,7 @@ def no_edges():
 
 @njit(**FAST)
 def noted(motion, matrix, manifolds, system, when, edges):
-    """The edges with those contacts of an inner step that acted; `when` is the part of the step that was over."""
+    """Add the contacts of an inner step that acted to the edges; `when` is the part of the step that has passed."""
     acted = 0
     for c in range(len(system.where)):
         acted += system.row[c, 0, IMPULSE] > 0.0
@@ -49,10 +49,11 @@ def noted(motion, matrix, manifolds, system, when, edges):
 
 @njit(**FAST)
 def gathered(world, motion, matrix, manifolds, pairs, when, edges):
-    """One edge a place: what acted there in the inner steps of a step, and what is near at its end but did not act.
+    """One edge for each place: for contacts that acted in the inner steps of a step, and for near ones at its end that
+    did not act.
 
     Args:
-        pairs: of how many manifolds, the first ones, bodies are near.
+        pairs: the number of manifolds, counted from the first, whose bodies are near.
     """
     edges, e = _longer(edges, points_of(manifolds, pairs))
     for m in range(pairs):
@@ -80,7 +81,7 @@ def gathered(world, motion, matrix, manifolds, pairs, when, edges):
 
 @njit(**FAST)
 def _longer(edges, more):
-    """The edges with room for `more` behind them, and how many there were."""
+    """The edges with room for `more` after them, and their number before."""
     count = len(edges.pair)
     longer = Edges(np.empty((count + more, 2), np.int64), np.empty((count + more, WIDTH)))
     for e in range(count):
@@ -125,7 +126,7 @@ def _twin(value, first, last, other, e):
 
 @njit(**BARE)
 def _merge(value, k, other, e):
-    """A later impulse joins an earlier one: their sum acts at their mean place."""
+    """Merge a later impulse with an earlier one: their sum acts at their mean place."""
     weight = value[k, WEIGHT] + other[e, WEIGHT]
     share = other[e, WEIGHT] / weight
     for x in range(6):

@@ -1,8 +1,8 @@
 """Structures of arrays by reference, compiled.
 
-Numba passes a NamedTuple as all numbers of all its arrays, each by itself: a hundred arrays are some thousand arguments
-of every function, which take most of the time in which these are compiled, and much of that of a call. A reference is
-one argument. Its fields are read as those of the tuple are; a field that is a NamedTuple is a reference again.
+Numba passes a NamedTuple as all members of all its arrays, each as an argument: a hundred arrays are about a thousand
+arguments of every function, which take most of the compile time, and much of the time of a call. A reference is one
+argument. Its fields are read like those of the tuple; a field that is a NamedTuple is again a reference.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, mod
 
 
 class Reference(types.Opaque):
-    """The place of a NamedTuple of the type `of`."""
+    """The address of a NamedTuple of the type `of`."""
 
     def __init__(self, of: types.NamedTuple) -> None:
         self.of = of
-        # The name is part of those of all functions that have one: the whole type would be thousands of letters.
+        # The name becomes part of the names of all functions that take a reference: the whole type would have thousands
+        # of letters.
         kind = hashlib.sha256(of.name.encode()).hexdigest()[:12]
         super().__init__(f"{of.instance_class.__name__}@{kind}")
 
@@ -67,7 +68,7 @@ def _reference(typing: Any, value: types.Type) -> Any:
     return Reference(value)(value), code
 
 
-# A reference to a NamedTuple, for compiled code; of None it is None. Numba frees arrays behind the last use of the
-# variable that holds them: a reference is to be taken of an argument, or of what is used once more after all that uses
-# the reference.
+# A reference to a NamedTuple, for compiled code; None for None. Numba frees arrays after the last use of the variable
+# that holds them, so take references of arguments only, or of variables that are used again after the last use of the
+# reference.
 reference: Any = (lambda value: value) if vars(config)["DISABLE_JIT"] else _reference

@@ -1,4 +1,4 @@
-"""Many steps in one call, compiled: they are checked here, and what a recording keeps of each is written down."""
+"""Many steps in one call, compiled: each is checked, and its data for a recording is stored."""
 
 from __future__ import annotations
 
@@ -16,51 +16,51 @@ from sdfsim.physics.solver.sleep import rests
 from sdfsim.physics.solver.survey import broken, energy, touching
 from sdfsim.physics.solver.vectors import BARE, ENTRY, FAST, add, dot, get, put, sub
 
-HELD, SURFACES, THREADS, NOTE = 6, 7, 8, 9  # the places of those arguments of `run_steps` that may be None
-ROOM = 64  # contact points that a recording has room for at first
+HELD, SURFACES, THREADS, NOTE = 6, 7, 8, 9  # positions of the arguments of `run_steps` that may be None
+ROOM = 64  # number of contact points for which a recording has room at first
 
 
 class Script(NamedTuple):
-    """Where the paths of S scripted bodies lead in each of n steps."""
+    """Poses and velocities of S scripted bodies in each of n steps."""
 
     body: np.ndarray  # [S] int64
     pose: np.ndarray  # [n, S, 7] position and orientation at the end of a step
-    velocity: np.ndarray  # [n, m, S, 6] velocity and angular velocity that lead there, of each of m inner steps
+    velocity: np.ndarray  # [n, m, S, 6] velocity and angular velocity that lead there, for each of m inner steps
 
 
 class Kept(NamedTuple):
-    """What is kept of each of n steps, none where nobody wants a recording. N bodies, model units."""
+    """What is kept of each of n steps (n is 0 without a recording) of N bodies, model units."""
 
     position: np.ndarray  # [n, N, 3]
     orientation: np.ndarray  # [n, N, 4]
     velocity: np.ndarray  # [n, N, 3]
     angular_velocity: np.ndarray  # [n, N, 3]
-    energy: np.ndarray  # [n, 3] kinetic and potential; what pulls have given in the step
-    count: np.ndarray  # [n, 5] int64: pairs looked at, contacts, active bodies, sleeping ones, points where they touch
+    energy: np.ndarray  # [n, 3] kinetic and potential energy; work of pulls in the step
+    count: np.ndarray  # [n, 5] int64: pairs tested, contacts, active bodies, sleeping ones, points where bodies touch
     depth: np.ndarray  # [n] the deepest penetration
-    joint: np.ndarray  # [n, J, 7] of each joint where it is; force and torque on its first body, at its anchor
+    joint: np.ndarray  # [n, J, 7] angle, position or length of each joint; force and torque on its first body
 
 
 @njit(**ENTRY, nogil=True)
 def run_steps(
     shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, most, kept, within, steps
 ):
-    """Advance `motion`, and what `held` knows of joints, by so many steps, in place; the first state that cannot be
-    ends it early.
+    """Advance `motion`, and the state of joints in `held`, by the given number of steps, in place. Ends early at the
+    first invalid state.
 
     Args:
-        held: None where no joint holds bodies. What asks for what is None is not compiled.
-        surfaces: True where shapes may meet as surfaces, else None.
-        threads: True where there may be so many pairs that they are worth their while, else None.
-        note: True where what contacts did in the step is wanted, see `record`, else None.
-        most: [5] what a state may be, see `survey.broken`.
-        within: bodies that are no farther apart touch.
+        held: None if no joint holds bodies. Code for an argument that is None is not compiled.
+        surfaces: True if shapes may meet as surfaces, else None.
+        threads: True if there may be enough pairs for threads to pay off, else None.
+        note: True to record what contacts did in the step, see `record`; else None.
+        most: [5] limits of a valid state, see `survey.broken`.
+        within: bodies that are no farther apart count as touching.
 
     Returns:
-        The manifolds at the end; what contacts did in the last step, where it is to be noted; its counts, as in `Kept`;
-        how many steps were made; the body whose state cannot be after the next one (-1: none) and what is wrong with
-        it; where that body was before that step; what pulls have given; and of all steps that are kept, one after the
-        other, the pairs of bodies that touch [C, 2] and the points [C, 3] where they do.
+        The manifolds at the end; what contacts did in the last step, if it is recorded; its counts, as in `Kept`; the
+        number of steps made; the body whose state is invalid after the next step (-1: none), and what is wrong with it;
+        where that body was before that step; the work of pulls; and for all kept steps, one after the other, the pairs
+        of bodies that touch [C, 2] and the points [C, 3] where they touch.
     """
     shapes, world, work = reference(shapes), reference(world), reference(work)
     motion, rules, told = reference(motion), reference(rules), reference(kept)
@@ -72,7 +72,7 @@ def run_steps(
         for s in range(len(script.body)):
             b = script.body[s]
             for x in range(3):
-                # The mean says whom a body may reach in the step.
+                # The mean velocity determines which bodies a scripted body may reach in the step.
                 motion.velocity[b, x] = script.velocity[k, :, s, x].mean()
                 motion.angular[b, x] = script.velocity[k, :, s, 3 + x].mean()
         for i in range(len(going)):
@@ -122,14 +122,14 @@ def run_steps(
 
 @njit(**BARE)
 def _rest_on(world, work, motion):
-    """A step of which all sleep: it would find nobody near another, and leave them as they are."""
+    """A step in which all bodies sleep: the full step would find no near bodies, and change nothing."""
     for b in world.going:
         motion.touching[b] = work.met[b] = False
 
 
 @njit(**BARE)
 def _keep(kept, k, world, motion, rules, counts, pulled):
-    """What is kept of step k, but for joints and where bodies touch."""
+    """Store the data of step k, except joints and the points where bodies touch."""
     for b in range(len(motion.position)):
         for x in range(3):
             kept.position[k, b, x], kept.velocity[k, b, x] = motion.position[b, x], motion.velocity[b, x]
@@ -156,7 +156,7 @@ def _keep_joints(kept, k, each):
 
 @njit(**FAST)
 def _with_room(pair, point, count, wanted):
-    """Pairs [P, 2] and points [P, 3], of which `count` count, with room for as many as are wanted."""
+    """Pairs [P, 2] and points [P, 3], of which the first `count` are used, enlarged to hold `wanted`."""
     room = len(pair)
     if wanted <= room:
         return pair, point
@@ -171,7 +171,7 @@ def _with_room(pair, point, count, wanted):
 
 @njit(**BARE)
 def _pulled(going, wrench, motion, place, spin, dt):
-    """What forces and torques at bodies have given them in a step, from where they were and how they turned before."""
+    """The work of forces and torques at bodies in a step, from their positions and turns before it."""
     given = 0.0
     for i in range(len(going)):
         b = going[i]
@@ -183,7 +183,7 @@ def _pulled(going, wrench, motion, place, spin, dt):
 
 @njit(**BARE)
 def _energies(world, motion, rules):
-    """Kinetic and potential energy of the bodies that move."""
+    """Kinetic and potential energy of the dynamic bodies."""
     kinetic = potential = 0.0
     for b in world.going:
         if world.moves[b]:

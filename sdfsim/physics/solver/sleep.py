@@ -1,4 +1,4 @@
-"""Sleep, compiled: islands that rest in balance are frozen, and woken by what moves beside them."""
+"""Sleep, compiled: islands at rest and in balance are frozen, and woken by bodies that move beside them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sdfsim.physics.solver.vectors import BARE, FAST, get, norm, put, sub
 
 @njit(**BARE)
 def rests(world, motion):
-    """Whether all bodies that move sleep, and nothing is led along."""
+    """Whether all dynamic bodies sleep, and no scripted body moves."""
     for b in world.going:
         if stirs(world, motion, b):
             return False
@@ -23,7 +23,7 @@ def rests(world, motion):
 
 @njit(**BARE)
 def woken(world, motion, manifolds, near):
-    """Wake the islands that something awake may touch in this step; whether there were any."""
+    """Wake the islands that something awake may touch in this step. Returns whether there were any."""
     found = False
     for p in range(len(near.start)):
         a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
@@ -47,8 +47,8 @@ def woken(world, motion, manifolds, near):
 
 @njit(**FAST)
 def put_to_sleep(world, motion, rules, manifolds, held):
-    """Freeze the islands all of which have stayed where they were for long enough; joints join as contacts do. `held`
-    is None where there is none."""
+    """Freeze the islands whose bodies have all stayed in place for long enough; joints join bodies as contacts do.
+    `held` is None if there are no joints."""
     n, rests = len(world.shape), False
     for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
@@ -98,7 +98,7 @@ def put_to_sleep(world, motion, rules, manifolds, held):
 
 @njit(**BARE)
 def _join_held(world, joint, parent):
-    """Join what joints [J, 2] connect, -1 for the world."""
+    """Join the bodies that joints [J, 2] connect; -1 is the world."""
     for j in range(len(joint)):
         a, b = joint[j, 0], joint[j, 1]
         if a >= 0 and b >= 0 and world.moves[a] and world.moves[b]:
@@ -107,7 +107,7 @@ def _join_held(world, joint, parent):
 
 @njit(**BARE)
 def _stir_held(world, motion, joint, parent, restless):
-    """What a joint holds to a body that is led along does not rest."""
+    """Mark bodies that a joint holds to a moving scripted body as restless."""
     for j in range(len(joint)):
         for s in range(2):
             a, b = joint[j, s], joint[j, 1 - s]
@@ -126,7 +126,7 @@ def _drop_anchor(motion, b, column):
 
 @njit(**BARE)
 def _strayed(world, motion, b, column):
-    """How far at most any point of a body is from where an anchor has it."""
+    """A bound of how far any point of a body is from its place in an anchor pose."""
     anchor, cosine = motion.anchor[b], 0.0
     for x in range(4):
         cosine += anchor[column + 3 + x] * motion.orientation[b, x]
@@ -136,11 +136,11 @@ def _strayed(world, motion, b, column):
 
 @njit(**BARE)
 def _balanced(world, motion, rules, b):
-    """Whether the forces at a body are in balance: as it went on in the second half of its quiet time, against the
-    first, it would stay near in the time that follows.
+    """Whether the forces at a body are in balance: if the motion changes as it did from the first half of its quiet
+    time to the second, the body stays near in the time that follows.
 
-    Of the poses q0, q1, q2 at the start, the middle and the end the change of the way is q2 - 2 q1 + q0, which a
-    constant force makes a quarter of what it moves a body in as long a time from rest.
+    With the poses q0, q1, q2 at the start, the middle and the end, this change is q2 - 2 q1 + q0. For a constant force
+    it is a quarter of how far the force would move a body from rest in the next quiet time.
     """
     half, whole = rules.rest - rules.rest // 2, rules.rest
     anchor = motion.anchor[b]
@@ -160,6 +160,6 @@ def _balanced(world, motion, rules, b):
         later = (halfway * motion.orientation[b, x] - anchor[10 + x]) / half
         before = (anchor[10 + x] - sign * anchor[3 + x]) / (whole - half)
         turned += (later - before) ** 2
-    # Steps a half apart: the acceleration a step, and what it makes of a body at rest in `whole` steps more.
+    # The two halves give the acceleration per step, and from it the motion of a body at rest in `whole` more steps.
     gain = (math.sqrt(most) + 2.0 * math.sqrt(turned) * world.radius[b]) / half
     return 0.5 * gain * whole * whole < rules.drift

@@ -1,4 +1,5 @@
-"""Distances met by surfaces, compiled: the nodes of one body in the distances of another, refined along its surface."""
+"""Surfaces against distances, compiled: nodes of one body in the distance of another, refined along the first one's
+surface."""
 
 from __future__ import annotations
 
@@ -22,21 +23,21 @@ from sdfsim.physics.solver.distance import (
 from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
-KEYS = 1024  # patches of a shape at most
+KEYS = 1024  # largest number of patches of a shape
 ROUNDS = 12  # of refinement
-NEAR = 2.0  # cells: so near to its surface a grid is fine
-FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
-ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they must lead, in strides
-WAYS = 8  # in which the outermost nodes of a face are looked for
-ONTO_IT = 0.05  # cells: so near a surface is a place on it
-STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
-LONGER = 4.0  # times the last step of it, at most
-SHORTEST, AHEAD = 2.5, 4.0  # the first one again: of the last, and of the way since, at least
+NEAR = 2.0  # cells: a grid is fine within this distance of its surface
+FARTHER = 2.0  # cells: elsewhere its distance may be too large by this much, at a tip
+ONTO, BESIDE = 3, 0.05  # number of steps back onto the body's own surface, and how near, in strides, they must get
+WAYS = 8  # directions in which the outermost nodes of a face are searched
+ONTO_IT = 0.05  # cells: a point this near a surface is on it
+STRIDE, FINEST = 0.02, 5e-4  # first and last step of the refinement, relative to a body's size
+LONGER = 4.0  # a step is at most this many times the last one
+SHORTEST, AHEAD = 2.5, 4.0  # first step when starting again: least multiples of the last, and of the motion since
 
 
 @njit(**BARE)
 def map_between(position, matrix, scales, coms, a, b):
-    """Rows of W and the vector c: a point p of shape a is at W p + c of shape b (both at scale 1)."""
+    """Rows of W and the vector c: a point p of shape a is the point W p + c of shape b (both at scale 1)."""
     ratio = scales[a] / scales[b]
     x = turn_back(matrix, b, (matrix[a, 0, 0], matrix[a, 1, 0], matrix[a, 2, 0]))
     y = turn_back(matrix, b, (matrix[a, 0, 1], matrix[a, 1, 1], matrix[a, 2, 1]))
@@ -63,14 +64,14 @@ def mapped(w, c, p):
 
 @njit(**BARE)
 def is_round(table, s):
-    """Whether a shape is all within a radius of a line."""
+    """Whether a shape consists of all points within a radius of a line or point."""
     return table[s, KIND] == SPHERE or table[s, KIND] == CAPSULE
 
 
 @njit(**INLINED)
 def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, way, scratch, count):
-    """Where the surface of one body is near another: from the deepest nodes of its near leaves down the other's
-    distance; added to what is found. `way` is by how much the two have moved since they were last looked at."""
+    """Find where the surface of one body is near another, by descent along the other's distance from the deepest nodes
+    of its near leaves, and add these points. `way` is how much the two have moved since the last search."""
     if near.count[pair, side] == 0:
         return count
     one, other = (a, b) if side == 0 else (b, a)
@@ -80,7 +81,8 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
     size = shapes.clump_ball[shapes.clump_start[r], 3]
     kept = _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch)
     chosen = _chosen(scratch, kept, look)
-    # A round body may be smaller than what lies between two nodes: it is also met from where its own middle says.
+    # A round body may be smaller than the space between two nodes, so the search also starts at the point below its own
+    # centre.
     back, middle = map_between(motion.position, matrix, world.scale, world.com, other, one)
     half = shapes.table[s, SIZE + 1] if shapes.table[s, KIND] == CAPSULE else 0.0
     first = (-1 if half == 0.0 else -3) if is_round(shapes.table, s) else 0
@@ -91,14 +93,14 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             key, stride, at = 0, STRIDE * size, -1
             p = _foot(shapes, r, mapped(back, middle, (0.0, 0.0, half * (e + 2))))
             if abs(distance_alone(shapes.table, shapes.brick, shapes.sample, r, p)) > ONTO_IT * shapes.table[r, CELL]:
-                continue  # too far for its way onto the surface
+                continue  # too far to reach the surface
             d, n = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, p))
         else:
             i, stride = scratch.pick[e], STRIDE * size
             key, at, p = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
             d, n = scratch.depth[i] / k, get(scratch.normal, i)
         if at >= 0 and near.placed[at]:
-            # From where the way led the last time, with shorter steps, unless the node is deeper by now.
+            # Start where the last descent ended, with shorter steps, unless the node is deeper by now.
             q, short = get(near.place, at), min(stride, max(SHORTEST * FINEST * size, AHEAD * way / own))
             if q[0] == p[0] and q[1] == p[1] and q[2] == p[2]:
                 stride = short
@@ -114,7 +116,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             put(near.place, at, p)
         if d > look:
             continue
-        # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
+        # p of shape `one`, relative to its centre of mass; and its foot on the other, likewise.
         mine = sub(scale(p, own), get(world.com, one))
         theirs = sub(along(scale(mapped(w, c, p), k), n, -d), get(world.com, other))
         write(scratch.found, count, side, mine, theirs, turn(matrix, other, n), d, key)
@@ -124,7 +126,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
 
 @njit(**BARE)
 def _foot(shapes, s, p):
-    """A place on the surface of shape s, from p against its distance."""
+    """A point on the surface of shape s, from p along the negative gradient of its distance."""
     for _ in range(ONTO):
         d, n = distance(shapes.table, shapes.brick, shapes.sample, s, p)
         p = along(p, n, -d)
@@ -133,10 +135,10 @@ def _foot(shapes, s, p):
 
 @njit(**INLINED)
 def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch):
-    """The deepest node of each near leaf around which the surface may touch; how many.
+    """The deepest node of each near leaf around which the surface may touch. Returns their number.
 
-    How far a leaf and each of its nodes were at least is known until bodies are looked for again: what cannot be near
-    or deepest by now, as far as bodies have moved since, is not asked again.
+    Lower bounds of the distances of leaves and nodes are kept until the next search for near bodies: nodes that cannot
+    be near or deepest, given how far bodies have moved since, are not evaluated again.
     """
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     flat, kept = table[s, KIND] == PLANE, 0
@@ -152,7 +154,7 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
         outward = OUTWARD * own * (norm(get(shapes.leaf_ball, i)) + shapes.leaf_ball[i, 3])
         deepest, chosen, lowest, closest = 0.0, -1, math.inf, math.inf
         facing, d, bound, there = (0.0, 0.0, 0.0), 0.0, -math.inf, (0.0, 0.0, 0.0)
-        # The one that was deepest comes first: few others can then be deeper.
+        # The former deepest node comes first: few others can then be deeper.
         for e in range(first - 1 if best >= 0 else first, last):
             if e == best:
                 continue
@@ -167,7 +169,7 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
                 d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
                 low = d
             else:
-                low = max(low, bound - own * norm(sub(p, there)))  # near to one that is far
+                low = max(low, bound - own * norm(sub(p, there)))  # near to a far node
                 if low - around > look or low - outward > lowest:
                     near.node_away[known], closest = low + went, min(closest, low - around)
                     continue
@@ -202,8 +204,8 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
 
 @njit(**INLINED)
 def _chosen(scratch, kept, level):
-    """Of candidates that face the same way the deepest, and of those that are about as deep the outermost to all sides:
-    the corners of a face, in whatever order its leaves are. How many, to scratch.pick."""
+    """Pick, to scratch.pick, the deepest of the candidates that face the same way, and of those about as deep the
+    outermost to all sides: the corners of a face, whatever the order of its leaves. Returns their number."""
     depth, key, normal, place, pick, used = (
         scratch.depth, scratch.key, scratch.normal, scratch.place, scratch.pick, scratch.used,
     )  # fmt: skip
@@ -245,13 +247,13 @@ def _chosen(scratch, kept, level):
 
 @njit(**INLINED)
 def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
-    """From a place p on shape s, at the distance d of t with the normal n in t's axes, down the distance along the
-    surface of s, in steps of `stride` at first and `least` at last: place, distance at the scale of t, and normal."""
+    """Descend along the surface of s to lower distances of t, from a point p on s with distance d and normal n (in t's
+    axes), in steps from `stride` down to `least`. Returns the point, the distance at the scale of t, and the normal."""
     ratio = k / own
     _, m = distance(table, brick, sample, s, p)
-    way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and how steep the distance was along it
+    way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and the slope of the distance along it
     for _ in range(ROUNDS):
-        # The other's normal in own axes (w is a rotation times own / k), less its part across the own surface.
+        # The other's normal in own axes (w is a rotation times own / k), minus its component normal to the own surface.
         g = (
             (w[0][0] * n[0] + w[1][0] * n[1] + w[2][0] * n[2]) * ratio,
             (w[0][1] * n[0] + w[1][1] * n[1] + w[2][1] * n[2]) * ratio,
@@ -261,8 +263,8 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
         slope = norm(g)
         if slope < 0.02:
             break
-        # As far as the slope leads if it goes on to change as in the last step (secant), and a little at first; in
-        # powers of two, or rounding would grow tenfold in each step.
+        # Step length: to where the slope vanishes if it continues to change as in the last step (secant), and a short
+        # step at first; in powers of two, or rounding errors would grow tenfold in each step.
         change = was + dot(way, g)
         if was > 0.0:
             longer = min(slope / change, LONGER) if change > 0.0 else LONGER
@@ -270,7 +272,8 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
         way, was, better = scale(g, -1.0 / slope), slope, False
         while stride > least:
             q, share = along(p, way, stride), 0.4
-            # Back onto the own surface; beyond an edge one step does not lead there, and a place beside it is none.
+            # Back onto the own surface. Beyond an edge one step is not enough, and a point beside the surface is not
+            # accepted.
             own_d, across_own = distance(table, brick, sample, s, q)
             for _ in range(ONTO):
                 if abs(own_d) <= BESIDE * stride:
@@ -284,7 +287,7 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
                     better = True
                     p, d, n, m = q, there, normal, across_own
                     break
-                # The lowest place of the parabola that has the slope here and the distance there.
+                # The minimum of the parabola through the slope here and the distance there.
                 fall = slope * stride / ratio
                 share = min(0.4, max(0.1, 0.5 * fall / (there - d + fall)))
             stride *= share
@@ -329,8 +332,8 @@ def round_points(shapes, world, motion, matrix, reach, a, b, side, found):
 
 @njit(**BARE)
 def at_least(table, t, d):
-    """How far a place is from shape t at least, of the distance that is found there: between the corners of a grid's
-    bricks that may be too much."""
+    """A lower bound of a point's distance to shape t, from the distance that was read: between the corners of a grid's
+    bricks that may be too large."""
     if table[t, KIND] != GRID or d <= NEAR * table[t, CELL]:
         return d
     return max(NEAR, d / table[t, CELL] - FARTHER) * table[t, CELL]
@@ -338,14 +341,14 @@ def at_least(table, t, d):
 
 @njit(**BARE)
 def beyond(shapes, t, w, c, k, own, e):
-    """How far a leaf is from shape t at least."""
+    """A lower bound of a leaf's distance to shape t."""
     d = distance_alone(shapes.table, shapes.brick, shapes.sample, t, mapped(w, c, get(shapes.leaf_ball, e)))
     return k * at_least(shapes.table, t, d) - own * shapes.leaf_ball[e, 3]
 
 
 @njit(**BARE)
 def _lowest(table, brick, sample, t, w, c, half):
-    """Where between -half and half of its axis a capsule is nearest to shape t: golden section."""
+    """The point of a capsule's axis, between -half and half, that is nearest to shape t, by golden section search."""
     low, high = -half, half
     one, other = high - 0.6180339887498949 * (high - low), low + 0.6180339887498949 * (high - low)
     f = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
@@ -366,7 +369,7 @@ def _lowest(table, brick, sample, t, w, c, half):
 def swallowed(shapes, world, motion, matrix, a, b, side, found):
     """Whether the centre of one body is inside both solids (that of a ring on a peg is not inside the ring).
 
-    The nearest surface is then the wrong way out for the nodes beyond the other's middle. The pair has one contact
+    For nodes beyond the other's middle the nearest surface is then on the wrong side. The pair gets one contact
     instead, at this centre, along the other's normal there.
     """
     one, other = (a, b) if side == 0 else (b, a)

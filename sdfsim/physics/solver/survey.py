@@ -1,4 +1,4 @@
-"""What a run looks at after every step, compiled: whether the state can be, its energy, and where bodies touch."""
+"""Checks and measures after every step, compiled: whether the state is valid, its energy, and where bodies touch."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Touching(NamedTuple):
     point: np.ndarray  # [E, 3] on the first, world
     normal: np.ndarray  # [E, 3] from the second to the first
     impulse: np.ndarray  # [E, 3] on the first in the last inner step
-    gap: np.ndarray  # [E] below 0 where they are in each other
+    gap: np.ndarray  # [E] distance, below 0 if they overlap
 
 
 @njit(**BARE)
 def broken(position, orientation, velocity, angular, before, i, b, dt, most):
-    """What is wrong with the state of body b, which was at `before` [i] at the start of a step of `dt`; -1 where it is
-    sound: 0 where |q|^2 is away from 1 by more than most[0]; 1 to 4 where the position, velocity, angular velocity or
-    the speed of the way is more than most[1] to most[4], or not a number."""
+    """What is wrong with the state of body b, which was at `before` [i] at the start of a step of `dt`; -1 if it is
+    valid. 0: |q|^2 differs from 1 by more than most[0]. 1 to 4: the position, velocity, angular velocity or the speed
+    of its displacement is above most[1] to most[4], or not a number."""
     x, y, z, w = orientation[b, 0], orientation[b, 1], orientation[b, 2], orientation[b, 3]
     if not abs(x * x + y * y + z * z + w * w - 1.0) <= most[0]:
         return 0
@@ -39,8 +39,8 @@ def broken(position, orientation, velocity, angular, before, i, b, dt, most):
 
 @njit(**ENTRY)
 def first_fault(looked_at, position, orientation, velocity, angular, before, dt, most):
-    """The first of the bodies `looked_at` [N] bool whose state cannot be, -1 where all are sound; and what is wrong,
-    see `broken`, with those that were at `before` [N, 3]."""
+    """The first of the bodies `looked_at` [N] bool with an invalid state, -1 if all are valid; and what is wrong, see
+    `broken`. Bodies were at `before` [N, 3]."""
     for b in range(len(looked_at)):
         if looked_at[b]:
             wrong = broken(position, orientation, velocity, angular, before, b, b, dt, most)

@@ -1,4 +1,5 @@
-"""Time of impact, compiled: conservative advancement of what goes farther in an inner step than it is thick."""
+"""Time of impact, compiled: conservative advancement of bodies that move farther in an inner step than walls are
+thick."""
 
 from __future__ import annotations
 
@@ -12,12 +13,13 @@ from sdfsim.physics.solver.narrow_phase import SOLIDS, nearest, pair_kind
 from sdfsim.physics.solver.surface_distance import is_round
 from sdfsim.physics.solver.vectors import BARE, FAST, along, get, norm, put, scale, sub, to_matrix, turned_by
 
-THIN = 0.4  # of a wall: who goes farther in an inner step is watched on its way
+THIN = 0.4  # relative to a wall: motion in an inner step beyond which a body is checked on its way
 
 
 @njit(**BARE, inline="always")
 def time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch, surfaces):
-    """How much of the inner step each body may move, so that none passes through what is thinner than its way."""
+    """The part of the inner step by which each body may move, so that none passes through anything thinner than its
+    motion."""
     free, change, part = work.free, work.change, work.part
     for b in world.going:
         part[b] = 1.0
@@ -40,7 +42,7 @@ def time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch,
 
 @njit(**BARE)
 def _harmless(shapes, world, a, b):
-    """How deep two bodies may overlap before a distance points out of the wrong side of a wall."""
+    """How deep two bodies may overlap before a distance points to the wrong side of a wall."""
     depth = math.inf
     if pair_kind(shapes, world.shape[a], world.shape[b]) == SOLIDS:
         for body in (a, b):
@@ -59,7 +61,7 @@ def _harmless(shapes, world, a, b):
 
 @njit(**FAST)
 def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth, surfaces):
-    """How much of the inner step a pair may move until it overlaps a little: conservative advancement."""
+    """The part of the inner step by which a pair may move until it overlaps slightly, by conservative advancement."""
     free, change = work.free, work.change
     gone = work.gone[manifolds.pair[p, 0]] + work.gone[manifolds.pair[p, 1]]
     place, frame, turned = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 4))
@@ -79,12 +81,12 @@ def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p,
             for x in range(4):
                 turned[side, x] = q[x]
             to_matrix(turned, side, frame)
-        rest = max((1.0 - t) * way - deep, -0.5 * deep)  # what is no nearer is not met before the end
+        rest = max((1.0 - t) * way - deep, -0.5 * deep)  # bodies farther apart do not meet before the end
         gap = nearest(
             shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, rest,
             0.0 if t == 0.0 else -0.5 * deep, t == 0.0, scratch.simplex, surfaces,
         )  # fmt: skip
-        # Or they are in contact already, and it is answered.
+        # Or they are in contact already, and the contact acts.
         if gap >= rest or (t == 0.0 and gap <= 0.0):
             return 1.0
         if gap <= -0.5 * deep:

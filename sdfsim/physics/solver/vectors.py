@@ -6,21 +6,21 @@ import math
 
 from numba import njit
 
-# Of functions that Python calls. What is not said here would be taken from who calls a function first.
+# For functions that Python calls. Options that are not given here would be taken from the first caller.
 ENTRY = {
     "cache": True, "fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy", "forceinline": False,
     "no_cfunc_wrapper": True,
 }  # fmt: skip
-# Of functions that only compiled code calls: a way in from Python takes as long to compile as most of them.
+# For functions that only compiled code calls: an entry point for Python takes as long to compile as most of them.
 FAST = {**ENTRY, "no_cpython_wrapper": True, "_nrt": True}
-# Likewise, of functions that make no arrays: without this each counts the references of all arrays that it is given,
-# which takes longer than what most of them do.
+# Likewise, for functions that make no arrays: without this each would count the references of all arrays that it gets,
+# which takes longer than the work of most of them.
 BARE = {**FAST, "_nrt": False}
-# Likewise, of functions that few places call, again and again: all numbers of all arrays are copied for a call.
+# Likewise, for functions that few places call very often: a call copies all members of all arrays.
 INLINED = {**BARE, "forceinline": True}
-# `inline="always"` is for functions that one place calls: they become part of who calls them before that is compiled. A
-# function is compiled together with all that it calls, down to the last, and so is, once more, who calls it: the fewer
-# lie above one another, the less there is to do.
+# `inline="always"` is for functions that are called in one place: they become part of the caller before it is compiled.
+# A function is compiled together with everything that it calls, and again as part of its own caller: the fewer levels
+# there are, the less there is to compile.
 
 
 @njit(**BARE)
