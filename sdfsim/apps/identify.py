@@ -73,9 +73,7 @@ FARTHEST = {
     "height": 0.15,
     "tilt": 0.15,
 }
-SHELL = (
-    5.0 / 3.0
-)  # of the inertia of a solid cube or ball has a hollow one: with its mass inside, no such body has more
+SHELL = 5.0 / 3.0  # inertia of a hollow cube or ball over that of a solid one: the most that such a body can have
 FACTORS = ("mass", "inertia", "size")
 OF_JOINTS = {"joint_friction": DRAG, "joint_damping": DAMPING}  # in weights of a joint's lighter body, see `heft`
 

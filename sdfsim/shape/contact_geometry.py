@@ -28,16 +28,10 @@ DENSEST = 4000  # largest number of nodes of a closed form, roughly
 LATTICE = 40  # cells, along the largest extent, of the lattice that says which patch is nearest
 MOST_PATCHES = 1024  # patches of a shape: the contact solve cannot distinguish more
 OUTSIDE = 1e-3  # relative to the extent: vertices deeper in the union are not on its surface
-APART, DENSEST_ON_GRID = (
-    2.0,
-    3000,
-)  # least distance, in cells, of nodes on a grid, and their largest number
+APART, DENSEST_ON_GRID = 2.0, 3000  # least distance of nodes on a grid, cells, and their largest number
 LEAF, CLUMP = 16, 256  # largest number of nodes in a leaf, and in a clump of leaves
 ROUNDED = 0.1  # cells: an edge of the mesh counts as rounded off if the grid is off by this much there
-ALONG_EDGE, MOST_ON_EDGES = (
-    2.0,
-    4000,
-)  # distance, in cells, of nodes on such edges, and their largest number
+ALONG_EDGE, MOST_ON_EDGES = 2.0, 4000  # distance of nodes on such edges, cells, and their largest number
 
 _log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from sdfsim.physics.solver.joints import (
     roused,
     solve_with_joints,
 )
-from sdfsim.physics.solver.narrow_phase import broad_phase, narrow_phase
+from sdfsim.physics.solver.narrow_phase import find_near, narrow_phase
 from sdfsim.physics.solver.record import gathered, no_edges, noted
 from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.sleep import put_to_sleep, woken
@@ -55,14 +55,14 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
     for b in world.going:
         to_matrix(motion.orientation, b, matrix)
         work.met[b] = False
-    manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
+    manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
     stirred = rules.options.sleep
     while stirred:
         stirred = woken(world, motion, reference(manifolds), reference(near))
         if held is not None:
             stirred = stirred or roused(world, motion, joints)
         if stirred:
-            manifolds, near = broad_phase(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
+            manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
     contacts, edges = 0, no_edges()
     _shifted(world, work, motion, rules, -0.5)
@@ -72,7 +72,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
         for b in world.going:
             if work.gone[b] > work.ways[b] and (world.moves[b] or world.scripted[b]):
                 left = rules.substep_dt * (rules.options.substeps - k)
-                manifolds, near = broad_phase(shapes, world, work, motion, rules, left, manifolds, surfaces, threads)
+                manifolds, near = find_near(shapes, world, work, motion, rules, left, manifolds, surfaces, threads)
                 break
         for s in range(len(script.body)):
             for x in range(3):

@@ -99,7 +99,7 @@ class Near(NamedTuple):
 
 
 @njit(**FAST)
-def broad_phase(shapes, world, work, motion, rules, span, old, surfaces, threads):
+def find_near(shapes, world, work, motion, rules, span, old, surfaces, threads):
     """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
 
     Sets in `work` how far each body may move until the next search, and which bodies have others near.

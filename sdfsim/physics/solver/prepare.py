@@ -16,7 +16,7 @@ from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
 from sdfsim.physics.motion import MOTION, Motion
-from sdfsim.physics.options import Options
+from sdfsim.physics.options import COARSE, PYBULLET_ROUNDS, ROUNDS, SLOP, SLOP_A_TIME, SLOW, Options
 from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
@@ -36,15 +36,9 @@ FORMS = {
     "cylinder": kinds.CYLINDER,
 }  # fmt: skip
 SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
-# Penetration that is left as it is, so that what rests has contacts that do not come and go: model lengths, and less in
-# inner steps below the usual 4 ms, which scenes of slender bodies have.
-SLOP, SLOP_A_TIME = 5e-4, 0.125
-ROUNDS, TEACHERS = 100, 50  # of sequential impulses in an inner step at most, and of the teacher
 CROWD = 64  # number of dynamic bodies from which threads may test pairs
 TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
-COARSE = 0.01  # model times: in longer inner steps what is hit in their course is recorded as well
 NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 0, 6)))
-SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
 
 
 class SharedShapes:
@@ -300,7 +294,7 @@ def compiled_rules(options: Options) -> compiled.Rules:
         SLOW * math.hypot(*options.gravity) * inner,
         ahead=inner if options.record and inner > COARSE else 0.0,
         slop=min(SLOP, SLOP_A_TIME * inner),
-        rounds=TEACHERS if options.adds else ROUNDS,
+        rounds=PYBULLET_ROUNDS if options.adds else ROUNDS,
     )
 
 

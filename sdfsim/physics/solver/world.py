@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sdfsim.physics.options import Options
+from sdfsim.physics.options import ROUNDS, SLOP, Options
 
 POINTS = 24  # largest number of points of a manifold
 # Columns of a contact point: its position on each body (about its centre of mass, in its axes); the unit normal from
@@ -127,9 +127,9 @@ class Rules(NamedTuple):
     search_margin: float = 0.006  # new ones are searched up to this distance plus twice the options' margin
     still: float = 1e-4  # pairs that have moved by less within a step are not tested again
     erp: float = 0.08  # share of a penetration that an inner step resolves, by velocity
-    slop: float = 5e-4  # penetration that is not resolved
+    slop: float = SLOP  # penetration that is not resolved
     split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
-    rounds: int = 100  # largest number of sweeps of sequential impulses
+    rounds: int = ROUNDS  # largest number of sweeps of sequential impulses
     exact: float = 2e-5  # sweeps end when no impulse changes a velocity by more
     apart: float = 0.03  # least distance of points of a manifold from each other
     # stray, rest: a body that stays within `stray` for `rest` steps falls asleep, if its forces are so nearly in
