@@ -1,1 +1,2 @@
-"""The networks: SDF-Sim as published (`sdf-sim`), and `impulse`, which acts on top of the contact solve."""
+"""The networks: `impulse`, which acts on top of the contact solve; SDF-Sim as published (`sdf-sim`), and its
+baselines."""

@@ -1,4 +1,4 @@
-"""The contact graph of the *impulse* network: bodies joined by contact edges, each with a frame of its own.
+"""The contact graph of the *impulse* network: bodies joined by contact edges, each of which has its own frame.
 
 Everything a network sees is a scalar in an edge's frame, made dimensionless by a speed and the time step, so that
 the prediction turns with the scene and does not depend on the choice of units.
@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-REST_SPEED = 0.2  # model units: what gravity adds to a speed in one step of training; slower counts as resting
+REST_SPEED = 0.2  # model units: the speed that gravity adds in one training step; slower counts as resting
 EDGE_FEATURES = 30
-# Of a graph's tensors those with a row for each edge, but for its ends; and those with a row for each body.
+# The tensors of a graph with one row per edge, except its ends, and those with one row per body.
 OF_EDGES = ("normal", "arm_first", "arm_second", "impulse", "gap", "when", "friction", "restitution")
 OF_BODIES = (
     "inverse_mass", "inverse_inertia", "velocity", "angular", "free_velocity", "free_angular", "solved_velocity",
@@ -21,34 +21,34 @@ OF_BODIES = (
 
 @dataclass(frozen=True)
 class ContactGraph:
-    """N bodies and E places where the contact solve had them meet or nearly meet, in single precision."""
+    """N bodies and E places where they met or nearly met in the contact solve, in single precision."""
 
-    inverse_mass: Tensor  # [N], 0 for bodies that do not move
-    inverse_inertia: Tensor  # [N, 3, 3], world axes, 0 for bodies that do not move
+    inverse_mass: Tensor  # [N], 0 for bodies that are not dynamic
+    inverse_inertia: Tensor  # [N, 3, 3], world axes, 0 for bodies that are not dynamic
     # velocity, angular: [N, 3] at the start of the step
     velocity: Tensor
     angular: Tensor
     # free_velocity, free_angular: [N, 3] at its end in free flight
     free_velocity: Tensor
     free_angular: Tensor
-    # solved_velocity, solved_angular: [N, 3] at its end as the solve has it
+    # solved_velocity, solved_angular: [N, 3] at its end, by the solve
     solved_velocity: Tensor
     solved_angular: Tensor
-    # mean_velocity, mean_angular: [N, 3] the mean over the step as the solve has it
+    # mean_velocity, mean_angular: [N, 3] mean over the step, by the solve
     mean_velocity: Tensor
     mean_angular: Tensor
     # first, second: [E] int64
     first: Tensor
     second: Tensor
     pair: Tensor  # [E] int64, number of the unordered pair of bodies, 0 ... pairs - 1.
-    pairs: int  # how many pairs there are
+    pairs: int  # number of pairs
     normal: Tensor  # [E, 3], from `second` to `first`
     # arm_first, arm_second: [E, 3] from the centres of mass
     arm_first: Tensor
     arm_second: Tensor
-    impulse: Tensor  # [E, 3] that the solve gave `first`, and opposite `second`
-    gap: Tensor  # [E] signed distance when the place was first looked at
-    when: Tensor  # [E] the part of the step that was over by then
+    impulse: Tensor  # [E, 3] impulse of the solve on `first`; `second` gets the opposite
+    gap: Tensor  # [E] signed distance when the place was first found
+    when: Tensor  # [E] the part of the step that had passed by then
     # friction, restitution: [E] products of the two bodies' coefficients
     friction: Tensor
     restitution: Tensor
@@ -62,16 +62,16 @@ def in_single(graph: ContactGraph) -> ContactGraph:
 
 @dataclass(frozen=True)
 class EdgeFrames:
-    """What the rounds of message passing need of every edge, computed once a step. A body's twist is its velocity and
-    angular velocity, stacked. Rows and columns of three are the edge's axes: normal, tangent, binormal."""
+    """Data of every edge that the rounds of message passing need, computed once a step. A body's twist is its velocity
+    and angular velocity, stacked. Rows and columns of three are the edge's axes: normal, tangent, binormal."""
 
     speed: Tensor  # [E, 1], the scale that makes velocities dimensionless
-    mass: Tensor  # [E, 3] effective mass along each axis; 0 along those on which nothing may act
+    mass: Tensor  # [E, 3] effective mass along each axis; 0 along axes on which no impulse may act
     # jacobian_first, jacobian_second: [E, 3, 6] J, from a twist to the velocity of the contact point along each axis
     jacobian_first: Tensor
     jacobian_second: Tensor
-    # response_first, response_second: [E, 6, 3] M^-1 J^T, the twist that a unit impulse along each axis gives, opposite
-    # to the second
+    # response_first, response_second: [E, 6, 3] M^-1 J^T, change of twist by a unit impulse along each axis; for the
+    # second body, by the opposite
     response_first: Tensor
     response_second: Tensor
     solved: Tensor  # [E, 3] impulse of the solve along each axis
@@ -80,7 +80,8 @@ class EdgeFrames:
 
 
 def number_pairs(first: Tensor, second: Tensor, bodies: int) -> tuple[Tensor, int]:
-    """Number the unordered pairs {first, second} of [E] edges consecutively: [E] and how many."""
+    """Number the unordered pairs {first, second} of [E] edges consecutively. Returns the numbers [E] and the number of
+    pairs."""
     key = torch.minimum(first, second) * bodies + torch.maximum(first, second)
     unique, pair = torch.unique(key, return_inverse=True)
     return pair, len(unique)
@@ -91,7 +92,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
     of the scene would show them (augmentation)."""
     g = graph
     slip = relative_velocity(g, g.velocity, g.angular)
-    lift = relative_velocity(g, g.free_velocity, g.free_angular) - slip  # what gravity and free spin add
+    lift = relative_velocity(g, g.free_velocity, g.free_angular) - slip  # the change by gravity and free spin
     axes, tangential = _axes(g, slip, lift)
     if mirrored:
         axes = axes * axes.new_tensor([1.0, 1.0, -1.0])[:, None]
@@ -100,7 +101,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
     moment_first, turn_first, twist_first = _response(g.inverse_inertia[g.first], g.arm_first, axes)
     moment_second, turn_second, twist_second = _response(g.inverse_inertia[g.second], g.arm_second, axes)
     push_first, push_second = g.inverse_mass[g.first, None], g.inverse_mass[g.second, None]
-    # Inverse effective mass matrix in the frame: how an impulse along one axis changes velocity along another.
+    # Inverse effective mass matrix in the frame: how an impulse along one axis changes the velocity along another.
     compliance = twist_first + twist_second
     direct = compliance.diagonal(dim1=-2, dim2=-1) + push_first + push_second
     mass = 1.0 / direct.clamp_min(1e-12)
@@ -152,7 +153,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
 
 
 def relative_velocity(graph: ContactGraph, velocity: Tensor, angular: Tensor) -> Tensor:
-    """[E, 3] velocity of `first`'s surface against `second`'s at the contact point, for body velocities [N, 3]."""
+    """[E, 3] velocity of `first`'s surface relative to `second`'s at the contact point, for body velocities [N, 3]."""
     g = graph
     one = velocity[g.first] + torch.linalg.cross(angular[g.first], g.arm_first)
     two = velocity[g.second] + torch.linalg.cross(angular[g.second], g.arm_second)
@@ -160,11 +161,12 @@ def relative_velocity(graph: ContactGraph, velocity: Tensor, angular: Tensor) ->
 
 
 def _axes(g: ContactGraph, slip: Tensor, lift: Tensor) -> tuple[Tensor, Tensor]:
-    """[E, 3, 3] frames: normal, tangent, binormal; and [E, 1] whether the tangent means anything.
+    """[E, 3, 3] frames: normal, tangent, binormal; and [E, 1] whether the tangent has a meaning.
 
-    The tangent is along the sliding velocity; else along the tangential part of what gravity adds; else where the
-    contact point goes when it is pushed along the normal; else along what happens at the two bodies' other contacts.
-    All of these turn with the scene. Where none exists nothing says which way a tangential impulse should go.
+    The tangent is along the sliding velocity. If that is zero, it is along the tangential part of the velocity that
+    gravity adds; else along the motion of the contact point when it is pushed along the normal; else along the motion
+    at the two bodies' other contacts. All of these rotate with the scene. If none exists, the direction of a tangential
+    impulse is not determined.
     """
     n = g.normal
 
@@ -208,7 +210,7 @@ def _response(inverse_inertia: Tensor, arm: Tensor, axes: Tensor) -> tuple[Tenso
 
 
 def _centripetal(g: ContactGraph) -> Tensor:
-    """[E, 3] relative velocity that the turning of the arms adds over the step."""
+    """[E, 3] relative velocity that the rotation of the arms adds over the step."""
 
     def part(body: Tensor, arm: Tensor) -> Tensor:
         w = g.angular[body]

@@ -1,8 +1,9 @@
-"""The networks on surface nodes by name: SDF-Sim (*sdf-sim*) and the baselines of its paper; their graphs differ.
+"""The networks on surface nodes by name: SDF-Sim (*sdf-sim*) and the baselines of its paper, which differ in their
+graphs.
 
-All graphs are of a state that carries its two earlier poses. Vertices, particles and body nodes of all have the
-features of SDF-Sim's nodes, contact edges reach farther by what their ends close in during a step, and an infinite
-floor is one node below whatever is near it. The papers of the baselines do otherwise, or do not say.
+All graphs are made from a state with its two earlier poses. In all of them vertices, particles and body nodes have the
+features of SDF-Sim's nodes, contact edges reach farther by the distance that their ends close in a step, and an
+infinite floor is one node below whatever is near it. The papers of the baselines differ in this, or do not say.
 """
 
 from collections.abc import Callable
@@ -24,23 +25,23 @@ from sdfsim.shape.shape import Shape
 
 
 def points(shape: Shape, count: int | None) -> Shape:
-    """The shape with the first `count` of its nodes (None: all): those that reach farthest, then the most spread."""
+    """The shape with the first `count` of its nodes (None: all): the outermost ones, then the most evenly spread."""
     return replace(shape, nodes=shape.nodes[:count])
 
 
 def particles(shape: Shape, count: int | None) -> Shape:
-    """As `points`; an infinite plane is one node, so that edges have an end there."""
+    """As `points`; an infinite plane gets one node, so that edges have an end there."""
     return replace(points(shape, count), nodes=np.zeros((1, 3))) if _endless(shape) else points(shape, count)
 
 
 def vertices(shape: Shape, count: int | None) -> Shape:
-    """The shape with the vertices of a mesh as nodes, about `count` at most; an infinite plane is one node and one
+    """The shape with the vertices of a mesh as nodes, at most about `count`; an infinite plane gets one node and one
     face.
 
-    The mesh is that of the hulls of the convex pieces, where a shape was made of such and they have no more vertices
-    than wanted: what the teacher collides, and as many vertices as the published graphs have (their sizes fit 440 a
-    body). Else it is the shown mesh, reduced by quadric error to 2 `count` - 4 faces: 76 hulls have no mesh of 64
-    vertices, and what the reduction takes off a body (up to 5 cm of the shapes of MOVi-B at 64) its mesh lacks.
+    If the shape is made of convex pieces with at most `count` vertices, the mesh is that of their hulls: this is what
+    PyBullet collides, and has as many vertices as the published graphs (their sizes fit 440 per body). Otherwise it is
+    the shown mesh, reduced by quadric error to 2 `count` - 4 faces, as for example 76 hulls cannot have a mesh of 64
+    vertices. The reduced mesh lacks what the reduction cuts off (up to 5 cm of the shapes of MOVi-B at 64).
     """
     if _endless(shape):
         return replace(shape, nodes=np.zeros((1, 3)), faces=np.zeros((1, 3), dtype=np.int64))
@@ -53,7 +54,7 @@ def vertices(shape: Shape, count: int | None) -> Shape:
 
 
 def _reduced(mesh: Mesh, count: int | None) -> Mesh:
-    """The mesh with doubled vertices joined and at most `count` of them, about."""
+    """The mesh with doubled vertices merged, and at most about `count` vertices."""
     import open3d as o3d
 
     given = o3d.geometry.TriangleMesh(
@@ -71,16 +72,16 @@ def _endless(shape: Shape) -> bool:
 
 @dataclass(frozen=True)
 class Family:
-    """Everything but weights that is specific to one network."""
+    """Everything that is specific to one network, except its weights."""
 
     layout: Layout  # of its graphs
-    # the shape with the nodes that the network works on (at most a number of them, None for all)
+    # the shape with the nodes that the network uses (at most the given number, None for all)
     surface: Callable[[Shape, int | None], Shape]
-    # what of the bodies is near what, for bodies, state, gravity, reach, time step and the compiled scene of a run
+    # finds the near parts of bodies, from bodies, state, gravity, reach, time step and the compiled scene of a run
     near: Callable[[BodyTensors, StateTensors, np.ndarray, float, float, Compiled | None], Contacts | Pairs]
-    none: Callable[[device], Contacts | Pairs]  # the same of bodies that are near nothing
-    graph: Callable[[BodyTensors, StateTensors, Any], MultiGraph]  # the graph of bodies, their state and what is near
-    distances: bool = False  # whether `near` asks the compiled distances of a scene
+    none: Callable[[device], Contacts | Pairs]  # the same for bodies that are near nothing
+    graph: Callable[[BodyTensors, StateTensors, Any], MultiGraph]  # the graph of bodies, their state and near parts
+    distances: bool = False  # whether `near` uses the compiled distances of a scene
 
 
 _no_faces, _no_nodes = partial(no_pairs, corners=3), partial(no_pairs, corners=1)

@@ -1,25 +1,25 @@
-"""The graphs of networks on surface nodes: what SDF-Sim and the networks of its comparison see.
+"""The graphs of networks on surface nodes: SDF-Sim's, and those of the networks in its paper's comparison.
 
 **SDF-Sim** as published (section 3 and appendix): every body has one body node and its surface nodes, joined both ways
-(up: to the body node). A surface node within the contact radius of another body joins that body's node both ways. No
-surface node is ever joined to another.
+(up: to the body node). A surface node within the contact radius of another body is joined to that body's node both
+ways. Surface nodes are never joined to each other.
 
 **FIGNet** (Allen et al., 2023, arXiv 2212.03574) and **FIGNet*** (Lopez-Guevara et al., 2024, arXiv 2401.11985): nodes
 are the vertices of meshes and one node a body. Edges join neighbours on a mesh, vertices and their body's node, and the
-faces of two bodies that are near each other. A face edge knows the closest points of the two faces; its message has a
-part for each of the receiving face's three vertices, in the order of their distance to its closest point. FIGNet* is
-FIGNet without mesh edges.
+faces of two bodies that are near each other. The features of a face edge include the closest points of the two faces;
+its message has a part for each of the receiving face's three vertices, in the order of their distance to its closest
+point. FIGNet* is FIGNet without mesh edges.
 
 **MeshGraphNets** (Pfaff et al., 2021, arXiv 2010.03409) for rigid bodies, as SDF-Sim's paper compares it: mesh edges
 join neighbours, world edges join vertices of different bodies within a radius, a small one in *mgn*, a large one in
 *mgn-large*. There are no body nodes; shape matching makes motions rigid.
 
 **DPI** (Li et al., 2019, arXiv 1810.01566) for rigid bodies: particles are joined to their body's root both ways, and
-to particles of different bodies within a radius. Here they lie on the surface (the paper's fill the body), and all
-kinds of edges pass messages at once in every step, with weights of that step (there one after the other, in every round
-with the same).
+to particles of different bodies within a radius. Here they lie on the surface (in the paper they fill the body), and in
+every step all kinds of edges pass messages at once, with weights of that step (in the paper one after the other, with
+the same weights in every round).
 
-`families.py` lists what else is not as in the networks' own papers.
+`families.py` lists other differences from the networks' own papers.
 """
 
 import torch
@@ -51,8 +51,8 @@ def sdf_sim_graph(bodies: BodyTensors, state: StateTensors, contacts: Contacts) 
 
 
 def _contact_features(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> Tensor:
-    """[E, 15]: node to closest point, normal, both seen from the other body's centre, distances. An infinite floor has
-    no centre: its body node stands in for the closest point."""
+    """[E, 15]: node to closest point, normal, both relative to the other body's centre, and distances. An infinite
+    floor has no centre: the closest point takes its place."""
     c = contacts
     to_closest = -c.distance[:, None] * c.normal
     bounded = bodies.size[c.body].isfinite()[:, None]
@@ -76,7 +76,8 @@ def fignet_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> Mult
 
 
 def _face_features(way: Tensor, sending: Tensor, receiving: Tensor, normal: Tensor, other: Tensor) -> Tensor:
-    """[E, 34]: between the closest points, from these to the corners of both faces, with lengths; both normals."""
+    """[E, 34]: vectors between the closest points and from these to the corners of both faces, with lengths; both
+    normals."""
     corners = [part for face in (sending, receiving) for part in (face.flatten(1), face.norm(dim=-1))]
     return torch.cat([way, way.norm(dim=-1, keepdim=True), *corners, normal, other], -1)
 
@@ -87,7 +88,7 @@ def mgn_graph(bodies: BodyTensors, state: StateTensors, pairs: Pairs) -> MultiGr
 
 
 def world_edges(pairs: Pairs) -> EdgeSet:
-    """Edges both ways between nodes of different bodies: from sender to receiver, and how far."""
+    """Edges both ways between nodes of different bodies: vector from sender to receiver, and its length."""
     length = pairs.way.norm(dim=-1, keepdim=True)
     forth, back = torch.cat([pairs.way, length], -1), torch.cat([-pairs.way, length], -1)
     return both_ways(forth, back, pairs.first, pairs.second)

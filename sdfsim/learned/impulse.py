@@ -1,12 +1,12 @@
 """The *impulse* network: message passing between bodies over contact edges, on top of the contact solve.
 
-What it decodes are impulses. They act on both bodies of an edge, equal and opposite, at the contact point, with their
-true mass and inertia. So linear momentum is conserved exactly, angular momentum exactly at the instant the impulses
-act, and the step turns with the scene, whatever the weights are.
+The network decodes impulses. They act on both bodies of an edge, equal and opposite, at the contact point, with the
+bodies' true mass and inertia. So linear momentum is conserved exactly, angular momentum exactly at the instant at which
+the impulses act, and the step rotates with the scene, whatever the weights are.
 
-The rounds start from what the solve makes of the step, and what they add is held to a trust region (`bounded`).
+The rounds start from the solve's result for the step, and what they add stays within a trust region (`bounded`).
 
-This form is for training and to be read. `kernels.impulse` is the same, compiled.
+This is the form for training; `inference` uses it in simulations.
 """
 
 from collections.abc import Iterable
@@ -18,20 +18,20 @@ from torch import Tensor, nn
 
 from sdfsim.learned.contact_graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames
 
-# Model units, relative speeds of two surfaces before the step: up to the first what they do is left to the solve, from
-# the second on the network has its full say. So what rests, rolls or stands in a tower does what the solve knows.
+# Model units, relative speeds of two surfaces before the step: up to the first the network adds nothing, from the
+# second on it has its full effect. So bodies that rest, roll or stand in a tower move as the solve has it.
 CALM, LIVELY = 0.05, 0.5
-LEVER = 0.5  # of the way from a centre of mass to a contact: how far off the contact an impact may act
+LEVER = 0.5  # relative to the distance from a centre of mass to a contact: how far from the contact an impact may act
 
 
 @dataclass(frozen=True)
 class ImpulseConfig:
     width: int = 64  # of every latent and hidden layer
-    rounds: int = 6  # of message passing, each with weights of its own
-    # 1 for a network that is given where contacts are but not what the solve makes of them, and that nothing bounds:
-    # what learning alone gives, for comparison
+    rounds: int = 6  # of message passing, each with its own weights
+    # 1 for a network that gets the contacts, but not the solve's impulses, and is not bounded: learning alone, for
+    # comparison
     alone: int = 0
-    # 1 for one that acts where surfaces strike each other, and turns bodies there too, see `struck`
+    # 1 for a network that acts where surfaces strike each other, and also turns bodies there, see `struck`
     impacts: int = 0
 
     def __post_init__(self) -> None:
@@ -43,7 +43,7 @@ class ImpulseConfig:
 
 @dataclass(frozen=True)
 class Velocities:
-    """What the network predicts for N bodies, model units, world frame."""
+    """The network's predictions for N bodies, model units, world frame."""
 
     # velocity, angular: [N, 3] at the end of the step
     velocity: Tensor
@@ -60,7 +60,7 @@ def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
 
 
 class Round(nn.Module):
-    """One round: edges read both bodies and the current relative velocities, then push and inform them."""
+    """One round: edges read both bodies and the present relative velocities, then give them impulses and messages."""
 
     def __init__(self, width: int, moments: bool = False) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class Round(nn.Module):
         self.attention = nn.Linear(width, 1)
         self.normal_impulse = nn.Linear(width, 2)
         self.tangent_impulse = nn.Linear(width, 4)
-        # what turns both bodies by itself, as a contact does that is a patch and no point
+        # moments on both bodies, as from a contact that is a patch and not a point
         self.moment = nn.Linear(width, 6) if moments else None
         for head in (self.normal_impulse, self.tangent_impulse, self.moment):
             if head is not None:
@@ -82,7 +82,7 @@ class Round(nn.Module):
                 nn.init.zeros_(head.bias)
 
     def read(self, body: Tensor, edge: Tensor, first: Tensor, second: Tensor, relative: Tensor) -> Tensor:
-        """[E, width] of the edges' own latents, those of their bodies, and [E, 6] what is seen of their motion."""
+        """[E, width] from the edges' own latents, those of their bodies, and the relative motion [E, 6]."""
         return self.edge(torch.cat([self.normalise(edge), body[first], body[second], relative], -1))
 
     def impulse(self, hidden: Tensor, friction: bool) -> Tensor:
@@ -101,12 +101,12 @@ class Round(nn.Module):
         to_first, to_second = (self.message(hidden) * weight).chunk(2, -1)
         received = torch.zeros_like(body).index_add_(0, graph.first, to_first).index_add_(0, graph.second, to_second)
         body = body + self.body(torch.cat([body, received], -1))
-        # Scenery carries no message from one body to another.
+        # Static bodies carry no message from one body to another.
         return edge + self.latent(hidden), body * (graph.inverse_mass > 0)[:, None]
 
 
 class ImpulseNetwork(nn.Module):
-    """Encode edges, then `rounds` of pushing; see the module's docstring."""
+    """Encode edges, then `rounds` of message passing; see the module's docstring."""
 
     def __init__(self, config: ImpulseConfig) -> None:
         super().__init__()
@@ -122,8 +122,8 @@ class ImpulseNetwork(nn.Module):
         mirrored: bool = False,
         trust: float = 1.0,
     ) -> Velocities:
-        """Velocities after the contacts have acted; `mirrored` as for `edge_frames`. At a `trust` of 0 the solve stands
-        alone."""
+        """Velocities after the contacts have acted; `mirrored` as for `edge_frames`. With a `trust` of 0 the network
+        adds nothing to the solve."""
         alone = bool(self.config.alone)
         graph = without_solve(graph) if alone else graph
         frames = edge_frames(graph, mirrored=mirrored)
@@ -157,7 +157,7 @@ class ImpulseNetwork(nn.Module):
 
 
 def without_solve(graph: ContactGraph) -> ContactGraph:
-    """The graph with free flight in place of what the solve makes of the step."""
+    """The graph with free flight in place of the solve's result."""
     return replace(
         graph,
         solved_velocity=graph.free_velocity,
@@ -174,21 +174,20 @@ def relative(graph: ContactGraph, frames: EdgeFrames, twist: Tensor) -> Tensor:
 
 
 def pushed(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, twist: Tensor) -> Tensor:
-    """Twists [N, 6, K] after impulses [E, axis, K] on the first bodies, opposite on the second."""
+    """Twists [N, 6, K] after impulses [E, axis, K] on the first bodies; the second get the opposite."""
     axes = impulse.shape[1]
     twist = twist.index_add(0, graph.first, frames.response_first[..., :axes] @ impulse)
     return twist.index_add(0, graph.second, frames.response_second[..., :axes] @ impulse)
 
 
 def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor, trust: float) -> Tensor:
-    """What may be added to the solve, of what the network would add: impulses [E, axis, 2] at the end of the step, and
-    those that move bodies in it. `start` are twists [N, 6, 2] from the solve, `trust` is 0 to 1.
+    """Bound what the network adds to the solve: impulses [E, axis, 2], at the end of the step and those that move
+    bodies in it. `start` are twists [N, 6, 2] from the solve, `trust` is 0 to 1.
 
     - Only where surfaces moved against each other before the step, see `CALM`.
 
-    - Solve and network together never pull, push no more than twice as hard as the solve, or than it takes to part
-    surfaces that would be inside each other at the end of the step as restitution allows, and keep to the friction
-    cone.
+    - Solve and network together never pull, keep to the friction cone, and push at most twice as hard as the solve, or
+    as hard as restitution allows to separate surfaces that would overlap at the end of the step.
 
     - No more kinetic energy than the solve took, island by island.
     """
@@ -202,7 +201,7 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
     normal = torch.minimum((push + added[:, 0, 0]).clamp_min(0.0), most)
     ends = [(normal - push)[:, None]]
     if added.shape[1] == 3:
-        # As the teacher has it the solve holds its two axes of friction apart: both may grip more than the cone.
+        # If the solve bounds its two axes of friction separately, as PyBullet does, both together may exceed the cone.
         grip = torch.where(push > 0.0, drag.norm(dim=-1) / push.clamp_min(1e-12), 0.0)
         hold = torch.maximum(graph.friction, grip) * normal
         total = drag + added[:, 1:, 0]
@@ -213,10 +212,10 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
 
 
 def with_moments(graph: ContactGraph, frames: EdgeFrames) -> EdgeFrames:
-    """Frames with three more axes: of moments on the first bodies, opposite on the second, about the edges' axes. Their
-    mass makes the change of an angular velocity that of a speed at the end of the lever."""
+    """Frames with three more axes: moments about the edges' axes on the first bodies, opposite on the second. Their
+    effective mass converts a change of angular velocity to that of the speed at the end of the lever."""
     axes = frames.jacobian_first[..., :3]
-    axes = axes * torch.linalg.det(axes)[:, None, None]  # a mirror image turns the other way round
+    axes = axes * torch.linalg.det(axes)[:, None, None]  # a mirror image turns the other way
     none = torch.zeros_like(axes)
     about = torch.cat([none, axes], -1)
     turn_first, turn_second = (
@@ -235,7 +234,7 @@ def with_moments(graph: ContactGraph, frames: EdgeFrames) -> EdgeFrames:
 
 
 def _arm(graph: ContactGraph) -> Tensor:
-    """[E] how far a contact is from the centre of mass of the body that moves, or of the nearer one."""
+    """[E] distance of a contact from the centre of mass of the dynamic body, or of the nearer one."""
     far = torch.full_like(graph.gap, torch.inf)
     ways = [
         torch.where(graph.inverse_mass[body] > 0, arm.norm(dim=-1), far)
@@ -245,13 +244,13 @@ def _arm(graph: ContactGraph) -> Tensor:
 
 
 def struck(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor, trust: float) -> Tensor:
-    """What may be added to the solve where surfaces strike each other, of what the network would add: impulses and
-    moments [E, axis, 2]. `start` are twists [N, 6, 2] from the solve, `trust` is 0 to 1.
+    """Bound what the network adds to the solve where surfaces strike each other: impulses and moments [E, axis, 2].
+    `start` are twists [N, 6, 2] from the solve, `trust` is 0 to 1.
 
     - Only between bodies that approach each other at one of their edges, see `CALM`.
 
-    - Solve and network together rebound with a restitution of 0 to 1, keep to the friction cone, and turn bodies as a
-    push does that acts off the contact, by `LEVER` of the arm at most.
+    - Solve and network together rebound with a restitution of 0 to 1, keep to the friction cone, and turn bodies at
+    most as a push does that acts beside the contact, by `LEVER` of the arm.
 
     - No more kinetic energy than the solve took, island by island.
     """
@@ -275,14 +274,14 @@ def struck(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor
 
 
 def _shortened(vector: Tensor, most: Tensor) -> Tensor:
-    """[E, K] vectors no longer than `most` [E]."""
+    """[E, K] vectors, shortened to at most `most` [E]."""
     length = vector.square().sum(-1).clamp_min(1e-24).sqrt()
     return vector * (most / length).clamp_max(1.0)[:, None]
 
 
 def _energy_share(graph: ContactGraph, frames: EdgeFrames, end: Tensor, seen: Tensor, start: Tensor) -> Tensor:
     """[E] the share of impulses `end` [E, axis] that adds no more energy to an island than the solve took from it. The
-    work of an impulse is its product with the mean of the relative velocities before and after it."""
+    work of an impulse is its product with the mean of the relative velocities before and after."""
     with torch.no_grad():
         free = torch.cat([graph.free_velocity, graph.free_angular], -1)
         taken = kinetic(graph, free) - kinetic(graph, start[..., 0])
@@ -304,7 +303,7 @@ def _energy_share(graph: ContactGraph, frames: EdgeFrames, end: Tensor, seen: Te
 
 
 def kinetic(graph: ContactGraph, twist: Tensor) -> Tensor:
-    """[N] kinetic energy of the bodies that move, for twists [N, 6]."""
+    """[N] kinetic energy of the dynamic bodies, for twists [N, 6]."""
     moves = graph.inverse_mass > 0
     turns = (graph.inverse_inertia.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
     unit = torch.eye(3, dtype=twist.dtype, device=twist.device)
@@ -315,7 +314,7 @@ def kinetic(graph: ContactGraph, twist: Tensor) -> Tensor:
 
 
 def islands(graph: ContactGraph) -> Tensor:
-    """[N] the least number of the bodies that move and are joined to this one by edges."""
+    """[N] the lowest number among the dynamic bodies that edges join to this one."""
     moves = graph.inverse_mass > 0
     label = torch.arange(len(moves), device=moves.device)
     one = torch.where(moves[graph.first], graph.first, graph.second)

@@ -1,4 +1,4 @@
-"""The *impulse* network in a simulation: the graph of a solved step, and the step with what the network adds."""
+"""The *impulse* network in a simulation: the graph of a solved step, and the step with the network's corrections."""
 
 from copy import deepcopy
 
@@ -17,7 +17,7 @@ from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, E
 
 
 def doubled(network: ImpulseNetwork) -> ImpulseNetwork:
-    """A copy in double precision: what it adds then keeps momentum to the last digits of a state."""
+    """A copy in double precision: its impulses then conserve momentum to the last digits of a state."""
     return deepcopy(network).cpu().double()
 
 
@@ -25,9 +25,9 @@ def step_graph(
     bodies: Bodies, before: State, solved: State, edges: Edges, options: Options, known: float,
     rows: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ContactGraph]:  # fmt: skip
-    """The bodies `rows` [A] int64 (None: those that met somebody in a solved step with these `edges`), and their graph
-    in double precision: in units in which the step lasts `known` (a network knows no other) and gravity is what it is,
-    masses relative to the heaviest."""
+    """The bodies `rows` [A] int64 (None: those that met another in a solved step with these `edges`), and their graph
+    in double precision. Units are such that the step is `known`, the only step that the network was trained with, and
+    gravity keeps its value; masses are relative to the heaviest."""
     rows = np.unique(edges.pair) if rows is None else rows
     inside = np.searchsorted(rows, edges.pair)
     time = options.dt / known
@@ -85,8 +85,8 @@ def corrected(
     network: ImpulseNetwork, bodies: Bodies, before: State, solved: State, edges: Edges, options: Options,
     known: float, trust: float = 1.0,
 ) -> State:  # fmt: skip
-    """What a network, which was trained on steps of `known`, makes of a step of the solve with these `edges`, at least
-    one; `trust` (0 to 1) scales what it adds."""
+    """The state after a step of the solve with these `edges` (at least one), corrected by a network that was trained on
+    steps of `known`; `trust` (0 to 1) scales the correction."""
     rows, graph = step_graph(bodies, before, solved, edges, options, known)
     with torch.no_grad():
         made = network(graph, friction=options.friction, trust=trust)
@@ -96,7 +96,7 @@ def corrected(
 def changed(
     bodies: Bodies, solved: State, rows: np.ndarray, graph: ContactGraph, made: Velocities, options: Options
 ) -> State:
-    """The solved step with the velocities that a network has `made` of those of the bodies `rows`."""
+    """The solved step with the velocities `made` by a network for the bodies `rows`."""
     time, moves = options.dt / graph.dt, bodies.moves[rows]
     rows = rows[moves]
     change = {

@@ -1,7 +1,7 @@
-"""Encode, process, decode on typed graphs: the one network that SDF-Sim and its baselines share.
+"""Encode, process, decode on typed graphs: the network that SDF-Sim and its baselines share.
 
-They differ in their graphs alone: which sets of nodes there are, and which kinds of edges join them (`Layout`). An edge
-joins single nodes, or the three corners of one face to those of another and then carries a message for each.
+They differ only in their graphs: the sets of nodes, and the kinds of edges that join them (`Layout`). An edge joins
+single nodes, or the three corners of one face to those of another; then it carries a message for each corner.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Features:
 
 @dataclass(frozen=True)
 class EdgeKind:
-    """Edges from nodes of the set `sender` to nodes of the set `receiver`, `corners` at either end."""
+    """Edges from nodes of the set `sender` to nodes of the set `receiver`, with `corners` nodes at each end."""
 
     sender: str
     receiver: str
@@ -34,7 +34,7 @@ class EdgeKind:
 
 @dataclass(frozen=True)
 class Layout:
-    """What graphs of a network consist of; the set "node" is decoded."""
+    """The parts of a network's graphs; the set "node" is decoded."""
 
     nodes: dict[str, Features]
     edges: dict[str, EdgeKind]
@@ -58,11 +58,11 @@ class MultiGraph:
 
     @property
     def edge_count(self) -> int:
-        """How many edges there are, each direction counted."""
+        """Number of edges, counting both directions."""
         return sum(len(edges.sender) for edges in self.edges.values())
 
     def mirrored(self, layout: Layout) -> MultiGraph:
-        """What the mirror image of the scene would give: y of every vector feature reversed."""
+        """The graph of the scene's mirror image: y of every vector feature reversed."""
         nodes = {name: flipped(x, layout.nodes[name]) for name, x in self.nodes.items()}
         kinds = layout.edges
         edges = {k: replace(e, features=flipped(e.features, kinds[k].features)) for k, e in self.edges.items()}
@@ -87,7 +87,7 @@ class GraphConfig:
     """Sizes of a network (published, all of them: width 128; SDF-Sim, FIGNet, MeshGraphNets: 10 to 15 steps)."""
 
     width: int = 128  # of every latent and hidden layer
-    steps: int = 10  # of message passing, each with weights of its own
+    steps: int = 10  # of message passing, each with its own weights
 
 
 def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn.Sequential:
@@ -97,7 +97,8 @@ def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn
 
 
 class EdgeUpdate(nn.Module):
-    """MLP over [edge, its senders, its receivers], its first layer split so that each part is as cheap as it can be."""
+    """MLP over [edge, its senders, its receivers], with its first layer split so that each part is computed as cheaply
+    as possible."""
 
     def __init__(self, width: int, corners: int) -> None:
         super().__init__()
@@ -116,7 +117,7 @@ class EdgeUpdate(nn.Module):
 
 
 def _gathered(layer: nn.Linear, latent: Tensor, index: Tensor) -> Tensor:
-    """[E, width] of a layer on the latents of nodes `index` [E, corners]: each edge's, or first every node's once."""
+    """[E, width] a layer applied to the latents of nodes `index` [E, corners]: per edge, or first once per node."""
     if len(index) < len(latent):
         return layer(latent[index].flatten(1))
     parts = layer.weight.split(latent.shape[1], dim=1)
@@ -181,7 +182,7 @@ class GraphNetwork(nn.Module):
 
 
 class Normaliser(nn.Module):
-    """Standardises features by mean and deviation that are gathered before training and kept with the weights."""
+    """Standardises features by mean and deviation, which are gathered before training and stored with the weights."""
 
     total: Tensor
     sum: Tensor
@@ -204,7 +205,7 @@ class Normaliser(nn.Module):
         """Mean and deviation (at least 1e-6), float32 [size] each."""
         mean = self.sum / self.total.clamp_min(1)
         variance = (self.squares / self.total.clamp_min(1) - mean.square()).clamp_min(0.0)
-        # A feature that never varied (a constant coefficient) is only centred.
+        # A feature that never varied (such as a constant coefficient) is only centred.
         deviation = torch.where(variance > 1e-12, variance.sqrt(), torch.ones_like(variance))
         return mean.float(), deviation.float()
 

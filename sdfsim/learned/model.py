@@ -1,4 +1,4 @@
-"""A trained model: network, the units it was trained in, and the ranges it has seen; its file."""
+"""A trained model (network, units and ranges of its training data), and its file."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
 from sdfsim.physics.options import GRAVITY, LENGTH, STEP
 
-if TYPE_CHECKING:  # it takes its time to load
+if TYPE_CHECKING:  # slow to load
     from torch import nn
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # of any size of a network
-MODEL_VERSION = 3  # 2: networks without the contact solve; 1: of an earlier teacher
+MODEL_VERSION = 3  # 2: networks without the contact solve; 1: trained on data of an earlier version of the teacher
 SOLVER = "solver"
-LEARNED = ("gnn", "sdf-sim")  # bundled networks that go by learning alone, without the solve
+LEARNED = ("gnn", "sdf-sim")  # bundled networks that use learning alone, without the solve
 SURFACE = ("sdf-sim", "fignet", "fignet-star", "mgn", "dpi")  # networks whose messages run between surface nodes
 
 
@@ -30,23 +30,23 @@ class Model:
 
     name: str  # bundled name or file stem
     kind: str  # "solver", "impulse" or one of `SURFACE`
-    network: Any  # an `nn.Module` in evaluation mode; None for the solver, and where the weights are left aside
+    network: Any  # an `nn.Module` in evaluation mode; None for the solver, or if loaded without weights
     dt: float  # s, the step of the training data, or of the solver for bodies of `length` at `gravity`
     gravity: float  # m/s^2, its magnitude in the training data
-    # m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it. The solver is
-    # rescaled to the smallest body that moves.
+    # m, the middle of the range of training bodies' largest extents, to which other scenes are rescaled. For the
+    # solver, scenes are rescaled by their smallest dynamic body.
     length: float
     reach: float  # m, contact radius D
-    nodes: int | None = None  # surface nodes a body it was trained with; None for all
-    # inner steps of the solve in a step; 0 for those of the recording engine (5 where none has recorded)
+    nodes: int | None = None  # surface nodes per body in training; None for all
+    # inner steps of the solve in a step; 0: as in the engine that recorded the data (5 without one)
     inner: int = 0
-    # name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size)
+    # name -> [low, high] of the training data (friction, restitution, mass_ratio, speed, size)
     ranges: dict[str, list[float]] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)  # training record (data, steps, seconds, errors)
 
     def to(self, device: str) -> Model:
-        """The same model with its weights on `device`: this one, or a copy where they are elsewhere. The solver has
-        none."""
+        """The same model with its weights on `device`: this one, or a copy if they are elsewhere. The solver has no
+        weights."""
         if self.network is None:
             return self
         there, (kind, _, index) = {w.device for w in self.network.state_dict().values()}, device.partition(":")
@@ -55,7 +55,8 @@ class Model:
         return replace(self, network=deepcopy(self.network).to(device))
 
     def save(self, path: Path) -> None:
-        """Write a `.safetensors` file whose metadata holds all that is not weights (temporary name, then renamed)."""
+        """Write a `.safetensors` file whose metadata holds everything but the weights (temporary name, then
+        renamed)."""
         from safetensors.torch import save
 
         info = {
@@ -66,12 +67,12 @@ class Model:
         }
         weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
         with replacing(path) as partial:
-            # Bytes, not the library's own file: a full disk is then an OSError like any other.
+            # Written as bytes, not by the library: a full disk is then an OSError like any other.
             partial.write_bytes(save(weights, metadata={"sdfsim_model": json.dumps(info)}))
 
 
 def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
-    """An untrained network of `kind` ("impulse" or one of `SURFACE`). Raises KeyError for another."""
+    """An untrained network of `kind` ("impulse" or one of `SURFACE`). Raises KeyError for another kind."""
     if kind == "impulse":
         from sdfsim.learned.impulse import ImpulseConfig, ImpulseNetwork
 
@@ -88,18 +89,18 @@ def bundled_models() -> list[str]:
 
 
 def model_names() -> list[str]:
-    """What a model may be called: the solver, and the bundled networks."""
+    """Names of bundled models: the solver and the networks."""
     return [SOLVER, *bundled_models()]
 
 
 def sound_models() -> list[str]:
-    """The solver, and the bundled networks on top of it: what hard cases and studies run where no model is named."""
+    """The solver, and the bundled networks on top of it: the default of hard cases and studies."""
     return [name for name in model_names() if name not in LEARNED]
 
 
 def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:
     """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is None.
-    Raises SdfsimError for an unknown name, or an unreadable or foreign file."""
+    Raises SdfsimError for an unknown name, or a file that is unreadable or not a model."""
     from safetensors import SafetensorError, safe_open
 
     if name is None or name == SOLVER:
@@ -107,7 +108,8 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
     path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
     if not path.exists():
         raise SdfsimError(
-            f"model {str(name)!r} not found", f"there are {', '.join(model_names())}; or the path of a .safetensors"
+            f"model {str(name)!r} not found",
+            f"models are {', '.join(model_names())}; or give the path of a .safetensors",
         )
     try:
         with safe_open(path, framework="pt" if weights else "np") as file:
@@ -130,7 +132,7 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
 
 
 def _check_size(kind: str, config: dict[str, Any], found: dict[str, list[int]]) -> None:
-    """Raise ValueError if the weights of a file are not those of its network: before memory is taken for it."""
+    """Raise ValueError if the weights of a file do not fit its network, before memory is allocated for it."""
     if any(isinstance(value, int) and not 0 <= value <= MOST for value in config.values()):
         raise ValueError(f"sizes of its network must be 0 to {MOST} (got {config})")
     import torch
@@ -139,4 +141,4 @@ def _check_size(kind: str, config: dict[str, Any], found: dict[str, list[int]]) 
         wanted = {name: list(weight.shape) for name, weight in new_network(kind, config).state_dict().items()}
     if wanted != found:
         odd = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
-        raise ValueError(f"the weights are not those of its network: {odd[0]} and {len(odd) - 1} others")
+        raise ValueError(f"the weights do not fit its network: {odd[0]} and {len(odd) - 1} others")

@@ -1,9 +1,9 @@
 """Where surfaces of two bodies are near each other: SDF-Sim's edges, and pairs of nodes and of faces for the baselines.
 
-What counts is d - (closing speed) dt <= reach. A fixed threshold would let a fast body bounce inside one step without
-ever having had an edge. SDF-Sim asks the distances of other bodies at its nodes (`find_contacts`). For the baselines
-boxes around bodies and then around their nodes or faces are compared, then true distances are taken. An infinite plane
-has one node and one face, which lie wherever they are closest to the other's.
+Surfaces are near if d - (closing speed) dt <= reach. With a fixed threshold a fast body could bounce inside one step
+without ever having an edge. SDF-Sim evaluates the distances of other bodies at its nodes (`find_contacts`). For the
+baselines, boxes around bodies and then around their nodes or faces are compared, then true distances. An infinite plane
+has one node and one face, which lie wherever they are closest to the other part.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sdfsim.learned.surfaces import expanded, node_owner
 from sdfsim.learned.tensors import BodyTensors, StateTensors, state_arrays
 from sdfsim.physics.solver.prepare import Compiled, nodes_near
 
-PIERCING = 1e-9  # relative: areas and denominators below count as none
+PIERCING = 1e-9  # relative: smaller areas and denominators count as zero
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Contacts:
 
     owner: Tensor  # [E] int64, the body whose node it is
     node: Tensor  # [E] int64, index into `Bodies.node`
-    body: Tensor  # [E] int64, the body it meets
-    seen: Tensor  # [E, 3] float64, the node from the centre of mass of `body`
+    body: Tensor  # [E] int64, the body that it is near
+    seen: Tensor  # [E, 3] float64, the node relative to the centre of mass of `body`
     distance: Tensor  # [E] float64, signed distance of the node from `body`
     normal: Tensor  # [E, 3] float64, unit outward normal of `body` at the closest point
 
@@ -51,8 +51,8 @@ def no_contacts(device: torch.device) -> Contacts:
 def find_contacts(
     bodies: BodyTensors, state: StateTensors, gravity: np.ndarray, reach: float, dt: float, scene: Compiled | None
 ) -> Contacts:
-    """All contact edges of a state within `reach`, the contact radius D, under gravity [3], by the compiled `scene`;
-    all in model units."""
+    """All contact edges of a state within `reach` (the contact radius D) under gravity [3], found with the compiled
+    `scene`; all in model units."""
     assert scene is not None
     found = nodes_near(scene, state_arrays(state), gravity, reach, dt)
     index, value = (torch.from_numpy(array).to(bodies.device) for array in found)
@@ -61,7 +61,7 @@ def find_contacts(
 
 
 def where(state: StateTensors, bodies: BodyTensors, contacts: Contacts | Pairs) -> Tensor:
-    """[E, 3] where the nodes of contact edges are in a state, world."""
+    """[E, 3] positions of the nodes of contact edges in a state, world."""
     turned = pose.rotate(state.orientation[contacts.owner], bodies.node[contacts.node])
     return state.position[contacts.owner] + turned
 
@@ -70,7 +70,7 @@ def where(state: StateTensors, bodies: BodyTensors, contacts: Contacts | Pairs) 
 class Pairs:
     """E pairs of nodes (C = 1) or faces (C = 3) of two bodies, each pair once; model units, world frame."""
 
-    # owner, body: [E] int64, the bodies of the first and of the second; a plane is always a second
+    # owner, body: [E] int64, the bodies of the first and of the second part; a plane is always second
     owner: Tensor
     body: Tensor
     # first, second: [E, C] int64, indices into `Bodies.node`; corners of faces by distance to the closest point
@@ -100,7 +100,7 @@ class Pairs:
 
 
 def no_pairs(device: torch.device, corners: int) -> Pairs:
-    """None at all of nodes (one corner) or of faces (three)."""
+    """No pairs, of nodes (one corner) or of faces (three)."""
     nobody = torch.zeros(0, dtype=torch.int64, device=device)
     parts, way = nobody.reshape(0, 1).expand(-1, corners), torch.zeros(0, 3, dtype=torch.float64, device=device)
     arms = torch.zeros(0, corners, 3, dtype=torch.float64, device=device)
@@ -111,14 +111,14 @@ def near_pairs(
     bodies: BodyTensors, state: StateTensors, gravity: np.ndarray, reach: float, dt: float,
     scene: Compiled | None = None, *, faces: bool,
 ) -> Pairs:  # fmt: skip
-    """All pairs of nodes, or of `faces`, of different bodies within `reach` (model length) during a step, as
-    `find_contacts` has it."""
+    """All pairs of nodes, or of `faces`, of different bodies within `reach` (model length) during a step, in the sense
+    of `find_contacts`."""
     part = bodies.face if faces else torch.arange(len(bodies.node), device=bodies.device)[:, None]
     owner = node_owner(bodies)
     fall = torch.from_numpy(gravity * dt).to(bodies.device)
     velocity = state.velocity + fall * bodies.moves[:, None]
     arm = pose.rotate(state.orientation[owner], bodies.node)
-    # Differences of places alone matter; about the mean they keep their precision far from the origin.
+    # Only differences of positions matter; relative to the mean they keep their precision far from the origin.
     place = (state.position - state.position[bodies.moves].mean(0))[owner] + arm if bodies.moves.any() else arm
     speed = velocity[owner] + torch.linalg.cross(state.angular_velocity[owner], arm)
     first, second = _near(bodies, part, owner, place, speed.norm(dim=-1) * dt + 0.5 * reach)
@@ -141,7 +141,7 @@ def near_pairs(
     on_second = torch.where(endless[:, None], on_first - below[:, None] * up, on_second)
     way = on_second - on_first
     distance = torch.where(endless, below, way.norm(dim=-1))
-    # Where surfaces cross, the distance is 0 and the direction is 0: these pairs are near at any speed.
+    # Where surfaces cross, distance and direction are 0: these pairs are near at any speed.
     along = torch.where(endless[:, None], -up, way / distance.abs().clamp_min(1e-12)[:, None])
     approach = _speed_at(bodies, state, velocity, owner[a[:, 0]], on_first - _centre(place, arm, a))
     approach = approach - _speed_at(bodies, state, velocity, owner[b[:, 0]], on_second - _centre(place, arm, b))
@@ -171,7 +171,7 @@ def _speed_at(bodies: BodyTensors, state: StateTensors, velocity: Tensor, body: 
 
 
 def _by_distance(part: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Corners [E, C] and their offsets [E, C, 3], the nearest first: their order in the mesh says nothing."""
+    """Corners [E, C] and their offsets [E, C, 3], the nearest first: their order in the mesh has no meaning."""
     order = offset.square().sum(-1).argsort(dim=1, stable=True)
     return part.gather(1, order), offset.gather(1, order[..., None].expand_as(offset))
 
@@ -189,7 +189,10 @@ def _near(bodies: BodyTensors, part: Tensor, owner: Tensor, place: Tensor, margi
     low, high = place[part].amin(1) - wide, place[part].amax(1) + wide
     start = torch.searchsorted(of_part, torch.arange(len(bodies) + 1, device=of_part.device))
     endless = ~bodies.size.isfinite()
-    low[endless[of_part]], high[endless[of_part]] = -torch.inf, torch.inf  # each is compared by its height alone
+    low[endless[of_part]], high[endless[of_part]] = (
+        -torch.inf,
+        torch.inf,
+    )  # planes are compared by height only
     index = of_part[:, None].expand_as(low)
     empty = torch.full((len(bodies), 3), torch.inf, dtype=low.dtype, device=low.device)
     lowest, highest = empty.scatter_reduce(0, index, low, "amin"), (-empty).scatter_reduce(0, index, high, "amax")
@@ -197,7 +200,7 @@ def _near(bodies: BodyTensors, part: Tensor, owner: Tensor, place: Tensor, margi
     one, other = torch.where(endless[one], other, one), torch.where(endless[one], one, other)
     meet = ((lowest[one] <= highest[other]) & (highest[one] >= lowest[other])).all(-1) & bodies.may_meet(one, other)
     one, other = one[meet], other[meet]
-    # Of each body the parts in the box of the other; then all pairs of these.
+    # The parts of each body in the box of the other; then all pairs of these.
     pair, first = _inside(start, one, low, high, lowest[other], highest[other])
     number, second = _inside(start, other, low, high, lowest[one], highest[one])
     begins = torch.searchsorted(number, torch.arange(len(one) + 1, device=number.device))
@@ -210,23 +213,23 @@ def _near(bodies: BodyTensors, part: Tensor, owner: Tensor, place: Tensor, margi
 def _inside(
     start: Tensor, body: Tensor, low: Tensor, high: Tensor, lowest: Tensor, highest: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """For bodies [P] and boxes [P, 3], which parts of each overlap its box: the number of the pair and the part."""
+    """For bodies [P] and boxes [P, 3] each, the parts that overlap the box: the number of the pair, and the part."""
     pair, part = expanded(start[body], start[body + 1])
     inside = ((low[part] <= highest[pair]) & (high[part] >= lowest[pair])).all(-1)
     return pair[inside], part[inside]
 
 
 def closest_points(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """Closest points [E, 3] on either of pairs of triangles, [E, 3, 3] float64 with corners in rows.
+    """Closest points [E, 3] on both triangles of pairs, [E, 3, 3] float64 with corners in rows.
 
-    They are a corner and a point inside the other triangle, or points on two sides; where the triangles cross, a point
-    that a side of one has in common with the other.
+    They are a corner and a point inside the other triangle, or points on two sides; if the triangles cross, a point
+    where a side of one meets the other.
     """
     side_one, side_other = one.roll(-1, 1) - one, other.roll(-1, 1) - other
     firsts, seconds, distances = [], [], []
 
     def add(first: Tensor, second: Tensor, known: Tensor | None = None) -> None:
-        """Candidates [E, K, 3]; those that are not `known` [E, K] do not count."""
+        """Add candidates [E, K, 3]; those that are not `known` [E, K] do not count."""
         far = (first - second).norm(dim=-1)
         firsts.append(first)
         seconds.append(second)
@@ -254,7 +257,7 @@ def _feet(corner: Tensor, triangle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _within(point: Tensor, triangle: Tensor) -> Tensor:
-    """[E, K] whether points [E, K, 3] of a triangle's plane are inside it; none where it has no area."""
+    """[E, K] whether points [E, K, 3] of a triangle's plane are inside it; none if it has no area."""
     u, v = (triangle[:, k] - triangle[:, 0] for k in (1, 2))
     w = point - triangle[:, :1]
     uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)

@@ -1,5 +1,5 @@
-"""Rotations as unit quaternions (xyzw) in torch, for networks: batched over leading dimensions, in the dtype they are
-given. `sdfsim.physics.pose` is the same in NumPy."""
+"""Rotations as unit quaternions (xyzw) in torch, for networks: batched over leading dimensions, in the dtype of the
+input. `sdfsim.physics.pose` is the same in NumPy."""
 
 import torch
 from torch import Tensor
@@ -49,7 +49,7 @@ def from_rotvec(r: Tensor) -> Tensor:
 
 
 def to_rotvec(q: Tensor) -> Tensor:
-    """Rotation vectors [..., 3] rad, of at most half a turn, of unit quaternions [..., 4]."""
+    """Rotation vectors [..., 3] rad, at most half a turn, of unit quaternions [..., 4]."""
     q = torch.where(q[..., 3:] < 0, -q, q)
     s = q[..., :3].norm(dim=-1, keepdim=True)
     angle = 2.0 * torch.atan2(s, q[..., 3:])

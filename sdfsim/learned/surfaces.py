@@ -1,6 +1,7 @@
-"""What all networks on surface nodes share: features of nodes and of edges within bodies, targets, the step to poses.
+"""The parts that all networks on surface nodes share: features of nodes and of edges within bodies, targets, and the
+step to new poses.
 
-A network gives every surface node an acceleration; shape matching turns those of a body into its next pose.
+A network predicts an acceleration for every surface node; shape matching turns those of a body into its next pose.
 """
 
 from dataclasses import fields, replace
@@ -19,8 +20,8 @@ NODES = {"body": NODE, "node": NODE}
 STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
 MESH = EdgeKind("node", "node", INTRA)
 TARGET = Features(3, (0,))  # of accelerations
-# Weight of staying at `start`, over the nodes' spread. Far below what any extent beyond rounding weighs, it decides
-# only about turns that the nodes leave open.
+# Weight of staying at `start`, relative to the nodes' spread. It is far below the weight of any extent beyond rounding,
+# so it decides only about rotations that the nodes do not define.
 STAY = 1e-12
 _NOT_PER_BODY = ("node", "node_start", "face", "allowed")
 
@@ -34,8 +35,8 @@ def node_owner(bodies: BodyTensors) -> Tensor:
 def compact(
     bodies: BodyTensors, state: StateTensors, contacts: Any, rows: Tensor
 ) -> tuple[BodyTensors, StateTensors, Any]:
-    """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts
-    (`Contacts` or `Pairs`), which are among them."""
+    """Only the bodies `rows` [A], in ascending order, with their states and all contacts (`Contacts` or `Pairs`), which
+    must be among them."""
     if len(rows) == len(bodies):
         return bodies, state, contacts
     owner, node = expanded(bodies.node_start[rows], bodies.node_start[rows + 1])
@@ -59,7 +60,7 @@ def compact(
 
 
 def _numbers(kept: Tensor, count: int) -> Tensor:
-    """[count] int64, the place of each of `count` things among the `kept` ones; -1 for the others."""
+    """[count] int64, the index of each of `count` entries among the `kept` ones; -1 for the others."""
     number = torch.full((count,), -1, dtype=torch.int64, device=kept.device)
     number[kept] = torch.arange(len(kept), device=kept.device)
     return number
@@ -76,8 +77,8 @@ def expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
 def motion_features(bodies: BodyTensors, state: StateTensors) -> dict[str, Tensor]:
     """Features of body nodes [N, 13] and surface nodes [M, 13], the same for every network.
 
-    Displacement over each of the last two steps, displacement of the body's centre over the last, inverse mass,
-    friction, restitution, and whether the body is static. Displacements are differences of poses in float64, never of
+    Displacement over each of the last two steps, displacement of the body's centre over the last step, inverse mass,
+    friction, restitution, and whether the body is static. Displacements are differences of float64 poses, never of
     large float32 positions.
     """
     earlier_position, earlier_orientation = _history(state)
@@ -98,7 +99,8 @@ def motion_features(bodies: BodyTensors, state: StateTensors) -> dict[str, Tenso
 
 
 def star(bodies: BodyTensors, state: StateTensors) -> dict[str, EdgeSet]:
-    """Edges between the surface nodes and their body's node, up and down: the node from the centre, now and at rest."""
+    """Edges between the surface nodes and their body's node, up and down: the node relative to the centre, now and at
+    rest."""
     owner = node_owner(bodies)
     features = _now_and_at_rest(_arms(bodies, state), bodies.node)
     node, body = torch.arange(len(owner), device=owner.device)[:, None], owner[:, None]
@@ -106,11 +108,12 @@ def star(bodies: BodyTensors, state: StateTensors) -> dict[str, EdgeSet]:
 
 
 def mesh_edges(bodies: BodyTensors, state: StateTensors) -> EdgeSet:
-    """Edges along the sides of the mesh's faces, each once a direction: sender from receiver, now and at rest."""
+    """Edges along the sides of the mesh's faces, once in each direction: sender relative to receiver, now and at
+    rest."""
     sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
-    sides = sides[sides[:, 0] != sides[:, 1]]  # those of the plane's one node
+    sides = sides[sides[:, 0] != sides[:, 1]]  # drops those of the plane's one node
     count = len(bodies.node)
-    # `unique` takes 50 times as long for rows as for numbers.
+    # `unique` is 50 times slower for rows than for numbers.
     key = torch.unique(torch.cat([sides, sides.flip(1)]) @ sides.new_tensor([count, 1]))
     sender, receiver = key // count, key % count
     arm = _arms(bodies, state)
@@ -119,21 +122,21 @@ def mesh_edges(bodies: BodyTensors, state: StateTensors) -> EdgeSet:
 
 
 def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
-    """[E, 8] float32: a vector [E, 3] as it is in the world and as it is in the body's axes, and its lengths."""
+    """[E, 8] float32: a vector [E, 3] in world axes and the one at rest in body axes, each with its length."""
     return torch.cat([now, now.norm(dim=-1, keepdim=True), rest, rest.norm(dim=-1, keepdim=True)], -1).float()
 
 
 def _arms(bodies: BodyTensors, state: StateTensors) -> Tensor:
-    """[M, 3] nodes from their body's centre of mass, world axes."""
+    """[M, 3] nodes relative to their body's centre of mass, world axes."""
     return pose.apply(pose.to_matrix(state.orientation)[node_owner(bodies)], bodies.node)
 
 
 def advance(bodies: BodyTensors, state: StateTensors, acceleration: Tensor, dt: float) -> StateTensors:
-    """The next state when every node of a body accelerates by `acceleration` [M, 3] (displacement a step, twice)."""
+    """The next state if every node of a body accelerates by `acceleration` [M, 3] (change of displacement per step)."""
     earlier_position, earlier_orientation = _history(state)
     owner = node_owner(bodies)
     now, before = pose.to_matrix(state.orientation), pose.to_matrix(earlier_orientation[1])
-    # Relative to each body's own centre, so that a far origin costs no precision.
+    # Relative to each body's own centre, so that precision does not suffer far from the origin.
     step = (state.position - earlier_position[1])[owner] + pose.apply((now - before)[owner], bodies.node)
     moved = pose.apply(now[owner], bodies.node) + step + acceleration
     offset, orientation = match_shapes(bodies.node, moved, owner, state.orientation)
@@ -178,10 +181,10 @@ def match_shapes(rest: Tensor, moved: Tensor, owner: Tensor, start: Tensor) -> t
     on the same side as `start`; NaN for a body with a node that is not finite.
 
     Nodes were at `rest` [M, 3] about each body's centre of mass, body axes; the network `moved` them, [M, 3] world.
-    Turns that the nodes leave open (about a line of them, any of a single one) stay as in `start` [N, 4].
+    Rotations that the nodes do not define (about a line of nodes, or any for a single node) stay as in `start` [N, 4].
 
-    Of all rotations q the one with the largest sum of moved . (q rest) is the main eigenvector of a symmetric matrix of
-    four rows (Horn, 1987). So it is a rotation whatever the nodes are: flat, mirrored by noise, all in one place.
+    The rotation q with the largest sum of moved . (q rest) is the main eigenvector of a symmetric 4 x 4 matrix (Horn,
+    1987). So the result is always a rotation, even for nodes that are flat, mirrored by noise, or all in one place.
     """
     bodies = len(start)
 
@@ -202,7 +205,7 @@ def _main_turn(spread: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
     """Quaternion [N, 4] and matrix [N, 3, 3] of the rotation nearest to `spread` [N, 3, 3] (moved times rest)."""
     a, before = spread.double(), start.double()
     known = a.isfinite().all(-1).all(-1)
-    a = torch.where(known[:, None, None], a, 0.0)  # the decomposition of a NaN is an exception, for all bodies at once
+    a = torch.where(known[:, None, None], a, 0.0)  # decomposing a NaN would raise an exception for all bodies
     a = a / a.norm(dim=(-2, -1), keepdim=True).clamp_min(torch.finfo(a.dtype).tiny)
     trace = a.diagonal(dim1=-2, dim2=-1).sum(-1)
     curl = torch.stack([a[:, 2, 1] - a[:, 1, 2], a[:, 0, 2] - a[:, 2, 0], a[:, 1, 0] - a[:, 0, 1]], -1)

@@ -12,7 +12,7 @@ from sdfsim.physics.motion import Motion
 
 @dataclass(frozen=True)
 class BodyTensors:
-    """What such a network asks of N bodies with M surface nodes: fields of `Bodies`."""
+    """The fields of `Bodies` that such a network needs, for N bodies with M surface nodes."""
 
     inverse_mass: Tensor  # [N] float64
     friction: Tensor  # [N] float64
@@ -42,7 +42,7 @@ class BodyTensors:
 
 @dataclass(frozen=True)
 class StateTensors:
-    """Where N bodies are and how they move, float64; see `State`."""
+    """Poses and velocities of N bodies, float64; see `State`."""
 
     position: Tensor  # [N, 3]
     orientation: Tensor  # [N, 4]

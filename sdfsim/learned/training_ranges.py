@@ -1,4 +1,4 @@
-"""Where scenes leave what a model has seen in training: its predictions are then extrapolation, and are flagged."""
+"""Finds where scenes are outside a model's training data: its predictions are then extrapolation, and are flagged."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -16,16 +16,16 @@ LABELS = {
     "friction": "friction of two bodies, multiplied",
     "restitution": "restitution of two bodies, multiplied",
 }
-# Deepest start of one body in another in the training data, over its largest side.
+# Deepest overlap at a start in the training data, relative to the body's largest side.
 DEEPEST = 0.16
-SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
+SLACK = 0.05  # relative: for rounding, and for fits that extend slightly beyond the solid
 
 
 def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> list[str]:
-    """One line for every quantity of `scenes` that lies outside the ranges of `model`; empty when it knows them all.
+    """One line for every quantity of `scenes` that is outside the ranges of `model`; empty if there are none.
 
-    Sizes and speeds are compared in model units, so that a small or slow scene is not by itself unknown. Scenery is
-    not compared in size: what matters of it is the surface near a contact.
+    Sizes and speeds are compared in model units, so a small or slow scene is not outside because of that. Sizes of
+    static bodies are not compared: only their surface near a contact matters.
     """
     if not model.ranges:
         return []
@@ -33,7 +33,7 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
     si = {"size": units.length, "speed": units.velocity}
     lines = []
     if any(b.motion == "kinematic" for scene in scenes for b in scene.bodies):
-        lines.append(f"bodies on a path: {model.name} has seen none in training")
+        lines.append(f"bodies on a path: {model.name} was not trained with any")
     for name, label in LABELS.items():
         values = [value for some in found for value in some.get(name, [])]
         if not values or name not in model.ranges:
@@ -50,7 +50,7 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
 
 
 def _values(scene: Scene, units: Units) -> dict[str, list[float]]:
-    """The values of each quantity of `LABELS` in a scene; none where no body is dynamic."""
+    """The values of each quantity of `LABELS` in a scene; none if no body is dynamic."""
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     if not moving:
         return {}
@@ -64,30 +64,30 @@ def _values(scene: Scene, units: Units) -> dict[str, list[float]]:
 
 
 def constant_in_training(model: Model) -> list[str]:
-    """The quantities that never varied in training: the model cannot know what they change."""
+    """The quantities that never varied in training: the model has not learned their effect."""
     return [name for name, (low, high) in model.ranges.items() if high - low <= 1e-9]
 
 
 def _products(scene: Scene, name: str) -> list[float]:
-    """Products of a coefficient of pairs with a dynamic body, the smallest and the largest of all such among them."""
+    """Products of a coefficient for pairs with a dynamic body, including the smallest and the largest of all."""
     moving, others = (
         sorted(getattr(b, name) for b in scene.bodies if (b.motion == "dynamic") == moves) for moves in (True, False)
     )
-    # A product is extreme where both of its factors are, and two dynamic bodies cannot both be the same one.
+    # A product is extreme if both of its factors are; the two dynamic bodies of a pair must be different.
     ends = moving[:2] + moving[2:][-2:]
     return [a * b for a, b in combinations(ends, 2)] + [a * b for a in ends for b in (*others[:1], *others[-1:])]
 
 
 def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
-    """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
-    Bodies have `names` [N]; a model unit is `metres` m."""
-    from sdfsim.physics.solver.prepare import Compiled, nodes_near  # numba takes its time to load
+    """A line if pairs overlap deeper than any in the models' training data; else empty. Bodies have `names` [N]; a
+    model unit is `metres` m."""
+    from sdfsim.physics.solver.prepare import Compiled, nodes_near  # numba is slow to load
 
     index, value = nodes_near(Compiled(bodies, state), state, np.zeros(3), reach=0.0, dt=0.0)
     if not len(index):
         return []
     owners, _, others = index.T
-    # Of the two the smaller one that moves is what the way out is long or short for.
+    # Relative to the smaller dynamic body of the two, which is the one to be pushed out.
     size = np.where(bodies.moves, bodies.size, np.inf)
     part = -value[:, 0] / np.minimum(size[owners], size[others])
     deep = part > DEEPEST
@@ -97,7 +97,7 @@ def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: floa
     worst = int(part.argmax())
     owner, body = names[owners[worst]], names[others[worst]]
     return [
-        f"pairs that start inside one another: {pairs} here, {owner!r} in {body!r} by "
+        f"pairs that overlap at the start: {pairs} here, {owner!r} in {body!r} by "
         f"{-float(value[worst, 0]) * metres:.3g} m, {float(part[worst]):.0%} of a body's size; "
         f"trained on up to {DEEPEST:.0%}"
     ]

@@ -86,7 +86,7 @@ def test_starts_inside_one_another_are_flagged_from_a_sixth_of_the_size_on(dropp
 
     assert lines(0.3, 1.0) == lines(0.15, 0.86) == lines(0.15, 0.86, 0.1) == []
     (line,) = lines(0.1, 0.8, 0.1)
-    assert line.startswith("pairs that start inside one another: 2 here") and "20%" in line and "0.02 m" in line
+    assert line.startswith("pairs that overlap at the start: 2 here") and "20%" in line and "0.02 m" in line
     (line,) = lines(-5.0, 1.0)
     assert "1 here, 'low' in 'floor' by 5.3 m, 530% of a body's size; trained on up to 16%" in line
     apart = replace(
