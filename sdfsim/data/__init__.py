@@ -1,1 +1,1 @@
-"""Recorded motion: the teacher, its scenarios, the dataset format, and what is read off recordings."""
+"""Recorded motion: the teacher (PyBullet), its scenarios, the dataset format, and simulations from recordings."""

@@ -1,4 +1,4 @@
-"""Many trajectories at once: as one set of bodies, and simulated again by a model."""
+"""Many trajectories at once: as one set of bodies, and as simulations by a model."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ def merged(
     floor: tuple[float, float] = FLOOR,
     plane: Shape = PLANE,
 ) -> tuple[Bodies, State]:
-    """Bodies of all trajectories, each at its frame of [W], then one floor they share; worlds do not touch each other.
+    """Bodies of all trajectories, each at its frame in `frames` [W], then one floor that they share; worlds do not
+    touch each other.
 
-    Masses and inertias are relative to the mean mass of the bodies that move in the trajectory, as in `Simulator`:
+    Masses and inertias are relative to the mean mass of the dynamic bodies of the trajectory, as in `Simulator`:
     inverse masses are inputs of networks on surface nodes. `units` must have a mass of 1.
     """
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
@@ -54,7 +55,8 @@ def scene_of(
     floor: tuple[float, float] = FLOOR,
     plane: Shape = PLANE,
 ) -> tuple[Scene, list[int]]:
-    """One scene of all trajectories, each at its frame, and the world of each of its bodies (-1, the floor: in all)."""
+    """One scene with all trajectories, each at its frame, and the world of each of its bodies (-1: the floor, which is
+    in all)."""
     names = sorted({str(n) for t in trajectories for n in t.shape})
     about = [centred(shapes[n]) for n in names]
     bodies, world = [], []
@@ -83,8 +85,8 @@ def scene_of(
 
 
 def centred(shape: Shape) -> Shape:
-    """The shape with its centre of mass at the origin, as trajectories need it, and with the contact geometry that it
-    has: contacts know nothing of centres of mass."""
+    """The shape with its centre of mass at the origin, as trajectories need it. It keeps its contact geometry, which
+    does not depend on the centre of mass."""
     if not shape.com.any():
         return shape
     other = replace(shape, com=np.zeros(3))
@@ -111,15 +113,15 @@ def roll_out(
     as_teacher: bool = False,
     floor: tuple[float, float] = FLOOR,
 ) -> list[Trajectory]:
-    """Simulate a batch of trajectories that share step and gravity from their first frames. Returns the predicted
-    motions, steps + 1 frames.
+    """Simulate a batch of trajectories with the same step and gravity from their first frames. Returns the predicted
+    motions, of steps + 1 frames.
 
-    The solve makes `substeps` inner steps in a recorded one. With `as_teacher` it has three habits of the teacher:
+    The solve makes `substeps` inner steps in a recorded one. With `as_teacher` it does three things as PyBullet does:
     bodies are larger by `MARGIN` than their shapes, the push out of an overlap adds to the speed of a rebound, and
     friction is bounded along two axes. "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit
     code 3) for a state that is not finite.
     """
-    from sdfsim.physics.solver.prepare import SharedShapes  # numba takes its time to load
+    from sdfsim.physics.solver.prepare import SharedShapes  # numba is slow to load
 
     stepper = stepper_of(model, contact=contact, free_flight=free_flight)
     units = model_units(stepper, group[0])
@@ -142,7 +144,7 @@ def _rolled(
     group: list[Trajectory], shapes: dict[str, Shape], plane: Shape, units: Units, stepper: Stepper, options: Options,
     steps: int, floor: tuple[float, float], shared: SharedShapes,
 ) -> list[Trajectory]:  # fmt: skip
-    """The predicted motion of trajectories that are simulated side by side."""
+    """The predicted motions of trajectories that are simulated side by side."""
     bodies, start = merged(group, [0] * len(group), shapes, units, floor, plane)
     start = stepper.began(start, bodies, options)
     _, carry = stepper.advance(start, stepper.init(bodies, start, options, shared), steps, keep=True)
@@ -178,7 +180,7 @@ def every(trajectory: Trajectory, stride: int) -> Trajectory:
 
 
 def model_units(stepper: Stepper, like: Trajectory) -> Units:
-    """Model units in which the recorded step is the model's own; of models without a step, units of a metre."""
+    """Model units in which the recorded step is the model's own step; for models without a step, units of a metre."""
     model = stepper.model
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
     if not stepper.on_surfaces:

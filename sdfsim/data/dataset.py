@@ -1,7 +1,7 @@
-"""The dataset format: one `.npz` a trajectory, `shapes/` with a Shape folder a name, and `dataset.json`.
+"""The dataset format: one `.npz` per trajectory, `shapes/` with one Shape folder per name, and `dataset.json`.
 
-A file holds the velocities that its recording engine gave. A trajectory that is loaded has those at the instants of its
-positions, which is what every simulation starts from: see `at_instants`.
+A file holds the velocities of the engine that recorded it. A loaded trajectory has velocities at the instants of its
+positions, from which simulations start: see `at_instants`.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
 LONGEST_STEP = 10.0  # s, between recorded frames
 LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
-EXACTLY = 1e-3  # of what gravity adds in a step: in free flight velocities differ by less from that
+EXACTLY = 1e-3  # relative to the change of velocity by gravity in a step: largest deviation in free flight
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
-IN_FILE = {"orientation": "quat_xyzw"}  # names of arrays that differ there
+IN_FILE = {"orientation": "quat_xyzw"}  # names of arrays that differ in files
 _AXES = {  # T frames, N bodies
     "position": ("T", "N", 3), "quat_xyzw": ("T", "N", 4), "velocity": ("T", "N", 3), "angular_velocity": ("T", "N", 3),
     "shape": ("N",), "scale": ("N",), "mass": ("N",), "inertia": ("N", 3), "friction": ("N",), "restitution": ("N",),
@@ -54,15 +54,15 @@ class Trajectory(Motion):
     gravity: np.ndarray  # [3] m/s^2
 
     def save(self, path: Path) -> None:
-        """Write the file. Its velocities must be those that the engine recorded."""
+        """Write the file. The velocities must be those that the engine recorded."""
         arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
         write_arrays(path, {IN_FILE.get(name, name): array for name, array in arrays.items()})
 
     @classmethod
     def load(cls, path: Path, *, as_recorded: bool = False) -> Trajectory:
-        """Read and check one file. The `dataset.json` beside it, or in the folder above, has the engine's inner step;
-        `as_recorded` keeps the velocities of the engine, from which the same engine continues.
-        Raises SdfsimError with the file and the field that is wrong."""
+        """Read and check one file. The `dataset.json` beside it, or in the folder above, gives the engine's inner step.
+        `as_recorded` keeps the velocities of the engine, from which the same engine continues. Raises SdfsimError with
+        the file and the field that is wrong."""
         found = _checked(path, read_arrays(path, "a trajectory"))
         recorded = cls(**{name: found.pop(IN_FILE[name]) for name in IN_FILE}, **found)
         return recorded if as_recorded else at_instants(recorded, engine_substep(path.parent))
@@ -72,8 +72,9 @@ def at_instants(recorded: Trajectory, substep: float) -> Trajectory:
     """The trajectory with velocities at the instants of its positions.
 
     The recording engine's position step already uses the new velocity (symplectic Euler). Its flights are exact
-    parabolas, but of bodies that are half an inner step `substep` s of gravity faster than recorded. Bodies that fly
-    before or after an instant get the velocity of their parabola; bodies that lie or slide keep the recorded one.
+    parabolas, but for velocities that are further by half an inner step (`substep` s) of gravity than the recorded
+    ones. Bodies that fly before or after an instant get the velocity of their parabola; bodies that lie or slide keep
+    the recorded one.
     """
     added = np.diff(recorded.velocity, axis=0) - recorded.gravity * recorded.dt
     flies = np.linalg.norm(added, axis=-1) < EXACTLY * np.linalg.norm(recorded.gravity) * recorded.dt
@@ -85,8 +86,8 @@ def at_instants(recorded: Trajectory, substep: float) -> Trajectory:
 
 
 def engine_substep(data: Path) -> float:
-    """The recording engine's inner step in s, where the dataset (a folder or one of its splits) has it; 0 elsewhere.
-    Raises SdfsimError if the `dataset.json` holds something else there."""
+    """The recording engine's inner step in s, from the `dataset.json` of a dataset folder or one of its splits; 0 if it
+    is not given. Raises SdfsimError if it is invalid."""
     home = home_of(data)
     settings = (read_info(home).get("engine_settings") or {}) if home else {}
     found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
@@ -132,7 +133,7 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def check_names(where: str, names: Iterable[str]) -> None:
-    """Raises SdfsimError if one of the names cannot be that of a Shape folder of a dataset."""
+    """Raises SdfsimError if one of the names is not valid for a Shape folder of a dataset."""
     for name in names:
         if not _NAME.fullmatch(name):
             raise SdfsimError(f"{where}: {name!r} cannot name a Shape folder", "use letters, digits, spaces, . _ -")
@@ -145,8 +146,8 @@ def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
 
 
 def read_info(folder: Path) -> dict:
-    """`dataset.json` of a dataset folder. Raises SdfsimError if it is absent, no JSON object, or of `sdfsim dataset`
-    with another version of the teacher."""
+    """`dataset.json` of a dataset folder. Raises SdfsimError if it is absent, not a JSON object, or made by `sdfsim
+    dataset` with another version of the teacher."""
     info = read_json(folder / INFO, "a dataset folder is what `sdfsim dataset` writes")
     if not isinstance(info, dict):
         raise SdfsimError(f"{folder / INFO}: must be a JSON object")
@@ -166,9 +167,9 @@ def home_of(data: Path) -> Path | None:
 class Conditions:
     """How a dataset was recorded, by its `dataset.json`."""
 
-    floor: tuple[float, float]  # its friction and restitution
-    floor_given: bool  # whether a dataset.json has these; else they are those of the recipes' floor
-    by_teacher: bool  # whether a dataset.json names PyBullet as the teacher has it set
+    floor: tuple[float, float]  # the floor's friction and restitution
+    floor_given: bool  # whether a dataset.json gives these; else they are those of the recipes' floor
+    by_teacher: bool  # whether a dataset.json names PyBullet with the teacher's settings
 
 
 def conditions_of(data: Path) -> Conditions:
@@ -181,8 +182,8 @@ def conditions_of(data: Path) -> Conditions:
 
 
 def floor_of(info: dict, folder: Path = Path()) -> tuple[float, float]:
-    """Friction and restitution of the floor in the `dataset.json` of a folder, or the recipes' own where it has none.
-    Raises SdfsimError if either is missing, negative or no number, or the restitution is above 1."""
+    """Friction and restitution of the floor in the `dataset.json` of a folder, or of the recipes' floor if it has none.
+    Raises SdfsimError if either is missing, negative or not a number, or if the restitution is above 1."""
     floor = info.get("floor")
     if floor is None:
         return FLOOR
@@ -198,8 +199,8 @@ def ranges_of(
     size: np.ndarray, speed: np.ndarray, mass_ratio: np.ndarray, friction: np.ndarray, restitution: np.ndarray,
     floor: np.ndarray,
 ) -> dict[str, list[float]]:  # fmt: skip
-    """[low, high] of what a model has seen, SI units: sizes and speeds of the bodies that move, mass ratios within a
-    scene, and the products of two bodies' coefficients, or of a body's and those of its `floor` [F, 2]."""
+    """[low, high] of training data, SI units: sizes and speeds of dynamic bodies, mass ratios within a scene, and the
+    products of two bodies' coefficients, or of a body's with those of a `floor` [F, 2]."""
 
     def products(values: np.ndarray, floors: np.ndarray) -> list[float]:
         low, high = float(values.min()), float(values.max())
@@ -215,8 +216,8 @@ def ranges_of(
 
 
 def trajectory_files(folder: Path, split: str) -> list[Path]:
-    """Trajectory files of a dataset in name order: of `folder/split/`, or of `folder` where nothing is split. Raises
-    SdfsimError if there are none, or other splits but not this one."""
+    """Trajectory files of a dataset in name order: in `folder/split/`, or in `folder` if it has no splits. Raises
+    SdfsimError if there are none, or if the folder has other splits but not this one."""
     split_up = [name for name in SPLITS if (folder / name).is_dir()]
     if split_up and split not in split_up:
         raise SdfsimError(f"{folder}: no {split} split here, only {', '.join(split_up)}")
@@ -228,12 +229,12 @@ def trajectory_files(folder: Path, split: str) -> list[Path]:
 
 
 def shapes_folder(folder: Path) -> Path:
-    """Where the Shape folders of a dataset are: its own `shapes/`, or its parent's for a split folder."""
+    """The folder of a dataset's Shape folders: its own `shapes/`, or its parent's for a split folder."""
     return folder / "shapes" if (folder / "shapes").is_dir() else folder.parent / "shapes"
 
 
 def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
-    # Imported here: training from cached contact frames runs where only torch and numpy are installed.
+    # Imported here, because training from cached contact frames also runs if only torch and numpy are installed.
     from sdfsim.shape.shape import load_shape
 
     return {name: load_shape(shapes_folder(folder) / name) for name in sorted(names)}

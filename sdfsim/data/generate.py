@@ -1,4 +1,4 @@
-"""Datasets made by the teacher: shapes, then trajectories on all cores."""
+"""Makes datasets with the teacher (PyBullet): first shapes, then trajectories on all cores."""
 
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare
 
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
 STEPS = 100
-REDRAWS = 1000  # of a scene in which a body found no room
+REDRAWS = 1000  # redraws of a scene in which there was no room for a body
 
 
 def make_dataset(
@@ -34,14 +34,15 @@ def make_dataset(
 ) -> dict:
     """Write `trajectories` files under `out/SPLIT/` and the Shape folders under `out/shapes/`; returns a report.
 
-    Files that exist are kept, so that an interrupted run continues. With the same shapes, trajectory k of a split
-    depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
-    (see `split_of`), so that those of validation and test are never trained on.
+    Existing files are kept, so that an interrupted run continues. With the same shapes, trajectory k of a split depends
+    only on (seed, split, k). Every recipe except movi-b draws the bodies of a split from that split's shapes (see
+    `split_of`), so that shapes of validation and test are never trained on.
 
-    Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; `random_solids`
-    of PyBullet are added. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
-    `RATES`. Raises SdfsimError for an option that the recipe does not take, no usable shapes or none to be fetched,
-    PyBullet absent, another dataset in `out`, or another run writing to it.
+    `shapes` is a folder (see `origins`; movi-b takes NAME/ folders only) or the name of a public set; `random_solids`
+    of PyBullet are added. `bodies` is the number of moving bodies, in place of the recipe's range (bowl and pile);
+    `fps` is one of `RATES`. Raises SdfsimError if the recipe does not take an option, if there are no usable shapes or
+    they cannot be fetched, if PyBullet is not installed, or if `out` holds another dataset or another run is writing to
+    it.
     """
     plan = RECIPES[recipe]
     engine = import_pybullet()
@@ -60,7 +61,7 @@ def make_dataset(
     if plan.counted:
         info["bodies"] = bodies
     with locked(out):
-        # Before anything is written: engine files of another dataset's shapes must stay what they are.
+        # Before anything is written: engine files of another dataset's shapes must not change.
         _check_same(out, info)
         found, left_out = prepare(given, out / "shapes" / "engine", lambda f, m: on_progress(0.1 * f, m))
         info["shapes"] = [source.name for source in found]
@@ -100,8 +101,8 @@ def report_lines(report: dict) -> list[str]:
 
 
 def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int = FPS) -> Trajectory:
-    """One trajectory of `STEPS` steps, with velocities as the engine gives them, at `fps` in `RATES`. Raises
-    SdfsimError if no scene of `REDRAWS` had room for its bodies."""
+    """One trajectory of `STEPS` steps, with the velocities of the engine, at `fps` in `RATES`. Raises SdfsimError if
+    none of `REDRAWS` scenes had room for its bodies."""
     for _ in range(REDRAWS):
         with Teacher(np.array(GRAVITY), FLOOR, step=1.0 / fps, substeps=RATES[fps]) as teacher:
             placed = RECIPES[recipe].spawn(teacher, rng, cast)
@@ -133,7 +134,7 @@ def _make_one(recipe: str, cast: Cast, fps: int, seed: list[int], index: int, pa
 def _origins(
     recipe: str, shapes: Path | None, random_solids: int, bodies: int | None, on_progress: Progress
 ) -> list[Origin]:
-    """Where the shapes of a recipe come from, its own scenery last. Raises SdfsimError for options that it does not
+    """The origins of a recipe's shapes, its own scenery last. Raises SdfsimError for options that the recipe does not
     take."""
     plan = RECIPES[recipe]
     unused = {

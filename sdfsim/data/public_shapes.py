@@ -1,11 +1,11 @@
-"""Public shapes by name: fetched once into the user's cache folder, every file checked by its SHA-256.
+"""Public shapes by name: fetched once into the user's cache folder, with every file checked by its SHA-256.
 
 `kubasic` is the eleven bodies of MOVi-B, from Kubric's KuBasic assets (CC BY-SA 4.0, the Kubric authors). `ycb` is six
-scans of the YCB object set (CC BY 4.0), as the repository eleramp/pybullet-object-models has reoriented them: YCB's own
-site offers the same objects in other files.
+scans of the YCB object set (CC BY 4.0), reoriented as in the repository eleramp/pybullet-object-models; YCB's own site
+has other files of the same objects.
 
-public_shapes.sha256 holds the sums of the files that the published figures were made from. An archive as a whole is not
-checked: packing it anew changes no shape.
+public_shapes.sha256 holds the checksums of the files that the published figures were made from. An archive as a whole
+is not checked, because packing it again does not change shapes.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ YCB = (
     "/pybullet_object_models/ycb_objects"
 )
 ARCHIVE = ".tar.gz"
-# Of every set: its files, as they lie in the set's folder, and their SHA-256.
+# For every set: its files, by their names in the set's folder, and their SHA-256.
 SUMS: dict[str, dict[str, str]] = {}
 for line in Path(__file__).with_suffix(".sha256").read_text(encoding="utf-8").splitlines():
     checksum, path = line.split()
@@ -33,8 +33,8 @@ for line in Path(__file__).with_suffix(".sha256").read_text(encoding="utf-8").sp
 
 
 def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
-    """The folder that `--shapes` means: of this path, else the public set of this name in `SUMS`, fetched if need be.
-    Raises SdfsimError if a download failed or a file is not the one expected."""
+    """The folder for `--shapes`: this path if it exists, else the public set of this name in `SUMS`, fetched if
+    necessary. Raises SdfsimError if a download failed or a file is not the expected one."""
     name = str(shapes)
     if name not in SUMS or shapes.is_dir():
         return shapes
@@ -45,18 +45,18 @@ def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
         on_progress(0.0, f"fetching {url}")
         content = fetched(url, hint)
         found = {file: content.get(Path(file).name) or content.get("", b"") for file in missing if _url(file) == url}
-        for file in found:  # all of them before any is kept
+        for file in found:  # check all files before any is kept
             _check(found[file], SUMS[name][file], f"{url}: {Path(file).name}", hint)
         for file in found:
             (folder / file).parent.mkdir(parents=True, exist_ok=True)
             write_bytes(folder / file, found[file])
-    for file, expected in SUMS[name].items():  # people may have put it there, so it is checked each time
-        _check((folder / file).read_bytes(), expected, str(folder / file), "remove it, then it is fetched again")
+    for file, expected in SUMS[name].items():  # users may have put it there, so it is checked each time
+        _check((folder / file).read_bytes(), expected, str(folder / file), "remove it, and it is fetched again")
     return folder
 
 
 def _url(file: str) -> str:
-    """The address of a file of a set: Kubric's archive of its folder's name, or the file alone."""
+    """The address of a file of a set: Kubric's archive named after its folder, or the file itself."""
     if folder := Path(file).parent.name:
         return f"{KUBRIC}/{folder}{ARCHIVE}"
     return f"{YCB}/{Path(file).stem.title().replace('_', '')}/textured_simple_reoriented.obj"
@@ -64,12 +64,13 @@ def _url(file: str) -> str:
 
 def _check(content: bytes, expected: str, what: str, hint: str) -> None:
     if (got := hashlib.sha256(content).hexdigest()) != expected:
-        raise SdfsimError(f"{what}: another file than expected: SHA-256 {got}, not {expected}", hint)
+        raise SdfsimError(f"{what}: not the expected file: SHA-256 {got}, not {expected}", hint)
 
 
 def fetched(url: str, hint: str, inside: str = "", kept: Path | None = None) -> dict[str, bytes]:
-    """The files of an archive by their base names, so that no path in it matters, of all folders or of those of one
-    name; a single file under "". `kept` is where people may have put it. Raises SdfsimError if it cannot be had."""
+    """The files of an archive by their base names (so paths in it do not matter), from all folders or only from those
+    named `inside`; a single file has the name "". `kept` is where users may have put it. Raises SdfsimError if it
+    cannot be fetched."""
     import pooch
 
     pooch.get_logger().setLevel("WARNING")  # it would log the checksum of each download
@@ -88,6 +89,6 @@ def fetched(url: str, hint: str, inside: str = "", kept: Path | None = None) -> 
                 return {name: content.read() for name, content in opened if content is not None}
     except (OSError, EOFError, tarfile.TarError, zlib.error) as error:
         reason: BaseException = error
-        while reason.__context__ is not None:  # the first cause is short: "Name or service not known"
+        while reason.__context__ is not None:  # the first cause is short, such as "Name or service not known"
             reason = reason.__context__
         raise SdfsimError(f"{url}: cannot be fetched: {reason}", hint) from error

@@ -1,8 +1,8 @@
 """Public recordings of real tosses by name: fetched once into the user's cache folder and checked by their SHA-256.
 
-Both were tossed onto a table and tracked at 148 Hz by the DAIR Lab of the University of Pennsylvania (BSD 3-Clause):
-`contactnets-cube`, an acrylic cube, with the code of ContactNets (Pfrommer, Halm and Posa 2020), and
-`contactnets-elbow`, two printed links on a hinge, with that of dair_pll (Bianchini, Halm and Posa 2023).
+The DAIR Lab of the University of Pennsylvania (BSD 3-Clause) tossed both onto a table and tracked them at 148 Hz:
+`contactnets-cube`, an acrylic cube, published with the code of ContactNets (Pfrommer, Halm and Posa 2020), and
+`contactnets-elbow`, two printed links on a hinge, published with that of dair_pll (Bianchini, Halm and Posa 2023).
 """
 
 import hashlib
@@ -22,18 +22,18 @@ from sdfsim.data.public_shapes import ARCHIVE, fetched
 
 GITHUB = "https://codeload.github.com"
 RATE = 148.0  # Hz
-UNIT = 0.0524  # m: lengths of the cube's files are in half sides
+UNIT = 0.0524  # m: the unit of length in the cube's files is half a side
 
 
 @dataclass(frozen=True)
 class Tosses:
-    """Where a set is published: the files N.pt in a folder of one commit, so that they cannot change."""
+    """Where a set is published: files N.pt in a folder of one commit, so that they cannot change."""
 
     repository: str
     commit: str
     folder: str
     count: int
-    checksum: str  # SHA-256 of all the files, one after the other in the order of their numbers
+    checksum: str  # SHA-256 of all files, one after the other in the order of their numbers
 
     @property
     def url(self) -> str:
@@ -59,7 +59,7 @@ bodies:
   - {{name: table, plane: {{}}, friction: 1, restitution: 1}}
   - {{name: cube, shape: cube, position: [0, 0, 0.2], mass: 0.37, inertia_factor: {factor}}}
 """
-# The gravity is that with which the recorded elbows fall, so that lengths and times agree.
+# The gravity is that of the recorded falls of the elbow, so that lengths and times agree.
 ELBOW = """version: 1
 model: solver
 effects: {{sleep: off}}
@@ -72,12 +72,12 @@ bodies:
 joints:
   - {{name: elbow, type: hinge, bodies: [two, one], anchor: [-0.035, 0.06, 0.2], axis: [0, 1, 0]}}
 """
-FALL = [0.1, 0.05, -9.64]  # m/s^2, of all the elbow's flights
+FALL = [0.1, 0.05, -9.64]  # m/s^2, in all flights of the elbow
 
 
 def public_tosses(name: Path, on_progress: Progress = silent) -> Path:
-    """The folder of this name, else that of the public set of this name in `SETS`: its `tosses.npz` and `scene.yaml`,
-    fetched if need be. Raises SdfsimError if the download failed or is not what is expected."""
+    """The folder of this name, else that of the public set of this name in `SETS`, with its `tosses.npz` and
+    `scene.yaml`, fetched if necessary. Raises SdfsimError if the download failed or is not the expected one."""
     if str(name) not in SETS or name.exists():
         return name
     known, folder = SETS[str(name)], user_cache("public") / name
@@ -88,7 +88,7 @@ def public_tosses(name: Path, on_progress: Progress = silent) -> Path:
         files = [found.get(f"{k}.pt", b"") for k in range(known.count)]
         if (got := hashlib.sha256(b"".join(files)).hexdigest()) != known.checksum:
             told = f"its {known.count} files have the SHA-256 {got}, not {known.checksum}"
-            raise SdfsimError(f"{known.url}: other tosses than expected: {told}", f"remove {by_hand}, if it is there")
+            raise SdfsimError(f"{known.url}: not the expected tosses: {told}", f"remove {by_hand}, if it is there")
         arrays, scene = (_cube if name.name.endswith("cube") else _elbow)([_tensor(content) for content in files])
         folder.mkdir(parents=True, exist_ok=True)
         write_arrays(folder / "tosses.npz", arrays)
@@ -103,14 +103,14 @@ def _tensor(content: bytes) -> np.ndarray:
 
 
 def _cube(files: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], str]:
-    """Of rows [1, T, 19]: place in half sides, quaternion wxyz, velocities."""
+    """From rows [1, T, 19]: position in half sides, quaternion wxyz, velocities."""
     rows = [file.reshape(-1, 19) for file in files]
     poses, scene = np.concatenate(rows), CUBE.format(gravity=-9.81, factor=1.196)
     return _arrays([len(r) for r in rows], UNIT * poses[:, None, :3], poses[:, None, [4, 5, 6, 3]], ["cube"]), scene
 
 
 def _elbow(files: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], str]:
-    """Of rows [T, 15]: quaternion wxyz and place of the first link, angle of the hinge, velocities."""
+    """From rows [T, 15]: quaternion wxyz and position of the first link, angle of the hinge, velocities."""
     links = [links_of(r[:, 4:7], Rotation.from_quat(r[:, [1, 2, 3, 0]]), r[:, 7]) for r in files]
     links = [upright(both, number) for number, both in enumerate(links)]
     place, turn = (np.concatenate([getattr(both, n) for both in links]) for n in Links._fields)
@@ -128,8 +128,9 @@ def _arrays(counts: Sequence[int], place: np.ndarray, turn: np.ndarray, names: l
 
 LINK = np.array([0.1, 0.05, 0.05])  # m
 PIVOT, ARM = np.array([-0.035, 0.06, 0.0]), np.array([0.035, 0.0, 0.0])  # m: link 1 to the hinge, that to link 2
-# The first recordings lie in axes that are 2.3 degrees off the table: mean normal of the faces on which links came to
-# rest in them. From the 323rd on these are upright to 0.1 degrees. Between the two is no link that rests on a face.
+# The axes of the first recordings are tilted by 2.3 degrees against the table, by the mean normal of the faces on which
+# links came to rest. From the 323rd on the axes are upright to 0.1 degrees. In the recordings between, no link rests on
+# a face.
 TILTED, NORMAL = 322, np.array([-0.0310, 0.0261, 0.99918])
 
 
@@ -141,15 +142,15 @@ class Links(NamedTuple):
 
 
 def links_of(place: np.ndarray, one: Rotation, angle: np.ndarray) -> Links:
-    """Both links, by the pose of the first, place [T, 3] m, and the angle [T] rad of the hinge."""
+    """Both links, from the pose of the first (position [T, 3] m) and the angle [T] rad of the hinge."""
     two = one * Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0])
     other = place + one.apply(PIVOT) + two.apply(ARM)
     return Links(np.stack([place, other], 1), np.stack([one.as_quat(), two.as_quat()], 1))
 
 
 def upright(links: Links, number: int) -> Links:
-    """A recording in axes that stand on the table; its number tells which it has. Each was shifted by those who
-    published it such that the lowest corner of its last frame is at z = 0, and is again."""
+    """A recording in axes that are upright on the table; its number determines its own axes. Its authors shifted each
+    so that the lowest corner of its last frame is at z = 0, and so does this."""
     if number >= TILTED:
         return links
     turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], NORMAL[None] / np.linalg.norm(NORMAL))[0]

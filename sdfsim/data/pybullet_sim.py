@@ -1,7 +1,7 @@
 """The teacher: PyBullet with Kubric's settings (an optional extra, `pip install sdfsim[data]`).
 
-docs/teacher.md compares the settings one by one. Before the first inner step the engine makes another one, with the
-bodies far apart, because it would use the inertias of a mass of 1 kg in it.
+docs/teacher.md compares the settings one by one. Before the first inner step the engine makes an extra one, with the
+bodies far apart, because it uses the inertias of a mass of 1 kg in its first step.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from sdfsim.base.files import write_text
 from sdfsim.base.lazy import optional
 
 TEACHER_VERSION = 2  # written to `dataset.json`; datasets of another version are refused
-RATES = {50: 5, 60: 4}  # recorded frames a second -> inner steps in one
-FPS = 50  # unless another rate is asked for
+RATES = {50: 5, 60: 4}  # recorded frames per second -> inner steps per frame
+FPS = 50  # the default rate
 DT = 1.0 / FPS  # s, one recorded step at that rate
 SUBSTEPS = RATES[FPS]
 SUBSTEP = DT / SUBSTEPS  # s
@@ -32,7 +32,7 @@ MAXIMAL = {"useMaximalCoordinates": True}
 FAR = (0.0, 0.0, -100.0)  # m, where bodies wait to be placed
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 MARGIN = 1e-3  # m, around the convex pieces of every body that is loaded from a file (Bullet's default)
-APART = 1000.0  # m between bodies that are not to touch
+APART = 1000.0  # m between bodies that must not touch
 Vector = np.ndarray | tuple[float, ...]
 URDF_TEMPLATE = """<robot name="body"><link name="base">
 <inertial><origin xyz="0 0 0"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
@@ -45,7 +45,7 @@ URDF_TEMPLATE = """<robot name="body"><link name="base">
 class TeacherBody:
     """One body as the engine needs it."""
 
-    urdf: Path  # file whose collision mesh is an OBJ with one convex piece per group, or whose body is an exact form
+    urdf: Path  # file whose collision mesh is an OBJ with one convex piece per group, or an exact form
     scale: float  # uniform size factor
     mass: float  # kg (0 for static)
     friction: float  # lateral friction coefficient
@@ -70,8 +70,8 @@ def engine_settings(step: float, substeps: int) -> dict:
 
 
 def set_as_teacher(info: dict) -> bool:
-    """Whether a `dataset.json` names this engine with the settings that the teacher has, with any inner step: its
-    recordings then have the teacher's habits, bodies larger by `MARGIN` and pushes that add to rebounds."""
+    """Whether a `dataset.json` names this engine with the teacher's settings, with any inner step. In its recordings,
+    bodies are then larger by `MARGIN`, and pushes out of overlaps add to rebounds."""
     settings, ours = info.get("engine_settings"), engine_settings(DT, SUBSTEPS)
     if info.get("engine") != "pybullet" or not isinstance(settings, dict):
         return False
@@ -79,7 +79,7 @@ def set_as_teacher(info: dict) -> bool:
 
 
 def substeps_of(step: float) -> int:
-    """Inner steps in a recorded step of `step` s. Raises SdfsimError if the teacher records at no such rate."""
+    """Inner steps in a recorded step of `step` s. Raises SdfsimError if the teacher does not record at this rate."""
     for fps, substeps in RATES.items():
         if abs(step - 1.0 / fps) < 1e-9:
             return substeps
@@ -97,7 +97,7 @@ class Teacher:
         self.pb = import_pybullet()
         self.substeps = substeps
         self.client = self.pb.connect(self.pb.DIRECT)
-        self.bodies: list[int] = []  # the engine's handles, by the index of a body
+        self.bodies: list[int] = []  # the engine's handles, by body index
         self._floor: int | None = None
         self._settled = True
         self._gravity = gravity
@@ -115,9 +115,9 @@ class Teacher:
 
     def add(self, body: TeacherBody, position: Vector = FAR, quat: Vector = UNTURNED) -> int:
         """Add a body with its centre of mass at `position` [3] m, orientation `quat` [4] xyzw; returns its index."""
-        # Added far away and then moved: the engine's order of pairs depends on it.
+        # Added far away and then moved, because the engine's order of pairs depends on it.
         given = {"basePosition": FAR, "globalScaling": body.scale, "useFixedBase": int(body.mass == 0)}
-        # Cylinders are round, and not prisms of 32 sides.
+        # Exact cylinders, not prisms of 32 sides.
         handle = self._call("loadURDF", str(body.urdf), flags=self.pb.URDF_USE_IMPLICIT_CYLINDER, **given, **MAXIMAL)
         surface = {"lateralFriction": body.friction, "restitution": body.restitution}
         self._call("changeDynamics", handle, -1, mass=body.mass, **surface, **BODY_SETTINGS)
@@ -128,7 +128,7 @@ class Teacher:
         return index
 
     def overlaps(self, index: int) -> bool:
-        """Whether body `index` touches or penetrates anything; around convex pieces is a margin of 1 mm."""
+        """Whether body `index` touches or penetrates anything; convex pieces have a margin of 1 mm."""
         mine = self.bodies[index]
         others = [other for other in (self._floor, *self.bodies) if other not in (None, mine)]
         return any(self._call("getClosestPoints", mine, other, 0.0) for other in others)
@@ -140,7 +140,7 @@ class Teacher:
     def set_inertia(self, index: int, diagonal: np.ndarray) -> None:
         """Replace the inertia of body `index` by `diagonal` [3] kg m^2, body axes."""
         handle = self.bodies[index]
-        # Without a mass the engine takes that of its command before.
+        # Without a mass the engine takes that of its previous command.
         mass = self._call("getDynamicsInfo", handle, -1)[0]
         self._call("changeDynamics", handle, -1, mass=mass, localInertiaDiagonal=list(diagonal))
         self._settled = False
@@ -172,10 +172,10 @@ class Teacher:
         return [p[0] for p in poses], [p[1] for p in poses], [s[0] for s in speeds], [s[1] for s in speeds]
 
     def _settle(self) -> None:
-        """Take one inner step with the moving bodies far from everything, and put them back as they were.
+        """Make one inner step with the moving bodies far from everything, and put them back as they were.
 
-        The engine turns inertias into the world's axes only at the end of a step. Bodies that touch something in their
-        first one would answer with the inertia of the URDF's 1 kg.
+        The engine converts inertias to world axes only at the end of a step. Bodies that touch something in their first
+        step would react with the inertia of the URDF's 1 kg.
         """
         state = list(zip(*self._state(), strict=True))
         moving = [i for i, body in enumerate(self.bodies) if self._call("getDynamicsInfo", body, -1)[0] > 0]

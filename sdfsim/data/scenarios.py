@@ -1,4 +1,4 @@
-"""What the teacher's scenes start from: MOVi-B and MOVi-C as Kubric spawns them (Greff et al., 2022), and our own."""
+"""The starts of the teacher's scenes: MOVi-B and MOVi-C as Kubric spawns them (Greff et al., 2022), and our own."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,13 +16,13 @@ from sdfsim.learned.training_ranges import DEEPEST
 TRIES = 100  # places for one body before the scene is drawn again
 UP, STILL = np.array([0.0, 0.0, 1.0]), np.zeros(3)
 
-# Tossed bodies, as Kubric has them.
-REGION = ((-5.0, -5.0, 1.0), (5.0, 5.0, 5.0))  # m, holds every tossed body's bounds at the start
+# Tossed bodies, as in Kubric.
+REGION = ((-5.0, -5.0, 1.0), (5.0, 5.0, 5.0))  # m, contains the bounds of every tossed body at the start
 COUNT = (3, 10)
 SIZES = (0.7, 1.4)
 MATERIALS = {"metal": (2.7, 0.4, 0.3), "rubber": (1.1, 0.8, 0.7)}  # density, friction, restitution
-# MOVi-C: largest extent in m; Kubric's coefficients. Our meshes have no true size, so none has a mass of its own:
-# all have rubber's density.
+# MOVi-C: largest extent in m; Kubric's coefficients. Our meshes have no true size, and so no mass of their own: all
+# have rubber's density.
 EXTENTS_C = (0.75, 3.0)
 PLAIN = (1.1, 0.5, 0.5)  # density, friction, restitution
 
@@ -31,18 +31,18 @@ BALLS = (1, 16)
 
 PILE = (5, 30)
 PILE_EXTENTS = (0.5, 1.5)  # m
-PILE_RADIUS = 0.55  # m for one body, growing with the third root of their number
+PILE_RADIUS = 0.55  # m for one body, growing with the cube root of their number
 PILE_GAPS = (0.02, 0.15)  # m between the boxes around bodies
-PILE_TRIES = 8  # places for one body, of which it takes the lowest
+PILE_TRIES = 8  # places tried for one body, which takes the lowest
 
 VARIED_EXTENTS = (0.7, 1.4)  # m
 FRICTIONS, RESTITUTIONS = (0.0, 1.0), (0.0, 1.0)
 DENSITIES = (0.1, 10.0)  # log-uniform
-MASS_RATIO = 100.0  # at most, within one scene
+MASS_RATIO = 100.0  # largest mass ratio within a scene
 OBSTACLES = {"obstacle_bowl": "bowl", "obstacle_torus": "torus", "obstacle_gear": "gear"}
 OBSTACLE_EXTENTS = (2.0, 4.0)  # m
-OBSTACLE_SHARE = 0.3  # of the scenes whose bodies are tossed or at rest
-# Of the scenes, by how they start: tossed as in MOVi, `at_rest`, or in one of the motions of `set_moving`.
+OBSTACLE_SHARE = 0.3  # share of the scenes whose bodies are tossed or at rest
+# Shares of scenes by their start: tossed as in MOVi, `at_rest`, or in one of the motions of `set_moving`.
 SHARES = {
     "tossed": 0.35,
     "resting": 0.35,
@@ -52,27 +52,27 @@ SHARES = {
     "head-on": 0.05,
     "spinning": 0.03,
 }
-FEW = (1, 4)  # bodies in one kind of motion; head-on two or four
-BALL_SHARE = 0.5  # of the bodies in one kind of motion; all of those that roll
+FEW = (1, 4)  # number of bodies in one kind of motion; head-on two or four
+BALL_SHARE = 0.5  # share of balls among the bodies in one kind of motion; of those that roll, all are balls
 
 # Starts at or near rest.
 STARTS = ("still", "dropped", "nudged", "pressed")
-GAP = 2.5e-3  # m, under a body that is put down: around the engine's convex pieces are 1 mm, so 2 mm between two
-DROP = 0.1  # m, at most, under one that is dropped
-NUDGE = 0.3  # m/s, at most, along x and along y
-PRESSED = 0.5 * DEEPEST  # of its extent: how far at most a body is moved into what is around it, along each axis
+GAP = 2.5e-3  # m, under a body that is put down: the engine adds 1 mm around convex pieces, so 2 mm between two
+DROP = 0.1  # m, largest height of one that is dropped
+NUDGE = 0.3  # m/s, largest speed along x and along y
+PRESSED = 0.5 * DEEPEST  # relative to its extent: how far at most a body is moved into others, along each axis
 FIELD = 3.0  # m, half the side of the square of floor that is used
-STACKED = 0.5  # part of the bodies that go on top of the one before
-STEADY = 0.03  # least distance of the centre of mass from the rim of the face it stands on, over the largest extent
+STACKED = 0.5  # share of bodies that are put on top of the one before
+STEADY = 0.03  # least distance of the centre of mass from the rim of the face below it, relative to the extent
 
 # Starts in one kind of motion.
 SPEEDS = (0.5, 4.0)  # m/s
 SPINS = (1.0, 10.0)  # rad/s, about the vertical
 HEIGHTS = (0.1, 2.0)  # m, under a body that falls
 MEETING = (0.1, 1.0)  # s, until the bodies of a pair touch
-ALOFT = 32.0  # m, the lowest pair: more than it falls in 2 s, with what a hit may add
+ALOFT = 32.0  # m, height of the lowest pair: more than it falls in 2 s, including what a hit may add
 APART = 12.0  # m between the heights of pairs
-HALF = 0.5  # of the bodies move along x or y, have the spin of rolling, or are unturned; the others are random
+HALF = 0.5  # share of bodies that move along x or y, have the spin of rolling, or are not turned; others: random
 
 Bodies = list[tuple[ShapeSource, TeacherBody]]
 Draw = Callable[[ShapeSource], TeacherBody]
@@ -83,13 +83,13 @@ Pose = tuple[np.ndarray, Rotation]  # [3] m of the centre of mass, and the orien
 class Cast:
     shapes: list[ShapeSource]  # to draw bodies from
     scenery: dict[str, ShapeSource] = field(default_factory=dict)  # the recipe's own shapes, by name
-    bodies: int | None = None  # how many bodies move, None for the recipe's own range
+    bodies: int | None = None  # number of moving bodies, None for the recipe's own range
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How scenes start: `spawn` puts the bodies of a scene into the teacher's world and returns them in its order,
-    static ones with mass 0; None where one found no room."""
+    """How scenes start: `spawn` puts the bodies of a scene into the teacher's world and returns them in that order,
+    static ones with mass 0; None if there was no room for one."""
 
     spawn: Callable[[Teacher, np.random.Generator, Cast], Bodies | None]
     kubasic: bool = False  # takes NAME/ folders as they are, in all splits; otherwise shapes are split by name
@@ -161,10 +161,10 @@ def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
 
 
 def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
-    """Any friction, restitution and mass ratio, and starts of all kinds, in the parts of `SHARES`.
+    """Any friction, restitution and mass ratio, and starts of all kinds, in the shares `SHARES`.
 
-    An obstacle is in 30 % of the scenes that are tossed or at rest (in equal parts the kinds of `STARTS`). In the
-    others one to four bodies, half of them balls, are in one kind of motion on an empty floor; pairs that meet head-on
+    30 % of the scenes that are tossed or at rest (the kinds of `STARTS` in equal parts) have an obstacle. In the other
+    scenes one to four bodies, half of them balls, are in one kind of motion on an empty floor; pairs that meet head-on
     do so in flight, far above it.
     """
     start = str(rng.choice(list(SHARES), p=list(SHARES.values())))
@@ -183,7 +183,7 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | N
         volume = source.volume * extent**3
         heaviest, most = max(masses, default=0.0), min(masses, default=np.inf) * MASS_RATIO
         low = min(max(volume * DENSITIES[0], heaviest / MASS_RATIO), most)
-        high = max(min(volume * DENSITIES[1], most), low)  # the ratio wins over the densities
+        high = max(min(volume * DENSITIES[1], most), low)  # the mass ratio takes precedence over densities
         masses.append(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
         return TeacherBody(source.urdf, extent, masses[-1], rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))
 
@@ -211,7 +211,7 @@ RECIPES = {
 
 
 def _toss(teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Draw) -> Bodies | None:
-    """Kubric's 3 to 10 bodies without overlaps, thrown across; None when one finds no room."""
+    """Kubric's 3 to 10 bodies without overlaps, thrown across the floor; None if there is no room for one."""
 
     def propose(source: ShapeSource, body: TeacherBody) -> Pose | None:
         rotation = Rotation.random(rng=rng)
@@ -231,10 +231,10 @@ def _toss(teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Draw) ->
 
 
 def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: str) -> bool:
-    """Put bodies down, after those that the teacher has: all at rest, all dropped from `DROP` at most, all given a
-    nudge, or pressed into one another, as `start` says. False when one found no room.
+    """Put bodies down, after those that the teacher has already: all at rest, all dropped from `DROP` at most, all
+    given a nudge, or pressed into each other, as `start` says. False if there was no room for one.
 
-    Only pressed bodies overlap; models learn from them how bodies separate. Shapes have a largest extent of 1 m at
+    Only pressed bodies overlap; from these models learn how bodies separate. Shapes have a largest extent of 1 m at
     scale 1.
     """
     first, below, top = len(teacher.bodies), np.zeros(2), 0.0
@@ -261,11 +261,12 @@ def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: s
 
 
 def set_moving(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, motion: str) -> bool:
-    """Put bodies into the world, after those that it has, all in one kind of motion. False when one found no room.
+    """Put bodies into the world, after those that it has already, all in one kind of motion. False if there was no room
+    for one.
 
-    Bodies that roll must be balls: half go along x or y, half have the spin of their speed and the others any. Bodies
-    that slide do not turn at first. Bodies that spin or fall have no other velocity. "head-on" takes two at a time.
-    Shapes have a largest extent of 1 m at scale 1.
+    Bodies that roll must be balls: half move along x or y; half have the spin of rolling and the others a random one.
+    Bodies that slide do not turn at first. Bodies that spin or fall have no other velocity. "head-on" takes two bodies
+    at a time. Shapes have a largest extent of 1 m at scale 1.
     """
     if motion == "head-on":
         for k in range(0, len(bodies) - 1, 2):
@@ -302,7 +303,7 @@ def _velocities(rng: np.random.Generator, motion: str, extent: float) -> tuple[n
 
 
 def _meet(teacher: Teacher, rng: np.random.Generator, pair: Bodies, height: float) -> None:
-    """Two bodies at `height` m that fly at each other along a level line."""
+    """Put two bodies at `height` m that fly towards each other along a horizontal line."""
     line = _direction(rng)
     speeds, rotations = rng.uniform(*SPEEDS, 2), Rotation.random(2, rng=rng)
     reach = [body.scale * np.linalg.norm(source.vertices, axis=1).max() for source, body in pair]
@@ -317,7 +318,8 @@ def _meet(teacher: Teacher, rng: np.random.Generator, pair: Bodies, height: floa
 def _find_room(
     teacher: Teacher, one: tuple[ShapeSource, TeacherBody], propose: Callable[[ShapeSource, TeacherBody], Pose | None]
 ) -> Pose | None:
-    """Add a body at the first of `TRIES` proposed poses where it overlaps nothing; that pose, None without any."""
+    """Add a body at the first of `TRIES` proposed poses where it overlaps nothing. Returns this pose, or None if there
+    is none."""
     index = teacher.add(one[1])
     for _ in range(TRIES):
         if (pose := propose(*one)) is None:
@@ -344,18 +346,18 @@ def _box(source: ShapeSource, body: TeacherBody, rotation: Rotation) -> tuple[np
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:
-    """A level unit vector [3]."""
+    """A horizontal unit vector [3]."""
     turn = rng.uniform(0.0, 2 * np.pi)
     return np.array([np.cos(turn), np.sin(turn), 0.0])
 
 
 def upright(source: ShapeSource, body: TeacherBody, place: np.ndarray, height: float, rotation: Rotation) -> np.ndarray:
-    """Where [3] m the centre of mass is when the lowest point is at `height` m over `place` [2] m."""
+    """The centre of mass [3] m for which the body's lowest point is `height` m above the floor at `place` [2] m."""
     return np.array([*place, height - _box(source, body, rotation)[0][2]])
 
 
 def _standing(source: ShapeSource, rng: np.random.Generator) -> Rotation:
-    """A rotation in which a shape stands on a random one of its steady faces; any rotation where it has none."""
+    """A rotation in which a shape stands on a random one of its stable faces; any rotation if it has none."""
     turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
     faces = steady_faces(source.vertices)
     if len(faces) == 0:
@@ -364,19 +366,20 @@ def _standing(source: ShapeSource, rng: np.random.Generator) -> Rotation:
 
 
 def steady_faces(vertices: np.ndarray) -> np.ndarray:
-    """Outward unit normals [K, 3] of the faces of the convex hull on which a body of vertices [V, 3] about its centre
-    of mass stands without tipping over."""
+    """Outward unit normals [K, 3] of the faces of the convex hull on which a body stands without tipping over;
+    `vertices` [V, 3] are relative to its centre of mass."""
     hull = ConvexHull(vertices)
     extent = float(np.ptp(vertices, axis=0).max())
     corners = vertices[hull.vertices]
-    # Triangles of one face differ by rounding.
+    # The normals of triangles of one face differ by rounding.
     _, first = np.unique(hull.equations.round(3), axis=0, return_index=True)
     steady = [plane[:3] for plane in hull.equations[first] if _margin(corners, plane, extent) >= STEADY * extent]
     return np.array(steady).reshape(-1, 3)
 
 
 def _margin(corners: np.ndarray, plane: np.ndarray, extent: float) -> float:
-    """How far within the face on `plane` [4] (normal, offset) the origin's foot is; negative outside, -inf: no face."""
+    """How far the origin's foot is within the face on `plane` [4] (normal, offset); negative outside, -inf if it is not
+    a face."""
     normal, offset = plane[:3], plane[3]
     face = corners[np.abs(corners @ normal + offset) < 1e-3 * extent]
     axes = np.linalg.svd(normal[None])[2][1:]

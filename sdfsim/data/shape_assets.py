@@ -1,4 +1,5 @@
-"""The shapes of a dataset: found, cut into convex pieces for the engine, split by name, and fitted."""
+"""The shapes of a dataset: finds them, cuts them into convex pieces for PyBullet, splits them by name, and fits
+them."""
 
 import hashlib
 import subprocess
@@ -22,11 +23,11 @@ from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.make import analytic_shape, fit_pieces
 
-NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since contacts happen there
-THINNEST = 0.02  # thickness over largest extent below which a mesh is left out: no fit resolves it
+NODES = 512  # surface nodes per shape: the vertices and edges of the pieces first, since contacts happen there
+THINNEST = 0.02  # thickness relative to the largest extent, below which a mesh is left out, as a fit cannot resolve it
 VISUAL, COLLISION = "visual_geometry.obj", "collision_geometry.obj"  # the two files of a NAME/ folder
 VHACD = {"resolution": 1_000_000, "concavity": 0.0025, "maxNumVerticesPerCH": 64}
-# In a process of its own: it prints to stdout, and on an odd mesh it aborts, or takes all the memory there is.
+# Runs in a process of its own: it prints to stdout, and on some meshes it aborts or takes all memory.
 VHACD_CALL = f"""
 import resource, sys, pybullet
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
@@ -37,21 +38,21 @@ VHACD_TIME = 600  # s
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a shape comes from: a mesh that V-HACD cuts, convex pieces with a mesh to show, or a primitive."""
+    """The origin of a shape: a mesh that V-HACD cuts, convex pieces with a mesh to show, or a primitive."""
 
     name: str  # of the Shape folder
-    mesh: Path | None = None  # file of the solid, which is also what is shown
-    pieces: Path | None = None  # OBJ with one convex piece a group
+    mesh: Path | None = None  # file of the solid, which is also the mesh that is shown
+    pieces: Path | None = None  # OBJ with one convex piece per group
     primitive: str = ""  # name of a primitive, in place of files
-    as_is: bool = False  # keep size and origin of the files, as MOVi-B does. Other shapes get a largest extent of 1 m.
+    as_is: bool = False  # keep size and origin of the files, as MOVi-B does; others get a largest extent of 1 m
 
     @property
     def how(self) -> str:
-        """Where its convex pieces come from."""
+        """The source of its convex pieces."""
         return "primitive" if self.primitive else "own" if self.pieces else "vhacd"
 
     def digest(self) -> str:
-        """Changes with the geometry and how it is cut."""
+        """A hash that changes with the geometry and the way it is cut."""
         digest = hashlib.sha256(f"{self.how} {self.primitive} {VHACD if self.how == 'vhacd' else ''}".encode())
         for file in (self.mesh, self.pieces):
             if file is not None:
@@ -61,7 +62,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class ShapeSource:
-    """One shape as recipes and the fit need it."""
+    """One shape in the form that recipes and fits need."""
 
     name: str  # of the Shape folder
     urdf: Path  # engine file, its base frame at the centre of mass
@@ -69,28 +70,29 @@ class ShapeSource:
     vertices: np.ndarray  # [V, 3] m about the centre of mass, at scale 1
     pieces: Path  # OBJ of the convex pieces, in the frame of the engine
     display: Path | None  # mesh file to show, or None for the pieces' own boundary
-    # com, size: the displayed mesh comes into the engine's frame by (vertex - com [3]) / size
+    # com, size: (vertex - com [3]) / size converts the displayed mesh to the engine's frame
     com: np.ndarray
     size: float
     sphere: bool = False  # the engine's body is an exact sphere of diameter 1 m, `pieces` a hull of points on it
 
 
 def split_of(name: str) -> str:
-    """The split whose trajectories may hold a shape: eight names of ten train, one validates, one tests."""
+    """The split whose trajectories may contain a shape: of ten names, eight are for training, one for validation, one
+    for test."""
     tenth = int(hashlib.sha256(name.encode()).hexdigest(), 16) % 10
     return {8: "validation", 9: "test"}.get(tenth, "train")
 
 
 def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False) -> list[Origin]:
-    """Shapes of a folder (NAME/ folders with `visual_geometry.obj` and `collision_geometry.obj`, and mesh files), then
-    the first of PyBullet's random solids.
+    """Shapes in a folder (NAME/ folders with `visual_geometry.obj` and `collision_geometry.obj`, and mesh files), then
+    the first `random_solids` of PyBullet's random solids.
 
-    `as_is` takes the NAME/ folders alone, in their own size (Kubric's assets have their centre of mass at 0). Raises
-    SdfsimError for no shapes, one name twice, or one that no Shape folder can have.
+    `as_is` takes only the NAME/ folders, in their own size (Kubric's assets have their centre of mass at 0). Raises
+    SdfsimError if there are no shapes, if a name occurs twice, or if one is not valid for a Shape folder.
     """
     found = []
     if shapes is not None:
-        # Kubric's `dome` is scenery, not one of its eleven bodies: it has no visual geometry.
+        # Kubric's `dome` is scenery, not one of the eleven bodies: it has no visual geometry.
         folders = sorted(p.parent for p in shapes.glob(f"*/{COLLISION}") if (p.parent / VISUAL).exists())
         found += [Origin(f.name, f / VISUAL, f / COLLISION, as_is=as_is) for f in folders]
         if not as_is and shapes.is_dir():
@@ -111,9 +113,9 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
 
 
 def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[list[ShapeSource], dict[str, str]]:
-    """Engine files of all shapes, about their centres of mass; files that are there already are kept.
+    """Write engine files of all shapes, about their centres of mass; existing files are kept.
 
-    Returns the usable shapes in the order of `found`; and the others, name -> why. Raises SdfsimError if a shape
+    Returns the usable shapes in the order of `found`, and for the others name -> reason. Raises SdfsimError if a shape
     taken `as_is` cannot be used.
     """
     engine.mkdir(parents=True, exist_ok=True)
@@ -126,7 +128,7 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
 
 
 def _prepare_one(origin: Origin, engine: Path) -> dict[str, Any]:
-    """Write the pieces of one shape; its record."""
+    """Write the pieces of one shape, and return its record."""
     file, digest = engine / f"{origin.name}.json", origin.digest()
     if file.exists() and (record := read_json(file)).get("sha256") == digest:
         return record
@@ -141,7 +143,8 @@ def _prepare_one(origin: Origin, engine: Path) -> dict[str, Any]:
 
 
 def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
-    """Write NAME.obj in the engine's frame; volume at scale 1, and centre of mass and size in the original's."""
+    """Write NAME.obj in the engine's frame. Returns the volume at scale 1, and centre of mass and size in the original
+    frame."""
     file = engine / f"{origin.name}.obj"
     if origin.as_is:
         assert origin.mesh and origin.pieces
@@ -174,8 +177,9 @@ def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
 def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource:
     pieces, urdf = engine / f"{origin.name}.obj", engine / f"{origin.name}.urdf"
     sphere = origin.primitive == "sphere"
-    # A ball of facets would lose a third of its speed in 3 s of rolling. Pieces have a path from the URDF on, so that a
-    # dataset can be moved; not the bare name, which the engine would look for in the working directory first.
+    # A ball made of facets would lose a third of its speed in 3 s of rolling. Paths of pieces are relative to the URDF,
+    # so that a dataset can be moved; but not bare names, which the engine would look for in the working directory
+    # first.
     mesh = f'<mesh filename="../{pieces.resolve().parent.name}/{pieces.name}"/>'
     write_urdf('<sphere radius="0.5"/>' if sphere else mesh, urdf)
     loaded = [load_mesh(origin.mesh)] if origin.as_is and origin.mesh else load_pieces(pieces)
@@ -185,8 +189,8 @@ def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource
 
 
 def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
-    """Convex pieces of a solid, given by its boundary in metres, by V-HACD; its files, `scratch` with endings, are
-    removed. Raises SdfsimError if it failed."""
+    """Convex pieces of a solid, given by its boundary in metres, by V-HACD. Its files (`scratch` with endings) are
+    removed. Raises SdfsimError if V-HACD failed."""
     before, after, log = (scratch.with_name(f".{scratch.name}.{end}") for end in ("in.obj", "out.obj", "log"))
     try:
         write_text(before, wavefront([mesh]))
@@ -202,7 +206,7 @@ def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
 
 def fit_shapes(sources: list[ShapeSource], out: Path, on_progress: Progress) -> None:
     """Fit a Shape folder `out/NAME` for every shape that has none yet. The surface is that of the convex pieces, since
-    that is what the teacher collides."""
+    PyBullet collides these."""
     todo = [source for source in sources if not (out / source.name / "shape.json").exists()]
     for done, (index, _) in enumerate(parallel(_fit_one, [(s, out / s.name) for s in todo]), start=1):
         on_progress(done / len(todo), f"shape {todo[index].name} fitted, {done} of {len(todo)}")

@@ -189,10 +189,7 @@ def _near(bodies: BodyTensors, part: Tensor, owner: Tensor, place: Tensor, margi
     low, high = place[part].amin(1) - wide, place[part].amax(1) + wide
     start = torch.searchsorted(of_part, torch.arange(len(bodies) + 1, device=of_part.device))
     endless = ~bodies.size.isfinite()
-    low[endless[of_part]], high[endless[of_part]] = (
-        -torch.inf,
-        torch.inf,
-    )  # planes are compared by height only
+    low[endless[of_part]], high[endless[of_part]] = -torch.inf, torch.inf  # planes are compared by height only
     index = of_part[:, None].expand_as(low)
     empty = torch.full((len(bodies), 3), torch.inf, dtype=low.dtype, device=low.device)
     lowest, highest = empty.scatter_reduce(0, index, low, "amin"), (-empty).scatter_reduce(0, index, high, "amax")

@@ -82,8 +82,8 @@ class Carry:
     given: float = 0.0  # work of pulls in these steps, model units
     frames: Frames | None = None  # frames of these steps, if they were asked for
     scene: Compiled | None = None  # the bodies for compiled code, if the stepper uses any
-    # The weights of a network on the solve, for compiled code, and the bodies as tensors, for a network on surface
-    # nodes. Both also depend on the options.
+    # weights: a network on the solve, in double precision; tensors: the bodies, for a network on surface nodes. Both
+    # also depend on the options.
     weights: ImpulseNetwork | None = None
     tensors: BodyTensors | None = None
     edges: Edges | None = None  # what contacts did in the latest step, if `options.record`

@@ -1,1 +1,1 @@
-"""From recorded motion to weights: contact frames, tasks, the training loop."""
+"""From recorded motion to weights: contact frames, tasks, and the training loop."""

@@ -1,4 +1,4 @@
-"""The batches of a training run, in the order of its steps: drawn when they are asked for, or ahead by workers."""
+"""The batches of a training run, in the order of its steps: drawn on demand, or in advance by worker processes."""
 
 import signal
 import sys
@@ -14,21 +14,21 @@ from torch.utils.data import DataLoader, Dataset
 from sdfsim.base.errors import SdfsimError
 from sdfsim.training.distributed import Team
 
-AHEAD = 4  # batches that each worker draws ahead
+AHEAD = 4  # batches that each worker draws in advance
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a step trains on."""
+    """The batch of a step."""
 
-    batch: Any  # the task's
-    mirrored: bool  # whether its mirror image is trained on
+    batch: Any  # the task's batch
+    mirrored: bool  # whether to train on its mirror image
     seconds: float  # s of processor time that drawing took
 
 
 @dataclass(frozen=True)
 class Draws(Dataset):
-    """The batch of every step, which depends on (seed, step) alone."""
+    """The batch of every step, which depends only on (seed, step)."""
 
     task: Any
     count: int  # frames in a batch
@@ -44,13 +44,13 @@ class Draws(Dataset):
 
 
 def batches(draws: Draws, first: int, workers: int = 0) -> Iterator[Drawn]:
-    """What the steps from `first` on train on, the same for any number of `workers`: processes that draw ahead. Raises
-    SdfsimError if one of them ended."""
+    """The batches of the steps from `first` on, the same for any number of `workers`, processes that draw in advance.
+    Raises SdfsimError if one of them ended."""
     steps = range(first, sys.maxsize)
     if not workers:
         yield from map(draws.__getitem__, steps)
         return
-    # Spawned, not forked: nothing of a CUDA context or of running threads is copied.
+    # Spawned, not forked, so that no CUDA context or running thread is copied.
     loader = DataLoader(
         draws, batch_size=None, sampler=steps, collate_fn=_as_it_is, num_workers=workers, prefetch_factor=AHEAD,
         worker_init_fn=_deaf, multiprocessing_context="spawn",
@@ -60,11 +60,11 @@ def batches(draws: Draws, first: int, workers: int = 0) -> Iterator[Drawn]:
     except RuntimeError as error:
         if "DataLoader worker" not in str(error).partition("\n")[0]:
             raise
-        raise SdfsimError("a process that draws batches has ended", "fewer --workers need less memory") from error
+        raise SdfsimError("a process that draws batches has ended", "fewer --workers use less memory") from error
 
 
 def moved(value: Any, device: torch.device) -> Any:
-    """A batch, its parts or a tensor on a device."""
+    """Move a batch, its parts or a tensor to a device."""
     if isinstance(value, torch.Tensor):
         return value.to(device)
     if isinstance(value, dict):
@@ -79,5 +79,5 @@ def _as_it_is(value: Any) -> Any:
 
 
 def _deaf(_: int) -> None:
-    """Ctrl-C is for the process that trains: it ends its workers."""
+    """Ignore Ctrl-C in workers: the training process handles it and ends them."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,8 +1,8 @@
-"""Contact frames: recorded steps in which something touches, with what the contact solve makes of each.
+"""Contact frames: recorded steps in which something touches, with the contact solve's result for each.
 
-The solve follows a recording step by step, every step from where the recording has the bodies. So training needs
-neither signed distances nor the solve itself, only torch and numpy. Disturbed starts are solved as well: in a rollout a
-network meets states that differ a little from recorded ones.
+The solve follows a recording step by step; each step starts from the recorded state. So training needs neither signed
+distances nor the solve itself, only torch and numpy. Disturbed starts are solved as well, because in a rollout a
+network gets states that differ slightly from recorded ones.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ if TYPE_CHECKING:
     from sdfsim.physics.options import Options
     from sdfsim.physics.solver.record import Edges
 
-STEP = 0.02  # s, the step that networks know
-FRAMES_VERSION = 11  # counts up whenever frames of the same recordings come out differently
+STEP = 0.02  # s, the step with which networks are trained
+FRAMES_VERSION = 11  # increase it whenever frames of the same recordings come out differently
 TOGETHER = 25  # trajectories that are followed side by side
 ENDS = ("first", "second")
-# What was recorded of a step, and where a graph has it of what a step has led to.
+# Recorded quantities of a step, and the names of the solve's results for them in a graph.
 TOLD = {"velocity": "solved_velocity", "angular": "solved_angular"} | {n: n for n in ("mean_velocity", "mean_angular")}
 
 
 @dataclass(frozen=True)
 class Solved:
-    draws: int = 2  # how often every recording is followed: first from the states as they are, then from disturbed ones
-    # shift, speed: m and m/s, standard deviations of the disturbance of a body's place and velocity, and by turning and
-    # spinning of its surface. Every body's is a part of it, log-uniform from `least` to all.
+    draws: int = 2  # times that every recording is followed: first from recorded states, then from disturbed ones
+    # shift, speed: m and m/s, standard deviations of the disturbance of a body's position and velocity, and, by
+    # rotation and spin, of its surface. For each body it is multiplied by a factor, log-uniform from `least` to 1.
     shift: float = 0.003
     speed: float = 0.03
     least: float = 0.05
@@ -58,35 +58,39 @@ class Solved:
 
 @dataclass(frozen=True)
 class ContactFrames:
-    """F frames with contact out of many trajectories, flattened.
+    """F frames with contact from many trajectories, flattened.
 
-    Units are metres, seconds and kilograms where the step is `STEP`. Frames of other steps are in units in which
-    it is that long and gravity is what it is (Froude scaling): to a network, which knows no other step, their bodies
-    are larger or smaller.
+    Units are metres, seconds and kilograms if the step is `STEP`. Frames of other steps are in units in which the step
+    has this length and gravity keeps its value (Froude scaling): to a network, which is trained with this step only,
+    their bodies look larger or smaller.
 
-    A frame holds its trajectory's bodies that move or not (rows of `bodies`, `truth` and what follows these) and its
-    contact edges, each as a `ContactGraph` has them. `second` = -1 means the floor, which is no row.
+    A frame holds all bodies of its trajectory (rows of `bodies`, `truth` and the fields after them) and its contact
+    edges, in the form of a `ContactGraph`. `second` = -1 means the floor, which has no row.
     """
 
     # body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1]
     body_start: np.ndarray
     edge_start: np.ndarray
-    bodies: dict[str, np.ndarray]  # of `OF_BODIES`, [B, ...]; masses are relative to one that changes from step to step
-    edges: dict[str, np.ndarray]  # of `OF_EDGES`, [E, ...]; `first` and `second`: [E] int16, bodies within the frame
-    truth: dict[str, np.ndarray]  # of `Velocities`, [B, 3]: what was recorded
+    bodies: dict[
+        str, np.ndarray
+    ]  # by the names in `OF_BODIES`, [B, ...]; masses are relative to one that changes from step to step
+    edges: dict[
+        str, np.ndarray
+    ]  # by the names in `OF_EDGES`, [E, ...]; `first` and `second`: [E] int16, bodies within the frame
+    truth: dict[str, np.ndarray]  # fields of `Velocities`, [B, 3]: recorded values
     mass: np.ndarray  # [B] kg, 0 for static bodies; friction, restitution, size: [B]
     friction: np.ndarray
     restitution: np.ndarray
     size: np.ndarray
     floor: np.ndarray  # [F, 2] friction and restitution of each frame's floor
     gravity: np.ndarray  # [3] m/s^2
-    trajectories: np.ndarray  # [K] int64, how many were followed, of each of the K sets that were joined
+    trajectories: np.ndarray  # [K] int64, number of trajectories in each of the K sets that were joined
 
     def __len__(self) -> int:
         return len(self.edge_start) - 1
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All of it, by names in which a stroke leads to what a field holds."""
+        """All arrays, by names in which a slash leads to the entries of a field."""
         told: dict[str, np.ndarray] = {}
         for name, value in vars(self).items():
             told |= {f"{name}/{of}": v for of, v in value.items()} if isinstance(value, dict) else {name: value}
@@ -109,7 +113,7 @@ class ContactFrames:
 
     @classmethod
     def load(cls, path: Path) -> ContactFrames:
-        """Read a cache file. Raises SdfsimError: not contact frames, or not of this version."""
+        """Read a cache file. Raises SdfsimError if it does not hold contact frames of this version."""
         arrays = read_arrays(path, "contact frames", "delete it to have it made again")
         try:
             if int(arrays.pop("version", 0)) == FRAMES_VERSION:
@@ -127,12 +131,13 @@ class ContactFrames:
 
 def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress = silent) -> ContactFrames:
     """The contact frames of a dataset split: from the cache file beside it, else made now and cached. Raises
-    SdfsimError for no trajectories, unreadable ones, some that differ in step or gravity, or none with a contact."""
+    SdfsimError if there are no trajectories, if they are unreadable or differ in step or gravity, or if none has a
+    contact."""
     folder = data / "frames"
     name = f"{split}-{how.draws}"
     made = list(folder.glob(f"{name}-*.npz"))
     if not (data / split).is_dir() and len(made) == 1:
-        # A machine that only trains may have been given nothing but the cache.
+        # A machine that only trains may have only the cache.
         return ContactFrames.load(made[0])
     files = trajectory_files(data, split)
     cached = folder / f"{name}-{_fingerprint(files, how)}.npz"
@@ -156,7 +161,7 @@ def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress
 
 
 def join_frames(sets: list[ContactFrames]) -> ContactFrames:
-    """Several sets of frames as one. Raises SdfsimError: they differ in gravity."""
+    """Several sets of frames as one. Raises SdfsimError if they differ in gravity."""
     one = sets[0]
     if any(not np.allclose(one.gravity, other.gravity) for other in sets[1:]):
         raise SdfsimError("datasets that are trained on together must share gravity")
@@ -171,7 +176,7 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
 
 
 def inner_steps(dt: float, substep: float) -> int:
-    """Inner steps of `substep` s in a recorded step of `dt` s; 0 (unknown) counts as in our own recordings.
+    """Number of inner steps of `substep` s in a recorded step of `dt` s; for 0 (unknown) that of our own recordings.
     Raises SdfsimError for more than 5."""
     count = round(dt / substep) if substep > 0 else SUBSTEPS
     if not 1 <= count <= SUBSTEPS:
@@ -180,7 +185,8 @@ def inner_steps(dt: float, substep: float) -> int:
 
 
 def _fingerprint(files: list[Path], how: Solved) -> str:
-    """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are solved."""
+    """A hash that changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are
+    solved."""
     info = [home / INFO] if (home := home_of(files[0].parent)) else []
     records = [*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))]
     told = [record.read_text(encoding="utf-8") for record in records]
@@ -188,7 +194,7 @@ def _fingerprint(files: list[Path], how: Solved) -> str:
 
 
 def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
-    """The frames of each draw and step: of all trajectories of a group at that step."""
+    """The frames of each draw and step, for all trajectories of a group."""
     from sdfsim.data.batching import merged, state_at  # needs the SDFs, hence more than torch and numpy
     from sdfsim.learned.model import load_model
     from sdfsim.physics.bodies import Units
@@ -241,8 +247,8 @@ def _of_step(
     bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, options: Options,
     of_floor: tuple[float, float],
 ) -> list[ContactFrames]:  # fmt: skip
-    """The frames of a step of several trajectories on one floor, of this friction and restitution, in units in which it
-    lasts `STEP`; none where nothing touches."""
+    """The frames of a step of several trajectories on one floor with this friction and restitution, in units in which
+    the step is `STEP`; none if nothing touches."""
     from sdfsim.learned.inference import step_graph
 
     if not len(edges.pair):
@@ -253,7 +259,7 @@ def _of_step(
     used, frame, count = np.unique(world[edges.pair[:, 0]], return_inverse=True, return_counts=True)
     rows = np.flatnonzero(np.isin(world[:floor], used))
     begin = np.concatenate([[0], np.cumsum(np.bincount(world[rows])[used])])
-    # Of the same edges, once with what the solve makes of the step, and once with what was recorded.
+    # The same edges, once with the solve's result for the step, and once with the recorded one.
     graph, truth = (
         vars(step_graph(bodies, state, end, edges, options, STEP, np.append(rows, floor))[1])
         for end in (after, recorded)

@@ -1,4 +1,4 @@
-"""Several processes or GPUs that train one network, as `torchrun` starts them."""
+"""Training one network with several processes or GPUs that `torchrun` starts."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -59,7 +59,7 @@ ALONE = Team()
 
 
 def gather_team(device: str) -> tuple[Team, str]:
-    """The team that `torchrun` has started this process for, and its own device; alone where there is none."""
+    """The team to which this process belongs if `torchrun` started it, else a team of one; and the process's device."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
         return ALONE, device

@@ -1,4 +1,4 @@
-"""What training the *impulse* network means: batches of contact frames, and a loss on velocities."""
+"""The task of training the *impulse* network: batches of contact frames, and a loss on velocities."""
 
 from dataclasses import dataclass
 
@@ -12,22 +12,22 @@ from sdfsim.learned.impulse import ImpulseNetwork, Velocities
 from sdfsim.training.contact_cache import ENDS, STEP, ContactFrames
 from sdfsim.training.distributed import ALONE, Team
 
-HUBER = 0.01  # m/s: below it errors count squared, above it by their size; what rests may creep by less than that
-CALM_SHARE = 0.2  # how often frames in which nothing is hit are drawn, against those with the hardest hits
+HUBER = 0.01  # m/s: smaller errors count squared, larger ones linearly; bodies at rest may creep more slowly than this
+CALM_SHARE = 0.2  # how often frames without a hit are drawn, relative to those with the hardest hits
 
 
 @dataclass(frozen=True)
 class ContactBatch:
-    """A graph, what happened, and which bodies count."""
+    """A graph, the recorded result, and the bodies that count."""
 
     graph: ContactGraph  # the input
     truth: Velocities  # recorded velocities
     size: Tensor  # [N] m, turns an angular error into a speed
-    counts: Tensor  # [N] bool, bodies that move and have a contact edge
+    counts: Tensor  # [N] bool, dynamic bodies with a contact edge
 
 
 class ImpulseTask:
-    """Draws batches from contact frames, hard ones more often; on the CPU."""
+    """Draws batches from contact frames, those with hard hits more often; on the CPU."""
 
     def __init__(self, frames: ContactFrames) -> None:
         self.frames = frames
@@ -40,7 +40,7 @@ class ImpulseTask:
         return self.frames.digest()
 
     def ranges(self) -> dict[str, list[float]]:
-        """What the frames hold; see `ranges_of`."""
+        """The ranges of the frames; see `ranges_of`."""
         f = self.frames
         moving = f.mass > 0
         heaviest = np.maximum.reduceat(f.mass, f.body_start[:-1])
@@ -50,7 +50,7 @@ class ImpulseTask:
         return ranges_of(f.size[moving], speed, ratios, f.friction, f.restitution, f.floor)
 
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> ContactBatch:
-        """A batch of `count` frames, or the part of it that falls to one of a team."""
+        """A batch of `count` frames, or this process's part of it."""
         picked = np.sort(rng.choice(len(self.frames), size=count, p=self.weight))
         return self.batch(picked[team.share(count)])
 
@@ -93,7 +93,7 @@ class ImpulseTask:
         return torch.stack(terms).mean(0)[batch.counts].sum() / max(1, int(batch.counts.sum()))
 
     def weight_of(self, batch: ContactBatch) -> int:
-        """Over how many bodies a batch's loss is the mean."""
+        """The number of bodies over which a batch's loss is averaged."""
         return int(batch.counts.sum())
 
 
@@ -103,7 +103,7 @@ def _size(error: Tensor) -> Tensor:
 
 
 def _ranges(start: np.ndarray, picked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows start[k] : start[k + 1] of every picked k, and which of the picked each row belongs to."""
+    """Rows start[k] : start[k + 1] of every picked k, and for each row the index of its k in `picked`."""
     count = start[picked + 1] - start[picked]
     which = np.repeat(np.arange(len(picked)), count)
     first = np.repeat(np.cumsum(count) - count, count)

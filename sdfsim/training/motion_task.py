@@ -1,8 +1,8 @@
-"""What training the *impulse* network on recorded motions means, over several steps in a row.
+"""The task of training the *impulse* network on recorded motions, over several steps in a row.
 
-Windows of recordings run side by side, each from where the recording has the bodies: the contact solve steps them, the
-network changes what it makes of contacts, and the next step starts from there. Gradients flow through the network and
-through what its changes lead to, free motion and contacts that hold. What the solve makes of a step is a constant.
+Windows of recordings run side by side, each from a recorded state. The contact solve steps them, the network corrects
+its impulses, and the next step starts from the result. Gradients flow through the network and through the effects of
+its corrections: free motion, and contacts that hold. The solve's own result is treated as a constant.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ from sdfsim.training.distributed import ALONE, Team
 if TYPE_CHECKING:
     from sdfsim.apps.observed import Recording
 
-SOFT = 0.02  # of a body's size: errors below count squared, above by their size
-LOST = 0.3  # of a body's size: errors count as less than this, since who is as far off has met with chance
-SLOW = 0.03  # model units of speed: what moves slower has come to rest
-IMPACT = 3.0  # times what gravity makes in a frame: larger changes of a velocity are of contacts
-HORIZONS = 0.25, 0.5, 1.0  # model units of time: lengths of windows, each batch has one of them
-NOISE = 2.0  # deviations of the tracker's noise, by which starts are disturbed
-KNOWN = 0.1  # of its noise in a pose over the spacing of frames: how uncertain a fitted velocity is
-HELD = 6  # every so many-th recording is held out
-LEAST = 4  # recordings
+SOFT = 0.02  # relative to a body's size: smaller errors count squared, larger ones linearly
+LOST = 0.3  # relative to a body's size: bound of an error's contribution, since motions this far off are chaotic
+SLOW = 0.03  # model units of speed: slower bodies count as at rest
+IMPACT = 3.0  # times the change of velocity by gravity in a frame: larger changes come from contacts
+HORIZONS = 0.25, 0.5, 1.0  # model units of time: lengths of windows; each batch has one of them
+NOISE = 2.0  # starts are disturbed by this many standard deviations of the tracker's noise
+KNOWN = 0.1  # uncertainty of a fitted velocity, relative to the noise of a pose divided by the spacing of frames
+HELD = 6  # every sixth recording is held out
+LEAST = 4  # least number of recordings
 
 
 @dataclass(frozen=True)
 class Starts:
-    """W windows of D bodies: poses and velocities at their first frames, and the poses that follow; SI units."""
+    """W windows of D bodies: poses and velocities at their first frames, and the following poses; SI units."""
 
     position: np.ndarray  # [W * D, 3]
     orientation: np.ndarray  # [W * D, 4]
     velocity: np.ndarray  # [W * D, 3]
     angular_velocity: np.ndarray  # [W * D, 3]
-    goal: np.ndarray  # [K, W * D, 7], NaN where there is none
+    goal: np.ndarray  # [K, W * D, 7], NaN for missing poses
 
 
 class Stepped(NamedTuple):
-    """One step: where the bodies are after it, and their contact graph; None where nothing touched."""
+    """One step: the poses after it, and the contact graph, or None if nothing touched."""
 
     position: np.ndarray  # [W * D, 3] model lengths
     orientation: np.ndarray  # [W * D, 4]
@@ -67,7 +67,7 @@ class Stepped(NamedTuple):
 
 
 class Worlds(Copies):
-    """Copies of the bodies of a scene that steps of a recording, whose frames are `dt` s apart, move."""
+    """Copies of a scene's bodies, moved by steps between the frames of a recording, `dt` s apart."""
 
     def __init__(self, scene: Scene, count: int, dt: float) -> None:
         super().__init__(scene, count)
@@ -78,8 +78,8 @@ class Worlds(Copies):
     def roll(
         self, network: ImpulseNetwork | None, starts: Starts, steps: int, *, mirrored: bool = False
     ) -> list[Stepped]:
-        """What comes of these starts with a network on the solve, or with the solve alone. Bodies that a network has
-        thrown to where none can be stay at rest far away, so that errors are large, but numbers."""
+        """Simulate from these starts with a network on the solve, or with the solve alone. Bodies that a network has
+        thrown to an invalid state rest far away from then on, so that errors are large but finite."""
         found, lost = [], np.zeros(self.total, bool)
         state = self.begun(starts.position, starts.orientation, starts.velocity, starts.angular_velocity)
         for _ in range(steps):
@@ -103,7 +103,7 @@ class Worlds(Copies):
 
 
 def _far_away(rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Poses and velocities at rest of bodies [K] int64, apart from each other and from all else; model units."""
+    """Poses and velocities of bodies [K] int64 at rest, far from each other and from everything else; model units."""
     still, count = np.zeros((len(rows), 3)), len(rows)
     place = np.stack([np.full(count, FARTHEST / 2), 1e3 * rows, np.full(count, FARTHEST / 2)], 1)
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
@@ -123,7 +123,7 @@ def joined(graphs: Sequence[ContactGraph]) -> ContactGraph:
 
 
 class MotionTask:
-    """Draws windows of recordings and tells how far a network on the solve leads from them; on the CPU."""
+    """Draws windows of recordings, and measures how far a network on the solve deviates from them; on the CPU."""
 
     def __init__(self, recordings: Sequence[Recording], scene: Scene, *, noisy: bool = False) -> None:
         self.recordings, self.scene, self.noisy = list(recordings), scene, noisy
@@ -137,22 +137,22 @@ class MotionTask:
         self.begin = {horizon: self._begin(max(2, round(horizon / self.dt))) for horizon in HORIZONS}
 
     def _begin(self, steps: int) -> tuple[list[tuple[int, int]], np.ndarray]:
-        """Where windows of so many steps may begin, and how often they do: something touches in their first half, and
-        half of them begin before the first impact, where velocities are known best and most is to come."""
+        """Where windows of `steps` steps may begin, and the probabilities: something touches in their first half, and
+        half of them begin before the first impact, where velocities are known best and most of the motion follows."""
         begin, early = [], []
         for k, r in enumerate(self.recordings):
             speed = np.linalg.norm(r.velocity, axis=-1).max(1) / self.units.velocity
             touched = np.asarray(~r.flying.all(1))
             fall = np.asarray(self.scene.gravity) * r.dt
             sudden = np.linalg.norm(np.diff(r.velocity, axis=0) - fall, axis=-1).max(1) > IMPACT * np.linalg.norm(fall)
-            touched[1:] |= sudden  # an impact between two frames of flight
+            touched[1:] |= sudden  # a sudden change between two frames of flight is an impact
             flown = int(touched.argmax())
             for t in np.flatnonzero(r.known[:-LEAST]):
                 if speed[t] > SLOW and touched[t + 1 : t + 1 + max(2, steps // 2)].any():
                     begin.append((k, int(t)))
                     early.append(t < flown)
         if not begin:
-            raise SdfsimError("nothing touches in the recordings, where they are smooth before it")
+            raise SdfsimError("no recording has a contact after a smooth stretch")
         first = np.array(early)
         weight = first / max(1, first.sum()) + ~first / max(1, (~first).sum())
         return begin, weight / weight.sum()
@@ -163,7 +163,7 @@ class MotionTask:
         return digest(told, [[getattr(b, name) for name in of] for b in self.scene.bodies])[:16]
 
     def ranges(self) -> dict[str, list[float]]:
-        """What the recordings hold, in the solver's units; see `ranges_of`."""
+        """The ranges of the recordings, in the solver's units; see `ranges_of`."""
         bodies = self.worlds(1).bodies
         moves = bodies.moves
         speed = np.concatenate([np.linalg.norm(r.velocity[r.known], axis=-1).ravel() for r in self.recordings])
@@ -182,7 +182,8 @@ class MotionTask:
         return self.starts(picked[team.share(count)], max(2, round(horizon / self.dt)), rng if self.noisy else None)
 
     def starts(self, picked: Sequence[tuple[int, int]], steps: int, rng: np.random.Generator | None = None) -> Starts:
-        """Windows that begin in these recordings at these frames, disturbed as a tracker does where `rng` is given."""
+        """Windows that begin in these recordings at these frames; if `rng` is given, disturbed like a tracker's
+        noise."""
         some = [(self.recordings[k], t) for k, t in picked]
         position, turn, speed, spin = (np.concatenate([getattr(r, name)[t] for r, t in some]) for name in MOTION)
         many = some[0][0].seen.shape[1]
@@ -208,14 +209,14 @@ class MotionTask:
         return loss_of(network, worlds, rolled, batch.goal, mirrored=mirrored)
 
     def weight_of(self, batch: Starts) -> int:
-        """Over how many windows of a body a batch's loss is the mean."""
+        """The number of windows of a body over which a batch's loss is averaged."""
         return len(batch.position)
 
 
 def loss_of(
     network: ImpulseNetwork, worlds: Worlds, rolled: Sequence[Stepped], goal: np.ndarray, *, mirrored: bool = False
 ) -> Tensor:
-    """Mean soft error of steps that a network has made against `goal` [K, W * D, 7] in metres."""
+    """Mean soft error of a network's steps against `goal` [K, W * D, 7] in metres."""
     total, dt = worlds.total, worlds.dt
     size = worlds.bodies.size[:total, None]
     place, turn = (np.stack([getattr(step, name) for step in rolled]) for name in ("position", "orientation"))
@@ -225,7 +226,7 @@ def loss_of(
     off = torch.from_numpy(np.nan_to_num(off).astype(np.float32))
     lengths = torch.from_numpy(np.concatenate([np.repeat(1.0 / size, 3, 1), np.full((total, 3), 0.5)], 1)).float()
     made = iter(_pushes(network, [step.graph for step in rolled if step.graph is not None], mirrored))
-    # What all that the network has added does to twists and poses: its value is 0, its gradient is not.
+    # The effect of the network's corrections on twists and poses: its value is 0, its gradient is not.
     twist, shift = torch.zeros(len(worlds.bodies), 6), torch.zeros(len(worlds.bodies), 6)
     errors = []
     for t, step in enumerate(rolled):
@@ -241,7 +242,7 @@ def loss_of(
 
 
 def _pushes(network: ImpulseNetwork, graphs: list[ContactGraph], mirrored: bool) -> list[tuple[Tensor, Tensor]]:
-    """Of each graph the changes of twists [A, 6] at the end of the step and on its mean, less their values."""
+    """For each graph the changes of twists [A, 6], at the end of the step and of its mean, minus their values."""
     if not graphs:
         return []
     made = network(joined(graphs), mirrored=mirrored)
@@ -256,7 +257,7 @@ def _pushes(network: ImpulseNetwork, graphs: list[ContactGraph], mirrored: bool)
 
 
 def _held(graph: ContactGraph, twist: Tensor) -> Tensor:
-    """Changes of twists [A, 6] after contacts that push: what goes along their normals is lost."""
+    """Changes of twists [A, 6] after contacts that push: components along their normals are removed."""
     with torch.no_grad():
         frames = edge_frames(graph)
         hold = (frames.solved[:, 0] > 0).to(twist.dtype) * frames.mass[:, 0]
@@ -267,6 +268,6 @@ def _held(graph: ContactGraph, twist: Tensor) -> Tensor:
 
 
 def _soft(error: Tensor) -> Tensor:
-    """[N] sizes of errors [N, 3], squared below `SOFT` and less than `LOST`."""
+    """[N] sizes of errors [N, 3], squared below `SOFT`, and bounded by `LOST`."""
     size = (error.square().sum(-1) + SOFT**2).sqrt() - SOFT
     return size / (1.0 + size / LOST)

@@ -1,4 +1,4 @@
-"""Presets: which network is trained, how large it is and for how long."""
+"""Presets: the kind of network, its size, and the length of training."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ class Preset:
     batch: int  # contact frames (impulse) or recorded steps (others) a step
     rate: float  # peak learning rate of Adam; it falls to a hundredth along a cosine
     reach: float = 0.1  # m, contact radius D
-    # surface nodes of a body (of meshes: about this number of vertices); None for all
+    # surface nodes of a body (for meshes, about this number of vertices); None for all
     nodes: int | None = None
-    noise: float | None = None  # m, standard deviation of their pose noise (None: none); *impulse* has its own
-    # peak learning rate of Muon, which then trains the hidden matrices; None leaves all to Adam, as published
+    noise: float | None = None  # m, standard deviation of pose noise, for networks on surface nodes (None: no noise)
+    # peak learning rate of Muon, which then trains the hidden matrices; None: Adam trains everything, as published
     matrix_rate: float | None = None
 
 
 LITTLE = {"width": 32, "rounds": 4}
 PUBLISHED = {"width": 128, "steps": 10}  # sizes of SDF-Sim's network
-# The radii of MeshGraphNets and DPI are not in the texts that we have: with these, graphs of MOVi-B have about as many
-# edges between bodies as SDF-Sim's paper counts (docs/paper.md).
+# The papers do not give the radii of MeshGraphNets and DPI. With these, graphs of MOVi-B have about as many edges
+# between bodies as SDF-Sim's paper counts (docs/paper.md).
 RADII = {"sdf-sim": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-large": 0.38, "dpi": 0.3}
 
 PRESETS = {
@@ -31,7 +31,7 @@ PRESETS = {
     "impacts": Preset(
         "impulse", {"width": 32, "rounds": 2, "impacts": 1}, steps=1_000, batch=32, rate=2e-3, matrix_rate=0.01
     ),
-    # SDF-Sim's graph with a network that a CPU keeps up with
+    # SDF-Sim's graph with a network that is small enough for a CPU
     "sdf-sim-small": Preset(
         "sdf-sim", {"width": 64, "steps": 5}, 20_000, batch=32, rate=1e-3, reach=RADII["sdf-sim"], nodes=64, noise=0.003
     ),

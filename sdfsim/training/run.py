@@ -1,4 +1,4 @@
-"""One training run: everything that changes while a network is trained, and how it is saved."""
+"""One training run: everything that changes during training, and how it is saved."""
 
 from __future__ import annotations
 
@@ -32,12 +32,11 @@ SMALLEST = 16  # rows and columns of a matrix that counts as hidden; smaller one
 
 
 class Run:
-    """Everything that changes while training, and how to save it.
+    """Everything that changes during training, and how to save it.
 
     The task is an `ImpulseTask`, a `SurfaceTask` or a `MotionTask`. The learning rate depends on `total`, the
     optimiser's steps of the whole run; a `team` shares the work, and `workers` draw batches ahead. It begins with the
-    weights of `first`, where another training has made some. Raises SdfsimError if these are of another network than
-    the plan's.
+    weights of `first`, if given. Raises SdfsimError if that is another network than the plan's.
     """
 
     def __init__(
@@ -55,12 +54,12 @@ class Run:
             self.origin["first"] = digest(first.network)
             if (first.kind, first.network.config) != (plan.kind, self.network.config):  # type: ignore[union-attr]
                 told = f"{first.name}: a network of another kind or size than the preset's"
-                raise SdfsimError(told, "train the one that it was trained as")
+                raise SdfsimError(told, "use the preset that it was trained with")
             self.network.load_state_dict(first.network.state_dict())
         self.network = self.network.to(device)
-        if hasattr(task, "prepare") and first is None:  # what comes from elsewhere has its statistics
+        if hasattr(task, "prepare") and first is None:  # weights from another training include statistics
             task.prepare(self.network, np.random.default_rng([seed, 1]), device)
-        # Averaged are the trained weights; feature statistics are fixed before the first step.
+        # Only trained weights are averaged; feature statistics are fixed before the first step.
         self.weights = dict(self.network.named_parameters())
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimiser = Optimiser(self.network, plan)
@@ -98,11 +97,12 @@ class Run:
         return batches(Draws(self.task, self.plan.batch, self.seed, self.team), self.step, self.workers)
 
     def close(self) -> None:
-        """End the workers; the next step would have new ones."""
+        """End the workers; a further step would start new ones."""
         self.__dict__.pop("drawn", None)
 
     def share(self) -> float:
-        """Of the peak learning rates: a warm-up over 2 % of all steps, 1000 at most, then a cosine to a hundredth."""
+        """Factor on the peak learning rates: a warm-up over 2 % of all steps, at most 1000, then a cosine down to a
+        hundredth."""
         warm = min(1.0, (self.step + 1) / max(1.0, min(1000.0, 0.02 * self.total)))
         fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self.step / self.total)))
         return warm * (0.01 + 0.99 * fall)
@@ -113,14 +113,14 @@ class Run:
         return network.eval().requires_grad_(False)
 
     def save(self, path: Path) -> None:
-        """Write everything. Arrays only: nothing is pickled."""
+        """Write everything, as arrays only: nothing is pickled."""
         states = {"network": self.network.state_dict(), "average": self.average, "optimiser": self.optimiser.state()}
         arrays = {f"{of}/{name}": value.cpu().numpy() for of, state in states.items() for name, value in state.items()}
         progress = {name: getattr(self, name) for name in ("step", "seconds", "loss", "total", "skipped")}
         write_arrays(path, arrays | {"run": np.array(json.dumps(self.origin | progress))}, compressed=False)
 
     def load(self, path: Path) -> None:
-        """Take up a saved run. Raises SdfsimError if it is of another preset, seed or data, or unreadable."""
+        """Load a saved run. Raises SdfsimError if it has another preset, seed or data, or is unreadable."""
         arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
         try:
             info: dict[str, Any] = json.loads(str(arrays.pop("run")))
@@ -146,7 +146,7 @@ class Run:
             ) from error
 
     def export(self, name: str, data: list[dict[str, Any]]):
-        """The averaged weights as a `Model`; `data` is what its card says of the datasets."""
+        """The averaged weights as a `Model`; `data` describes the datasets in its card."""
         from sdfsim.learned.model import Model
 
         ranges = self.task.ranges()
@@ -177,10 +177,10 @@ class Run:
 
 
 class Optimiser:
-    """Muon for the hidden matrices of a network, Adam for all else.
+    """Muon for the hidden matrices of a network, Adam for all other parameters.
 
-    Muon (Jordan et al., 2024) takes steps along the nearest orthogonal matrix to the momentum, so that every direction
-    of a hidden matrix learns at one pace. On contact frames a step of it was worth more than three of Adam's.
+    Muon (Jordan et al., 2024) makes steps along the orthogonal matrix nearest to the momentum, so that all directions
+    of a hidden matrix learn at the same pace. On contact frames one of its steps was worth more than three of Adam's.
     """
 
     def __init__(self, network: nn.Module, plan: Preset) -> None:
@@ -190,7 +190,7 @@ class Optimiser:
         self.parts: list[torch.optim.Optimizer] = [torch.optim.Adam(others, lr=plan.rate, fused=True)]
         self.rates = [plan.rate]
         if plan.matrix_rate:
-            # Four Newton-Schulz iterations are enough for a direction, and a fifth less work than the usual five.
+            # Four Newton-Schulz iterations are enough for a direction, and cost a fifth less than the usual five.
             muon = torch.optim.Muon(hidden, lr=plan.matrix_rate, momentum=0.95, weight_decay=0.0, ns_steps=4)
             self.parts.append(muon)
             self.rates.append(plan.matrix_rate)

@@ -1,4 +1,4 @@
-"""What training a network on surface nodes means: recorded steps of whole scenes, and a loss on node accelerations."""
+"""The task of training a network on surface nodes: recorded steps of whole scenes, and a loss on node accelerations."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ WARM_BATCHES = 20  # batches that set the feature statistics before the first st
 
 @dataclass(frozen=True)
 class Batch:
-    """A graph, the accelerations [M, 3] that were recorded, and which nodes move [M]."""
+    """A graph, the recorded accelerations [M, 3], and which nodes move [M]."""
 
     graph: MultiGraph
     target: Tensor
@@ -36,8 +36,8 @@ class Batch:
 
 
 class SurfaceTask:
-    """Draws recorded steps of random trajectories, turned by a random yaw, with rigid noise on the input poses where
-    `noisy`; on the CPU, since contacts are found there."""
+    """Draws recorded steps of random trajectories, turned by a random yaw, and if `noisy` with rigid noise on the input
+    poses; on the CPU, since contacts are found there."""
 
     def __init__(self, data: Path, split: str, plan: Preset, *, noisy: bool = False) -> None:
         self.made_of = (data, split, plan, noisy)
@@ -56,7 +56,7 @@ class SurfaceTask:
         self.shared = SharedShapes()
 
     def __getstate__(self) -> tuple:
-        """A process that draws batches makes its own."""
+        """A process that draws batches makes its own task."""
         return self.made_of
 
     def __setstate__(self, made_of: tuple) -> None:
@@ -67,31 +67,31 @@ class SurfaceTask:
         return digest(self.floor, self.trajectories, {name: shape.nodes for name, shape in self.shapes.items()})[:16]
 
     def prepare(self, network: GraphNetwork, rng: np.random.Generator, device: torch.device) -> None:
-        """Set the feature statistics of a network, which is on a device, from a few batches."""
+        """Set the feature statistics of a network, which is on `device`, from a few batches."""
         for _ in range(WARM_BATCHES):
             batch = moved(self.draw(rng, 4), device)
             network.observe(batch.graph)
             network.target.observe(batch.target[batch.moves])
 
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
-        """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
+        """`count` recorded steps as one graph, or this process's part of them."""
         bodies, state, after = self.scenes(rng, count, team)
         scene = Compiled(bodies, state, self.shared) if self.family.distances else None
         bodies, state = body_tensors(bodies, CPU), state_tensors(state, CPU)
-        # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
+        # The target leads from the disturbed poses to the recorded one, so that the network learns to undo errors.
         target = target_acceleration(bodies, state, *map(torch.from_numpy, after))
         graph = self.family.graph(bodies, state, self.near(bodies, state, scene))
         return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 
     def near(self, bodies: BodyTensors, state: StateTensors, scene: Compiled | None) -> Contacts | Pairs:
-        """What is near what; see `Family.near`."""
+        """The near parts of bodies; see `Family.near`."""
         gravity = np.asarray(self.trajectories[0].gravity, dtype=np.float64)
         return self.family.near(bodies, state, gravity, self.reach, self.dt, scene)
 
     def scenes(
         self, rng: np.random.Generator, count: int, team: Team = ALONE
     ) -> tuple[Bodies, State, tuple[np.ndarray, np.ndarray]]:
-        """Bodies of `count` recorded steps side by side, how they move before, and their poses [N, *] after."""
+        """Bodies of `count` recorded steps side by side, their motion before, and their poses [N, *] after."""
         picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
         frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
         yaw = pose.from_rotvec(np.array([0.0, 0.0, rng.uniform(0, 2 * np.pi)]))
@@ -122,11 +122,11 @@ class SurfaceTask:
         return error[batch.moves].square().mean()
 
     def weight_of(self, batch: Batch) -> int:
-        """Over how many nodes a batch's loss is the mean."""
+        """The number of nodes over which a batch's loss is averaged."""
         return int(batch.moves.sum())
 
     def ranges(self) -> dict[str, list[float]]:
-        """What the trajectories hold; see `ranges_of`."""
+        """The ranges of the trajectories; see `ranges_of`."""
         extent = {name: largest_extent(shape) for name, shape in self.shapes.items()}
         moving = [(t, ~t.static) for t in self.trajectories if not t.static.all()]
         return ranges_of(
@@ -139,12 +139,13 @@ class SurfaceTask:
         )
 
     def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> np.ndarray | None:
-        """Noise [3, 2, N + 1, 3] m of each input pose, shifts and turns at the surface, of its bodies and the floor:
-        that of the whole batch, so that it does not depend on the team's size; then this one's part of it."""
+        """Noise [3, 2, N + 1, 3] m for each input pose: shifts, and turns measured at the surface, for bodies and the
+        floor. It is drawn for the whole batch, so that it does not depend on the team's size; this process takes its
+        part."""
         if self.noise is None:
             return None
         ends = np.cumsum([0] + [t.position.shape[1] for t in picked])
-        # Sizes 1 / sqrt(3), so that the last pose of the walk is off by `noise`.
+        # Steps of size 1 / sqrt(3), so that the last pose of the walk deviates by `noise`.
         steps = rng.normal(scale=self.noise / np.sqrt(3), size=(3, 2, ends[-1] + 1, 3))
         mine = team.share(len(picked))
         rows = [*range(ends[mine.start], ends[mine.stop]), ends[-1]]
@@ -152,7 +153,7 @@ class SurfaceTask:
 
 
 def _disturbed(poses: list[tuple[np.ndarray, np.ndarray]], bodies: Bodies, noise: np.ndarray):
-    """Rigid displacements that walk over the three input poses by the steps `noise` [3, 2, N, 3] m."""
+    """Displace the three input poses rigidly by a random walk with the steps `noise` [3, 2, N, 3] m."""
     lever = np.where(bodies.moves, 2.0 / bodies.size, 0.0)[:, None]
     shift, turn = (noise * bodies.moves[:, None]).cumsum(0).swapaxes(0, 1)
     walked = [

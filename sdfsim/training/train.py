@@ -1,4 +1,5 @@
-"""Training: one loop for all networks, resumable to the step, needing only torch and numpy once frames are cached."""
+"""Training: one loop for all networks, which can resume at any step, and needs only torch and numpy once frames are
+cached."""
 
 import argparse
 import json
@@ -39,19 +40,19 @@ def train(
     allow_outside: bool = False,
     on_progress: Progress = silent,
 ) -> dict:
-    """Train a preset on one dataset or several, or on recordings of a `scene`; write `model.safetensors`, `log.jsonl`
-    and a checkpoint under `out`.
+    """Train a preset on one or several datasets, or on recordings of a `scene`; write `model.safetensors`, `log.jsonl`
+    and a checkpoint in `out`.
 
-    Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. Recordings are what
-    `sdfsim identify` reads, of one scene that says what they do not (best the one that it wrote); every sixth is held
-    out. They are trained on over several steps in a row, on the CPU, with the preset "impacts" or "alone". The preset
-    is a name in `PRESETS`, or one of your own, with other `steps` if given. Where a model is given as `first`, a
-    bundled name or a path, its weights are those to begin with. `resume` goes on from the checkpoint in `out`, with the
-    result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after which it stops
-    early. So many `workers` draw batches ahead, in processes of their own, and the result is the same: a GPU would wait
-    for the contacts of networks on surface nodes, which the CPU searches. Returns paths, losses and processor time.
-    Raises SdfsimError for unusable data, weights to begin with of another network than the preset's, a checkpoint in
-    `out` without `resume`, another run writing to it, or diverged training.
+    Datasets have train/ and validation/; several (impulse only) are used as if they were one. Recordings are in the
+    forms that `sdfsim identify` reads, of one scene (best as `identify` wrote it); every sixth is held out. Training on
+    them is over several steps in a row, on the CPU, with the preset "impacts" or "alone". The preset is a name in
+    `PRESETS`, or your own, with other `steps` if given. `first` is a model, by bundled name or path, with whose weights
+    training begins. `resume` continues from the checkpoint in `out`, with the result of an uninterrupted run. `budget`
+    is processor time in s, all cores together, after which training stops early. `workers` is a number of processes
+    that draw batches in advance, with the same result: otherwise a GPU waits for the contacts of networks on surface
+    nodes, which are found on the CPU. Returns paths, losses and processor time. Raises SdfsimError if data are
+    unusable, if `first` is another network than the preset's, if `out` has a checkpoint and `resume` is not set, if
+    another run is writing to `out`, or if training diverges.
     """
     from sdfsim.base.devices import pick_device
     from sdfsim.learned.model import load_model
@@ -71,7 +72,7 @@ def train(
     team, device = gather_team("cpu" if scene else device)
     place = pick_device(device)
     with locked(out) if team.leads else nullcontext():
-        with team.in_turn():  # the first finds contacts and caches them, the others read
+        with team.in_turn():  # the first process finds contacts and caches them, the others read them
             if scene is None:
                 task, held_out = _tasks(plan, folders, lambda _, message: on_progress(0.0, message))
                 counts = zip(folders, infos, task.counts, held_out.counts, strict=True)
@@ -96,13 +97,14 @@ def train(
             report |= {"model": str(out / "model.safetensors"), "held_out_loss": held_out_loss(run, held_out)}
             try:
                 model.save(out / "model.safetensors")
-            except ImportError:  # without safetensors: --resume writes it from the checkpoint elsewhere
+            except ImportError:  # without safetensors: --resume on another machine writes it from the checkpoint
                 report["model"] = None
     return report
 
 
 def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]:
-    """What a model's card says of a dataset. The numbers of trajectories count where these are not here."""
+    """The description of a dataset in a model's card. The numbers of trajectories are used if the files are not
+    here."""
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
     known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}
@@ -133,14 +135,14 @@ def _tasks(plan: Preset, folders: Sequence[Path], tell: Progress):
 
 
 def _check_kind(plan: Preset, scene: Path | None, workers: int) -> None:
-    """Raise SdfsimError if a preset does not train on what is given."""
+    """Raise SdfsimError if a preset cannot be trained on the given data."""
     impacts, alone = (bool(plan.config.get(name)) for name in ("impacts", "alone"))
     if scene is None and impacts:
         raise SdfsimError("preset: impacts trains on recordings of real motions", "give them as --data, with --scene")
     if scene is not None and workers:
         raise SdfsimError("workers: batches of recordings are drawn in one process", "leave --workers out")
     if scene is not None and not (impacts or alone):
-        raise SdfsimError("preset: on recordings of a scene impacts and alone are trained", "give --preset impacts")
+        raise SdfsimError("preset: only impacts and alone train on recordings of a scene", "give --preset impacts")
 
 
 def _motion_tasks(paths: Sequence[Path], scene: Path, tell: Progress, *, allow_outside: bool):
@@ -164,7 +166,7 @@ def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progre
                 run.advance()
                 run.seconds += time.process_time() - started
                 due = run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total
-                if run.team.leads and due:  # a step's line in the log is part of it
+                if run.team.leads and due:  # the log line is part of the step
                     entry = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss}
                     entry |= {"rate": run.plan.rate * run.share(), "held_out_loss": held_out_loss(run, held_out)}
                     with open(out / "log.jsonl", "a", encoding="utf-8") as log:
@@ -178,16 +180,16 @@ def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progre
                 saved = time.monotonic()
     finally:
         run.close()
-        # Also on Ctrl-C: what has been learned is kept.
+        # Also after Ctrl-C, so that the training so far is kept.
         if run.team.leads:
             run.save(out / "checkpoint.npz")
 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits for the end of a step: a checkpoint of half a step would make the resumed run another one."""
+    """Delay Ctrl-C to the end of a step: a checkpoint in the middle of a step would change the resumed run."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread hears of Ctrl-C
+        yield  # only the main thread receives Ctrl-C
         return
     pressed: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
@@ -200,17 +202,17 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _shorten(log: Path, step: int) -> None:
-    """Leave of a log what was written up to a step: the rest will be done, and logged, again."""
+    """Cut a log after a step: the later steps will be done, and logged, again."""
     kept = []
     for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []:
-        with suppress(ValueError):  # a kill has cut it short
+        with suppress(ValueError):  # the process may have been killed while writing a line
             if json.loads(line)["step"] <= step:
                 kept.append(line + "\n")
     write_text(log, "".join(kept))
 
 
 def main() -> None:
-    """Command line of this module, for machines that have only torch and numpy."""
+    """Command line of this module, for machines with only torch and numpy."""
     parser = argparse.ArgumentParser(description="Train on a dataset whose contact frames are cached.")
     parser.add_argument("data", type=Path, nargs="+")
     parser.add_argument("out", type=Path)
@@ -218,7 +220,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw batches ahead")
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw batches in advance")
     parser.add_argument("--resume", action="store_true")
     options = vars(parser.parse_args())
     data, out = options.pop("data"), options.pop("out")

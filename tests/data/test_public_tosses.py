@@ -106,7 +106,7 @@ def test_a_set_is_fetched_once_and_read_as_recordings(site, tmp_path):
 def test_other_tosses_are_refused_and_nothing_kept(site, tmp_path):
     name, file, content = site
     file.write_bytes(packed("contactnets-cube" if name.endswith("elbow") else "contactnets-elbow")[0])
-    with pytest.raises(SdfsimError, match="other tosses than expected: its 2 files have the SHA-256"):
+    with pytest.raises(SdfsimError, match="not the expected tosses: its 2 files have the SHA-256"):
         public_tosses(Path(name))
     assert not list((tmp_path / "cache").rglob("*.npz"))
     file.write_bytes(content)

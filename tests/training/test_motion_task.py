@@ -128,7 +128,7 @@ def test_what_does_not_fit_together_is_told(bounces, tmp_path):
     out = tmp_path / "run"
     cases: list[tuple[str, dict[str, Any]]] = [
         ("impacts trains on recordings", {"preset": "impacts"}),
-        ("impacts and alone are trained", {"preset": "small", "scene": scene}),
+        ("only impacts and alone train", {"preset": "small", "scene": scene}),
         ("drawn in one process", {"preset": "impacts", "scene": scene, "workers": 2}),
     ]
     for told, given in cases:
