@@ -1,1 +1,1 @@
-"""How good and how expensive: models against recordings, error against time, the hard cases."""
+"""Accuracy and cost: models compared with recordings, error against time, hard cases."""

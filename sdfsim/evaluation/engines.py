@@ -1,7 +1,7 @@
-"""PyBullet (the teacher) and MuJoCo, run from one start, of a recording or of a scene; and scenes run by them or by us.
+"""PyBullet and MuJoCo, run from the start of a recording or of a scene; and runs of scenes by them or by our models.
 
-Both take convex pieces, MuJoCo also a mesh as an SDF (its own octree). Spheres, boxes, cylinders and capsules are
-exact.
+Both collide convex pieces; MuJoCo also collides a mesh as an SDF (in its own octree). Spheres, boxes, cylinders and
+capsules are exact.
 """
 
 import re
@@ -33,39 +33,41 @@ from sdfsim.shape.shape import Shape, own_pieces
 from sdfsim.simulate.simulator import SimulationError, Simulator
 
 SAME_INERTIA = 1e-3  # relative
-SOFTEST = 3.0  # MuJoCo: period of a contact's spring over 2 pi, in steps of the engine; stable from 2 on
-LONGEST = 60.0  # s of the processor that an engine may take for a motion
+SOFTEST = 3.0  # MuJoCo: period of a contact's spring over 2 pi, in steps of the engine; stable from 2 upwards
+LONGEST = 60.0  # s of processor time that an engine may take for a motion
 
 SI = Units(1.0, 1.0, 1.0)
 
 
 class TooSlow(SdfsimError):
-    """An engine that was stopped because a motion took longer than `LONGEST`."""
+    """An engine was stopped because a motion took longer than `LONGEST`."""
 
 
 @dataclass(frozen=True)
 class Start:
-    motion: Trajectory  # its first frame counts
+    motion: Trajectory  # only its first frame is used
     urdfs: dict[str, Path]  # the engine's file of each shape, by name
     floor: tuple[float, float] | None  # friction and restitution of the floor z = 0, or None for no floor
-    own_inertia: bool = False  # bodies get the inertias of `motion`; else the engine's own must be the same
-    meshes: dict[str, Mesh] = field(default_factory=dict)  # about centres of mass, for engines that collide surfaces
+    own_inertia: bool = False  # bodies get the inertias of `motion`; else the engine's own must agree
+    meshes: dict[str, Mesh] = field(
+        default_factory=dict
+    )  # relative to centres of mass, for engines that collide surfaces
 
 
 @dataclass(frozen=True)
 class Timing:
-    """ms of the first step, and of the mean step after it by the clock and of the processor."""
+    """ms of the first step, and of the mean step after it, by the clock and in processor time."""
 
     first_ms: float
     wall_ms: float
     cpu_ms: float
 
 
-Engine = Callable[..., tuple[Trajectory, Timing]]  # called with a start, steps to record, and inner steps in one
+Engine = Callable[..., tuple[Trajectory, Timing]]  # called with a start, steps to record, and inner steps per step
 
 
 def timed(advance: Callable[[int], object], steps: int) -> Timing:
-    """How long `advance(count)` takes for a first step, and then for the others together."""
+    """Time `advance(count)` for a first step, and then for the others together."""
     began = time.perf_counter()
     advance(1)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -77,16 +79,16 @@ def timed(advance: Callable[[int], object], steps: int) -> Timing:
 
 
 def start_of_scene(scene: Scene, folder: Path, units: Units = SI) -> Start:
-    """A scene whose only plane, if any, is a level floor; shapes are named by their index in it.
+    """The start of a scene whose only plane, if any, is a level floor; shapes are named by their index in it.
 
-    The engine's files are written to `folder` where they are not there yet. Raises SdfsimError for bodies on a path, or
-    planes other than one level floor.
+    The engine's files are written to `folder` unless they exist. Raises SdfsimError for bodies on a path, or for planes
+    other than one level floor.
     """
     planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
     upright = [Rotation.from_quat(b.quat_xyzw).apply([0.0, 0.0, 1.0])[2] > 1 - 1e-9 for b in planes]
     if len(planes) > 1 or not all(upright) or any(b.motion == "kinematic" for b in scene.bodies):
         raise SdfsimError(
-            f"{scene.path or 'scene'}: engines know one level plane as the floor, and no bodies on a path"
+            f"{scene.path or 'scene'}: engines support one level plane as the floor, and no bodies on a path"
         )
     motion = start_motion(scene, units)
     motion.position[..., 2] -= planes[0].position[2] / units.length if planes else 0.0
@@ -97,12 +99,12 @@ def start_of_scene(scene: Scene, folder: Path, units: Units = SI) -> Start:
 
 
 def centred_mesh(shape: Shape) -> Mesh:
-    """A shape's surface about its centre of mass."""
+    """A shape's surface, relative to its centre of mass."""
     return Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces)
 
 
 def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
-    """The start of all bodies but planes as a recording of one frame; shapes are named by their index."""
+    """The start of all bodies except planes, as a recording of one frame; shapes are named by their index."""
     bodies, state = from_scene(scene, units)
     solid = solid_bodies(scene)
 
@@ -135,17 +137,18 @@ def solid_bodies(scene: Scene) -> np.ndarray:
 
 
 def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Trajectory, Timing]:
-    """PyBullet's motion of `steps` recorded steps, by default in the teacher's own inner steps.
+    """PyBullet's motion of `steps` recorded steps, by default with the inner steps of the training data.
 
     Raises:
-        SdfsimError: PyBullet is not installed, the teacher makes no such step, or an inertia differs from the recorded.
+        SdfsimError: PyBullet is not installed, the training data have no such step, or an inertia differs from the
+            recorded one.
     """
     t, parts = start.motion, []
     with Teacher(t.gravity, start.floor, step=t.dt, substeps=substeps or substeps_of(t.dt)) as teacher:
         for i, name in enumerate(t.shape):
             urdf = start.urdfs[str(name)]
             mass = 0.0 if t.static[i] else float(t.mass[i])
-            # Added far away and then moved, as when it was recorded: the engine's order of pairs depends on it.
+            # Added far away and then moved, as in the recording, because the engine's order of pairs depends on it.
             teacher.add(TeacherBody(urdf, float(t.scale[i]), mass, float(t.friction[i]), float(t.restitution[i])))
             teacher.place(i, t.position[0, i], t.orientation[0, i])
             if t.static[i]:
@@ -166,13 +169,13 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
 def mujoco(
     start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool = True, elliptic: bool = False
 ) -> tuple[Trajectory, Timing]:
-    """MuJoCo's motion of the same masses, inertias and starts; of the same convex pieces, or of meshes as SDFs; with
-    its usual pyramid of friction, or with a cone.
+    """MuJoCo's motion with the same masses, inertias and starts; with the same convex pieces, or with meshes as SDFs;
+    with its usual friction pyramid, or with a cone.
 
-    It takes the larger of two coefficients of friction where the teacher multiplies. So geoms that meet the floor carry
-    the product with the floor's, and those that meet other bodies carry their square. Those of static bodies take
-    priority, and carry the product with the median body's: exact where all bodies that move are of one material. Its
-    contacts are soft: a damped spring gives the wanted restitution.
+    MuJoCo takes the larger of two coefficients of friction, PyBullet their product. So geoms that meet the floor have
+    the product with the floor's, and those that meet other bodies have their square. Those of static bodies take
+    priority, and have the product with the median body's, which is exact if all dynamic bodies are of one material.
+    MuJoCo's contacts are soft: a damped spring gives the wanted restitution.
 
     Raises:
         SdfsimError: MuJoCo is not installed, a shape's engine file cannot be read, or the motion is unstable.
@@ -206,7 +209,7 @@ def mujoco(
                 if spec.mesh(shape["meshname"]) is None:
                     scaled = {"uservert": (form["uservert"] * t.scale[i]).ravel()}
                     spec.add_mesh(name=shape["meshname"], **form | scaled)
-            # One geom that meets the floor, and one that meets bodies.
+            # One geom that meets the floor, and one that meets other bodies.
             for kinds, other in (((1, 0), start.floor), ((2, 2), met)):
                 if other is None:
                     continue
@@ -216,7 +219,7 @@ def mujoco(
                 geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
                 bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
                 damping = max(-np.log(bounce) / np.hypot(np.pi, np.log(bounce)), 1e-3)
-                geom.solref = [SOFTEST * step / damping, damping]  # its frequency is one over their product
+                geom.solref = [SOFTEST * step / damping, damping]  # the spring's frequency is one over their product
     model = spec.compile()
     data: Any = engine.MjData(model)
     moving = np.flatnonzero(~t.static)
@@ -229,7 +232,9 @@ def mujoco(
         quat = np.roll(place[:, 3:], -1, axis=-1)
         return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
 
-    engine.set_mju_user_warning(lambda message: None)  # by default it writes them to a file in the working directory
+    engine.set_mju_user_warning(
+        lambda message: None
+    )  # by default MuJoCo writes warnings to a file in the working directory
     kinds = engine.mjtWarning
     unstable = [data.warning[int(kind)] for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
 
@@ -244,10 +249,10 @@ def mujoco(
 def engine_motion(
     start: Trajectory, steps: int, advance: Callable[[], None], state: Callable[[], tuple[np.ndarray, ...]]
 ) -> tuple[Trajectory, Timing]:
-    """The motion of an engine of `steps` calls of `advance`, and its time.
+    """The motion of an engine over `steps` calls of `advance`, and its time.
 
-    `state` gives positions [M, 3] m, quaternions [M, 4] xyzw and velocities [M, 3] m/s and rad/s of the bodies that
-    move, in the frame of the world. Raises SdfsimError if the motion is not finite, and TooSlow.
+    `state` gives positions [M, 3] m, quaternions [M, 4] xyzw and velocities [M, 3] m/s and rad/s of the dynamic bodies,
+    in the world frame. Raises SdfsimError if the motion is not finite, and TooSlow if it takes too long.
     """
     began = time.process_time()
     frames = [state()]
@@ -269,7 +274,8 @@ def engine_motion(
 
 
 def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.ndarray | dict[str, Any]]]:
-    """MuJoCo's kind of geom, and its size [3] m or what makes its mesh: one a convex piece, or an SDF of `mesh`."""
+    """MuJoCo's kinds of geoms, each with its size [3] m or the arguments of its mesh: one geom for each convex piece,
+    or an SDF of `mesh`."""
     kind, sizes = form_of(urdf)
     if kind == "sphere":
         return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([*sizes, 0.0, 0.0]))]
@@ -288,7 +294,7 @@ def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.nda
 
 
 def shape_urdf(shape: Shape, folder: Path) -> Path:
-    """The URDF of a shape, written into `folder` unless it is there: exact closed forms, convex pieces of others.
+    """The URDF of a shape, written to `folder` unless it exists: exact closed forms, and convex pieces of other shapes.
 
     Raises:
         SdfsimError: the shape's mesh cannot be cut into convex pieces.
@@ -313,7 +319,7 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
 
 
 def dataset_urdf(data: Path, shape: str) -> Path:
-    """The URDF of a dataset's shape. Raises SdfsimError if it, or the convex pieces beside it, are absent."""
+    """The URDF of a dataset's shape. Raises SdfsimError if it, or the file of convex pieces beside it, is missing."""
     path = shapes_folder(data) / "engine" / f"{shape}.urdf"
     if not path.is_file() or not path.with_suffix(".obj").is_file():
         raise SdfsimError(f"{path}: no engine file of shape {shape!r}", "`sdfsim dataset` writes them")
@@ -321,8 +327,8 @@ def dataset_urdf(data: Path, shape: str) -> Path:
 
 
 def form_of(urdf: Path) -> tuple[str, np.ndarray]:
-    """What a URDF of `shape_urdf` collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or
-    "capsule" and its radius and the length of its straight side, or "mesh", its pieces."""
+    """The geometry in a URDF of `shape_urdf`: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or
+    "capsule" with its radius and the length of its straight side, or "mesh" (its convex pieces)."""
     found = re.search(r"<(sphere|box|cylinder|capsule) ([^>]*)/>", urdf.read_text(encoding="utf-8"))
     if found is None:
         return "mesh", np.zeros(0)
@@ -338,7 +344,7 @@ class Ran:
     """A motion of a scene, up to its last good state."""
 
     scene: Scene
-    rollout: Rollout  # SI units; an engine's has no contacts and no counters
+    rollout: Rollout  # SI units; from an engine without contacts and counters
     broke: str = ""  # why it ended early
 
     @property
@@ -348,7 +354,7 @@ class Ran:
 
     @cached_property
     def motion(self) -> Trajectory:
-        """The bodies that are not planes as a recording; shapes are named by their index in the scene."""
+        """The bodies except planes as a recording; shapes are named by their index in the scene."""
         solid = solid_bodies(self.scene)
         frames = {name: getattr(self.rollout, name)[:, solid] for name in MOTION}
         return replace(start_motion(self.scene), **frames, dt=float(self.rollout.meta["dt"]))
@@ -359,7 +365,7 @@ class Ran:
         return self.motion.position[:, ~self.motion.static]
 
 
-Runner = Callable[[Scene, float], Ran]  # runs a scene for so many seconds
+Runner = Callable[[Scene, float], Ran]  # runs a scene for a number of seconds
 
 
 def by_model(scene: Scene, seconds: float, model: str | Model = SOLVER, device: str = "cpu") -> Ran:
@@ -370,8 +376,8 @@ def by_model(scene: Scene, seconds: float, model: str | Model = SOLVER, device: 
 
 
 def by_engine(scene: Scene, seconds: float, engine: Engine, folder: Path, units: Units = SI) -> Ran:
-    """An engine's motion of a scene, which it runs in `units`, with its files in `folder`; its bodies never sleep.
-    Where the motion fails they stay where they started.
+    """An engine's motion of a scene, simulated in `units`, with its files in `folder`; its bodies never sleep. If the
+    motion fails, bodies stay where they started.
 
     Raises:
         SdfsimError: see `start_of_scene`. NotInstalled, TooSlow.
@@ -389,7 +395,7 @@ def by_engine(scene: Scene, seconds: float, engine: Engine, folder: Path, units:
 
 
 def still(scene: Scene, seconds: float, broke: str = "") -> Ran:
-    """A run in which all bodies stay where they started: what is judged where there is no motion."""
+    """A run in which all bodies stay where they started, used for judging if there is no motion."""
     first = Simulator(scene, SOLVER).initial_rollout()
     return Ran(scene, join([first, replace(first, time=first.time + seconds)]), broke)
 

@@ -1,4 +1,4 @@
-"""Rollouts against a recorded dataset: the numbers that models are compared by, and their tables."""
+"""Rollouts compared with a recorded dataset: the measures of models, and their tables."""
 
 import math
 import time
@@ -36,9 +36,10 @@ from sdfsim.shape.shape import Shape
 from sdfsim.simulate.steppers import FreeFlight, stepper_of
 from sdfsim.training.contact_cache import inner_steps
 
-SURVIVED = "0.25"  # m, the limit whose median survival time is shown
+SURVIVED = "0.25"  # m, the limit for which the median survival time is shown
 NOTHING = "-"
-# m/s; 0 shows what a recording alone cannot restore: an engine keeps more state than its recorded frames.
+# m/s; 0 shows the effect of state that a recording does not contain: an engine keeps more state than its recorded
+# frames.
 PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}
 
 Rows = list[tuple[str, ...]]
@@ -57,34 +58,34 @@ def evaluate(
     errors_only: bool = False,
     on_progress: Progress = silent,
 ) -> dict:
-    """Roll a model out from the first frame of every trajectory and compare, with the ballistic baseline.
+    """Roll a model out from the first frame of every trajectory, and compare it and the ballistic baseline with the
+    recording.
 
     Args:
         model: bundled name, path or `Model`.
-        steps: how far; errors are reported at the horizons of `HORIZONS` up to there, and there.
+        steps: length of the rollouts; errors are reported at the horizons of `HORIZONS` up to it, and at it.
         free_flight: "exact" or (networks on surface nodes) "learned".
-        substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine where
-            that is the teacher, and for those of `users_inner` where it is another.
-        chaos_floor: also run the teacher again from starts that differ slightly (see `PERTURBATIONS`).
+        substeps: inner steps of the solve in a step; None: those of the model, else those of the recording engine if
+            that is the teacher (PyBullet with its settings), else those of `users_inner`.
+        chaos_floor: also run PyBullet again from starts that differ slightly (see `PERTURBATIONS`).
         errors_only: leave out penetration, energy gain and resting speed.
 
     Returns:
         A report:
         "model", "ballistic": errors as `errors` gives them.
         "chaos_floor": "perturbations" -> name -> errors; "median_farthest_unperturbed_m".
-        "outside_training": in what the scenes leave the model's training, one line each.
-        "median_survival_s": of all of them, by limit in m: until half of the bodies are farther from the recording.
-        "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
-        "engine_substep": s, the recording engine's inner step; 0 where no dataset.json has it.
-        "floor": its "friction" and "restitution"; "told" is whether a dataset.json has them.
-        "as_teacher": whether the solve has the teacher's habits: only for recordings of PyBullet as the teacher is set,
-            according to a dataset.json. All others are judged with the solve as `Simulator` runs it, on their floor.
-        "inner_steps": of the solve in a step.
-        Further counts, and "ms_per_step_per_trajectory".
+        "outside_training": in what ways the scenes are outside the model's training, one line each.
+        "median_survival_s": for all of them, by limit in m: time until half of the bodies are farther from the
+        recording. "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the recording.
+        "engine_substep": s, the recording engine's inner step; 0 if no dataset.json gives it. "floor": its "friction"
+        and "restitution"; "told" is whether a dataset.json gives them. "as_teacher": whether the solve imitates
+        PyBullet (see `roll_out`): only for recordings of PyBullet with the teacher's settings, by their dataset.json.
+        All others are compared with the solve as `Simulator` runs it, on their floor. "inner_steps": number of inner
+        steps of the solve in a step. Further counts, and "ms_per_step_per_trajectory".
 
     Raises:
-        SdfsimError: no or unreadable trajectories or shapes, or no `chaos_floor` where it is asked for; exit code 3
-            when a rollout is not finite.
+        SdfsimError: missing or unreadable trajectories or shapes, or a `chaos_floor` that cannot be measured; with exit
+            code 3 if a rollout is not finite.
     """
     used = (model if isinstance(model, Model) else load_model(model)).to(str(pick_device(device)))
     stepper = stepper_of(used, free_flight=free_flight)
@@ -154,7 +155,7 @@ def evaluate(
         report["penetration"] = depth | {"geometry": geometry, "every": EVERY}
         report["energy_gain"] = {who: energy_gain(motions) for who, motions in sides.items()}
         resting: dict[str, float | None] = {"bodies": int(sum(r.sum() for r in rest))}
-        for who, motions in sides.items():  # the median in the last steps of the bodies that rest in the recording
+        for who, motions in sides.items():  # the median, in the last steps, over the bodies that rest in the recording
             last = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
             speeds = np.concatenate(last)
             resting[who] = float(np.median(speeds)) if len(speeds) else None
@@ -164,7 +165,8 @@ def evaluate(
 
 
 def users_inner(dt: float, scenes: list[Scene]) -> int:
-    """Inner steps in a step of `dt` s that are no longer than those of `Simulator` with the smallest body."""
+    """Number of inner steps in a step of `dt` s, such that they are no longer than those of `Simulator` with the
+    smallest body."""
     longest = min(scene_units(scene).time for scene in scenes) * STEP / SUBSTEPS
     return max(1, math.ceil(dt / longest - 0.01))
 
@@ -172,7 +174,7 @@ def users_inner(dt: float, scenes: list[Scene]) -> int:
 def load_recorded(
     data: Path, split: str, *, most: int | None = None, as_recorded: bool = False
 ) -> tuple[Motions, dict[str, Shape]]:
-    """Trajectories in which something moves, those that can run together side by side, and their shapes."""
+    """Trajectories in which something moves, in groups that can run side by side, and their shapes."""
     recorded = [Trajectory.load(f, as_recorded=as_recorded) for f in trajectory_files(data, split)[:most]]
     recorded = [t for group in batches(recorded) for t in group if not t.static.all()]
     if not recorded:
@@ -186,11 +188,11 @@ def load_recorded(
 
 
 def teacher_again(data: Path, trajectories: Motions, steps: int, seed: int = 0) -> dict[str, Motions]:
-    """Run the teacher again from recorded starts (velocities as recorded) of a dataset with a URDF for every shape.
+    """Run PyBullet again from recorded starts (with velocities as recorded) of a dataset with a URDF for every shape.
 
-    Returns, by the names of `PERTURBATIONS`, the motions (steps + 1 frames) that follow when the velocity of each body
-    that moves is changed by so much in a random direction. Raises SdfsimError if PyBullet or an engine file is
-    absent, or the recording is not this teacher's.
+    Returns, by the names of `PERTURBATIONS`, the motions (steps + 1 frames) after the velocity of each dynamic body was
+    changed by that much in a random direction. Raises SdfsimError if PyBullet or an engine file is missing, or if the
+    recording was not made with the teacher's settings.
     """
     import_pybullet()
     home = home_of(data) or data.parent
@@ -225,7 +227,7 @@ def perturbed(t: Trajectory, size: float, seed: list[int]) -> Trajectory:
 
 
 def report_lines(report: dict[str, Any]) -> list[str]:
-    """The report for people: errors at every horizon, then the quality of the motion."""
+    """The report as text: errors at every horizon, then the quality of the motion."""
     name = report["model_name"]
     return [
         "Translation RMSE and mean rotation error up to each horizon (95 % intervals over trajectories)",
@@ -240,7 +242,7 @@ def report_lines(report: dict[str, Any]) -> list[str]:
 
 
 def error_rows(report: dict[str, Any], *, name: str) -> Rows:
-    """Errors up to every horizon, with their intervals; the head first. Rows are the model, the teacher again, and
+    """Errors up to every horizon, with their intervals; the header first. Rows are the model, PyBullet run again, and
     flight without contact."""
     again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
     spans = [f"{steps} steps = {found['seconds']:.3g} s" for steps, found in report["model"].items()]
@@ -256,7 +258,7 @@ def error_rows(report: dict[str, Any], *, name: str) -> Rows:
 
 
 def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
-    """Penetration, energy, rest and survival of the model and of the teacher's recording."""
+    """Penetration, energy, rest and survival of the model and of the recording."""
     head = ("", "penetration 95 %", "worst", "energy gain", "worst", "resting speed", f"within {SURVIVED} m for")
     length = max(found["seconds"] for found in report["model"].values())
 
@@ -285,9 +287,11 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 def notes(report: dict[str, Any]) -> list[str]:
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
     ground, source = report["floor"], "from dataset.json" if report["floor"]["told"] else "that of our recipes"
-    how = f"The solve has the teacher's habits: bodies larger by {MARGIN:g} m, pushes that add to rebounds."
+    how = f"The solve imitates PyBullet: bodies larger by {MARGIN:g} m, pushes that add to rebounds."
     if not report["as_teacher"]:
-        how = f"The solve is as users run it, in {report['inner_steps']} inner steps: no dataset.json has the teacher."
+        how = (
+            f"The solve is as users run it, in {report['inner_steps']} inner steps: no dataset.json names the teacher."
+        )
     lines = [
         f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {source}.",
         how,
@@ -298,20 +302,20 @@ def notes(report: dict[str, Any]) -> list[str]:
         *(f"Outside the model's training: {line}." for line in report["outside_training"]),
     ]
     if shown := sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh"):
-        lines.append(f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.")
+        lines.append(f"Without the engine's files, penetration is measured on the shown mesh of {', '.join(shown)}.")
     if steps < report["steps_asked"]:
         lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
     if not report["engine_substep"]:
         lines.append(
-            "No dataset.json has the engine's inner step: velocities count as those at the positions' instants."
+            "No dataset.json gives the engine's inner step: velocities are taken as those at the positions' instants."
         )
     if floor:
         farthest = f"{floor['median_farthest_unperturbed_m']:.1g} m (median of the trajectories)"
-        lines.append(f"Run again unperturbed, the teacher departs from its recording by up to {farthest}.")
+        lines.append(f"Run again without perturbation, PyBullet departs from its recording by up to {farthest}.")
     return lines
 
 
 def _perturbed(report: dict[str, Any]) -> dict[str, dict]:
-    """Errors of the teacher run again, by perturbation, without the run that nothing perturbs: that one is a note."""
+    """Errors of PyBullet run again, by perturbation, without the unperturbed run, which is reported as a note."""
     runs = report.get("chaos_floor", {}).get("perturbations", {})
     return {size: found for size, found in runs.items() if size != "0"}

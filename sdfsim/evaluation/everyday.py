@@ -1,12 +1,12 @@
-"""Everyday scenes that any rigid-body simulator has to get right, each with a closed form of the right answer.
+"""Everyday scenes that any rigid-body simulator should get right, each with the right answer in closed form.
 
     python -m sdfsim.evaluation.everyday [ROW ...] [--size 0.1] [--yaw 0] [--kind analytic] [--full]
 
-prints a line a check: what was measured, what is wanted, and whether it holds. A row is a kind of scene; `--size` is
-its unit of length (that of the smallest bodies), `--yaw` turns the whole scene about the vertical, and `--kind` is what
-solids are made of: closed forms, the exact distance of a mesh, or samples of it on a grid. Lengths below are in units
-of the size, times and speeds as at 10 cm (they scale by Froude's law). Everything is judged by closed forms and by the
-instruments of `sdfsim.physics.instruments`, never by what the contact solve says of itself.
+prints a line for each check: the measured value, the wanted one, and whether the check holds. A row is a kind of scene.
+`--size` is its unit of length (the size of the smallest bodies), `--yaw` turns the whole scene about the vertical, and
+`--kind` says how solids are given: in closed form, as the exact distance of a mesh, or as samples of it on a grid.
+Lengths below are in units of the size, times and speeds as at 10 cm (they scale by Froude's law). Everything is judged
+by closed forms and by the instruments of `sdfsim.physics.instruments`, never by values of the contact solve.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_primitive
 from sdfsim.shape.shape import Shape
 
 G = 9.81  # m/s^2
-UNIT = 0.1  # m, at which times and speeds are as they are written
+UNIT = 0.1  # m, the size at which times and speeds are as written
 SIZES = (0.02, 0.1, 1.0)  # m
 KINDS = ("analytic", "mesh", "grid")
 DENSITY = 500.0  # kg/m^3
@@ -41,7 +41,7 @@ STILL = Rotation.identity()
 
 @dataclass(frozen=True)
 class Setting:
-    """How a row is run, and by whom."""
+    """How a row is run, and with which model or engine."""
 
     size: float = 0.1  # m
     yaw: float = 0.0  # degrees
@@ -51,7 +51,7 @@ class Setting:
 
     @property
     def time(self) -> float:
-        """What times are multiplied by."""
+        """The factor on times."""
         return sqrt(self.size / UNIT)
 
     def box(self, x: float, y: float, z: float) -> Shape:
@@ -64,7 +64,7 @@ class Setting:
         return solid(self.kind, "cylinder", radius, height)
 
     def mesh(self, form: str, *dims: float) -> Shape:
-        """A solid whose faces matter: a mesh, or a grid of it."""
+        """A solid with facets: a mesh, or a grid of it."""
         return solid("mesh" if self.kind == "analytic" else self.kind, form, *dims)
 
     def __str__(self) -> str:
@@ -73,7 +73,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Check:
-    """One number, and between what it has to lie."""
+    """A measured number, and the range in which it should be."""
 
     name: str
     measured: float
@@ -111,8 +111,8 @@ def most(name: str, measured: float, limit: float, unit: str = "") -> Check:
 def solid(kind: str, form: str, *dims: float) -> Shape:
     """A box (x, y, z), ball (radius), cylinder or capsule (radius, height) of a kind.
 
-    As a mesh also a cylinder of so many facets, a ball of so many subdivisions, a tube (outer and inner radius,
-    height), a torus (major, minor radius) and a stool (legs).
+    As a mesh also a cylinder with a number of facets, a ball with a number of subdivisions, a tube (outer and inner
+    radius, height), a torus (major, minor radius) and a stool (legs).
     """
     if kind != "analytic":
         return mesh_shape(_mesh(form, *dims), name=form, kind="grid" if kind == "grid" else "mesh")
@@ -146,11 +146,11 @@ def _mesh(form: str, *dims: float) -> Mesh:
     return _stool(int(dims[0]))
 
 
-LEG = (0.45, 0.04, 0.5)  # how far out legs stand, half their width, and their length, of a stool
+LEG = (0.45, 0.04, 0.5)  # of a stool: distance of the legs from the axis, half their width, and their length
 
 
 def _stool(legs: int) -> Mesh:
-    """A round seat on thin legs, whose feet stand `LEG`[0] from the axis."""
+    """A round seat on thin legs at the distance `LEG`[0] from the axis."""
     out, half, length = LEG
     parts = [primitives.cylinder(0.5, 0.1, FACETS)]
     for k in range(legs):
@@ -180,7 +180,7 @@ class Put:
 
 
 def fixed(name: str, shape: Shape, at: Sequence[float] | np.ndarray, turn: Rotation = STILL) -> Put:
-    """Scenery with coefficients of 1, so that products are the bodies' own."""
+    """A static body with coefficients of 1, so that products are the other bodies' own."""
     return Put(name, shape, at, turn, fixed=True, mu=1.0, e=1.0)
 
 
@@ -190,7 +190,7 @@ def floor() -> Put:
 
 @dataclass(frozen=True)
 class Ran(engines.Ran):
-    """A motion, turned back by the setting's yaw, and checks of it."""
+    """A motion, turned back by the setting's yaw, and checks on it."""
 
     at: Setting = Setting()
     label: str = ""  # of the scene
@@ -205,12 +205,12 @@ class Ran(engines.Ran):
         return Check(f"{self.label}: {what}", float(measured), low, high, unit)
 
     def slid(self, name: str, put: Put, part: float) -> Check:
-        """How far a body slides until it stops, to half of what it moves in its first step."""
+        """The distance that a body slides until it stops, to within half of its motion in the first step."""
         way, dt = put.v[0] ** 2 / (2 * put.mu * G) / UNIT, float(np.diff(self.seconds).mean())
         return self.near("way", self.moved(name)[-1, 0], way, part, "sizes", put.v[0] * dt / 2 / UNIT)
 
     def laws(self, deep: float = DEEP) -> Iterator[Check]:
-        """Laws of every scene; bodies may overlap by a part `deep` of the smaller thickness."""
+        """Laws that hold for every scene; bodies may overlap by a part `deep` of the smaller thickness."""
         verdict = self.verdict
         overlap, floating = (100 * found.part if found else 0.0 for found in (verdict.overlap, verdict.floating))
         yield self.most("overlap", overlap, 100 * deep, "% of thickness")
@@ -270,7 +270,7 @@ class Ran(engines.Ran):
         return judged(self.scene, self.rollout, every=-(-len(self.rollout) // JUDGED) or 1)
 
     def gap(self, one: str, other: str, frame: int) -> float:
-        """Between the true surfaces of two bodies in a frame, in sizes; negative where they are in each other."""
+        """Distance between the true surfaces of two bodies in a frame, in sizes; negative if they overlap."""
         rows, at = (np.array([self.rollout.names.index(name)]) for name in (one, other)), np.array([frame])
         first, second = (placed(self.scene, self.rollout, at, row) for row in rows)
         found = gaps([solid_of(shape) for shape in self.scene.shapes], first, second, np.array([np.inf]))
@@ -426,7 +426,7 @@ def seams(at: Setting) -> Iterator[Check]:
     yield ran.near("speed", ran.v("it")[-1, 0], 0.3, 0.01, "m/s")
     yield from ran.laws()
     ran = run(at, "cube down a step of a hundredth", [*tiles(down=0.01), put], 0.8)
-    # It may keep as speed what it falls, and tips a little in between; a wall would stop it.
+    # It may keep the energy of its fall as speed, and tips slightly in between; a wall would stop it.
     yield ran.between("speed", ran.v("it")[-1, 0], 0.3 * 0.97, sqrt(0.3**2 + 2 * G * 0.01 * UNIT), "m/s")
     row = [fixed(f"tile {k}", small, [k, 0, -0.5]) for k in range(-4, 12)]
     put = Put("it", cube, [-1.3, 0.17, 0.5], about("z", 20), v=[1.0, 0, 0], mu=0)
@@ -436,11 +436,11 @@ def seams(at: Setting) -> Iterator[Check]:
 
 
 def thin_floors(at: Setting) -> Iterator[Check]:
-    """A wide thin box carries as a plane does."""
+    """A wide thin box carries bodies as a plane does."""
     cube = at.box(1, 1, 1)
     sheets = {"1000 x 1000 x 1": (1000, 1000, 1), "10 x 10 x 0.02": (10, 10, 0.02)}
     for name, size in sheets.items():
-        # No grid resolves a sheet of half a millimetre that is 10 m wide.
+        # A grid cannot resolve a sheet of half a millimetre that is 10 m wide.
         sheet = solid("analytic" if at.kind == "grid" else at.kind, "box", *size)
         ground = fixed("ground", sheet, [0, 0, -size[2] / 2])
         deep = DEEP / size[2]  # a hundredth of the cube
@@ -457,7 +457,7 @@ def thin_floors(at: Setting) -> Iterator[Check]:
 
 
 def rolling(at: Setting) -> Iterator[Check]:
-    """Round bodies keep rolling, and go down a slope with g sin a / (1 + k^2): a cylinder has k^2 = 1/2, a tube
+    """Round bodies keep rolling, and accelerate down a slope with g sin a / (1 + k^2): a cylinder has k^2 = 1/2, a tube
     (1 + (inner / outer)^2) / 2."""
     lie, exact = about("x", 90), at.kind == "analytic"
     forms = {
@@ -477,8 +477,8 @@ def rolling(at: Setting) -> Iterator[Check]:
                 put = Put("it", shape, [0, 0, radius], lie, v=[speed, 0, 0], w=[0, speed / (radius * UNIT), 0], mu=1.0)
                 ran = run(at, f"{name} at {speed:g} m/s on a {under}", [put, ground], seconds if speed < 2 else 2.0)
                 last = hypot(*ran.v("it")[-1, :2]) / speed
-                # A facet may stop it from rolling, or make it lose; what stands on an edge falls on a facet, and
-                # nothing else may make it faster.
+                # A facet may stop it from rolling, or make it lose energy. A body that stands on an edge falls on a
+                # facet; nothing else may make it faster.
                 fall = 0.0 if exact else 2 * G * radius * UNIT * (1 - cos(pi / FACETS)) / (1 + k2)
                 high = 100.1 * sqrt(1 + fall / speed**2)
                 yield ran.between("speed", 100 * last, 99.0 if exact else -inf, high, "%")
@@ -489,7 +489,7 @@ def rolling(at: Setting) -> Iterator[Check]:
             wanted = 0.5 * G * sin(radians(slope)) / (1 + k2) * ran.seconds[-1] ** 2 / UNIT
             least = 0.98 * wanted
             if not exact:
-                # Less one facet: it may stand on one at first.
+                # Minus one facet, as it may stand on one at first.
                 rolled = _over_facets(slope, radius * UNIT, k2, ran.seconds[-1]) / UNIT
                 least = 0.98 * rolled - 2 * radius * sin(pi / FACETS)
             yield ran.between("way", ran.place("it")[-1, 0], least, 1.02 * wanted, "sizes")
@@ -497,8 +497,8 @@ def rolling(at: Setting) -> Iterator[Check]:
 
 
 def _over_facets(slope: float, radius: float, k2: float, seconds: float) -> float:
-    """m that a polygon of `FACETS` corners rolls down a slope from rest if each facet that hits is dead: about the
-    corner that hits next its angular momentum is what it was."""
+    """Distance in m that a polygon of `FACETS` corners rolls down a slope from rest if its impacts are inelastic: about
+    the next corner that hits, its angular momentum is conserved."""
     turn, side = 2 * pi / FACETS, 2 * radius * sin(pi / FACETS)
     kept, pull = (k2 + cos(turn)) / (k2 + 1), G * sin(radians(slope)) / (1 + k2)
     way = speed = 0.0
@@ -510,8 +510,8 @@ def _over_facets(slope: float, radius: float, k2: float, seconds: float) -> floa
 
 
 def facets(at: Setting) -> Iterator[Check]:
-    """Faceted cylinders and icospheres never gain, lose no more than a polygon with dead impacts, and rest on slopes
-    below half the angle of a facet."""
+    """Faceted cylinders and icospheres never gain energy, lose no more than a polygon with inelastic impacts, and rest
+    on slopes below half the angle of a facet."""
     for count in (16, 32):
         can = at.mesh("cylinder", 0.5, 1.0, count)
         # Turned so that it stands on a facet: its centre is at the apothem's height.
@@ -522,8 +522,8 @@ def facets(at: Setting) -> Iterator[Check]:
         ran = run(at, f"{count} facets at 1 m/s", [put, floor()], 1.0)
         lost = ran.energy()[0] - ran.energy()[-1]
         turned = abs(ran.place("can")[-1, 0]) / (2 * pi * 0.5) * count
-        # A polygon of k^2 = 1/2 whose facets hit dead keeps (1/2 + cos(2 pi / N)) / (3/2) of its speed at each: about
-        # the corner that hits next its angular momentum is what it was.
+        # A polygon of k^2 = 1/2 with inelastic impacts keeps (1/2 + cos(2 pi / N)) / (3/2) of its speed at each facet:
+        # about the next corner that hits, its angular momentum is conserved.
         dead = 1 - (1 - 2 / 3 * (1 - cos(2 * pi / count))) ** (2 * turned + 4)
         rise = 9.81 * (0.5 - low) * UNIT / (0.75 * speed**2)
         yield ran.between("energy lost", 100 * lost / ran.kinetic()[0], -0.1, 100 * (dead + rise), "% of start")
@@ -539,7 +539,8 @@ def facets(at: Setting) -> Iterator[Check]:
 
 
 def round_on_meshes(at: Setting) -> Iterator[Check]:
-    """Balls and capsules on meshes: at rest the gap is below 0.2 % of the smaller body, and nothing pushes before."""
+    """Balls and capsules on meshes: at rest the gap is below 0.2 % of the smaller body, and nothing pushes before
+    contact."""
 
     def gap(ran: Ran, under: Sequence[str], one: str, frame: int, smaller: float) -> Check:
         apart = max(ran.gap(name, one, frame) for name in under)
@@ -610,8 +611,9 @@ def slabs(at: Setting) -> Iterator[Check]:
 
 
 def spins(at: Setting) -> Iterator[Check]:
-    """Spin about the vertical stops after w I / (mu m g R), where all that touches is R from the axis; on filled faces
-    between even pressure (2/3 R of a disc, 0.3826 a of a square of side a, L/4 of a thin bar) and all at the rim."""
+    """Spin about the vertical stops after w I / (mu m g R) if all contact is at the distance R from the axis. For
+    filled faces the distance is between that for even pressure (2/3 R for a disc, 0.3826 a for a square of side a, L/4
+    for a thin bar) and the rim's."""
     mu, w = 0.3, 10.0
 
     def arm(label: str, shape: Shape, height: float, low: float, high: float) -> Iterator[Check]:
@@ -620,11 +622,11 @@ def spins(at: Setting) -> Iterator[Check]:
         spin = np.abs(ran.w("it")[:, 2])
         over = np.flatnonzero(spin < 0.02 * w)
         at_s = inf
-        if len(over):  # between two frames as a line between their spins has it
+        if len(over):  # interpolated linearly between the spins of two frames
             k = int(over[0])
             share = (spin[k - 1] - 0.02 * w) / (spin[k - 1] - spin[k])
             at_s = float(ran.seconds[k - 1] + share * (ran.seconds[k] - ran.seconds[k - 1]))
-        # The arm R that makes this time: w I UNIT^2 / (mu m g t).
+        # The arm R that gives this time: w I UNIT^2 / (mu m g t).
         yield ran.between("arm", w * 0.98 * inertia / mass * UNIT**2 / (mu * G * at_s) / UNIT, low, high, "sizes")
         yield from ran.laws()
 
@@ -640,11 +642,11 @@ def spins(at: Setting) -> Iterator[Check]:
 
 
 def gentle(at: Setting) -> Iterator[Check]:
-    """Sleep on changes nothing before forces balance: gentle slopes, turning points."""
+    """Sleep changes nothing before forces are in balance: gentle slopes, turning points."""
     ball, cube = at.ball(0.5), at.box(1, 1, 1)
 
     def went(label: str, put: Put, pull: float, slope: float) -> Check:
-        """From its speed at the start, under a part `pull` of gravity along the slope."""
+        """Distance from its speed at the start, under a part `pull` of gravity along the slope."""
         ran = run(at, label, [put, floor()], 3.0, tilt=slope, sleep=True)
         t, a = ran.seconds[-1], pull * G * sin(radians(slope))
         return ran.near("way", ran.place(put.name)[-1, 0], (put.v[0] * t + 0.5 * a * t * t) / UNIT, 0.02, "sizes")
@@ -665,14 +667,14 @@ def gentle(at: Setting) -> Iterator[Check]:
 
 
 def edges(at: Setting) -> Iterator[Check]:
-    """Cubes edge on edge, and edge on face: where they first touch. Each edge is sqrt(1/2) from its cube's centre."""
+    """Cubes edge on edge, and edge on face: when they first touch. Each edge is sqrt(1/2) from its cube's centre."""
     cube = at.box(1, 1, 1)
     lower, upper = about("y", 45), about("x", 45)
     for place in ((0.0, 0.0), (0.125, 0.0), (0.125, -0.125), (0.31, 0.22)):
         # The lower edge runs along y, the upper along x; they cross at (0, y) and (x, 0).
         put = Put("upper", cube, [*place, 2 * sqrt(0.5) + 0.002], upper)
-        # Soon after they touch, 6 ms after the start. An edge off the middle then topples the cube about the place
-        # where they cross, r aside of and sqrt(1/2) below its centre, which keeps r^2 / (r^2 + 1/2 + 1/6) of its fall.
+        # Soon after they touch, which is 6 ms after the start. An edge beside the middle then topples the cube about
+        # the crossing, r aside of and sqrt(1/2) below its centre, which keeps r^2 / (r^2 + 1/2 + 1/6) of its fall.
         ran = run(at, f"edge on edge at {place}", [fixed("lower", cube, [0, 0, 0], lower), put], 0.03)
         k = ran.when(0.02)
         since = ran.seconds[k] - sqrt(2 * 0.002 * UNIT / G)
@@ -689,7 +691,7 @@ def edges(at: Setting) -> Iterator[Check]:
 
 
 def elastic(at: Setting) -> Iterator[Check]:
-    """Frictionless hits with e = 1 keep energy, momentum and angular momentum."""
+    """Frictionless hits with e = 1 conserve energy, momentum and angular momentum."""
     rng = np.random.default_rng(3)
     forms = {"cube": (1, 1, 1), "stick": (3, 0.3, 0.3), "plate": (2, 2, 0.2), "brick": (2, 1, 0.5)}
     shapes = [at.box(*size) for size in forms.values()]
@@ -714,7 +716,7 @@ def elastic(at: Setting) -> Iterator[Check]:
         turn.append(np.abs(angular[-1] - angular[0]).max())
     label = f"{count} throws"
     yield Check(f"{label}: hits", len(change), count / 4, count)
-    missed = [inf]  # where no throw hits, nothing is known
+    missed = [inf]  # if no throw hits, nothing is known
     yield Check(f"{label}: energy on average", 100 * float(np.mean(change or missed)), -0.1, 0.1, "%")
     yield most(f"{label}: energy at worst", 100 * float(np.abs(change or missed).max()), 2.0, "%")
     yield most(f"{label}: momentum", max(push or missed), 1e-9)
@@ -737,8 +739,8 @@ def elastic(at: Setting) -> Iterator[Check]:
 
 
 def _momenta(ran: Ran) -> tuple[np.ndarray, np.ndarray]:
-    """[T+1, 3] momentum and angular momentum about the origin, as parts of what the two bodies had at the start
-    without regard to directions."""
+    """[T+1, 3] momentum and angular momentum about the origin, relative to the sum of the two bodies' magnitudes at the
+    start."""
     push, turn = np.zeros((len(ran.time), 3)), np.zeros((len(ran.time), 3))
     had, had_turn = 0.0, 0.0
     for k, body in enumerate(ran.scene.bodies):
@@ -779,7 +781,7 @@ def before_touch(at: Setting) -> Iterator[Check]:
     bodies = [fixed("small", small, [0, 0, 0]), Put("large", large, [-3.6, 0, 0], v=[0.2, 0, 0], mu=0.0)]
     ran = run(at, "ball on a mesh ball", bodies, 0.6, gravity=0.0)
     # A frictionless ball without restitution stops when it hits a fixed one centrally. The nearest corner of the mesh
-    # is up to 0.05 rad aside, which leaves 0.01 m/s, and as much again at the next corner.
+    # is up to 0.05 rad aside, which leaves 0.01 m/s, and the same again at the next corner.
     yield ran.most("speed after", float(np.linalg.norm(ran.v("large")[-1])), 0.015, "m/s")
     yield from ran.laws()
     ring = at.mesh("torus", 0.5, 0.1)  # a hole of radius 0.4
@@ -800,7 +802,7 @@ ROWS: dict[str, Callable[[Setting], Iterator[Check]]] = {
 
 
 def checks(row: str, at: Setting) -> Iterator[tuple[str, Check]]:
-    """Every check of a row with its full name, as lists have it."""
+    """Every check of a row with its full name, as in lists."""
     for check in ROWS[row](at):
         yield f"{row}: {check.name} [{at}]", check
 

@@ -1,7 +1,7 @@
 """The hard cases: their scenes, what is measured on the motions, and the limits.
 
-Scenes are of metre-sized boxes and balls on a floor, in the teacher's gravity. Coefficients of the bodies and the floor
-are such that their products lie within what models are trained on, unless a case is about them.
+Scenes have metre-sized boxes and balls on a floor, with the gravity of the training data. Unless a case is about
+coefficients, the products of those of bodies and floor are within the models' training ranges.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,20 +35,20 @@ FRICTION, RESTITUTION = 0.8, 0.5  # of a body
 FLOOR_FRICTION, FLOOR_RESTITUTION = 0.5, 0.5
 FIXED: dict[str, Any] = {"motion": "static", "mass": 0.0, "friction": FLOOR_FRICTION, "restitution": FLOOR_RESTITUTION}
 NUDGE = 1e-3  # m and rad: how far repetitions of a case start from the exact one
-PLATE = 0.01  # m, thickness of what fast bodies are thrown at
+PLATE = 0.01  # m, thickness of the plate at which fast bodies are thrown
 BRICK = (1.0, 0.5, 0.4)  # m
 PLANK = (1.0, 0.2, 0.1)  # m
 CARD = (0.06, 0.6, 1.0)  # m, thickness along x, standing
 LEAN = 20.0  # degrees from upright
 BALLS = 8  # dropped at once
-BOXES = ((1.0, 1.0, 1.0), (1.0, 0.7, 0.5), (1.0, 0.5, 0.5), (0.4, 1.0, 0.8))  # m, of those tossed
-BOWL_BALL = 0.5  # m, size of what is piled into the bowl
+BOXES = ((1.0, 1.0, 1.0), (1.0, 0.7, 0.5), (1.0, 0.5, 0.5), (0.4, 1.0, 0.8))  # m, sizes of tossed boxes
+BOWL_BALL = 0.5  # m, size of the bodies that are piled into the bowl
 UP = np.array([0.0, 0.0, 1.0])
 
-FALLEN = 0.25  # of a body's height at the start: what has sunk by more has fallen
-GAIN = 0.01  # of the energy at the start: a step that adds more is counted
-APART = 0.1  # of a body's size: motions farther from each other than this have diverged
-RUNAWAY = 10.0  # times the energy at the start, and no motion is worth measuring
+FALLEN = 0.25  # relative to a body's height at the start: a body that has sunk by more has fallen
+GAIN = 0.01  # relative to the energy at the start: steps that add more are counted
+APART = 0.1  # relative to a body's size: motions farther from each other than this have diverged
+RUNAWAY = 10.0  # times the energy at the start: beyond it, motions are not measured
 
 
 Measure = Callable[[Sequence[Ran]], dict[str, float]]
@@ -58,29 +58,29 @@ Measure = Callable[[Sequence[Ran]], dict[str, float]]
 class Figure:
     name: str
     unit: str
-    digits: int = 2  # shown after the point; differences that are not shown do not count
-    limit: float | None = None  # largest value that is wanted; None where only the teacher gives a standard
-    largest: bool = False  # of several repetitions the largest counts, not the mean
-    judged: bool = True  # lower is better; other figures inform, such as the height of a rebound
+    digits: int = 2  # decimals shown; smaller differences do not count
+    limit: float | None = None  # largest value that is wanted; None if the only standard is PyBullet
+    largest: bool = False  # the largest of several repetitions counts, not the mean
+    judged: bool = True  # lower is better; figures that are not judged only inform, such as the height of a rebound
     longer: bool = False  # higher is better instead
 
 
 @dataclass(frozen=True)
 class Case:
-    """One case, by a name that is fit for a file."""
+    """One case, with a name that is valid for a file."""
 
     name: str
     group: str
     title: str
-    scenes: Callable[[int], list[Scene]]  # of one repetition, given its number; 0 is the exact case
-    measure: Measure  # of the motions of these scenes, in their order; gives `figures`
+    scenes: Callable[[int], list[Scene]]  # the scenes of one repetition, by its number; 0 is the exact case
+    measure: Measure  # computes `figures` from the motions of these scenes, in their order
     figures: tuple[Figure, ...]
     seconds: float = 3.0
-    repeats: int = 3  # from starts slightly off or with other random scenes: their spread is the noise
-    cuda: bool = False  # the scenes are simulated a second time there, behind the first
+    repeats: int = 3  # repetitions, with slightly different starts or other random scenes: their spread is the noise
+    cuda: bool = False  # the scenes are simulated a second time on CUDA, after the first
     engines: bool = True  # whether engines can take part
-    x: float | None = None  # where it stands in its group's plot of the first figure; None where it is not in a row
-    # figures of a model from scenes that this function makes; `scenes` then gives none
+    x: float | None = None  # its x in the group's plot of the first figure; None if it is not plotted
+    # figures of a model from scenes that this function makes itself; `scenes` is then empty
     own: Callable[[Model], dict[str, float]] | None = None
 
 
@@ -88,7 +88,7 @@ class Case:
 class Group:
     title: str
     axis: str = ""  # label of the cases' `x`
-    about: str = ""  # the quantity of a model's ranges that they are about: one that never varied was not learned
+    about: str = ""  # the quantity of a model's ranges that the cases are about: if it never varied, it was not learned
 
 
 GROUPS = {
@@ -122,7 +122,7 @@ def ball(diameter: float = 1.0) -> Shape:
 
 
 def body(name: str, shape: int, position: Sequence[float] | np.ndarray, **fields: Any) -> Body:
-    """A dynamic body of 1 kg that does not move, unless `fields` say otherwise."""
+    """A dynamic body of 1 kg at rest, unless `fields` say otherwise."""
     still: dict[str, Any] = {"quat_xyzw": np.array([0.0, 0.0, 0.0, 1.0])}
     still |= {"velocity": np.zeros(3), "angular_velocity": np.zeros(3)}
     usual = {"motion": "dynamic", "scale": 1.0, "mass": 1.0, "friction": FRICTION, "restitution": RESTITUTION}
@@ -132,9 +132,9 @@ def body(name: str, shape: int, position: Sequence[float] | np.ndarray, **fields
 def on_floor(
     shapes: Sequence[Shape], bodies: Sequence[Body], *, tilt: float = 0.0, sleep: bool = False, **material: float
 ) -> Scene:
-    """Bodies above the plane z = 0, which is the last of them; `material` is the floor's friction and restitution.
+    """Bodies above the plane z = 0, which is the last body; `material` is the floor's friction and restitution.
 
-    A `tilt` in degrees leans gravity towards +x, not the floor, which is the same.
+    A `tilt` in degrees leans gravity towards +x in place of the floor, which is equivalent.
     """
     floor, angle = body("floor", len(shapes), [0, 0, 0], **FIXED | material), np.radians(tilt)
     gravity = G * np.array([np.sin(angle), 0.0, -np.cos(angle)])
@@ -174,12 +174,12 @@ def yawed(scene: Scene, degrees: float) -> Scene:
 
 
 def overlapping(first: Shape, second: Shape, apart: float) -> Scene:
-    """Two bodies of 1 m at floor height, their centres `apart` m from each other."""
+    """Two bodies of 1 m at floor height, with centres `apart` m from each other."""
     return on_floor([first, second], [body("first", 0, [0, 0, 0.5]), body("second", 1, [apart, 0, 0.5])])
 
 
 def thrown_at_plate(speed: float, repeat: int) -> Scene:
-    """Eight boxes and eight balls of 20 cm in random orientations that fly down to a plate of 1 cm at `speed` m/s.
+    """Eight boxes and eight balls of 20 cm in random orientations that fly down at a plate of 1 cm with `speed` m/s.
 
     There is no floor: bodies that pass the plate fall on.
     """
@@ -195,7 +195,7 @@ def thrown_at_plate(speed: float, repeat: int) -> Scene:
 
 
 def resting(shape: Shape, *, sleep: bool) -> Scene:
-    """One body at rest on the floor, on its steady face that points down most; without such a face as it is."""
+    """One body at rest on the floor, on its stable face that points down most; if it has no such face, as it is."""
     vertices = shape.mesh.vertices - shape.com
     faces = steady_faces(vertices)
     turn = Rotation.identity()
@@ -211,13 +211,13 @@ def tower(count: int) -> Scene:
 
 
 def pyramid(layers: int = 4) -> Scene:
-    """Cubes in a plane, one less in each layer, each over the gap between two."""
+    """Cubes in a plane, one fewer in each layer, each over the gap between two."""
     places = [[1.05 * (i - (layers - k - 1) / 2), 0, 0.5 + k] for k in range(layers) for i in range(layers - k)]
     return on_floor([box(1.0)], [body(f"block[{n}]", 0, place) for n, place in enumerate(places)])
 
 
 def wall(layers: int = 5, length: int = 4) -> Scene:
-    """Bricks in running bond: every other layer is set off by half a brick, and has half a brick at either end."""
+    """Bricks in running bond: every other layer is shifted by half a brick, and has half a brick at either end."""
     long, deep, high = BRICK
     pitch = 1.01 * long  # sides do not touch
     bricks = []
@@ -270,7 +270,7 @@ def card_house() -> Scene:
 def dropped(restitution: float, repeat: int) -> Scene:
     """Balls far from each other whose lowest points are 0.9 to 1.1 m above a floor of restitution 1.
 
-    Not one height: how an engine bounces depends on how far above the floor a step happens to end.
+    The heights differ, because an engine's rebound depends on how far above the floor a step happens to end.
     """
     heights = np.random.default_rng(repeat).uniform(0.9, 1.1, BALLS)
     places = [[4.0 * k, 0, 0.5 + height] for k, height in enumerate(heights)]
@@ -285,7 +285,7 @@ def slope(friction: float, degrees: float) -> Scene:
 
 
 def piled(count: int, repeat: int) -> Scene:
-    """Balls and boxes in a loose lattice inside a bowl, and above it as far as they find no room."""
+    """Balls and boxes in a loose lattice inside a bowl, and above it if there is no room inside."""
     rng = np.random.default_rng(repeat)
     inner, outer = bowl_radii(count, BOWL_BALL)
     spacing = 1.2 * BOWL_BALL
@@ -340,9 +340,9 @@ def size(scene: Scene) -> float:
 
 
 def ran_away(trial: Ran) -> str:
-    """When a motion had more than `RUNAWAY` times the energy it started with; empty if never.
+    """A text that says when a motion had more than `RUNAWAY` times the energy at its start; empty if never.
 
-    The energy at the start counts from one size below the lowest body, so that it is not zero.
+    The energy at the start is relative to one size below the lowest body, so that it is not zero.
     """
     course, strength = energy(trial.motion), float(np.linalg.norm(trial.scene.gravity))
     lowest = (trial.path[0] @ -trial.scene.gravity).min() - strength * size(trial.scene)
@@ -352,7 +352,7 @@ def ran_away(trial: Ran) -> str:
 
 
 def rest(trials: Sequence[Ran], *, times: Sequence[float]) -> dict[str, float]:
-    """How a body at rest behaves: drift after each of `times`, and speed, height and motion over the last second."""
+    """Behaviour of a body at rest: drift after each of `times`, and speed, height and motion over the last second."""
     trial = trials[0]
     path, turn = trial.path[:, 0], trial.motion.orientation[:, ~trial.motion.static][:, 0]
     drift = 100 / size(trial.scene) * np.linalg.norm((path - path[0])[:, :2], axis=1)
@@ -367,7 +367,7 @@ def rest(trials: Sequence[Ran], *, times: Sequence[float]) -> dict[str, float]:
 
 
 def standing(trials: Sequence[Ran]) -> dict[str, float]:
-    """How many bodies of a stack have fallen, and how far the others have shifted sideways at most, % of size."""
+    """Number of bodies of a stack that have fallen, and the largest sideways shift of the others, % of size."""
     path, scene = trials[0].path, trials[0].scene
     heights = []
     for body in _dynamic(scene):
@@ -379,13 +379,13 @@ def standing(trials: Sequence[Ran]) -> dict[str, float]:
 
 
 def squeezed(trials: Sequence[Ran]) -> dict[str, float]:
-    """Penetration of a stack, % of size, and how many have fallen."""
+    """Penetration of a stack, % of size, and the number of fallen bodies."""
     depth = depths(trials[0])
     return standing(trials) | {"worst depth": 100 * float(depth.max(initial=0.0)) / size(trials[0].scene)}
 
 
 def separated(trials: Sequence[Ran]) -> dict[str, float]:
-    """Highest speed m/s of bodies that start in each other, and how deep they still are at the end, % of size."""
+    """Highest speed m/s of bodies that overlap at the start, and their overlap at the end, % of size."""
     scene, motion = trials[0].scene, trials[0].motion
     speed = np.linalg.norm(motion.velocity[:, ~motion.static], axis=2)
     left = depths(trials[0], every=max(1, len(motion.position) - 1)).max(initial=0.0)
@@ -393,7 +393,7 @@ def separated(trials: Sequence[Ran]) -> dict[str, float]:
 
 
 def passed(trials: Sequence[Ran]) -> dict[str, float]:
-    """Share % of bodies thrown at a plate about the origin that have been below it while over its area."""
+    """Share in % of bodies, thrown at a plate about the origin, that have been below it within its area."""
     shares = []
     for trial in trials:
         plate = next(b for b in trial.scene.bodies if b.motion == "static")
@@ -405,21 +405,22 @@ def passed(trials: Sequence[Ran]) -> dict[str, float]:
 
 
 def rebound(trials: Sequence[Ran], *, restitution: float) -> dict[str, float]:
-    """Mean height of the first rebound of balls dropped onto the floor, % of what they fell, against e^2."""
+    """Mean height of the first rebound of balls dropped onto the floor, in % of the fall, compared with e^2."""
     scene, motion, shares = trials[0].scene, trials[0].motion, []
     for k, body in enumerate(_dynamic(scene)):
         low, rate = trials[0].path[:, k, 2] - scene.shapes[body.shape].sdf.bounds[1, 2], motion.velocity[:, k, 2]
-        hit = np.flatnonzero(rate[1:] > rate[:-1])  # what flies gets slower upwards with every step
+        hit = np.flatnonzero(rate[1:] > rate[:-1])  # the upward speed of a flying body decreases with every step
         up = np.flatnonzero(rate[hit[0] + 1 :] > 0) if len(hit) else hit
         shares.append(100 * max(0.0, float(low[hit[0] + 1 + up[0] :].max())) / float(low[0]) if len(up) else 0.0)
     return {"rebound": float(np.mean(shares)), "error": abs(float(np.mean(shares)) - 100 * restitution**2)}
 
 
 def slipped(trials: Sequence[Ran], *, friction: float, offsets: Sequence[float]) -> dict[str, float]:
-    """Where a body on a slope begins to slide, in degrees from atan(friction); trials from rest, by rising offsets.
+    """The angle at which a body on a slope begins to slide, in degrees relative to atan(friction); trials start from
+    rest, with rising offsets.
 
-    The first angle counts at which it travels more than half of what it would slide two degrees beyond the critical
-    one. From that distance we go back by as much as each degree adds, by Coulomb's law.
+    It is the first angle at which the body moves more than half of the distance that it would slide two degrees beyond
+    the critical angle, corrected for this distance by Coulomb's law.
     """
     critical = float(np.degrees(np.arctan(friction)))
     travelled = np.array([np.linalg.norm(trial.path[-1, 0] - trial.path[0, 0]) for trial in trials])
@@ -431,13 +432,14 @@ def slipped(trials: Sequence[Ran], *, friction: float, offsets: Sequence[float])
 
 
 def slide(friction: float, degrees: float, seconds: float, gravity: float) -> float:
-    """m that a body slides from rest on a slope in `seconds`, by Coulomb's law."""
+    """Distance in m that a body slides from rest on a slope in `seconds`, by Coulomb's law."""
     angle = np.radians(degrees)
     return 0.5 * gravity * max(0.0, float(np.sin(angle) - friction * np.cos(angle))) * seconds**2
 
 
 def heaped(trials: Sequence[Ran]) -> dict[str, float]:
-    """A pile in a bowl: penetration, who left through the wall, and energy beyond that of the start."""
+    """A pile in a bowl: penetration, number of bodies that left through the wall, and energy beyond that of the
+    start."""
     scene, motion = trials[0].scene, trials[0].motion
     bowl = next(b for b in scene.bodies if b.name == "bowl")
     outer = 0.5 * bowl.scale
@@ -455,14 +457,16 @@ def heaped(trials: Sequence[Ran]) -> dict[str, float]:
 
 
 def created(trials: Sequence[Ran]) -> dict[str, float]:
-    """Energy that came from nothing: share % of steps that add more than `GAIN` of the start's, and the worst, %."""
+    """Energy from nothing: share in % of steps that add more than `GAIN` of the energy at the start, and the worst,
+    %."""
     courses = [energy(trial.motion) for trial in trials]
     gains = np.concatenate([np.diff(course) / course[0] for course in courses])
     return {"steps with gain": 100 * float((gains > GAIN).mean()), "worst gain": 100 * float(gains.max(initial=0.0))}
 
 
 def turned_back(trials: Sequence[Ran], *, degrees: Sequence[float]) -> dict[str, float]:
-    """Deviation % of size, at the end, of turned scenes from themselves; `degrees` is one group's, the first 0."""
+    """Deviation at the end, in % of size, of turned scenes from the unturned one; `degrees` are those of one group, the
+    first 0."""
     apart = 0.0
     for start in range(0, len(trials), len(degrees)):
         for offset, angle in enumerate(degrees[1:], 1):
@@ -472,7 +476,8 @@ def turned_back(trials: Sequence[Ran], *, degrees: Sequence[float]) -> dict[str,
 
 
 def diverged(trials: Sequence[Ran]) -> dict[str, float]:
-    """Mean time s until motions of the second half are 10 % of a size from the first half's; their length if never."""
+    """Mean time in s until motions of the second half are 10 % of a size from those of the first half; their length if
+    never."""
     half, times = len(trials) // 2, []
     for one, other in zip(trials[:half], trials[half:], strict=True):
         distance = _apart(one, other, Rotation.identity())
@@ -482,7 +487,7 @@ def diverged(trials: Sequence[Ran]) -> dict[str, float]:
 
 
 def _apart(reference: Ran, other: Ran, back: Rotation) -> np.ndarray:
-    """[T] % of size: root mean square over the bodies of how far they are from each other."""
+    """[T] % of size: root mean square distance over the bodies."""
     frames = min(len(reference.path), len(other.path))
     returned = back.apply(other.path[:frames].reshape(-1, 3)).reshape(frames, -1, 3)
     return 100 / size(reference.scene) * np.square(returned - reference.path[:frames]).sum(2).mean(1) ** 0.5
@@ -499,9 +504,9 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
     """Every case, in the order of the table.
 
     Args:
-        quick: fewer and shorter ones: two repetitions, no pile of 512, ten seconds of rest for sixty, a tenth of the
-            random scenes.
-        shapes: folder of meshes that are to rest on the floor too, each scaled to a largest extent of 1 m.
+        quick: fewer and shorter cases: two repetitions, no pile of 512, ten seconds of rest in place of sixty, a tenth
+            of the random scenes.
+        shapes: folder of more meshes to rest on the floor, each scaled to a largest extent of 1 m.
 
     Raises:
         SdfsimError: the folder holds no meshes, or one that cannot be used.
@@ -518,9 +523,9 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
         repeats: int = 3,
         **more: Any,
     ) -> None:
-        """A case of `scenes`: a function of the repetition, or scenes that repetitions nudge."""
+        """Add a case of `scenes`: a function of the repetition, or scenes that repetitions nudge."""
         of = (lambda repeat: [nudged(one, repeat) for one in scenes]) if isinstance(scenes, list) else scenes
-        repeats = min(repeats, 2) if quick else repeats  # there is no spread of one
+        repeats = min(repeats, 2) if quick else repeats  # a single repetition has no spread
         found.append(Case(name, group, title, of, measure, figures, repeats=repeats, **more))
 
     yaws = (0.0, 37.0) if quick else (0.0, 37.0, 121.0, 245.0)  # degrees
@@ -623,7 +628,7 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
 
 
 def failures(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
-    """How many everyday checks of a row do not hold with a model, and how many there are."""
+    """Number of everyday checks of a row that do not hold with a model, and their total number."""
     found = [check for at in settings for check in ROWS[row](replace(at, by=partial(by_model, model=model)))]
     return {"fail": float(sum(not check.holds for check in found)), "checks": float(len(found))}
 

@@ -1,7 +1,7 @@
-"""What all studies share: results of cases x methods kept as files, tables, plots, peak memory.
+"""Tools that all studies share: results of cases x methods kept as files, tables, plots, peak memory.
 
-A study makes a `Job` for each case and method. `measure` runs those whose result its folder does not hold yet, each
-into one JSON file, so that an interrupted study goes on where it was.
+A study makes a `Job` for each case and method. `measure` runs those without a result in its folder and writes one JSON
+file for each, so that an interrupted study continues where it stopped.
 """
 
 import multiprocessing
@@ -28,12 +28,12 @@ FAILURES = (SdfsimError, RuntimeError, MemoryError)
 
 @dataclass(frozen=True)
 class Job:
-    """One case with one method, names fit for a file."""
+    """One case with one method; both names are valid for files."""
 
     case: str
     method: str
-    content: Any  # all that the result depends on; see `digest`
-    function: Callable[..., dict[str, Any]]  # makes the result, which JSON can hold
+    content: Any  # everything on which the result depends; see `digest`
+    function: Callable[..., dict[str, Any]]  # computes the result, which JSON can hold
     arguments: tuple = ()
 
 
@@ -44,16 +44,17 @@ def measure(
     where: Literal["here", "cores", "fresh"] = "here",
     on_progress: Progress = silent,
 ) -> Results:
-    """The results of all jobs by (case, method): those kept in FOLDER/METHOD/CASE.json where their content and the
-    compiled contact step are still the same, new ones elsewhere.
+    """The results of all jobs by (case, method): those kept in FOLDER/METHOD/CASE.json if their content and the
+    compiled contact step are unchanged, else new ones.
 
-    A job that fails gives {"failed": why}. That is not kept, because an engine or memory may be there the next time.
+    A job that fails gives {"failed": reason}. That is not kept, because an engine or memory may be available the next
+    time.
 
     Args:
-        where: "here", one after the other in this process; "cores", on all of them in the order of `jobs`; "fresh",
-            each in a process of its own, whose peak memory is then the job's.
+        where: "here": one after the other in this process; "cores": on all cores, in the order of `jobs`; "fresh": each
+            in its own process, whose peak memory is then the job's.
     """
-    from sdfsim.physics.solver import _cache  # numba takes its time to load
+    from sdfsim.physics.solver import _cache  # numba is slow to load
 
     todo: list[tuple[Job, Path, str]] = []
     version = [__version__, _cache().name]  # the name is a hash of the compiled step's source
@@ -90,11 +91,11 @@ def _run(job: Job, file: Path, mark: str) -> dict[str, Any]:
         return {"failed": (str(error).strip() or type(error).__name__).splitlines()[0]}
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, {"digest": mark, "result": result})
-    return read_json(file)["result"]  # as JSON has it, whether new or kept
+    return read_json(file)["result"]  # as read from JSON, whether new or kept
 
 
 def _kept(file: Path, mark: str) -> dict[str, Any]:
-    """The result in a file; empty where its content does not match."""
+    """The result in a file; empty if its content does not match."""
     try:
         content = read_json(file)
     except SdfsimError:
@@ -103,26 +104,26 @@ def _kept(file: Path, mark: str) -> dict[str, Any]:
 
 
 def machine() -> str:
-    """What timings depend on apart from the code: the machine's name and the number of torch's threads."""
+    """What timings depend on besides the code: the machine's name and the number of torch's threads."""
     return f"{platform.node()}, {torch.get_num_threads()} threads"
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; the first row is its head, numbers stand to the right."""
+    """A table in Markdown; the first row is the header, numbers are aligned right."""
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     rule = "| --- |" + " ---: |" * (len(rows[0]) - 1)
     return "\n".join([lines[0], rule, *lines[1:]]) + "\n"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number with `digits` significant digits; a dash where it is unknown."""
+    """A number with `digits` significant digits; a dash if it is unknown."""
     if value is None or not np.isfinite(value):
         return "-"
     return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
 
 
 def cells(found: dict[str, Any], columns: Iterable[str]) -> tuple[str, ...]:
-    """Cells of a table: these figures of a result; the last cell says why it failed."""
+    """Cells of a table: these figures of a result; the last cell says why it failed, if it did."""
     why = next((found[key] for key in ("failed", "broken") if found.get(key)), "")
     return (*(number(found.get(key)) for key in columns), why)
 
@@ -138,7 +139,7 @@ def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
 
 @dataclass(frozen=True)
 class Line:
-    name: str  # lines of one name have one colour in all panels
+    name: str  # lines with the same name have the same colour in all panels
     x: Sequence[float]  # [K]
     y: Sequence[float]  # [K]
     noise: Sequence[float] | None = None  # [K], half-widths of error bars
@@ -156,8 +157,8 @@ class Panel:
     x: str
     y: str
     lines: Sequence[Line]
-    log: str = ""  # of its axes: "", "x", "y" or "xy"
-    limit: float | None = None  # y of a dotted line: what is wanted
+    log: str = ""  # logarithmic axes: "", "x", "y" or "xy"
+    limit: float | None = None  # y of a dotted line: the wanted limit
 
 
 def draw(panels: Sequence[Panel], path: Path, *, size: tuple[float, float] = (3.3, 2.5)) -> None:
@@ -190,7 +191,7 @@ def draw(panels: Sequence[Panel], path: Path, *, size: tuple[float, float] = (3.
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """torch and the compiled step compute in one thread inside the block, whose time is then the processor's."""
+    """Inside the block torch and the compiled step use one thread, so that times are processor times."""
     import numba
 
     before = torch.get_num_threads(), numba.get_num_threads()
@@ -205,10 +206,10 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def peak_memory() -> Iterator[dict[str, float | None]]:
-    """Sets "mib" to the most by which the process grew inside the block; None where Linux does not report it."""
+    """Sets "mib" to the largest growth of the process inside the block; None if Linux does not report it."""
     peak: dict[str, float | None] = {"mib": None}
     try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # the peak counts from here
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # resets the peak
         before = _status("VmRSS")
     except OSError:
         yield peak

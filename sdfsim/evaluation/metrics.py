@@ -1,25 +1,25 @@
-"""What rollouts are judged by: errors as Rubanova et al. (2024) report them, energy, rest, survival."""
+"""Measures of rollouts: errors as Rubanova et al. (2024) report them, energy, rest, survival."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory
 
-HORIZONS = (50, 100)  # steps; errors over all steps up to there are what Rubanova et al. 2024 report
-REST_SPEED = 0.05  # m/s, what rests in a recording is slower than this
-REST_STEPS = 10  # the last steps, in which it has to be
-LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives
+HORIZONS = (50, 100)  # steps; Rubanova et al. 2024 report errors over all steps up to there
+REST_SPEED = 0.05  # m/s, bodies at rest in a recording are slower than this
+REST_STEPS = 10  # in this many last steps
+LIMITS = (0.1, 0.25, 0.5)  # m, translation errors up to which a body survives
 
 Motions = list[Trajectory]
 
 
 def errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
-    """Errors of motions, over the bodies that move.
+    """Errors of motions, over the dynamic bodies.
 
     Returns:
         Horizon in steps -> seconds, translation_rmse m and rotation_error degrees over all bodies and steps up to
-        there, with 95 % intervals over trajectories, and `at_frame`: the same in the last of these steps alone, where
-        translation is the mean over trajectories of the root mean square over bodies (so HOPNet, Wei et al. 2025).
+        there, with 95 % intervals over trajectories, and `at_frame`: the same in the last of these steps only, where
+        translation is the mean over trajectories of the root mean square over bodies (as in HOPNet, Wei et al. 2025).
     """
     longest = len(recorded[0].position) - 1
     bodies = np.array([(~t.static).sum() for t in recorded])
@@ -48,7 +48,7 @@ def errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
 
 
 def compared(motion: Trajectory, truth: Trajectory, frames: slice) -> tuple[float, float]:
-    """Root mean squared distance m, and mean angle in degrees, over some frames of the bodies that move."""
+    """Root mean square distance in m, and mean angle in degrees, over some frames of the dynamic bodies."""
     moving = ~truth.static
     apart = motion.position[frames, moving] - truth.position[frames, moving]
     turns, true = (Rotation.from_quat(t.orientation[frames, moving].reshape(-1, 4)) for t in (motion, truth))
@@ -63,7 +63,7 @@ def interval(values: np.ndarray) -> list[float]:
 
 
 def energy(motion: Trajectory) -> np.ndarray:
-    """[T] J: kinetic and potential energy of the bodies that move, heights taken from the origin (the floor)."""
+    """[T] J: kinetic and potential energy of the dynamic bodies, with heights relative to the origin (the floor)."""
     moving = ~motion.static
     mass, inertia = motion.mass[moving], motion.inertia[moving]
     velocity, quat = motion.velocity[:, moving], motion.orientation[:, moving]
@@ -75,25 +75,26 @@ def energy(motion: Trajectory) -> np.ndarray:
 
 
 def energy_gain(motions: Motions) -> dict[str, float | None]:
-    """Mean and worst, over the trajectories, of the largest gain as a fraction of the energy at the start (0 when it
-    never rises). Those that start without energy above that of rest at the origin's height have no fraction."""
+    """Mean and worst, over the trajectories, of the largest gain as a fraction of the energy at the start (0 if it
+    never rises). Trajectories that start with no more energy than at rest at the origin's height are left out."""
     courses = [course for course in map(energy, motions) if course[0] > 0]
     gains = [float((course.max() - course[0]) / course[0]) for course in courses]
     return {"mean": float(np.mean(gains)) if gains else None, "worst": max(gains) if gains else None}
 
 
 def speeds(motion: Trajectory) -> np.ndarray:
-    """[`REST_STEPS`, N] m/s over the last steps: displacement by time, so that a body which creeps is seen to move."""
+    """[`REST_STEPS`, N] m/s over the last steps: displacement divided by time, so that a creeping body counts as
+    moving."""
     return np.linalg.norm(np.diff(motion.position[-REST_STEPS - 1 :], axis=0), axis=-1) / motion.dt
 
 
 def resting(recorded: Trajectory) -> np.ndarray:
-    """[N] bool: the bodies, static ones left out, that are slower than `REST_SPEED` in all of the last steps."""
+    """[N] bool: the dynamic bodies that are slower than `REST_SPEED` in all of the last steps."""
     return (speeds(recorded) < REST_SPEED).all(0) & ~recorded.static
 
 
 def survival(motions: Motions, recorded: Motions) -> dict[str, float | None]:
-    """Limit of `LIMITS` -> seconds until more than half of all bodies have been at least so far from the recording;
+    """Limit of `LIMITS` -> seconds until more than half of all bodies have been at least this far from the recording;
     None if they never are."""
     error = np.concatenate([distance(m, t) for m, t in zip(motions, recorded, strict=True)], axis=1)
     farthest = np.maximum.accumulate(error, axis=0)
@@ -103,6 +104,6 @@ def survival(motions: Motions, recorded: Motions) -> dict[str, float | None]:
 
 
 def distance(motion: Trajectory, truth: Trajectory) -> np.ndarray:
-    """[T, N] m: translation errors of the bodies that move, the first frame included."""
+    """[T, N] m: translation errors of the dynamic bodies, including the first frame."""
     moving = ~truth.static
     return np.linalg.norm(motion.position[:, moving] - truth.position[:, moving], axis=-1)

@@ -20,8 +20,8 @@ SHOWN = 10  # rows of a learning curve
 
 
 def bundle(model: Path, data: Path, name: Annotated[str, typer.Option()], folder: Path = BUNDLED) -> dict:
-    """Evaluate what `sdfsim train` wrote on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`,
-    with the learning curve where `log.jsonl` lies beside the model; return the evaluation's report."""
+    """Evaluate a model of `sdfsim train` on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`,
+    with the learning curve if `log.jsonl` is beside the model; return the evaluation's report."""
     found = load_model(model)
     report = evaluate(data, model=found, chaos_floor=True)
     kept = ("model", "ballistic", "chaos_floor", "median_survival_s", "penetration", "energy_gain", "resting_speed")
@@ -65,8 +65,7 @@ def card_text(model: Model, report: dict) -> str:
 
 
 def _curve(card: dict) -> list[str]:
-    """How the held-out loss fell, at about `SHOWN` steps of the training, and how far that was; nothing where no log
-    was kept."""
+    """The held-out loss at about `SHOWN` steps of the training, and a summary of its fall; empty if there is no log."""
     curve = card.get("curve", [])
     if len(curve) < 2:
         return []

@@ -1,4 +1,4 @@
-"""How deep bodies are inside each other and the floor, measured on their exact geometry."""
+"""Depth of bodies in each other and in the floor, measured on their exact geometry."""
 
 from collections import defaultdict
 from collections.abc import Callable
@@ -19,31 +19,31 @@ from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape, with_sdf
 
-TOUCH = 0.01  # of the mean size of the moving bodies: a node this near to another surface is in contact
-EVERY = 10  # frames from one that is measured to the next
+TOUCH = 0.01  # relative to the mean size of the dynamic bodies: a node this near to another surface is in contact
+EVERY = 10  # every how many frames one is measured
 
 
 @dataclass(frozen=True)
 class ExactSolid:
-    """A shape's exact geometry about its centre of mass, at scale 1."""
+    """A shape's exact geometry, relative to its centre of mass, at scale 1."""
 
     nodes: np.ndarray  # [K, 3] m, surface nodes
     bounds: np.ndarray  # [2, 3] m, box of the solid (infinite for a plane)
     distance: Callable[[np.ndarray], np.ndarray]  # [P, 3] m -> [P] m, negative inside
-    # "pieces" (the convex pieces that an engine collides), "mesh" (the shape's), "shown mesh" (the same, where the
-    # engine collides pieces that are missing) or "closed form"
+    # "pieces" (the convex pieces that an engine collides), "mesh" (the shape's), "shown mesh" (the same, if the engine
+    # collided pieces that are missing) or "closed form"
     kind: str
 
 
 def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, ExactSolid]:
     """The exact geometry of every shape of a dataset.
 
-    A shape that was fitted to an engine's convex pieces is those pieces, where the dataset's engine file leads to
-    them: the mesh beside it is what is shown. Other learned or sampled distances give way to those of the mesh.
+    A shape that was fitted to an engine's convex pieces is measured on those pieces, if the dataset's engine file names
+    them; its mesh is only for display. Other learned or sampled distances are replaced by those of the mesh.
     """
     solids = {}
     for name, shape in shapes.items():
-        # A dataset's body frames sit at the centre of mass, and so do its shapes' origins.
+        # A dataset's body frames are at the centre of mass, and so are its shapes' origins.
         solids[name] = _exact(shape)
         if shape.source.get("kind") == "pieces" and isinstance(shape.sdf, MlpSdf | GridSdf):
             solids[name] = replace(solids[name], kind="shown mesh")
@@ -55,8 +55,8 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, ExactSolid]:
 
 
 def deepest(motion: Trajectory, solids: dict[str, ExactSolid], every: int = EVERY) -> np.ndarray:
-    """[F] m, signed distance of the deepest node of any body in another, or in the floor z = 0, of every `every`-th
-    frame: negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not
+    """[F] m, signed distance of the deepest node of any body in another, or in the floor z = 0, in every `every`-th
+    frame: negative inside, infinite if nothing touches. Pairs of static bodies, and static bodies in the floor, do not
     count."""
     kept = slice(every, None, every)
     position = motion.position[kept]
@@ -78,7 +78,7 @@ def deepest(motion: Trajectory, solids: dict[str, ExactSolid], every: int = EVER
         inside = local[((local >= low - touch) & (local <= high + touch)).all(1)]
         if len(inside):
             questions[str(motion.shape[j])].append((f, motion.scale[j], inside))
-    for name, asked in questions.items():  # all of one shape at once: a question has a price of its own
+    for name, asked in questions.items():  # all of one shape at once, as each call has a fixed cost
         frame, scale = (np.repeat([q[k] for q in asked], [len(q[2]) for q in asked]) for k in (0, 1))
         distance = scale * solids[name].distance(np.concatenate([q[2] for q in asked]) / scale[:, None])
         np.minimum.at(lowest, frame, distance)
@@ -86,8 +86,8 @@ def deepest(motion: Trajectory, solids: dict[str, ExactSolid], every: int = EVER
 
 
 def penetration(motions: list[Trajectory], solids: dict[str, ExactSolid]) -> dict:
-    """Penetration m over the frames of all `motions` in which something touches: percentile_95 and worst of the depth
-    of a frame's deepest node (None where nothing touches), and steps_with_contact."""
+    """Penetration in m over the frames of all `motions` in which something touches: percentile_95 and worst of the
+    depth of a frame's deepest node (None if nothing touches), and steps_with_contact."""
     depth = _touching(np.concatenate([deepest(motion, solids) for motion in motions]))
     return {
         "percentile_95": float(np.percentile(depth, 95)) if len(depth) else None,
@@ -112,7 +112,7 @@ def _touching(distance: np.ndarray) -> np.ndarray:
 
 
 def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np.ndarray, touch: float) -> np.ndarray:
-    """[F, N, N] bool: the boxes around two bodies come within `touch` m, and one of the two moves."""
+    """[F, N, N] bool: the boxes around two bodies are within `touch` m, and one of the two is dynamic."""
     finite = np.asarray(np.isfinite(bounds).all((1, 2)))
     bounds = np.where(finite[:, None, None], bounds, 0.0)
     centre = position + (turn @ bounds.mean(1)[..., None])[..., 0]

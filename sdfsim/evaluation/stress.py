@@ -1,4 +1,4 @@
-"""The hard cases run with models, the teacher and other engines; their table, plots and report."""
+"""Runs the hard cases with models, PyBullet (the teacher) and other engines; makes their table, plots and report."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -27,12 +27,12 @@ from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import PlaneSdf
 from sdfsim.simulate.steppers import stepper_of
 
-VERSION = 5  # counts up when the measurements change, so that kept results are measured again
+VERSION = 5  # increase it when the measurements change, so that kept results are measured again
 TEACHER = "teacher"
 USUAL = {TEACHER: bullet}
 OUTSIDE = "†"
 WATCHED = 10.0  # s of a recording
-OWN = 1e4  # about how long a case with scenes of its own takes, as `work` counts
+OWN = 1e4  # estimated cost of a case that makes its own scenes, in the unit of `work`
 LOOKED_AT = 20  # frames of a motion, evenly spaced, in which surfaces are measured
 LEGEND = (
     "bold: beyond what is wanted, or the motion blew up",
@@ -48,10 +48,10 @@ class Study:
 
     cases: list[Case]
     models: list[str]
-    engines: list[str]  # the teacher where PyBullet is installed
-    # (case, who) -> figures (name -> a value a repetition); lines of broke, outside and laws (which a motion of ours
-    # breaks, by instruments that do not use the solve); recording (a path in the folder, or None). There is no entry
-    # where a model or engine does not take part in a case.
+    engines: list[str]  # the teacher, if PyBullet is installed
+    # (case, who) -> figures (name -> one value per repetition); lines of broke, outside and laws (which a motion of
+    # ours breaks, by instruments that do not use the solve); recording (a path in the folder, or None). If a model or
+    # engine does not take part in a case, there is no entry.
     results: Results
     quick: bool  # whether it is the short form
 
@@ -71,18 +71,18 @@ def stress(
     engines: Mapping[str, Engine] = USUAL,
     on_progress: Progress = silent,
 ) -> Study:
-    """Run every case that `out` does not hold the result of yet. It holds results/, the engine's files, and in
-    recordings/ a motion of each case that is not as wanted.
+    """Run every case for which `out` has no result yet. `out` gets results/, the engine's files, and in recordings/ a
+    motion of each case that is not as wanted.
 
     Args:
         models: names or paths; none for the solver and the bundled networks on it.
         quick: fewer and shorter cases.
-        shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
+        shapes: folder of more meshes to rest on the floor, or name of a public set (see `public_folder`).
         engines: by name; the teacher is `TEACHER`.
 
     Raises:
-        SdfsimError: no such model or device, two models of one name, unusable shapes or none to be fetched, another run
-            in the folder, or a folder that cannot be written.
+        SdfsimError: no such model or device, two models with the same name, shapes that are unusable or cannot be
+            fetched, another run in the folder, or a folder that cannot be written.
     """
     device = str(pick_device(device))
     tested = [load_model(name) for name in models or sound_models()]
@@ -97,7 +97,7 @@ def stress(
     scenes = {case.name: [case.scenes(repeat) for repeat in range(case.repeats)] for case in found}
 
     def work(case: Case) -> float:
-        """About how long a model takes, without a unit; a step costs time without bodies too."""
+        """Estimated cost of a model, without a unit; a step costs time even without bodies."""
         if case.own:
             return OWN
         return case.seconds * sum(10 + len(scene.bodies) for repeat in scenes[case.name] for scene in repeat)
@@ -107,7 +107,7 @@ def stress(
         figures = [figure.name for figure in case.figures]
         content = [VERSION, case.seconds, case.cuda, figures, scenes[case.name]]
         for model in tested:
-            # Another device is for networks: the solver has none.
+            # Another device is for networks: the solver has no network.
             if not case.cuda or (stepper_of(model).network and torch.cuda.is_available()):
                 arguments = (case, model, device, out)
                 jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments))
@@ -116,7 +116,9 @@ def stress(
             jobs.append(Job(case.name, name, [content, settings], _tried, (case, engines[name], device, out)))
             cut |= {id(shape): shape for scene in scenes[case.name][0] for shape in scene.shapes}
     with locked(out):
-        for shape in cut.values():  # before the work is split up, so that no two processes cut one mesh into pieces
+        for (
+            shape
+        ) in cut.values():  # before the work is split up, so that a mesh is not cut into pieces by two processes
             if not isinstance(shape.sdf, PlaneSdf):
                 shape_urdf(shape, out / "engine")
         results = measure(jobs, out / "results", where="cores", on_progress=on_progress)
@@ -158,7 +160,7 @@ def _tried(case: Case, model: Model | Engine, device: str, out: Path) -> dict[st
 
 
 def ran(who: Model | Engine, scene: Scene, seconds: float, device: str, folder: Path) -> Ran:
-    """The motion of a scene by a model or by an engine; one that ran away, or took too long, counts as broken."""
+    """The motion of a scene by a model or by an engine; a motion that ran away or took too long counts as broken."""
     try:
         if isinstance(who, Model):
             run = by_model(scene, seconds, who, device)
@@ -173,7 +175,7 @@ def ran(who: Model | Engine, scene: Scene, seconds: float, device: str, folder: 
 
 
 def value(result: dict[str, Any], figure: Figure) -> float:
-    """The mean of the repetitions, or the largest where that is what counts."""
+    """The mean of the repetitions, or the largest if that is what counts."""
     values = result["figures"][figure.name]
     return max(values) if figure.largest else statistics.fmean(values)
 
@@ -190,7 +192,7 @@ def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
     if result is None:
         return "-", "shown"
     now, spread = value(result, figure), noise(result, figure)
-    shown = f"{round(now, figure.digits) + 0.0:.{figure.digits}f}"  # no minus before a zero
+    shown = f"{round(now, figure.digits) + 0.0:.{figure.digits}f}"  # avoids -0
     if float(f"{spread:.{figure.digits}f}") > 0:
         shown += f" ± {spread:.{figure.digits}f}"
     shown += f" {figure.unit}"
@@ -210,7 +212,8 @@ def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
 
 
 def rows(study: Study, marks: dict[str, str]) -> list[tuple[str, ...]]:
-    """The table, its head first, with a row for each figure; `marks` (state -> text) surround missed or behind ones."""
+    """The table, its header first, with a row for each figure; `marks` (state -> text) surround those that are missed
+    or behind."""
     table: list[tuple[str, ...]] = [("case", "figure", "wanted", *study.who)]
     for case in study.cases:
         for k, figure in enumerate(case.figures):
@@ -222,7 +225,7 @@ def rows(study: Study, marks: dict[str, str]) -> list[tuple[str, ...]]:
 
 
 def losses(study: Study) -> dict[str, dict[str, int]]:
-    """For each model how many judged figures there are, and how many are missed, behind the teacher, or blew up."""
+    """For each model the number of judged figures, and of those missed, behind the teacher, or blown up."""
     found = {}
     for who in study.who:
         mine = [case for case in study.cases if (case.name, who) in study.results]
@@ -241,7 +244,7 @@ def loss_lines(study: Study) -> list[str]:
 
 
 def table(study: Study) -> str:
-    """The whole study in Markdown: what was lost, the legend, and a table for each group."""
+    """The whole study in Markdown: the losses, the legend, and a table for each group."""
     parts = ["\n".join(f"- {line}" for line in [*loss_lines(study), *LEGEND]) + "\n"]
     for name in dict.fromkeys(case.group for case in study.cases):
         part = replace(study, cases=[case for case in study.cases if case.group == name])
@@ -250,7 +253,7 @@ def table(study: Study) -> str:
 
 
 def draw_group(study: Study, name: str, path: Path) -> bool:
-    """Write a plot of one group's first figure along its cases; False where these have no common axis."""
+    """Write a plot of one group's first figure along its cases. Returns False if these have no common axis."""
     group, along = GROUPS[name], [case for case in study.cases if case.group == name and case.x is not None]
     if len(along) < 2:
         return False

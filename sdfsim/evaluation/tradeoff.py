@@ -41,24 +41,24 @@ from sdfsim.shape.surface_nodes import hull_nodes
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.simulate.steppers import stepper_of
 
-VERSION = 2  # counts up when the measurements change, so that kept results are measured again
+VERSION = 2  # increase it when the measurements change, so that kept results are measured again
 REPEATS = 7
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, STEPS_QUICK = 100, 50
-TIMED = 80  # steps, at most
-EXPLODED = 1.0  # energy gain over the energy at the start, beyond which a motion blew up
-OFF = 1e-3  # m/s, by which the starts of the chaos floor differ from the recorded ones
-HORIZON = 50  # steps of the errors that are drawn
-FAR = 4.0  # times the largest time or error of ours: farther away nothing is drawn
+TIMED = 80  # largest number of steps that are timed
+EXPLODED = 1.0  # energy gain relative to the energy at the start, beyond which a motion blew up
+OFF = 1e-3  # m/s: difference of the chaos floor's starts from the recorded ones
+HORIZON = 50  # steps over which the drawn errors are taken
+FAR = 4.0  # times our largest time or error: points farther away are not drawn
 ENGINES: dict[str, Engine] = {
     "PyBullet": engines.bullet,
     "MuJoCo": engines.mujoco,
     "MuJoCo mesh SDF": partial(engines.mujoco, pieces=False),
 }
-# Steps of the engine in a recorded one.
+# Steps of the engine in a recorded step.
 INNER = {"PyBullet": (5, 4, 3, 2, 1), "MuJoCo": (10, 5, 2), "MuJoCo mesh SDF": (5, 2)}
 INNER_QUICK = {"PyBullet": (5, 1), "MuJoCo": (5,)}
-TRUTH = f"PyBullet {1e3 * SUBSTEP:.3g} ms"  # made the recordings: no error of its own
+TRUTH = f"PyBullet {1e3 * SUBSTEP:.3g} ms"  # it made the recordings, so it has no error of its own
 FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
 GRIDS = (32, 64, 128, 256)
 PHYSICAL = ("contact", "friction", "restitution", "rotation")  # effects that the engines always have
@@ -70,27 +70,27 @@ Rows = list[tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Cases:
-    """What every model and engine simulates."""
+    """The scenes that every model and engine simulates."""
 
-    recorded: list[Trajectory]  # as the teacher moved the bodies, from their first frames on
-    starts: list[Trajectory]  # with velocities at the instants of the positions: what ours start from
-    shapes: dict[str, Shape]  # of every name in use, their origins at the centres of mass
+    recorded: list[Trajectory]  # as PyBullet moved the bodies, from their first frames on
+    starts: list[Trajectory]  # with velocities at the instants of the positions: the starts of our models
+    shapes: dict[str, Shape]  # by name, with origins at the centres of mass
     urdfs: dict[str, Path]  # the engines' files, by name; missing ones are left out
     solids: dict[str, ExactSolid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
-    by_teacher: bool = True  # whether the recordings are the teacher's; the solve then has its habits
-    length: float = 1.0  # m of the scene in one of these; recordings are 1
+    by_teacher: bool = True  # whether the recordings have the teacher's settings; the solve then imitates PyBullet
+    length: float = 1.0  # m of the scene in one unit of these; 1 for recordings
     time: float = 1.0  # s
 
     @property
     def steps(self) -> int:
-        """How far all are simulated."""
+        """Number of steps that are simulated."""
         return len(self.recorded[0].position) - 1
 
     @property
     def timed(self) -> int:
-        """Which trajectory is timed: the one in the middle by its number of bodies."""
+        """The trajectory that is timed: the median one by number of bodies."""
         return int(np.argsort([len(t.mass) for t in self.recorded], kind="stable")[len(self.recorded) // 2])
 
 
@@ -98,14 +98,14 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
     """The trajectories of a dataset's test split, at most `MOST`; a quick study takes fewer and shorter ones. Raises
     SdfsimError as `load_recorded` does, or for recordings of different gravities."""
     most = MOST_QUICK if quick else MOST
-    # The engine starts again from its own velocities, others from those at the instants of the positions.
+    # The engine starts again from its own velocities, our models from those at the instants of the positions.
     recorded, shapes = load_recorded(data, "test", most=most, as_recorded=True)
     check_alike(str(data), recorded)
     longest = min(STEPS_QUICK if quick else STEPS, *(len(t.position) - 1 for t in recorded))
     recorded, substep = [first_frames(t, longest + 1) for t in recorded], engine_substep(data)
     urdfs = {}
     for name in shapes:
-        with suppress(SdfsimError):  # the engines are points that say so
+        with suppress(SdfsimError):  # the points of the engines then report it
             urdfs[name] = dataset_urdf(data, name)
     conditions = conditions_of(data)
     return Cases(
@@ -120,11 +120,12 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
 
 
 def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Cases:
-    """The one case that a scene makes: the teacher simulates it, and that is what contenders are judged by.
+    """The single case of a scene: PyBullet simulates it, and its motion is the reference for all.
 
-    Lengths, times and masses are those of `model` (Froude scaling), so that the teacher, whose steps and margins are
-    meant for bodies of about a metre, serves scenes of any size. The engines' files go to `folder`. Raises SdfsimError
-    for a scene with more than bodies, that all meet each other, on one level plane, or without PyBullet.
+    Lengths, times and masses are those of `model` (Froude scaling), so that PyBullet, whose steps and margins are meant
+    for bodies of about a metre, serves scenes of any size. The engines' files are written to `folder`. Raises
+    SdfsimError if PyBullet is not installed, or if the scene has anything but bodies that may all touch each other, on
+    one level plane.
     """
     units = stepper_of(load_model(model, weights=False)).units(scene)
     start = start_of_scene(scene, folder, units)
@@ -138,7 +139,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
         raise SdfsimError(f"{scene.path}: {next(problem for problem, there in problems.items() if there)}")
     shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}
     t = start.motion
-    # The engine flies bodies as if they were faster than given by half an inner step of gravity.
+    # The engine's bodies fly as if their velocities were further by half an inner step of gravity.
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
@@ -161,17 +162,17 @@ def _centred(shape: Shape, name: str) -> Shape:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to simulate. The defaults are those of `sdfsim evaluate`."""
+    """One way to simulate; the defaults are those of `sdfsim evaluate`."""
 
     model: str  # name or path
     # "own": the shapes' own; "thin K": K of them, outermost first; "grid N": new samples from N^3 points
     nodes: str = "own"
-    # "own", convex pieces where the shape has some; "mlp", its network alone; "grid N", samples of the exact distance,
-    # N along each side; "mesh", the distance to the mesh that is shown
+    # "own": convex pieces if the shape has some; "mlp": its network alone; "grid N": samples of the exact distance, N
+    # along each side; "mesh": the distance to the shown mesh
     sdf: str = "own"
     stride: int = 1  # recorded steps in a step
-    substeps: int = SUBSTEPS  # inner steps of the solve in a step, where the model does not say how many
-    contact: bool = True  # off is the ballistic baseline
+    substeps: int = SUBSTEPS  # inner steps of the solve in a step, if the model does not give their number
+    contact: bool = True  # False is the ballistic baseline
 
     @property
     def label(self) -> str:
@@ -184,7 +185,7 @@ class Variant:
 
     @property
     def family(self) -> str:
-        """The name that variants share which differ in one setting alone."""
+        """The name shared by variants that differ in one setting only."""
         if not self.contact:
             return "all contact ignored"
         usual, name = Variant(self.model), self.label.partition(",")[0]
@@ -193,7 +194,7 @@ class Variant:
 
 
 def variants(models: Sequence[str], *, quick: bool) -> list[Variant]:
-    """Each model with each of its settings changed alone, and two useful combinations."""
+    """Each model with each of its settings changed separately, and two useful combinations."""
     chosen = []
     for name in models:
         knobs: list[dict[str, Any]] = [{}]
@@ -232,7 +233,7 @@ def arranged(variant: Variant, cases: Cases) -> dict[str, Shape]:
 
 
 def measure_ours(variant: Variant, cases: Cases) -> dict[str, Any]:
-    """Errors and times of our simulator in one variant: see `_judged` and `_times`."""
+    """Errors and times of our simulator for one variant: see `_judged` and `_times`."""
     with peak_memory() as memory:
         began = time.perf_counter()
         model, shapes = load_model(variant.model), arranged(variant, cases)
@@ -261,7 +262,7 @@ def _time_simulator(variant: Variant, model: Model, shapes: dict[str, Shape], ca
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
-    """Errors and times of an engine with `substeps` steps in a recorded one; starts differ by `off` m/s."""
+    """Errors and times of an engine with `substeps` steps in a recorded step; starts differ by `off` m/s."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
     run = ENGINES[name]
@@ -299,10 +300,9 @@ def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[st
 
 
 def _times(run: Callable[[], Timing], cases: Cases) -> dict[str, Any]:
-    """The time of a run relative to our default's, measured in turn with it, and the default's milliseconds per
-    simulated second. A shared machine slows both alike.
-
-    All run in one thread and count processor time: wall time on a shared core depends on other processes.
+    """The time of a run relative to our default's, measured alternately with it, and the default's milliseconds per
+    simulated second. A shared machine slows both alike. All runs use one thread and count processor time: wall time on
+    a shared core depends on other processes.
     """
     model = load_model(SOLVER)
     repeats, usual = zip(
@@ -327,15 +327,15 @@ def tradeoff(
     """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
 
     Args:
-        source: dataset folder, or a scene file, which the teacher then simulates; None takes a random scene of
-            boxes and balls.
-        out: folder to write; results that it holds already are kept.
-        models: names or paths (none: the solver and the bundled networks on it).
+        source: dataset folder, or a scene file, which PyBullet then simulates; None: a random scene of boxes and balls.
+        out: folder to write; results in it are kept.
+        models: names or paths (empty: the solver and the bundled networks on it).
         quick: fewer variants on fewer, shorter scenes.
 
     Returns:
         The content of report.json: `points`, each with its label, its kind ("ours", "engine", "floor", "baseline"),
-        what was measured, or why it `failed`; and `front`, the labels of ours that no other of ours beats, by time.
+        the measurements, or why it `failed`; and `front`, the labels of our points that no other of ours beats, by
+        time.
 
     Raises:
         SdfsimError: bad input, none of our variants could be measured, or another study writes to the same folder.
@@ -397,8 +397,8 @@ def tradeoff(
 def picture(
     points: Sequence[dict[str, Any]], families: dict[str, str], best: Sequence[str], steps: int, out: Path
 ) -> None:
-    """Error against time, a line for each family of labels. Families far from ours are named in the title and not
-    drawn, as ours would all lie in a corner of the picture."""
+    """Error against time, with a line for each family of labels. Families far from ours are named in the title and not
+    drawn, as our points would otherwise be squeezed into a corner."""
     error = {p["label"]: p["translation_rmse"][str(steps)] for p in points}
 
     def along(name: str, points: Sequence[dict[str, Any]]) -> Line:
@@ -441,7 +441,7 @@ def table(points: list[dict[str, Any]]) -> str:
 
 
 def report_table(report: dict[str, Any]) -> tuple[Rows, list[str]]:
-    """The report for people: a row for each point, by time, and where the files are."""
+    """The report as text: a row for each point, by time, and the places of the files."""
     steps, best = str(report["horizon_steps"]), set(report["front"])
     rows: Rows = [("", "ms / s", "p95", "m", "degrees", "penetration m", "MiB")]
     for p in sorted(report["points"], key=lambda p: p.get("ms", float("inf"))):

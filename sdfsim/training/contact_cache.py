@@ -71,12 +71,8 @@ class ContactFrames:
     # body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1]
     body_start: np.ndarray
     edge_start: np.ndarray
-    bodies: dict[
-        str, np.ndarray
-    ]  # by the names in `OF_BODIES`, [B, ...]; masses are relative to one that changes from step to step
-    edges: dict[
-        str, np.ndarray
-    ]  # by the names in `OF_EDGES`, [E, ...]; `first` and `second`: [E] int16, bodies within the frame
+    bodies: dict[str, np.ndarray]  # `OF_BODIES`, [B, ...]; masses are relative to one that changes from step to step
+    edges: dict[str, np.ndarray]  # `OF_EDGES`, [E, ...]; `first` and `second`: [E] int16, bodies within the frame
     truth: dict[str, np.ndarray]  # fields of `Velocities`, [B, 3]: recorded values
     mass: np.ndarray  # [B] kg, 0 for static bodies; friction, restitution, size: [B]
     friction: np.ndarray

@@ -185,7 +185,7 @@ def test_the_report_says_which_floor_and_which_habits(tmp_path):
         teacher = name == "teacher"
         floor = "0.3, restitution 0.5, that of our recipes" if teacher else "0.2, restitution 0.1, from dataset.json"
         assert f"Floor: friction {floor}." in lines
-        assert any(line.startswith("The solve has the teacher's habits") for line in lines) is teacher
+        assert any(line.startswith("The solve imitates PyBullet") for line in lines) is teacher
         assert any(line.startswith("The solve is as users run it") for line in lines) is not teacher
 
 
