@@ -1,1 +1,1 @@
-"""What the commands do with scenes and runs: simulate, plan, fit, identify, record, show, export."""
+"""The work of the commands on scenes and runs: simulate, plan, fit, identify, record, show, export."""

@@ -1,4 +1,4 @@
-"""What the command info tells: versions, devices, models; what is missing here, what for, and how to get it."""
+"""The report of the command info: versions, devices, models; what is missing, what it is for, and how to get it."""
 
 import ctypes
 import importlib
@@ -14,20 +14,20 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.version import __version__
 from sdfsim.learned.model import model_names
 
-# Whose versions are told; all that are needed are asked for.
+# Packages whose versions are reported; every required package is checked.
 NEEDED = ("torch", "numpy", "scipy", "numba", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk")
-# Packages of extras: the extra, and what is done with it.
+# Packages of extras: the extra, and what it is for.
 EXTRAS = {
     "usd-core": ("export", "export of .usd"),
-    "coacd": ("export", "convex pieces, which .xml and .urdf need of shapes without any"),
-    "pybullet": ("data", "data sets of the teacher, and runs beside it"),
+    "coacd": ("export", "convex pieces, which .xml and .urdf need for shapes without any"),
+    "pybullet": ("data", "training data, and comparisons with PyBullet"),
     "mujoco": ("mjcf", "import of MJCF, and comparisons with MuJoCo"),
     "matplotlib": ("bench", "plots of tradeoff and stress, the picture of identify"),
     "imagecodecs": ("record3d", "depth of Record3D"),
     "OpenEXR": ("record3d", "depth of Record3D, in its other form"),
     "distributed": ("cluster", "work on a Dask cluster"),
 }
-# Libraries of the system that packages load, and their Debian names.
+# System libraries that packages load, and their Debian packages.
 LIBRARIES = {
     "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1",
     "libusb-1.0.so.0": "libusb-1.0-0", "libgomp.so.1": "libgomp1",
@@ -36,7 +36,7 @@ DRIVER = ("libvulkan_lvp.so", "libvulkan1 mesa-vulkan-drivers")  # graphics on t
 
 
 def about() -> dict[str, Any]:
-    """Versions, devices, models, and in `missing` one line for each thing that is not here."""
+    """Versions, devices, models, and in `missing` one line for each thing that is missing."""
     versions = {"sdfsim": __version__, "python": platform.python_version(), "system": platform.platform(terse=True)}
     versions |= {name: _version(name) or "missing" for name in (*NEEDED, *EXTRAS)}
     missing = [f"{name}: pip install {name}" for name in _needed() if _version(name) is None]
@@ -51,7 +51,7 @@ def about() -> dict[str, Any]:
             devices += [f"cuda:{k} {found.cuda.get_device_name(k)}" for k in range(found.cuda.device_count())]
             threads = found.get_num_threads()
     if len(devices) == 1:
-        missing.append("a CUDA device, for training and volsdf at speed: all else runs without")
+        missing.append("a CUDA device, for fast training and volsdf: everything else runs without it")
     for name, (extra, use) in EXTRAS.items():
         if versions[name] == "missing":
             missing.append(f"{name}, for {use}: pip install 'sdfsim[{extra}]'")
@@ -60,11 +60,11 @@ def about() -> dict[str, Any]:
     except SdfsimError as error:
         missing.append(f"the viewer of recordings: {error.hint}")
     if not has_screen():
-        missing.append("a screen: watch in the browser (view --web), or render movies and pictures")
+        missing.append("a screen: use the browser (view --web), or render movies and pictures")
     if sys.platform == "linux" and not _loads(DRIVER[0]):
         missing.append(f"a Vulkan driver, for view --screenshot: apt-get install {DRIVER[1]}")
     if not _compiled():
-        missing.append("the compiled contact step: the first run makes it, in about a minute")
+        missing.append("the compiled contact step: the first run compiles it, in about a minute")
     return {
         "versions": versions, "devices": devices, "cpu_threads": threads, "models": model_names(), "missing": missing,
     }  # fmt: skip
@@ -77,7 +77,7 @@ def about_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _needed() -> list[str]:
-    """The packages that the project asks for, extras aside."""
+    """The packages that the project requires, without extras."""
     try:
         asked = metadata.requires("sdfsim") or []
     except metadata.PackageNotFoundError:  # a checkout that is not installed
@@ -93,7 +93,7 @@ def _version(package: str) -> str | None:
 
 
 def _unloaded(module: str, why: str) -> str:
-    """Of a module that does not load, by what the system says of it."""
+    """The line for a module that does not load, from the system's message."""
     lacking = re.search(r"lib[\w.+-]+\.so[\w.]*", why)
     if lacking and lacking[0] in LIBRARIES:
         return f"{lacking[0]}, which {module} loads: apt-get install {LIBRARIES[lacking[0]]}"

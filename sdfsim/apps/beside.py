@@ -1,4 +1,5 @@
-"""A recorded motion beside a simulated one: where the run begins, and what recordings and movies show through."""
+"""A recorded motion beside a simulated one: the run begins where it does, and recordings and movies show it
+translucent."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,34 +15,34 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 
 FILE = "beside.npz"  # in a run folder
-COLOR = (245, 140, 20)  # RGB of what was recorded
+COLOR = (245, 140, 20)  # RGB of the recorded bodies
 OPACITY = 0.5
 
 
 @dataclass(frozen=True)
 class Beside:
-    """K poses of the D bodies of a scene that move, where a recording has them."""
+    """K recorded poses of the D moving bodies of a scene."""
 
-    name: str  # of the recording
+    name: str  # name of the recording
     bodies: tuple[str, ...]  # their D names
-    time: np.ndarray  # [K] s of the run, which begins with the first
+    time: np.ndarray  # [K] s since the start of the run, which is the first pose
     position: np.ndarray  # [K, D, 3] m, centres of mass
     orientation: np.ndarray  # [K, D, 4] xyzw
-    # [D, *] position, orientation, velocity and angular_velocity at the start, as fits tell; none where it was read
-    # from a run folder
+    # [D, *] position, orientation, velocity and angular_velocity at the start, from fits; empty if read from a run
+    # folder
     start: dict[str, np.ndarray]
 
     def rows(self, scene: Scene) -> np.ndarray:
-        """[D] int64, which bodies of the scene they are."""
+        """[D] int64, their indices in the scene."""
         return np.array([[body.name for body in scene.bodies].index(name) for name in self.bodies], dtype=np.int64)
 
     def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [T, D, 3] and orientations [T, D, 4] at times [T], between poses as if moved evenly; after the last
-        one, that one."""
+        """Positions [T, D, 3] and orientations [T, D, 4] at times [T], interpolated between poses; after the last pose,
+        that one."""
         return between(self.time, self.position, self.orientation, time)
 
     def begun(self, scene: Scene) -> Scene:
-        """The scene with these bodies where the recording begins, and as fast."""
+        """The scene with the poses and velocities of these bodies at the start of the recording."""
         bodies = list(scene.bodies)
         for d, k in enumerate(self.rows(scene)):
             place, turn, speed, spin = (self.start[name][d] for name in MOTION)
@@ -50,7 +51,8 @@ class Beside:
         return replace(scene, bodies=tuple(bodies))
 
     def off(self, scene: Scene, rollout: Rollout) -> dict[str, Any]:
-        """How far a run is from its frames while both last, of all bodies: root mean square m, mean degrees, s."""
+        """Deviation of a run from the recording while both last, over all bodies: root mean square in m, mean in
+        degrees, and the time in s."""
         both, rows = self.time <= rollout.time[-1] + 1e-9, self.rows(scene)
         place, turn = between(rollout.time, rollout.position[:, rows], rollout.orientation[:, rows], self.time[both])
         away = np.linalg.norm(place - self.position[both], axis=-1)
@@ -70,7 +72,8 @@ class Beside:
 def between(
     time: np.ndarray, position: np.ndarray, orientation: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses at times `at` [T] of a motion [K, D, *], between its frames as if moved evenly, after the last that."""
+    """Poses at times `at` [T] of a motion [K, D, *], interpolated between its frames; after the last frame, that
+    one."""
     if len(time) < 2:
         return np.repeat(position, len(at), 0), np.repeat(orientation, len(at), 0)
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
@@ -81,8 +84,8 @@ def between(
 
 
 def beside_of(run: Path, scene: Scene) -> Beside | None:
-    """What a run, its folder or `rollout.npz`, was simulated beside; None where that was nothing. Raises SdfsimError
-    if the file is unreadable, or of other bodies."""
+    """The recorded motion beside which a run (its folder or `rollout.npz`) was simulated, None if there was none.
+    Raises SdfsimError if the file is unreadable, or is about other bodies."""
     file = (run if run.is_dir() else run.parent) / FILE
     if not file.exists():
         return None

@@ -1,7 +1,7 @@
 """`export`: a shape, a scene or a run becomes a file that other programs open.
 
-Pose frames are the shapes' own origins in every format. The report's `left_out` says what a format cannot hold;
-docs/export.md says it of each format.
+In every format poses are those of the shapes' own origins. The report's `left_out` says what the format cannot hold;
+docs/export.md lists it for each format.
 """
 
 import csv
@@ -42,41 +42,42 @@ from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 
 _log = logging.getLogger(__name__)
 
-# Concavity relative to the size; and a search a third as long as CoACD's own, which finds pieces as good.
+# Concavity relative to the size; and a search a third as long as CoACD's default, which finds equally good pieces.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
-RATE = 60.0  # USD time codes in a second; programs step through the whole ones
-# Schemas of PhysX (Isaac Sim, ManiSkill) and Newton for distances that they sample, and the attribute that says in how
-# many cells along the longest side. None of them is part of OpenUSD.
+RATE = 60.0  # USD time codes per second; programs step through whole ones
+# Schemas of PhysX (Isaac Sim, ManiSkill) and Newton for sampled distances, and the attribute for the number of cells
+# along the longest side. None of them is part of OpenUSD.
 USD_GRIDS = {
     "PhysxSDFMeshCollisionAPI": "physxSDFMeshCollision:sdfResolution",
     "NewtonSDFCollisionAPI": "newton:sdfMaxResolution",
 }
 USD_CELLS = 256
-STEP = 0.001  # s, of MuJoCo
-SOFT = 4.0  # steps, over 2 pi: the time in which a contact of MuJoCo swings
-MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
+STEP = 0.001  # s, the step of MuJoCo
+SOFT = 4.0  # steps, over 2 pi: the period of a MuJoCo contact
+MOST_PAIRS = 1000  # pairs of geoms whose coefficients are written one by one
 MOST_GROUPS = 31  # MuJoCo's bit masks
-# Names of ours, of MuJoCo's own, and of devices, which no file may have on Windows.
+# Names that are taken: our own, MuJoCo's, and device names, which Windows does not allow for files.
 RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "joints", "con", "prn", "aux", "nul")
 RESERVED += tuple(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))
 XML = ElementTree.Element
 
 
-# How MuJoCo collides what is no closed form: as convex pieces, or as distances that it samples from the mesh itself.
+# How MuJoCo collides shapes without a closed form: as convex pieces, or by distances that it samples from the mesh
+# itself.
 Collide = Literal["pieces", "sdf"]
 
 
 @dataclass(frozen=True)
 class Take:
-    """What is exported: N bodies at T times."""
+    """The data to export: N bodies at T times."""
 
     scene: Scene  # the bodies as they are at the start
     names: list[str]  # [N] unique names of ASCII letters, digits and underscores
-    shapes: list[str]  # names of the scene's shapes, likewise
+    shapes: list[str]  # names of the scene's shapes, in the same form
     colors: np.ndarray  # [N, 3] uint8 sRGB, for bodies whose mesh has no colours
     time: np.ndarray  # [T] s
     position: np.ndarray  # [T, N, 3] m, of the shapes' own origins
-    quat_xyzw: np.ndarray  # [T, N, 4], the nearer of the two signs from one time to the next
+    quat_xyzw: np.ndarray  # [T, N, 4], with the sign that is nearer to the time before
     collide: Collide = "pieces"
 
     @property
@@ -89,19 +90,19 @@ class Take:
         return zip(self.names, self.scene.bodies, shapes, self.colors, strict=True)
 
     def plane_size(self) -> float:
-        """m to each side, of the sheet that is shown for a plane."""
+        """Half the side, m, of the square that is shown for a plane."""
         return 6.0 * framed(self.scene)[1]
 
     def at_rate(self, fps: float) -> "Take":
-        """The same motion at so many evenly spaced times in a second, between frames as if moved evenly. The last of
-        them is not before the end: it has the last pose."""
+        """The same motion at `fps` evenly spaced times per second, interpolated between frames. The last time is not
+        before the end, and has the last pose."""
         count = int(np.ceil((self.time[-1] - self.time[0]) * fps - 1e-3)) + 1
         time = self.time[0] + np.arange(count) / fps
         place, turn = between(self.time, self.position, self.quat_xyzw, time)
         return replace(self, time=time, position=place, quat_xyzw=turn)
 
 
-Written = tuple[list[Path], list[str]]  # the files of an export, and what they do not hold, one line each
+Written = tuple[list[Path], list[str]]  # the files of an export, and what is left out, one line each
 
 
 def export(
@@ -114,31 +115,35 @@ def export(
     allow_outside: bool = False,
     on_progress: StageProgress = silent_stages,
 ) -> dict[str, Any]:
-    """Write a run (folder or rollout.npz), a scene.yaml, a sample by its name or a Shape folder in the format that the
-    ending of `out` names (see `FORMATS`).
+    """Write a run (folder or rollout.npz), a scene.yaml, a sample by its name or a Shape folder in the format given by
+    the ending of `out` (see `FORMATS`).
 
     Args:
-        scene_file: of a run; None: the one that it was made from.
-        fps: frames of the motion in a second, evenly spaced; None: every step of the run.
-        collide: for MuJoCo, see `Collide`; "sdf" takes about thirty times as long there.
+        scene_file: the scene of a run; None: the one that it was made from.
+        fps: frames of the motion per second, evenly spaced; None: every step of the run.
+        collide: for MuJoCo, see `Collide`; "sdf" is about thirty times slower there.
 
     Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, an
-    option that the format has no use for, a damaged source, an extra that is not installed, a shape without convex
-    pieces, or a file that cannot be written.
+        option that the format does not have, a damaged source, an extra that is not installed, a shape without convex
+        pieces, or a file that cannot be written.
     """
-    wanted = 'export writes files of files: scene.save("scene.yaml") or rollout.save("run.npz") first'
+    wanted = 'export reads files: scene.save("scene.yaml") or rollout.save("run.npz") first'
     source, out = _path("source", source, wanted), _path("out", out, "its ending names the format")
     scene_file = _path("scene_file", scene_file, wanted) if scene_file else None
     kind = out.suffix.lower()
     if kind not in FORMATS:
         raise SdfsimError(f"{out}: unknown format {out.suffix or '(no ending)'}", "end it in " + " ".join(FORMATS))
     if collide != "pieces" and FORMATS[kind] is not _mjcf:
-        raise SdfsimError(f"--collide {collide}: is for MuJoCo", "leave it out; USD has it for bodies without pieces")
+        raise SdfsimError(
+            f"--collide {collide}: is for MuJoCo", "leave it out; USD always uses it for bodies without pieces"
+        )
     if fps is not None and (FORMATS[kind] in (_mjcf, _urdf) or not 0.0 < fps <= 1e4):
         told = f"--fps {fps:g}: " + ("no motion in it" if 0.0 < fps <= 1e4 else "must be above 0, at most 10,000")
-        raise SdfsimError(told, "it goes with " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf)))
+        raise SdfsimError(
+            told, "formats with it: " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf))
+        )
     if FORMATS[kind] is _usd:
-        _pxr("Usd")  # before shapes are fitted for minutes
+        _pxr("Usd")  # checked before fitting shapes, which takes minutes
     check_writable(out.parent)
     take = replace(_read(source, scene_file, allow_outside, on_progress), collide=collide)
     take = take if fps is None else take.at_rate(fps)
@@ -176,7 +181,7 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, progress, allow_outside=allow_outside)
     elif not source.exists():
-        raise SdfsimError(f"{source}: there is no such folder or file", "give a run folder, scene.yaml or Shape folder")
+        raise SdfsimError(f"{source}: no such folder or file", "give a run folder, scene.yaml or Shape folder")
     else:
         hint = f"sdfsim fit {source} -o FOLDER makes a Shape folder of a mesh"
         message = f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder"
@@ -195,14 +200,14 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
 
 
 def plain_names(names: list[str]) -> list[str]:
-    """Unique names that every format takes, in place of `names`."""
+    """Unique names that every format accepts, in place of `names`."""
     used: set[str] = set(RESERVED)
     plain = []
     for name in names:
-        # What is no letter at the end goes: `cup[3]` becomes `cup_3`.
+        # Trailing separators are dropped: `cup[3]` becomes `cup_3`.
         stem = re.sub(r"\W", "_", re.sub(r"\W+$", "", name, flags=re.ASCII), flags=re.ASCII) or "_"
         stem = f"_{stem}" if stem[0].isdigit() else stem
-        # Names that differ in case alone are one file on some systems.
+        # Names that differ only in case are the same file on some systems.
         choice = next(c for k in range(len(used) + 1) if (c := f"{stem}_{k}" if k else stem).lower() not in used)
         used.add(choice.lower())
         plain.append(choice)
@@ -213,7 +218,7 @@ def plain_names(names: list[str]) -> list[str]:
 
 
 def _joint_names(take: Take) -> dict[str, str]:
-    """What every format takes, in place of the names of the joints."""
+    """Names that every format accepts, in place of the names of the joints."""
     names = [joint.name for joint in take.scene.joints]
     return dict(zip(names, plain_names(names), strict=True))
 
@@ -224,10 +229,10 @@ def _inertia(body: Body, shape: Shape) -> np.ndarray:
 
 
 def convex_pieces(shape: Shape) -> list[Mesh]:
-    """Convex pieces [m]: the shape's own, or those of CoACD. Raises SdfsimError if there are none."""
+    """Convex pieces [m]: the shape's own, or CoACD's. Raises SdfsimError if there are none."""
     if own := own_pieces(shape):
         return own
-    import open3d  # noqa: F401  (it cannot be loaded after CoACD)
+    import open3d  # noqa: F401  (it fails to load after CoACD)
 
     coacd = optional("coacd", "coacd", "export")
     coacd.set_log_level("off")
@@ -241,8 +246,8 @@ def convex_pieces(shape: Shape) -> list[Mesh]:
 def _write_assets(
     take: Take, out: Path, cuts: Callable[[Body], bool], on_progress: StageProgress
 ) -> tuple[dict[int, Path], dict[int, list[Path]]]:
-    """OBJ files in `NAME_assets/`, by the index of each shape without a closed form: what is shown of it, and its
-    convex pieces where a body `cuts` it."""
+    """Write OBJ files to `NAME_assets/`. Returns them by the index of each shape without a closed form: the shown mesh,
+    and its convex pieces if a body `cuts` it."""
     folder, shapes = out.with_name(f"{out.stem}_assets"), take.scene.shapes
 
     def obj(name: str, mesh: Mesh) -> Path:
@@ -273,7 +278,7 @@ def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
 
 
 def _rgba(shape: Shape, color: np.ndarray) -> str:
-    """For formats with one colour a mesh: the mean of its own ones, or `color`."""
+    """The colour for formats with one colour per mesh: the mean of its own colours, or `color`."""
     return _numbers((color if shape.mesh.colors is None else shape.mesh.colors.mean(0)) / 255.0, 1.0)
 
 
@@ -283,11 +288,11 @@ def _write_xml(path: Path, root: XML) -> None:
 
 
 def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> list[str]:
-    """What a format leaves out that has no motion, or no textures."""
+    """The lines for a format without motion, or without textures."""
     led = any(body.motion == "kinematic" for body in take.scene.bodies)
     lines = {
-        "the motion: the scene is as it is at the start": take.moving and not motion,
-        "the paths of kinematic bodies: they stand where they start": led and not (take.moving and motion),
+        "the motion: the scene is exported as at the start": take.moving and not motion,
+        "the paths of kinematic bodies: they stay at their start": led and not (take.moving and motion),
         "textures": not textures and any(shape.skin is not None for shape in take.scene.shapes),
     }
     return [line for line, missing in lines.items() if missing]
@@ -298,21 +303,21 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
 
 def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     file = GltfWriter()
-    # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
+    # Bodies of the same shape and colour share a mesh; those of the same shape share its arrays.
     numbers: dict[tuple[int, int], tuple[dict[str, int], int]] = {}
     drawn: dict[tuple[str, tuple[int, int]], int] = {}
     time = file.array(take.time) if take.moving else 0
     samplers, channels = [], []
     for k, (name, body, shape, color) in enumerate(take.each()):
         seen = shown(take.scene, k, take.plane_size())
-        form = (body.shape, k if is_infinite(shape) else -1)  # planes differ by what lies in them
+        form = (body.shape, k if is_infinite(shape) else -1)  # planes differ by the scenery that lies in them
         own = seen.colors is not None or seen.texture is not None
         if form not in numbers:
             mesh, normals = with_normals(seen)
             attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
             if mesh.uv is not None:
                 attributes["TEXCOORD_0"] = file.array(mesh.uv)
-            if mesh.colors is not None:  # in 16 bits: 8 are too few for dark colours once they count light
+            if mesh.colors is not None:  # in 16 bits: for linear light, 8 are too few for dark colours
                 shades = np.pad(light(mesh.colors), ((0, 0), (0, 1)), constant_values=1.0)
                 attributes["COLOR_0"] = file.array(np.round(65535 * shades), "<u2")
             numbers[form] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
@@ -330,7 +335,10 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
     write_bytes(out, file.to_bytes())
-    return [out], ["masses, friction and all else that is not visible", *_missing(take, motion=True, textures=True)]
+    return [out], [
+        "masses, friction and everything else that is not visible",
+        *_missing(take, motion=True, textures=True),
+    ]
 
 
 # --- USD ---
@@ -387,7 +395,7 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
             made, (friction, restitution) = materials[surface].GetPrim(), surface
             values = {"staticFriction": friction, "dynamicFriction": friction, "restitution": restitution}
             _usd_apply(made, "PhysicsMaterialAPI", **values)
-            # By default PhysX takes the mean of two bodies' coefficients. Its schema is not part of OpenUSD.
+            # By default PhysX uses the mean of two bodies' coefficients. Its schema is not part of OpenUSD.
             made.AddAppliedSchema("PhysxMaterialAPI")
             for what in ("friction", "restitution"):
                 made.CreateAttribute(f"physxMaterial:{what}CombineMode", sdf.ValueTypeNames.Token).Set("multiply")
@@ -422,14 +430,14 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
 
 
 def _usd_apply(prim: Any, schema: str, **values: Any) -> None:
-    """Give a prim a schema of UsdPhysics, and values for its attributes."""
+    """Apply a UsdPhysics schema to a prim, with values for its attributes."""
     prim.ApplyAPI(schema)
     for name, value in values.items():
         prim.GetAttribute(f"physics:{name}").Set(value)
 
 
 def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
-    """Prims below `path` that are seen and collide."""
+    """Write prims below `path` for display and collision."""
     gf, geom = _pxr("Gf"), _pxr("UsdGeom")
     form, solid = shape.sdf, f"{path}/solid"
     if isinstance(form, ClosedForm):
@@ -450,7 +458,7 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
         return
     seen = _usd_mesh(stage, solid, shape.mesh)
     pieces = own_pieces(shape) if dynamic else []
-    # Engines collide what moves as distances from its surface that they sample themselves, unless it has pieces.
+    # Unless a moving body has pieces, engines sample distances from its surface themselves.
     colliders = [(seen, "sdf" if dynamic else "none")]
     if pieces:
         colliders = [(_usd_mesh(stage, f"{path}/piece_{k}", piece), "convexHull") for k, piece in enumerate(pieces)]
@@ -493,14 +501,14 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     folder = out.with_name(f"{out.stem}_assets").name
     add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
     add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
-    if sampled:  # from so many places, and for so long, MuJoCo looks for where two bodies are nearest
+    if sampled:  # number of starts and iterations with which MuJoCo searches the nearest points of two bodies
         root[-1].attrib |= {"sdf_initpoints": "40", "sdf_iterations": "10"}
-    add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than is the default
+    add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than the default
     asset, world = add(root, "asset"), add(root, "worldbody")
     add(world, "light", directional="true", castshadow="false", pos="0 0 10", dir="-0.4 0.3 -0.9")
     group, allowed = contact_groups(scene.bodies)
     if len(allowed) > MOST_GROUPS:
-        left_out.append(f"collides_with: {len(allowed)} groups of bodies (MuJoCo knows {MOST_GROUPS})")
+        left_out.append(f"collides_with: {len(allowed)} groups of bodies (MuJoCo supports {MOST_GROUPS})")
         group, allowed = np.zeros_like(group), np.ones((1, 1), dtype=bool)
     meshes: set[str] = set()
     geoms: list[list[str]] = [[] for _ in take.names]
@@ -512,7 +520,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         name = file.stem + ("" if scale == 1.0 else f"-x{scale:.9g}")
         if name not in meshes:
             meshes.add(name)
-            # "convex" and "shell" need no enclosed volume, which meshes that are only shown may lack.
+            # "convex" and "shell" also work without an enclosed volume, which meshes for display may lack.
             inertia = "convex" if "-" in file.stem else "shell"
             add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
         return name
@@ -538,7 +546,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             add(node, "inertial", pos=_numbers(com), mass=_numbers(body.mass), fullinertia=full)
         if body.motion == "dynamic" and not above:
             com, turn = body.scale * shape.com, Rotation.from_quat(quat)
-            # Of the body's own origin, in world axes; and of its turning, in its own axes.
+            # Velocity of the body's own origin, in world axes; and angular velocity, in body axes.
             speed = body.velocity - np.cross(body.angular_velocity, turn.apply(com))
             places.append(_numbers(body.position, _wxyz(quat)))
             speeds.append(_numbers(speed, turn.inv().apply(body.angular_velocity)))
@@ -560,8 +568,8 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         for solid, label in zip(solids, geoms[k], strict=True):
             add(node, "geom", name=label, **solid, **surface)
 
-    # Between bodies of one material the square is the product. Other pairs are written one by one, while they are few:
-    # those of few geoms first, since the floor is one.
+    # Between bodies of the same material the square is the product. Other pairs are written one by one, up to a limit:
+    # first those of bodies with few geoms, as the floor is one.
     pairs, apart = [], {frozenset(joint.bodies) for joint in scene.joints if not joint.collides}
     surfaces = [(b.friction, b.restitution) for b in scene.bodies]
     order = sorted(range(len(geoms)), key=lambda k: len(geoms[k])) if len(set(surfaces)) > 1 else []
@@ -572,7 +580,9 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         if frozenset((i, j)) in apart:
             continue
         if len(pairs) + len(geoms[i]) * len(geoms[j]) > MOST_PAIRS:
-            left_out.append("friction and restitution of some unlike bodies: the larger friction of the two counts")
+            left_out.append(
+                "friction and restitution of some pairs of unlike bodies: the larger friction of the two is used"
+            )
             break
         surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
         pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[i] for b in geoms[j]]
@@ -593,12 +603,13 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
 
 
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
-    """Friction, and a contact as stiff as the step allows, damped so that bodies part at this part of their speed.
+    """Friction, and a contact as stiff as the step allows, damped so that bodies separate with the part `restitution`
+    of their speed.
 
-    MuJoCo has no restitution. A spring that only pushes, its damping relative to the critical one z, gives back
-    exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed; also above 1, where arccos and root are imaginary.
+    MuJoCo has no restitution. A spring that only pushes, with the damping z relative to the critical one, returns
+    exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed; also for z above 1, where arccos and root are imaginary.
     """
-    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to where MuJoCo does not change it
+    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to the largest that MuJoCo does not change
     turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
     back = np.exp(-damping * np.abs(turned))
     found = np.interp(-restitution, -back, damping)
@@ -615,7 +626,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     single = len(take.names) == 1 and take.scene.path is None
     tree, joint_names, every = jointed.trees(take.scene), _joint_names(take), list(take.each())
     links = dict(enumerate(take.names)) | {-1: "world"}
-    robots: dict[int, tuple[XML, Path]] = {}  # by the bodies in them
+    robots: dict[int, tuple[XML, Path]] = {}  # by their bodies
     for k in tree.order:
         (name, body, shape, color), above = every[k], tree.above.get(k)
         if above is None or above.parent < 0:
@@ -627,7 +638,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             robots[k] = robots[above.parent]
         root = robots[k][0]
         link = add(root, "link", name=name)
-        # A link that is held has its origin where the joint is.
+        # The origin of a link that a joint holds is at the joint.
         origin = np.zeros(3) if above is None else above.anchor
         surface = add(link, "contact")
         add(surface, "lateral_friction", value=_numbers(body.friction))
@@ -651,7 +662,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             add(add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
 
         if body.shape not in seen:
-            if isinstance(shape.sdf, PlaneSdf):  # PyBullet draws none
+            if isinstance(shape.sdf, PlaneSdf):  # PyBullet does not draw planes
                 visual = add(link, "visual")
                 add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
                 add(add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
@@ -662,7 +673,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         else:
             visual = part("visual")
             mesh(visual, seen[body.shape])
-            if body.motion == "static":  # triangles as they are, which PyBullet knows of what never moves
+            if body.motion == "static":  # the triangles themselves, which PyBullet supports for static bodies
                 mesh(part("collision", concave="yes"), seen[body.shape])
             for file in cut[body.shape] if body.motion != "static" else []:
                 mesh(part("collision"), file)
@@ -679,7 +690,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     poses = out.with_suffix(".csv")
     start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
     _csv(start, poses, on_progress)
-    left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_missing(take)]
+    left_out = ["the poses of bodies: they are in the CSV", "gravity, velocities and collides_with", *_missing(take)]
     left_out += jointed.urdf_left_out(take.scene, tree)
     return [*files, poses, *assets], left_out
 

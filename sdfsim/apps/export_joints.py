@@ -1,4 +1,4 @@
-"""Joints of a scene in the formats of `export`: nested bodies of MJCF, links of URDF, joints of UsdPhysics."""
+"""Joints of a scene in the formats of `export`: nested bodies in MJCF, links in URDF, joints in UsdPhysics."""
 
 import math
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.scene.scene import Body, Joint, Scene
 
-NESTING = ("hinge", "slider", "ball", "fixed")  # kinds that can hold a body below another
-KEEN = 20.0  # s/rad or s/m: a motor's largest force over how much too slow it then is
-EFFORT = 1e6  # N m or N, and rad/s or m/s: of URDF's limits, which must be given
+NESTING = ("hinge", "slider", "ball", "fixed")  # kinds of joints by which one body can hold another in a tree
+KEEN = 20.0  # s/rad or s/m: gain of a motor, its largest force divided by the speed error at which it gives this force
+EFFORT = 1e6  # N m or N, and rad/s or m/s: URDF requires limits, so these are given where there are none
 
 
 @dataclass(frozen=True)
 class Held:
-    """A joint as that of a child below its parent; turned round where the scene has the child second."""
+    """A joint between a child and its parent; reversed if the scene names the child second."""
 
     joint: Joint
     parent: int  # -1: the world
@@ -26,7 +26,7 @@ class Held:
     frame: Rotation  # of the joint's axes, in the child
     parent_anchor: np.ndarray  # [3] m, in the parent
     parent_frame: Rotation
-    sense: float  # -1 where it is turned round: its axis then is the other way
+    sense: float  # -1 if it is reversed: its axis then points the other way
 
     def axis(self) -> np.ndarray:
         """[3] in the child."""
@@ -34,7 +34,7 @@ class Held:
 
 
 def held(joint: Joint, child: int) -> Held:
-    """A joint as that of one of its bodies."""
+    """A joint, with one of its bodies as the child."""
     own = 0 if joint.bodies[0] == child else 1
     frames = [Rotation.from_quat(quat) for quat in joint.quat_xyzw]
     return Held(
@@ -45,21 +45,21 @@ def held(joint: Joint, child: int) -> Held:
 
 @dataclass(frozen=True)
 class Trees:
-    """The bodies of a scene as trees: who holds whom, and the joints that are left, which close loops."""
+    """The bodies of a scene as trees: which body holds which, and the other joints, which close loops."""
 
-    order: tuple[int, ...]  # all bodies, each right after its parent and all that its elder siblings hold
-    above: dict[int, Held]  # of bodies that are held
-    loops: tuple[Joint, ...]  # the others, distances among them
+    order: tuple[int, ...]  # all bodies, each after its parent, in depth-first order
+    above: dict[int, Held]  # the joints of bodies that are held
+    loops: tuple[Joint, ...]  # the other joints, including distances
 
     def root(self, k: int) -> int:
-        """The body that holds a body in the end, -1 for the world."""
+        """The root of a body's tree, -1 for the world."""
         while k in self.above:
             k = self.above[k].parent
         return k
 
 
 def trees(scene: Scene) -> Trees:
-    """Trees whose roots are the world and what it does not move, then bodies that fly."""
+    """Trees whose roots are the world and bodies that are not dynamic, then those of free bodies."""
     at: dict[int, list[int]] = {}
     for number, joint in enumerate(scene.joints):
         if joint.kind in NESTING:
@@ -68,7 +68,7 @@ def trees(scene: Scene) -> Trees:
     still = [k for k, body in enumerate(scene.bodies) if body.motion != "dynamic"]
     above: dict[int, Held] = {}
     reached, used = {-1, *still}, set()
-    # Bodies that no joint has first are the natural roots of what flies.
+    # Bodies that are first in no joint are the natural roots of free trees.
     free = [k for k in range(len(scene.bodies)) if k not in reached]
     firsts = {joint.bodies[0] for joint in scene.joints if joint.kind in NESTING}
     for seeds in ([-1, *still], *([k] for k in sorted(free, key=lambda k: k in firsts))):
@@ -98,18 +98,18 @@ def trees(scene: Scene) -> Trees:
 
 
 def place(body: Body | None) -> tuple[np.ndarray, Rotation]:
-    """Of a body at the start, or of the world."""
+    """Pose of a body at the start, or of the world."""
     return (np.zeros(3), Rotation.identity()) if body is None else (body.position, Rotation.from_quat(body.quat_xyzw))
 
 
 def start_of(scene: Scene, one: Held, child: int) -> float:
-    """rad or m: the position of a hinge or a slider at the start; 0 of others."""
+    """rad or m: the angle of a hinge or position of a slider at the start; 0 for other joints."""
     (here, turn), (there, other) = place(scene.bodies[child]), place(_body(scene, one.parent))
     own, theirs = turn * one.frame, other * one.parent_frame
     if one.joint.kind == "hinge":
         vector = (theirs.inv() * own).as_rotvec()
         angle = one.sense * vector[0]
-        # Turns add up, and a pose does not tell them: the one that is within the limits.
+        # Full turns add up, but a pose does not show them: take the angle within the limits.
         low, high = one.joint.limits or (-math.pi, math.pi)
         whole = 2.0 * math.pi
         return float(angle + whole * max(0, math.ceil((low - 1e-9 - angle) / whole)) - whole * max(
@@ -126,7 +126,7 @@ def _body(scene: Scene, k: int) -> Body | None:
 
 
 def _speed(scene: Scene, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity [3] m/s of a body at a point of the world, and its angular velocity [3] rad/s."""
+    """Velocity [3] m/s of a body at a point in the world, and its angular velocity [3] rad/s."""
     body = _body(scene, k)
     if body is None or body.motion != "dynamic":
         return np.zeros(3), np.zeros(3)
@@ -135,7 +135,7 @@ def _speed(scene: Scene, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def speed_of(scene: Scene, one: Held, child: int) -> np.ndarray:
-    """[0, 1 or 3] rad/s or m/s: how a joint moves at the start; of a ball in the axes of the child."""
+    """[0, 1 or 3] rad/s or m/s: the joint's speed at the start; for a ball in the axes of the child."""
     here, turn = place(scene.bodies[child])
     point = here + turn.apply(one.anchor)
     (fast, spin), (carried, turned) = _speed(scene, child, point), _speed(scene, one.parent, point)
@@ -145,10 +145,11 @@ def speed_of(scene: Scene, one: Held, child: int) -> np.ndarray:
 
 
 def left_out(joints: Sequence[Joint], *, breaks: bool = True, spring_of: Sequence[str] = ()) -> list[str]:
-    """What no format but ours has of joints, one line each."""
+    """Properties of joints that only our own format has, one line each."""
     lines = {
-        "what joints break at": breaks and any(np.isfinite([j.breaks_force, j.breaks_torque]).any() for j in joints),
-        "how limits of joints rebound": any(j.restitution for j in joints),
+        "the loads at which joints break": breaks
+        and any(np.isfinite([j.breaks_force, j.breaks_torque]).any() for j in joints),
+        "the restitution of joints' limits": any(j.restitution for j in joints),
     }
     lines |= {f"springs of {kind}s": any(j.kind == kind and j.spring for j in joints) for kind in spring_of}
     return [line for line, there in lines.items() if there]
@@ -166,14 +167,14 @@ def add(parent: Element, tag: str, **attributes: str) -> Element:
 
 
 def mjcf_pose(scene: Scene, tree: Trees, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Position [3] m and quaternion [4] xyzw of a body in that which holds it, at the start."""
+    """Position [3] m and quaternion [4] xyzw of a body in the frame of its parent, at the start."""
     here, turn = place(scene.bodies[k])
     there, other = place(_body(scene, tree.above[k].parent) if k in tree.above else None)
     return other.inv().apply(here - there), (other.inv() * turn).as_quat()
 
 
 def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Write what holds a body, and return its part of qpos and of qvel."""
+    """Write the joint that holds a body, and return its part of qpos and of qvel."""
     joint, start = one.joint, start_of(scene, one, child)
     speed = speed_of(scene, one, child)
     if joint.kind == "fixed":
@@ -194,8 +195,9 @@ def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) ->
 def mjcf_rest(
     root: Element, sites: Sequence[Element], scene: Scene, tree: Trees, bodies: Sequence[str], names: dict[str, str]
 ) -> tuple[list[float], list[str]]:
-    """Write loops, distances, motors and who does not touch whom: the controls [U] of the start, and what is left out.
-    `sites` are the elements of the bodies, the world's last; `bodies` and `names` what bodies and joints are called."""
+    """Write loops, distances, motors and excluded contacts. Returns the controls [U] at the start, and what is left
+    out. `sites` are the elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and
+    joints."""
     told, controls = left_out(scene.joints), []
     tags = ("equality", "tendon", "actuator", "contact")
     into = {tag: Element(tag) for tag in tags}
@@ -226,7 +228,7 @@ def mjcf_rest(
             add(into["equality"], "weld", name=name, **ends, anchor=_text(np.zeros(3)))
         elif joint.kind == "slider":
             told.append(f"slider {joint.name}, which closes a loop")
-        else:  # a hinge is held in two points of its axis
+        else:  # a hinge is held at two points of its axis
             points = [one.anchor] if joint.kind == "ball" else [one.anchor + s * 0.1 * one.axis() for s in (-1.0, 1.0)]
             for number, point in enumerate(points):
                 add(
@@ -252,11 +254,11 @@ def mjcf_rest(
         elif joint.motor.position is not None:
             add(into["actuator"], "position", kp=_text(speed / joint.motor.time), kv=_text(speed), **keys)
             controls.append(joint.motor.position)
-        else:  # nobody has told it what to do
+        else:  # no target is set
             add(into["actuator"], "motor", **keys)
             controls.append(0.0)
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
-        told.append("that a cone bounds the lean of a ball only: MuJoCo bounds its whole turn")
+        told.append("that a cone bounds only the lean of a ball: MuJoCo bounds its whole rotation")
     for tag in tags:
         before = root.find(tag)
         if len(into[tag]) and before is not None:
@@ -271,7 +273,7 @@ def mjcf_rest(
 
 def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], links: dict[int, str],
                origin: np.ndarray) -> None:  # fmt: skip
-    """Write what holds a link; `origin` [3] m is that of the parent's link in the parent's body."""
+    """Write the joint that holds a link; `origin` [3] m is that of the parent's link in the parent's body."""
     joint = one.joint
     bounded = joint.limits is not None and joint.kind != "ball"
     kinds = {"hinge": "revolute" if bounded else "continuous", "slider": "prismatic", "ball": "spherical"}
@@ -291,18 +293,20 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
 
 
 def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
-    """What a URDF does not hold of joints."""
+    """What a URDF leaves out of joints, one line each."""
     told = left_out(scene.joints, spring_of=("hinge", "slider"))
-    told += [f"joint {joint.name}: URDF knows trees only" for joint in tree.loops if joint.kind in NESTING]
-    told += [f"joint {joint.name}: URDF knows no {joint.kind}" for joint in tree.loops if joint.kind not in NESTING]
+    told += [f"joint {joint.name}: URDF supports trees only" for joint in tree.loops if joint.kind in NESTING]
+    told += [
+        f"joint {joint.name}: URDF has no {joint.kind} joints" for joint in tree.loops if joint.kind not in NESTING
+    ]
     if any(joint.motor for joint in scene.joints):
-        told.append("motors of joints: their largest force is the effort")
+        told.append("motors of joints: only their largest force is exported, as the effort")
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
         told.append("cones of balls")
     for k, one in tree.above.items():
         if abs(start := start_of(scene, one, k)) > 1e-9:
             unit = "m" if one.joint.kind == "slider" else "rad"
-            told.append(f"that joint {one.joint.name} starts at {start:.6g} {unit}: in a URDF all begin at zero")
+            told.append(f"that joint {one.joint.name} starts at {start:.6g} {unit}: in a URDF all joints start at zero")
     return told
 
 
@@ -312,7 +316,7 @@ def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
 def usd_joints(
     stage: Any, physics: Any, gf: Any, scene: Scene, bodies: Sequence[str], names: dict[str, str]
 ) -> list[str]:
-    """Write joints of UsdPhysics; their x axes are the joints' axes. Returns what is left out."""
+    """Write UsdPhysics joints; their x axes are the joints' axes. Returns what is left out."""
     made_of = {
         "hinge": physics.RevoluteJoint, "slider": physics.PrismaticJoint, "ball": physics.SphericalJoint,
         "fixed": physics.FixedJoint, "distance": physics.DistanceJoint,
@@ -350,7 +354,8 @@ def usd_joints(
 
 
 def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[str]:
-    """Motor, spring and damping of a hinge or slider; a drive's numbers are for degrees."""
+    """Write motor, spring and damping of a hinge or slider, and return what is left out; a drive's numbers are in
+    degrees."""
     told = [f"friction of joint {joint.name}"] if joint.friction else []
     if joint.kind not in ("hinge", "slider"):
         return [*told, *([f"spring and damping of joint {joint.name}"] if joint.spring or joint.damping else [])]

@@ -1,4 +1,4 @@
-"""What the fit command does: mesh files become shape folders, one or many."""
+"""The fit command: turns one or many mesh files into shape folders."""
 
 import hashlib
 from collections.abc import Sequence
@@ -24,7 +24,8 @@ ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_fr
 
 @dataclass(frozen=True)
 class Options:
-    """How meshes are fitted; see `fit_mesh`. `units` are those of the mesh files, as in scene.yaml (None: metres)."""
+    """How meshes are fitted; see `fit_mesh`. `units` are the units of the mesh files, as in scene.yaml (None:
+    metres)."""
 
     recipe: Recipe = "default"
     budget: float | None = None
@@ -45,18 +46,18 @@ def fit(
     device: str = "auto",
     on_progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Fit a mesh file and write the shape folder `out`, or several files, or those of a folder, into `out`/NAME.
+    """Fit a mesh file and write the shape folder `out`; or fit several files, or those of a folder, into `out`/NAME.
 
     Args:
-        recipe: how networks are fitted: "quick", "default", or "paper", as Rubanova et al. did.
-        budget: s, the longest time that one fit may take.
+        recipe: how networks are fitted: "quick", "default", or "paper" (as Rubanova et al.).
+        budget: s, time limit of one fit.
         cap: close openings of any size.
         thicken: m, the thickness that an open sheet gets.
         units: of the mesh files; None: metres.
         device: "cpu", "cuda" or "auto".
 
-    Returns the report of `fit_file`, or of `fit_many`. Raises SdfsimError if a mesh cannot be used, a folder cannot
-    be written, or there are no meshes; several meshes that cannot be used are told of in the report.
+    Returns the report of `fit_file` or of `fit_many`. Raises SdfsimError if the mesh cannot be used, if a folder cannot
+    be written, or if there are no meshes; of several meshes, the report says which cannot be used.
     """
     options = Options(recipe, budget, cap, thicken, units)
     sources = [Path(source)] if isinstance(source, Path | str) else [Path(one) for one in source]
@@ -74,16 +75,16 @@ def fit(
 
 
 def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
-    """Fit a mesh file and write the shape folder `out`, unless it is there from the same mesh and options. The report
-    has the folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether
-    it was missed. Raises SdfsimError if the mesh cannot be used, the folder cannot be written, or another run is
+    """Fit a mesh file and write the shape folder `out`, unless it exists with the same mesh and options. The report has
+    the folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether the
+    fit missed it. Raises SdfsimError if the mesh cannot be used, the folder cannot be written, or another run is
     writing to it."""
     where, loaded = pick_device(device), load_textured(mesh_file)
     mesh = loaded.mesh
     metres = UNITS[options.units or "m"]
     told = remarks(mesh_file, mesh, metres, given=options.units is not None)
     mesh = replace(mesh, vertices=mesh.vertices * metres)
-    # A mesh file names others, so its own bytes do not tell.
+    # A mesh file may name others, so its own bytes are not enough.
     skin, lost = dressed(loaded, thicken=options.thicken)
     skin = skin and replace(skin, vertices=skin.vertices * metres)
     told = [*lost, *told]
@@ -100,7 +101,7 @@ def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_pr
             wall = unseen_wall(shape.sdf, baked(shape.sdf, shape.nodes))
             source = shape.source | {"request": request}
             if wall is not None:
-                thin = f"walls of at most {wall:.2g} m: things may pass through; --thicken helps"
+                thin = f"walls of at most {wall:.2g} m: bodies may pass through them; --thicken helps"
                 source["notes"] = [*source.get("notes", []), thin]
             shape = replace(shape, source=source, certificate=certificate, skin=skin)
             shape.save(out)
@@ -119,7 +120,7 @@ def _kept(folder: Path, request: str) -> Shape | None:
 
 
 def fit_lines(report: dict[str, Any]) -> list[str]:
-    """What a person reads of a report of `fit`; of several meshes every line begins with the shape's name."""
+    """A report of `fit` as lines of text; for several meshes every line begins with the shape's name."""
     if "shapes" in report:
         lines = [f"{name}: {line}" for name, found in report["shapes"].items() for line in fit_lines(found)]
         return [*lines, f"wrote {report['folder']}"]
@@ -135,8 +136,9 @@ def fit_lines(report: dict[str, Any]) -> list[str]:
 
 
 def named_meshes(sources: list[Path]) -> dict[str, Path]:
-    """Mesh files, and those of folders, by the names their shapes get: the file's own name without suffix; where
-    several files share it, the name of the folder they lie in. Raises SdfsimError for no meshes, or two of one name."""
+    """Mesh files, including those in folders, by the names of their shapes: the file's name without suffix or, if
+    several files share it, the name of the file's folder. Raises SdfsimError for no meshes, or for two with the same
+    name."""
     files: list[Path] = []
     for source in sources:
         inside = visible(source) if source.is_dir() else [source]
@@ -160,8 +162,8 @@ def fit_many(
 ) -> dict[str, Any]:
     """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, one after the other on a GPU.
 
-    Returns `shapes`, by name the report of `fit_file` or the `error` that kept a mesh from being fitted; and in
-    `failed_checks` what missed its certificate.
+    Returns `shapes`, by name the report of `fit_file` or the `error` that prevented the fit; and in `failed_checks` the
+    shapes that missed their certificate.
     """
     where, names = pick_device(device), list(meshes)
     check_writable(out)
@@ -177,7 +179,7 @@ def fit_many(
 
 
 def _fit_one(file: Path, folder: Path, options: Options, device: str) -> dict[str, Any]:
-    """A report, or the error; whatever happens to one mesh must not stop the others."""
+    """A report, or the error: a failure of one mesh must not stop the others."""
     try:
         return fit_file(file, folder, options, device=device, on_progress=silent)
     except SdfsimError as error:

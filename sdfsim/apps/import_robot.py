@@ -1,4 +1,4 @@
-"""`import`: a URDF or MJCF file becomes a scene.yaml."""
+"""`import`: turns a URDF or MJCF file into a scene.yaml."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -27,9 +27,9 @@ def import_robot(
 ) -> dict[str, Any]:
     """Write the scene.yaml `out`, and a folder of shapes beside it, from a .urdf file or MuJoCo's .xml (or .mjcf).
 
-    `packages` are folders of ROS packages, `fixed` holds the root of a URDF, `floor` adds one at z = 0 on which all
-    stands, and `key` is the keyframe of an MJCF file that is the start. Returns a report: links, joints, files,
-    left_out and notes. Raises SdfsimError for what cannot be read, or if files cannot be written.
+    `packages` are folders of ROS packages, `fixed` holds the root of a URDF, `floor` adds a floor at z = 0 on which
+    everything stands, and `key` is the keyframe of an MJCF file to start from. Returns a report: links, joints, files,
+    left_out and notes. Raises SdfsimError if the file cannot be read, or if files cannot be written.
     """
     source, out = Path(source), Path(out)
     kind = source.suffix.lower()
@@ -45,7 +45,7 @@ def import_robot(
         robot = read_urdf(source, packages=[Path(folder) for folder in packages], fixed=fixed)
     else:
         if fixed or packages:
-            raise SdfsimError(f"{source}: --fixed and --packages go with a URDF", "an MJCF file says both itself")
+            raise SdfsimError(f"{source}: --fixed and --packages are for a URDF", "an MJCF file contains both")
         robot = read_mjcf(source, key=key)
     if not robot.links:
         raise SdfsimError(f"{source}: describes no bodies", "give the file that has them: it may include this one")

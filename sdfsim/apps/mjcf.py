@@ -1,5 +1,5 @@
-"""MJCF -> links and joints, as `robot` turns them into a scene. MuJoCo itself reads the file: its compiler knows all
-defaults, frames, inertias and includes, and what it refuses is no MJCF."""
+"""From MJCF to links and joints, which `robot` turns into a scene. MuJoCo itself reads the file: its compiler handles
+all defaults, frames, inertias and includes, and refuses anything that is not MJCF."""
 
 import re
 from dataclasses import replace
@@ -16,10 +16,10 @@ from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
 
 START = "start"  # the keyframe that our own exports have
-SOFTEST = 1.99  # damping ratio from which on contacts count as not rebounding
-USUAL = (0.02, 1.0)  # MuJoCo's own time and damping ratio of contacts
-NEAR = 1e-4  # m, or part of a length, by which ends of a loop may be apart
-# What a model may have that no scene holds: the field that counts it, and what to call it.
+SOFTEST = 1.99  # damping ratio from which contacts count as not rebounding
+USUAL = (0.02, 1.0)  # MuJoCo's default time and damping ratio of contacts
+NEAR = 1e-4  # m, or relative to a length: how far ends of a loop may be apart
+# Contents of a model that a scene cannot have: the field that counts them, and their name.
 COUNTED = {
     "nsensor": "sensors",
     "ncam": "cameras",
@@ -28,15 +28,15 @@ COUNTED = {
     "nflex": "deformable bodies (flex)",
     "nskin": "skins",
     "nplugin": "plugins",
-    "npair": "contact pairs with coefficients of their own: those of the two bodies count",
-    "ntex": "textures: colours stand for them",
+    "npair": "contact pairs with coefficients of their own: those of the two bodies are used",
+    "ntex": "textures: colours replace them",
 }
 
 
 def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
-    """The bodies and joints of an MJCF file, as they are in the keyframe `key`, or else in one called start, or as the
-    file draws them. Raises SdfsimError if MuJoCo is not installed or refuses the file, for no such keyframe, or for
-    geometry that no body can have."""
+    """The bodies and joints of an MJCF file, in the keyframe `key`, or else in one called start, or in the file's
+    initial pose. Raises SdfsimError if MuJoCo is not installed or refuses the file, if there is no such keyframe, or
+    for geometry that a body cannot have."""
     mujoco = optional("mujoco", "mujoco", "mjcf")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
@@ -84,15 +84,15 @@ class _Reader:
         roots = [b for b in range(1, model.nbody) if model.body_weldid[b] == 0 and model.body_mocapid[b] < 0]
         held = [b for b in roots if any(p == b and model.body_weldid[c] for c, p in enumerate(model.body_parentid))]
         if held:
-            told = "bodies without a joint to the world stand still, and hold what moves (<freejoint/> lets them go)"
+            told = "bodies without a joint to the world stand still, and hold others (<freejoint/> lets them go)"
             self.notes.append(named(told, [self._body_name(b) for b in held]))
         if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):
-            self.left.append("the air: density, viscosity and wind")
+            self.left.append("air: density, viscosity and wind")
         if np.any(model.body_gravcomp):
             self.left.append(named("gravcomp of bodies", self._names(model.body, np.flatnonzero(model.body_gravcomp))))
         links: list[Link] = []
-        geoms: list[list[int]] = []  # that each link touches others with
-        self.link: list[int] = []  # of every body, its first; -1 for the world, and where there is nothing
+        geoms: list[list[int]] = []  # geoms with which each link touches others
+        self.link: list[int] = []  # the first link of every body; -1 for the world, and if there is none
         for b in range(model.nbody):
             made = self._links(b)
             self.link.append(len(links) if b and made else -1)
@@ -125,7 +125,7 @@ class _Reader:
     # --- bodies ---
 
     def _links(self, b: int) -> list[tuple[Link, list[int]]]:
-        """A body that moves; or a link for each geometry of one that does not."""
+        """One link for a body that moves, or one for each geometry of a body that does not."""
         model, data = self.model, self.data
         pose = pose_of(data.xpos[b], Rotation.from_matrix(data.xmat[b].reshape(3, 3)))
         first = model.body_geomadr[b]
@@ -167,13 +167,13 @@ class _Reader:
         return found
 
     def _surface(self, geoms: list[int], name: str) -> dict[str, Any]:
-        """Coefficients of which two alike give MuJoCo's as their product."""
+        """Coefficients such that the product of two equal ones is MuJoCo's."""
         if not geoms:
             return {}
         frictions = {float(self.model.geom_friction[g, 0]) for g in geoms}
         if len(frictions) > 1:
             told = ", ".join(f"{value:g}" for value in sorted(frictions))
-            self.notes.append(f"body {name}: its geoms have unlike friction ({told}): the largest counts")
+            self.notes.append(f"body {name}: its geoms have different friction ({told}): the largest is used")
         friction = float(np.sqrt(max(frictions)))
         return {"friction": friction, "restitution": max(_restitution(self.model.geom_solref[g]) for g in geoms)}
 
@@ -203,13 +203,13 @@ class _Reader:
             faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
             mesh = Mesh(model.mesh_vert[corners].astype(np.float64), model.mesh_face[faces].astype(np.int64))
         else:
-            self.left.append(f"{where}: a {kind.name.removeprefix('mjGEOM_').lower()} is no shape here")
+            self.left.append(f"{where}: a {kind.name.removeprefix('mjGEOM_').lower()} is not supported as a shape")
             return None
         name: Any = "mesh" if mesh is not None else kind.name.removeprefix("mjGEOM_").lower()
         return Part(name, pose, sizes, mesh, where, color)
 
     def _apart(self, geoms: list[list[int]]) -> frozenset[tuple[int, int]]:
-        """Links that masks of bits or <exclude> keep apart; what is jointed is not asked for."""
+        """Pairs of links that bit masks or <exclude> keep apart, without those that joints connect."""
         model = self.model
         has, takes = (
             [[int(bits[g]) for g in own] for own in geoms] for bits in (model.geom_contype, model.geom_conaffinity)
@@ -253,7 +253,9 @@ class _Reader:
             if kind == types.mjJNT_BALL:
                 cone = (0.0, min(float(model.jnt_range[j, 1]), np.pi)) if limited else None
                 if limited:
-                    self.notes.append(f"joint {name}: MuJoCo bounds its turn, here the lean of the x axis of its body")
+                    self.notes.append(
+                        f"joint {name}: MuJoCo bounds its rotation; here the lean of its body's x axis is bounded"
+                    )
                     held["axis"] = data.xmat[b].reshape(3, 3)[:, 0].copy()
                 if stiff:
                     self.left.append(f"joint {name}: the stiffness of a ball")
@@ -266,8 +268,8 @@ class _Reader:
         return found
 
     def _motors(self) -> dict[str, dict[str, float]]:
-        """Actuators of hinges and slides, by their joints: those that keep a speed or a place, and those that give a
-        torque, which do nothing until they are told."""
+        """Actuators of hinges and slides, by their joints: those that keep a speed or a position, and those that give a
+        torque, which do nothing until it is set."""
         model, mj = self.model, self.mj
         found: dict[str, dict[str, float]] = {}
         others, freely, idle = [], [], []
@@ -314,16 +316,16 @@ class _Reader:
             else:
                 found[name] = {"speed": wanted / (-bias[2] * gear), "most": most}
         if idle:
-            self.notes.append(named("motors do nothing until their joint gets an effort or a target", idle))
+            self.notes.append(named("motors do nothing until an effort or a target of their joint is set", idle))
         if freely:
-            self.notes.append(named(f"actuators without a bound of force get one of {UNBOUNDED:g}", freely))
+            self.notes.append(named(f"actuators without a force limit get one of {UNBOUNDED:g}", freely))
         if others:
-            told = "actuators that are not a motor, position or velocity one of a hinge or slide"
+            told = "actuators other than motor, position and velocity of a hinge or slide"
             self.left.append(named(told, others))
         return found
 
     def _loops(self) -> list[LinkJoint]:
-        """Connect and weld of two bodies, which close loops."""
+        """Connect and weld equalities of two bodies, which close loops."""
         model, mj = self.model, self.mj
         found, others = [], []
         for k in range(model.neq):
@@ -339,18 +341,18 @@ class _Reader:
                 others.append(name)
                 continue
             ball = kind == mj.mjtEq.mjEQ_CONNECT
-            # Of a weld the anchor is that of the second body, and comes first; of a connect that of the first does.
+            # For a weld, the second body's anchor comes first; for a connect, the first body's.
             first, second = (ends[0], ends[1]) if ball else (ends[1], ends[0])
             places = [
                 self.data.xpos[b] + self.data.xmat[b].reshape(3, 3) @ model.eq_data[k, 3 * i : 3 * i + 3]
                 for i, b in enumerate((first, second))
             ]
             if np.linalg.norm(places[0] - places[1]) > NEAR:
-                self.notes.append(f"equality {name}: its ends are apart at the start; it holds them as they are")
+                self.notes.append(f"equality {name}: its ends are apart at the start; it keeps them at that distance")
             child, parent = both if both[0] >= 0 else both[::-1]
             found.append(LinkJoint(name, "ball" if ball else "fixed", child, parent, places[0], loop=True))
         if others:
-            self.left.append(named("equalities that are not a connect or weld of two bodies", others))
+            self.left.append(named("equalities other than connect or weld of two bodies", others))
         return found
 
     def _ropes(self) -> list[LinkJoint]:
@@ -388,14 +390,14 @@ class _Reader:
                 )
             )  # fmt: skip
         if others:
-            self.left.append(named("tendons that are not a rope, rod or spring between two sites", others))
+            self.left.append(named("tendons other than a rope, rod or spring between two sites", others))
         return found
 
 
 def _restitution(solref: np.ndarray) -> float:
-    """Of a body beside one like itself, from the damping of its contacts: a spring that only pushes gives back
-    exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed, z relative to the critical damping. MuJoCo's own default
-    counts as no rebound."""
+    """Restitution of a body against one like itself, from the damping of its contacts: a spring that only pushes
+    returns exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed, with the damping z relative to the critical one.
+    MuJoCo's default counts as no rebound."""
     time, damping = float(solref[0]), float(solref[1])
     if time <= 0.0 or damping <= 0.0 or damping >= SOFTEST or (time, damping) == USUAL:
         return 0.0

@@ -1,4 +1,4 @@
-"""What the command plan tells: which effects are in play, why, and what a step costs."""
+"""The report of the command plan: which effects are on, why, and what a step costs."""
 
 import importlib
 import sys
@@ -24,8 +24,8 @@ TRIAL_STEPS = 5
 def describe(
     scene_file: Path, *, model: str | None, device: str, on_progress: StageProgress, allow_outside: bool = False
 ) -> dict[str, Any]:
-    """The plan of a scene with its units, and what a step costs in the first few: pairs by what filters them; contacts,
-    nodes, edges, time and memory. Raises SdfsimError for bad input."""
+    """The plan of a scene with its units, and the cost of a step over the first few: pairs by what filters them;
+    contacts, nodes, edges, time and memory. Raises SdfsimError for invalid input."""
     pick_device(device)
     if model:
         load_model(model, weights=False)
@@ -63,7 +63,7 @@ def describe(
 
 
 def _peak_mib() -> float | None:
-    """The most memory that this process has had, MiB; None on Windows, which does not tell it this way."""
+    """Peak memory of this process, MiB; None on Windows, which does not report it this way."""
     try:
         resource: Any = importlib.import_module("resource")
     except ImportError:
@@ -82,16 +82,19 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         ),
         f"bodies: {counts}; {report['nodes']} surface nodes",
         f"pairs of bodies: {pairs['total']}, of which {pairs['unmoved']} without a dynamic body, "
-        f"{pairs['excluded']} kept apart by collides_with, {pairs['apart']} too far apart in the first step; "
+        f"{pairs['excluded']} excluded by collides_with, {pairs['apart']} too far apart in the first step; "
         f"{pairs['near']} left",
         f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s "
         f"with {report['substeps']} inner steps each",
         f"a step (over the first {TRIAL_STEPS}): {report['step_ms']:.2g} ms, {step['contacts']:.0f} contacts, "
         f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network"
         + ("" if report["memory_mib"] is None else f"; {report['memory_mib']:.0f} MiB"),
-        f"the whole run at that pace: {duration(report['run_s'])}; more where bodies meet later on",
+        f"the whole run at this speed:  {duration(report['run_s'])}; more where bodies meet later on",
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
-        *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
+        *(
+            f"constant in the model's training, so its effect was not learned: {name}"
+            for name in report["constant_in_training"]
+        ),
     ]

@@ -1,4 +1,4 @@
-"""`simulate`: a scene file becomes a run folder; and what is kept there so that a killed run goes on."""
+"""`simulate`: turns a scene file into a run folder, with checkpoints from which a killed run continues."""
 
 import shutil
 import time
@@ -42,10 +42,10 @@ from sdfsim.simulate.steppers import COUNTS, PHASES
 
 Viewer = Literal["none", "file", "native", "web"]
 EVERY = 30.0  # s between two checkpoints
-SETTLED = 25  # steps for which everything has to rest
+SETTLED = 25  # number of steps for which everything has to be at rest
 STILL = 0.01  # see `resting`
-TOLD = 12  # bodies, up to which each has a line at the end
-FAR = 10.0  # times the size of the scene: who is farther away in the end has left it
+TOLD = 12  # largest number of bodies for which each gets a line at the end
+FAR = 10.0  # times the size of the scene: a body farther away at the end has left the scene
 _REPORT = "report.json"
 _RESULTS = (_REPORT, "rollout.npz", "rollout.rrd", FILE)
 _STATE = "state.npz"
@@ -70,21 +70,22 @@ def simulate(
     beside: Beside | None = None,
 ) -> dict[str, Any]:
     """Simulate a scene file, or a sample by its name, and write config.yaml, report.json, rollout.npz and (unless
-    `viewer` is none) rollout.rrd; an earlier run in `out` is replaced. Returns the report; of the shapes that were
-    fitted for this scene, `failed_checks` names those that are not usable, and `caveats` those that are not exact.
+    `viewer` is none) rollout.rrd; an earlier run in `out` is replaced. Returns the report. Of the fitted shapes of this
+    scene, `failed_checks` names those that are not usable, and `caveats` those that are not exact.
 
-    What is None is as the scene says: model, `seconds` of simulated time, seed. `until_settled` ends the run as soon as
-    everything rests. `resume` goes on with the run in `out` that was interrupted, from the start where there is none; a
-    finished one is left as it is, and its report is returned. `beside` is a recorded motion of the scene: the run
-    begins where it does, the recording shows both, and the report says how far apart they are. `say` is called with
-    lines for the person.
+    `model`, `seconds` of simulated time and `seed` are by default (None) those of the scene. `until_settled` ends the
+    run as soon as everything is at rest. `resume` continues the interrupted run in `out`, or starts one if there is
+    none; a finished run is left as it is, and its report is returned. `beside` is a recorded motion of the scene: the
+    run begins where it does, the recording shows both, and the report says how far apart they are. `say` is called with
+    lines for the user.
 
-    Raises SdfsimError for bad input, an output that cannot be written, another run that writes to the same folder, or a
-    finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
-    what was computed before is in the folder.
+    Raises SdfsimError for invalid input, an output that cannot be written, another run that writes to the same folder,
+    or a finished run to resume that is not this one. Raises SimulationError for an invalid state, and
+    KeyboardInterrupt; the results until then are in the folder.
     """
     out = Path(out)
-    # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
+    # Check everything that can be wrong before fitting shapes, which takes minutes, and before deleting earlier
+    # results.
     check_device(device)
     if seconds is not None:
         check_seconds(seconds)
@@ -120,7 +121,7 @@ def simulate(
         kept = Checkpoint(out / "checkpoint", simulator)
         steps = simulator.steps_in(length)
         if resume and (done := finished(out / _REPORT, kept.identity, steps, until_settled=until_settled)):
-            kept.clear()  # where it was killed between its last file and its end
+            kept.clear()  # in case it was killed between its last file and its end
             say(f"{out}: finished already")
             return done
         parts = kept.restore() if resume else []
@@ -142,12 +143,12 @@ def simulate(
             live.log_steps(join(parts))
 
         started, broken = time.monotonic(), None
-        still = [row.all() for row in resting(scene, join(parts))]  # by frame, whether everything rests
+        still = [row.all() for row in resting(scene, join(parts))]  # for each frame, whether everything rests
 
         def settled() -> bool:
             return until_settled and len(still) > SETTLED and all(still[-SETTLED - 1 :])
 
-        at_once = 1 if until_settled else None  # so that the run ends with the step in which everything rests
+        at_once = 1 if until_settled else None  # so that the run ends at the step in which everything rests
         try:
             for part in simulator.frames(0 if settled() else steps - simulator.steps_done, at_once):
                 parts.append(part)
@@ -194,7 +195,7 @@ def simulate(
         if not isinstance(broken, KeyboardInterrupt):
             kept.clear()
         if isinstance(broken, SimulationError):
-            broken.rollout, broken.hint = rollout, f"what was computed is in {out}; {broken.hint}"
+            broken.rollout, broken.hint = rollout, f"results until then are in {out}; {broken.hint}"
         if broken is not None:
             raise broken
         return report
@@ -203,9 +204,10 @@ def simulate(
 def read_run(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Scene, Rollout]:
-    """A finished or interrupted run, by its folder or `rollout.npz`, and its scene: a scene file, or that the run was
-    made from. Raises SdfsimError for no run, no scene, or one that is not that of the run: of a scene that is given,
-    bodies and shapes count; where none is given, that its file was edited since."""
+    """A finished or interrupted run, by its folder or `rollout.npz`, and its scene: the given scene file, or the one
+    that the run was made from. Raises SdfsimError if there is no run or no scene, or if the scene is not that of the
+    run: a given scene must have the same bodies and shapes; the run's own scene file must not have been edited
+    since."""
     file = path / "rollout.npz" if path.is_dir() else path
     rollout = Rollout.load(file)
     compared = ("shapes",) if scene_file is not None else ("shapes", "bodies", "gravity")
@@ -220,14 +222,14 @@ def read_run(
         raise SdfsimError(f"{file}: its bodies are not those of {scene.path}", "give its scene: --scene")
     known, now = rollout.meta.get("scene", {}), fingerprints(scene)
     if other := [what for what in compared if known.get(what, now[what]) != now[what]]:
-        told = f"{file}: {scene.path} is not the scene that it was made of: other {' and '.join(other)}"
+        told = f"{file}: {scene.path} is not the scene that it was made from: other {' and '.join(other)}"
         raise SdfsimError(told, "simulate it anew, or give the scene as it was: --scene")
     return scene, rollout
 
 
 def resting(scene: Scene, rollout: Rollout) -> np.ndarray:
-    """[T+1, D] bool: which of the D dynamic bodies rest. They move by less than `STILL` of their size in the time that
-    they take to fall that far."""
+    """[T+1, D] bool: which of the D dynamic bodies rest. A body rests if it moves by less than `STILL` of its size in
+    the time that it takes to fall that far."""
     rows = _dynamic(scene)
     extents = [largest_extent(shape) for shape in scene.shapes]
     size = np.array([scene.bodies[k].scale * extents[scene.bodies[k].shape] for k in rows])
@@ -241,10 +243,9 @@ def _dynamic(scene: Scene) -> list[int]:
 
 
 def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
-    """The numbers of a run that a person looks at first. `cost` is what every counter and phase of the step took;
-    `ended` says where the bodies that move by themselves are in the end, and which of them `left` the scene for good;
-    `broken_laws` is what instruments say that do not use the contact solve (see `sdfsim.physics.instruments`), in a
-    twentieth of the run's time."""
+    """The main numbers of a run. `cost` has every counter and phase of the step; `ended` says where the dynamic bodies
+    are at the end, and which of them `left` the scene for good; `broken_laws` are the findings of instruments that do
+    not use the contact solve (see `sdfsim.physics.instruments`), in a twentieth of the run's time."""
     counters = rollout.counters
     rows, (centre, radius) = _dynamic(scene), framed(scene)
     place, speed = rollout.position[-1, rows], np.linalg.norm(rollout.velocity[-1, rows], axis=-1)
@@ -289,7 +290,7 @@ def ending_lines(report: dict[str, Any]) -> list[str]:
 
 
 def beside_lines(report: dict[str, Any]) -> list[str]:
-    """How far a run is from the recorded motion that it was simulated beside; none where there was nothing."""
+    """How far a run is from the recorded motion beside which it was simulated; empty if there was none."""
     if not (off := report.get("beside")):
         return []
     far = f"{1e3 * off['position_m']:.3g} mm (root mean square), {off['rotation_degrees']:.3g} degrees (mean)"
@@ -297,20 +298,19 @@ def beside_lines(report: dict[str, Any]) -> list[str]:
 
 
 class Checkpoint:
-    """What is kept of one run in a folder: its `identity`, its frames in parts, and the state that the last part leads
-    to."""
+    """The checkpoint of a run in a folder: its `identity`, its frames in parts, and the state after the last part."""
 
     def __init__(self, folder: Path, simulator: Simulator) -> None:
         self._folder = folder
         self._simulator = simulator
         self.identity = identity(simulator)
-        self._fresh: list[tuple[Rollout, State]] = []  # an interruption splits none
+        self._fresh: list[tuple[Rollout, State]] = []  # an interruption does not split one
         self._parts = 0
         self._saved = time.monotonic()
 
     def restore(self) -> list[Rollout]:
-        """The frames so far, the simulator's state brought to the last of them; none where nothing was kept. Raises
-        SdfsimError if that is of another scene, model or seed, or damaged."""
+        """The frames so far, with the simulator's state set to the last of them; empty if nothing was kept. Raises
+        SdfsimError if the checkpoint is of another scene, model or seed, or is damaged."""
         file = self._folder / _STATE
         if not file.exists():
             return []
@@ -325,24 +325,24 @@ class Checkpoint:
         return [Rollout.load(self._part(k)) for k in range(self._parts)]
 
     def add(self, part: Rollout) -> None:
-        """Keep frames and the state that they lead to; on disk when the last time is long enough ago."""
+        """Keep frames and the state after them; write them to disk if the last time is long enough ago."""
         self._fresh.append((part, self._simulator.state))
         if time.monotonic() - self._saved > EVERY:
             self.save()
 
     def save(self) -> None:
-        """Bring what is new to the disk; the state comes last, so that it never tells of a part that is not there."""
+        """Write new parts to disk. The state comes last, so that it never refers to a part that is not there."""
         if self._fresh:
             self._folder.mkdir(exist_ok=True)
             join([frame for frame, _ in self._fresh]).save(self._part(self._parts))
             done = {"identity": self.identity, "parts": self._parts + 1}
             write_arrays(self._folder / _STATE, done | self._fresh[-1][1].arrays(), compressed=False)
-            self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
+            self._fresh = []  # not earlier: after Ctrl-C during this, the next save must write the same part again
             self._parts += 1
         self._saved = time.monotonic()
 
     def clear(self) -> None:
-        """Nothing is to be gone on with. The state goes first: parts that a kill leaves are nothing without it."""
+        """Remove the checkpoint. The state goes first: parts that a killed process leaves are ignored without it."""
         (self._folder / _STATE).unlink(missing_ok=True)
         shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -351,8 +351,8 @@ class Checkpoint:
 
 
 def finished(report_file: Path, identity: str, steps: int, *, until_settled: bool) -> dict[str, Any] | None:
-    """The report of a run that is finished; None where it was interrupted or is not there. Raises SdfsimError if it
-    is another run, of another length (unless it ended `until_settled`), or its state broke."""
+    """The report of a finished run; None if it was interrupted or does not exist. Raises SdfsimError if it is another
+    run, if it has another length (unless it ended `until_settled`), or if it ended at an invalid state."""
     if not report_file.exists():
         return None
     report, folder = read_json(report_file, _ANEW), report_file.parent
@@ -370,7 +370,7 @@ def finished(report_file: Path, identity: str, steps: int, *, until_settled: boo
 
 
 def identity(simulator: Simulator) -> str:
-    """A hash of all that decides how a run goes: bodies with their paths and distances, start, rules, units, model."""
+    """A hash of everything that determines a run: bodies with their paths and distances, start, rules, units, model."""
     s = simulator
     model = (s.model.kind, s.model.reach, s.model.network)
     chosen = {name: value for name, value in vars(s.stepper).items() if isinstance(value, bool | float)}

@@ -16,17 +16,17 @@ from sdfsim.apps.recording import Playback
 from sdfsim.base.errors import SdfsimError
 
 WINDOW = "1600x900"
-LOOPBACK = "127.0.0.1"  # where viewers listen; their own default would let the whole network in
+LOOPBACK = "127.0.0.1"  # the address on which viewers listen; by default they would listen on the whole network
 _GRPC_PORT, _WEB_PORT = 9876, 9090
 _START_SECONDS = 60.0
 _WINDOWS_CTRL_C = 0xC000013A  # the exit code there
-_TOAST_SECONDS = 10.0  # the notices of the start cover the plots until they fade
+_TOAST_SECONDS = 10.0  # the notices at the start cover the plots until they fade
 _NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
 
 
 def stream_to_viewer(playback: Playback, kind: str) -> str:
-    """Send everything that `playback` logs from now on to a viewer: a window (`native`), or a page (`web`) that is
-    there for as long as this process runs, whose address is returned. Raises SdfsimError if it does not start."""
+    """Send everything that `playback` logs from now on to a viewer: a window (`native`), or a page (`web`) that exists
+    as long as this process runs. Returns the address of the page. Raises SdfsimError if the viewer does not start."""
     port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
     web = ["--serve-web", "--web-viewer-port", str(page_port)]
     viewer = _launch(port, web if kind == "web" else ["--expect-data-soon", "--hide-welcome-screen"])
@@ -44,7 +44,7 @@ def stream_to_viewer(playback: Playback, kind: str) -> str:
 
 
 def _started(viewer: subprocess.Popen, port: int) -> bool:
-    """Waits until a viewer answers at a port: whether it does."""
+    """Wait until a viewer answers at a port. Returns whether it does."""
     began = time.monotonic()
     while not _answers(port):
         if viewer.poll() is not None or time.monotonic() - began > _START_SECONDS:
@@ -66,14 +66,14 @@ def _command(port: int, options: list[str]) -> list[str]:
 
 
 def _launch(port: int, options: list[str]) -> subprocess.Popen:
-    """A viewer in a group of its own, which a Ctrl-C that is meant for this process does not end."""
+    """Start a viewer in its own process group, so that Ctrl-C for this process does not end it."""
     quiet, group = subprocess.DEVNULL, getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)  # Windows has no sessions
     command = _command(port, options)
     return subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True, creationflags=group)
 
 
 def check_screen(kind: str) -> None:
-    """Raises SdfsimError if a window (`native`) is wanted where there is no screen."""
+    """Raises SdfsimError if a window (`native`) is wanted but there is no screen."""
     if kind == "native" and not has_screen():
         raise SdfsimError("there is no screen here for a window", "watch it in the browser, --viewer web or view --web")
 
@@ -83,8 +83,9 @@ def has_screen() -> bool:
 
 
 def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lambda line: None) -> None:
-    """Open a recording, or that of a run folder, and wait until the viewer is closed; `say` is told the address of a
-    page in the browser (`web`). Raises SdfsimError for no such recording, no screen for a window, or if it fails."""
+    """Open a recording, or that of a run folder, and wait until the viewer is closed. `say` gets the address of a page
+    in the browser (`web`). Raises SdfsimError if there is no such recording, if there is no screen for a window, or if
+    the viewer fails."""
     recording = _recording(recording)
     port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
     if not web:
@@ -92,7 +93,7 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
     options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
     viewer, told = subprocess.Popen(_command(port, [str(recording), *options])), False
     try:
-        if web and _started(viewer, page_port):  # before, the address leads nowhere
+        if web and _started(viewer, page_port):  # before that, the address does not work
             say(f"watch it at {_page(page_port, port)}")
             say("the page stays up until Ctrl-C")
             told = True
@@ -107,8 +108,9 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
 
 
 def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> None:
-    """Write what the viewer shows of a recording `at` a time in s (default: the end) as a PNG, without a screen. Raises
-    SdfsimError for no such recording or time, no graphics driver, or a file that cannot be written."""
+    """Write the viewer's picture of a recording `at` a time in s (default: the end) as a PNG, without a screen. Raises
+    SdfsimError if there is no such recording or time, if there is no graphics driver, or if the file cannot be
+    written."""
     recording = _recording(recording)
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")
@@ -140,7 +142,7 @@ def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | 
     timelines = {t.name: t for recording in state.recordings for t in recording.timelines}
     if time_line := timelines.get("time"):
         first, last = (time_line.start or 0) * 1e-9, (time_line.end or 0) * 1e-9
-        # A run is a whole number of steps, so it ends up to one before the time that was asked for: its end too.
+        # A run is a whole number of steps, so it may end up to one step before the wanted time; then take its end.
         step = (last - first) / max(timelines["step"].end or 0, 1) if "step" in timelines else 0.0
         if at is not None and not first <= at <= last + max(step, 1e-6):
             raise SdfsimError(f"--at {at:g}: the recording holds {first:g} to {last:g} s")
@@ -161,7 +163,7 @@ def _end(process: subprocess.Popen) -> None:
 
 
 def _recording(place: Path) -> Path:
-    """The recording of a run folder or of a reconstruction, or the file itself. Raises SdfsimError if none is."""
+    """The recording of a run folder or of a reconstruction, or the file itself. Raises SdfsimError if there is none."""
     inside = [place / name for name in ("rollout.rrd", "reconstruction.rrd") if (place / name).is_file()]
     file = inside[0] if inside else place
     if not file.is_file() or file.open("rb").read(3) != b"RRF":
@@ -172,8 +174,8 @@ def _recording(place: Path) -> Path:
 
 
 def viewer_program() -> str:
-    """The viewer in the package of rerun itself: its script `rerun` only starts it, and need not be on the PATH, nor
-    end what it started. Another one may be named by RERUN_CLI_PATH, as that script does."""
+    """The viewer program inside the rerun package: the script `rerun` only starts it, may not be on the PATH, and may
+    not end it. As with that script, RERUN_CLI_PATH may name another one."""
     package = find_spec("rerun_cli")
     folders = package.submodule_search_locations if package else None
     home = Path(next(iter(folders or []), "."))

@@ -49,9 +49,7 @@ class Start:
     urdfs: dict[str, Path]  # the engine's file of each shape, by name
     floor: tuple[float, float] | None  # friction and restitution of the floor z = 0, or None for no floor
     own_inertia: bool = False  # bodies get the inertias of `motion`; else the engine's own must agree
-    meshes: dict[str, Mesh] = field(
-        default_factory=dict
-    )  # relative to centres of mass, for engines that collide surfaces
+    meshes: dict[str, Mesh] = field(default_factory=dict)  # about centres of mass, for engines that collide surfaces
 
 
 @dataclass(frozen=True)
@@ -232,9 +230,7 @@ def mujoco(
         quat = np.roll(place[:, 3:], -1, axis=-1)
         return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
 
-    engine.set_mju_user_warning(
-        lambda message: None
-    )  # by default MuJoCo writes warnings to a file in the working directory
+    engine.set_mju_user_warning(lambda message: None)  # by default they go to a file in the working directory
     kinds = engine.mjtWarning
     unstable = [data.warning[int(kind)] for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
 

@@ -185,8 +185,8 @@ def test_actuators_of_an_mjcf_become_motors_as_strong_as_theirs(tmp_path: Path) 
     assert (motors["jc"].most, motors["jc"].speed) == (pytest.approx(3.0), 0.0)
     told = "\n".join(report["notes"])
     assert "bodies without a joint to the world stand still" in told and "base" in told
-    assert "motors do nothing until their joint gets an effort or a target (1: mb)" in told
-    assert "actuators without a bound of force get one of 1e+06 (1: pa)" in told
+    assert "motors do nothing until an effort or a target of their joint is set (1: mb)" in told
+    assert "actuators without a force limit get one of 1e+06 (1: pa)" in told
     assert next(body for body in scene.bodies if body.name == "base").motion == "static"
     sim = Simulator(scene)
     sim.joint("jb").target = 0.5

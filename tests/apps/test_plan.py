@@ -52,7 +52,7 @@ def test_a_plan_reports_effects_pairs_and_costs(scene, model):
     assert any("path" in line for line in report["outside_training"])
     assert any(line.startswith("friction") for line in report["outside_training"]) is False  # 0.25 is in its range
     lines = "\n".join(plan_lines(report))
-    for word in ("off saves nothing", "[effects.sleep]", "kept apart by collides_with", "so not learned: restitution"):
+    for word in ("off saves nothing", "[effects.sleep]", "excluded by collides_with", "so not learned: restitution"):
         assert word in lines
 
 

@@ -37,7 +37,7 @@ def test_commands_take_names(tmp_path, monkeypatch):
     assert done.exit_code == 1 and "nosuchrun: no run folder, Shape folder, scene file or sample" in done.stderr
     assert "pile" not in done.stderr
     done = run("export", "runs/none", "-o", "x.glb")
-    assert done.exit_code == 1 and "none: there is no such folder or file" in done.stderr
+    assert done.exit_code == 1 and "none: no such folder or file" in done.stderr
     done = run("simulate", "towr", "-o", "run")
     assert done.exit_code == 1 and "towr: neither a scene file nor a sample (did you mean 'tower'?)" in done.stderr
     listed = run("samples").stdout
