@@ -93,8 +93,5 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
-        *(
-            f"constant in the model's training, so its effect was not learned: {name}"
-            for name in report["constant_in_training"]
-        ),
+        *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
     ]
