@@ -1,8 +1,8 @@
-"""Coefficients, sizes, masses and the lie of the ground from recorded motions: what `sdfsim identify` does.
+"""`identify`: finds coefficients, sizes, masses and the height and tilt of the ground from recorded motions.
 
-Recordings are cut into windows, short ones from all over them and long ones from their starts. The contact solve runs
-all of them side by side, each from where the recording has the bodies, and a fit moves the parameters until the windows
-go as recorded. Whole motions that the fit has not seen then tell how good that is.
+Recordings are cut into windows, short ones everywhere and long ones from their starts. The contact solve runs all of
+them side by side, each from the recorded state, and a fit changes the parameters until the windows agree with the
+recordings. Whole motions that the fit has not seen then show how good the result is.
 """
 
 from __future__ import annotations
@@ -37,29 +37,30 @@ from sdfsim.scene.scene import Joint, Scene
 from sdfsim.simulate.batch import Copies, inner_of_frame
 from sdfsim.simulate.steppers import Frames
 
-# Model units of time, about seconds for bodies of a metre: length and spacing of short windows, length of long ones.
+# Model units of time, about seconds for bodies of a metre: length and spacing of short windows, and length of long
+# ones.
 WINDOW, EVERY, LONG = 0.15, 0.06, 1.85
-MOST = 250  # short windows; of more every so many are taken
-WHOLE = 8  # long windows at least, for these to have the last word: few that are chaotic tell less than many short ones
-OUTLIER = 2e-3  # model lengths: errors of windows that count less than squared, beyond
-FAR = 0.3  # of a body's size: a motion that is farther off counts as so far, by however much it is
-WEAK = 1e-3  # how strongly parameters that nothing shows are held to the scene's
-# Of a parameter's width, for differences: contacts come and go, and impacts are found to an inner step, so that smaller
-# ones tell nothing.
+MOST = 250  # largest number of short windows; of more, an evenly spaced subset is used
+WHOLE = 8  # least number of long windows for a final fit to them: a few chaotic ones tell less than many short ones
+OUTLIER = 2e-3  # model lengths: larger errors of windows count less than squared
+FAR = 0.3  # relative to a body's size: bound of the error of a motion
+WEAK = 1e-3  # weight that keeps parameters that nothing shows at the scene's values
+# Steps for finite differences, relative to a parameter's width: contacts come and go, and impacts are resolved to an
+# inner step, so smaller differences tell nothing.
 NUDGE = {"friction": 0.02, "restitution": 0.02, "mass": 0.02, "inertia": 0.1, "size": 0.2, "height": 0.2, "tilt": 0.1,
          "joint_friction": 0.05, "joint_damping": 0.05}  # fmt: skip
-GRAVITY = 9.81  # m/s^2, by which joints of scenes without any are measured
-SURE = 1.96  # standard deviations in an interval of 95 %
-SHOWN = 0.25  # of its width: how well the windows have to tell a parameter, noise being `OUTLIER`
-IMPACT = 3.0  # times what gravity makes in a frame: changes of a velocity that weight and friction do not make
-HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are looked for
-HELD = 6  # every so many-th recording is kept out of the fit, where there are at least `ENOUGH`
+GRAVITY = 9.81  # m/s^2, used for joints of scenes without gravity
+SURE = 1.96  # half of an interval of 95 %, in standard deviations
+SHOWN = 0.25  # relative to its width: how precisely windows must determine a parameter, with noise of `OUTLIER`
+IMPACT = 3.0  # times the change of velocity by gravity in a frame: larger changes do not come from weight and friction
+HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are searched
+HELD = 6  # every sixth recording is kept out of the fit, if there are at least `ENOUGH`
 ENOUGH = 4
-TRIES = 15, 15, 8  # of the fits to short windows, and to long ones
-DRAWS = 400  # of recordings, for intervals
-POINTS, BEYOND = 4, 2.0  # of a profile: on either side, and how far out, in half intervals
-CROWD, ROUNDS, AROUND = 24, 14, 0.15  # of the search between them: points, rounds, and how far about, in widths
-# How far parameters are looked for from the scene's: logarithms of factors, model lengths, rad.
+TRIES = 15, 15, 8  # largest numbers of iterations of the fits to short windows, and to long ones
+DRAWS = 400  # random draws of recordings, for intervals
+POINTS, BEYOND = 4, 2.0  # points of a profile on each side, and their farthest distance, in half intervals
+CROWD, ROUNDS, AROUND = 24, 14, 0.15  # the search for long windows: points, rounds, and range, in widths
+# Search ranges of parameters around the scene's values: logarithms of factors, model lengths, rad.
 WIDTH = {
     "friction": 1.0, "restitution": 1.0, "mass": 3.0, "inertia": 0.5, "size": 0.1, "height": 0.05, "tilt": 0.05,
     "joint_friction": 0.05, "joint_damping": 0.05,
@@ -75,20 +76,23 @@ FARTHEST = {
 }
 SHELL = 5.0 / 3.0  # inertia of a hollow cube or ball over that of a solid one: the most that such a body can have
 FACTORS = ("mass", "inertia", "size")
-OF_JOINTS = {"joint_friction": DRAG, "joint_damping": DAMPING}  # in weights of a joint's lighter body, see `heft`
+OF_JOINTS = {
+    "joint_friction": DRAG,
+    "joint_damping": DAMPING,
+}  # largest values, in weights of a joint's lighter body, see `heft`
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that is looked for: of one body, or of all copies of one."""
+    """One unknown number: of one body, or of all copies of one."""
 
-    kind: str  # of `WIDTH`
-    bodies: tuple[int, ...]  # among those that move, static ones behind them
+    kind: str  # key of `WIDTH`
+    bodies: tuple[int, ...]  # indices: moving bodies first, then static ones
     name: str
-    start: float = 0.0  # as the scene has it; factors by their logarithms
+    start: float = 0.0  # value in the scene; logarithms for factors
     low: float = -math.inf
     high: float = math.inf
-    axis: int = 0  # of a tilt; of a joint its number
+    axis: int = 0  # axis of a tilt; or the number of a joint
 
     @property
     def width(self) -> float:
@@ -97,10 +101,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Ground:
-    """Where a static body is touched, model units."""
+    """The place where a static body is touched, model units."""
 
     centre: np.ndarray  # [3]
-    axes: np.ndarray  # [3, 3] rows: two tangents, which it is tilted about, and the normal, along which it is moved
+    axes: np.ndarray  # [3, 3] rows: two tangents, about which it is tilted, and the normal, along which it is moved
 
 
 @dataclass(frozen=True)
@@ -108,35 +112,35 @@ class Estimate:
     kind: str
     name: str
     unit: str
-    value: float | None  # None where they do not show it
+    value: float | None  # None if the recordings do not show it
     interval: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
 class Profile:
-    """How the loss goes with one parameter, the others fitted again for each of its values."""
+    """The loss as a function of one parameter; the others are fitted again for each value."""
 
-    kind: str  # of `HEADS`
+    kind: str  # key of `HEADS`
     name: str
     unit: str
-    value: float  # that was found, in this unit
-    interval: tuple[float, float] | None  # None where the recordings do not show it
+    value: float  # the value found, in this unit
+    interval: tuple[float, float] | None  # None if the recordings do not show it
     x: list[float]
-    loss: list[float]  # over that of `value`
+    loss: list[float]  # loss relative to that of `value`
 
 
 @dataclass(frozen=True)
 class Identified:
-    """What `identify` found. `scene_values`: body -> key of the scene file -> its value."""
+    """The result of `identify`. `scene_values`: body -> key of the scene file -> its value."""
 
     estimates: list[Estimate]
     windows: int
     error_m: float  # root mean square over short windows
-    held_out: dict[str, Any]  # errors of whole motions that the fit has not seen; of all, where `recordings` is 0
+    held_out: dict[str, Any]  # errors of whole motions that the fit has not seen; of all motions if `recordings` is 0
     notes: list[str]
     scene_values: dict[str, dict[str, Any]] = field(default_factory=dict)
     joint_values: dict[str, dict[str, Any]] = field(default_factory=dict)  # joint -> key -> value
-    profiles: list[Profile] = field(default_factory=list)  # where they are asked for
+    profiles: list[Profile] = field(default_factory=list)  # if they are asked for
 
     def report(self) -> dict[str, Any]:
         kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(WIDTH)[2:])
@@ -152,7 +156,7 @@ class Identified:
 HEADS = {
     "friction": "friction, product", "restitution": "restitution, product", "own_friction": "friction of its own",
     "own_restitution": "restitution of its own", "mass": "mass", "inertia": "inertia, factor", "size": "size, factor",
-    "height": "moved along its normal", "tilt": "tilted", "joint_friction": "friction of a joint",
+    "height": "shift along its normal", "tilt": "tilted", "joint_friction": "friction of a joint",
     "joint_damping": "damping of a joint",
 }  # fmt: skip
 UNITS = {"mass": " kg", "height": " m", "tilt": " degrees"}
@@ -183,7 +187,7 @@ def report_lines(found: Identified) -> list[str]:
 
 
 class Problem:
-    """A scene with its parameters: those of the bodies that touch something in recordings."""
+    """A scene with its parameters: those of bodies that touch something in the recordings."""
 
     def __init__(self, recordings: Sequence[Recording], scene: Scene) -> None:
         self.scene, self.recordings = scene, list(recordings)
@@ -193,12 +197,13 @@ class Problem:
         self.parameters: list[Parameter] = []
         self.ground: dict[int, Ground] = {}
         if any(b.motion == "kinematic" for b in scene.bodies):
-            raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
+            raise SdfsimError("bodies on paths: identify supports free and static bodies only")
         if any(r.dt == 0.0 for r in recordings):
-            raise SdfsimError("a recording is a single frame")
+            raise SdfsimError("a recording has a single frame")
 
     def short(self, chosen: Sequence[int]) -> Windows:
-        """The short windows of these recordings in which something touches; the parameters are those of their pairs."""
+        """The short windows of these recordings in which something touches; this also sets the parameters, by the pairs
+        that touch."""
         begin = []
         for k in chosen:
             r = self.recordings[k]
@@ -208,7 +213,7 @@ class Problem:
             begin += [(k, int(rows[0])) for rows in _groups(near, every)]
         if not begin:
             told = "give longer ones, of more frames a second"
-            raise SdfsimError("the recordings are too short, or nowhere smooth", told)
+            raise SdfsimError("the recordings are too short, or never smooth", told)
         windows = Windows(self, WINDOW, begin[:: -(-len(begin) // (2 * MOST))])
         touched = windows.touched()
         if not touched and not self.joints:
@@ -219,8 +224,8 @@ class Problem:
         return Windows(self, WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
 
     def whole(self, chosen: Sequence[int]) -> Windows:
-        """Long windows that follow each other through these recordings, from the first frame at which velocities are
-        known on; a last one is at least half as long."""
+        """Consecutive long windows of these recordings, from the first frame with known velocities; the last one is at
+        least half as long."""
         begin = []
         for k in chosen:
             r, t = self.recordings[k], 0
@@ -262,7 +267,7 @@ class Problem:
                 if joint.kind not in ("fixed", "distance"):
                     self._add(kind, joint.name, [], start / self.heft(joint, kind), 0.0, axis=j)
         for name, rows in static.items():
-            if len(rows) == 1:  # copies lie on a grid
+            if len(rows) == 1:  # copies are on a grid
                 points = np.concatenate([p for _, _, b, p, _ in touched if b == rows[0]])
                 self.ground[rows[0]] = self._touched_at(rows[0], points)
                 self._add("height", name, rows)
@@ -280,17 +285,18 @@ class Problem:
     def _most(
         self, kind: str, high: float, rows: list[int], static: dict[str, list[int]], reference: str | None
     ) -> float:
-        """What coefficients may be at most: those of bodies on the reference such that its own is the scene's."""
+        """Upper bounds of coefficients: for bodies on the reference body, such that its own coefficient is the
+        scene's."""
         if rows[0] >= len(self.moving) or reference is None:
             return high
         known = getattr(self.bodies[static[reference][0]], kind)
         if kind == "restitution" and any(max(pair) < len(self.moving) for pair in self.pairs):
-            return 1.0  # what bodies do to each other fixes what is whose, and a scene has none above 1
+            return 1.0  # contacts between bodies determine each body's own coefficient, and a scene has none above 1
         return high / known if known > 0.0 else high
 
     def heft(self, joint: Joint, kind: str) -> float:
-        """N m or N, of a joint's friction: the weight of its lighter body, where it turns at an arm of the body's size;
-        and of damping this at the speed of a fall through that size. So parameters are about one at most."""
+        """Unit of a joint's friction, N m or N: the weight of its lighter body, for torques times the body's size. For
+        damping it is divided by the speed of a fall through that size. So parameters are at most about one."""
         bodies = [b for b in (self.scene.bodies[k] for k in joint.bodies if k >= 0) if b.motion == "dynamic"]
         body = min(bodies, key=lambda b: b.mass)
         size = largest_extent(self.scene.shapes[body.shape]) * body.scale
@@ -301,14 +307,14 @@ class Problem:
         return body.mass * pull / (rate * size if kind == "joint_damping" else 1.0)
 
     def inertia_factor(self, body: int) -> float:
-        """The scene's, of a moving body."""
+        """The inertia factor of a moving body in the scene."""
         b = self.bodies[body]
         shape = self.scene.shapes[b.shape]
         own = b.mass / shape.volume * shape.inertia * b.scale**2
         return 1.0 if b.inertia is None else float(np.trace(b.inertia) / np.trace(own))
 
     def _touched_at(self, body: int, points: np.ndarray) -> Ground:
-        """Of points [P, 3] in model units."""
+        """The ground of a body that is touched at points [P, 3] in model units."""
         b, length = self.bodies[body], self.units.length
         points = points[:: -(-len(points) // 500)]
         own = pose.rotate(pose.conjugate(b.quat_xyzw), points * length - b.position) / b.scale
@@ -331,11 +337,11 @@ class Problem:
 
     @cached_property
     def start(self) -> np.ndarray:
-        """The parameters as the scene has them."""
+        """The parameters' values in the scene."""
         return np.clip([p.start for p in self.parameters], *self.bounds)
 
     def lie(self, values: np.ndarray, body: int) -> tuple[np.ndarray, np.ndarray]:
-        """By how much a static body is turned (a quaternion) about its ground's centre, and shifted, model units."""
+        """Rotation (a quaternion) of a static body about its ground's centre, and its shift, model units."""
         turn, shift = np.zeros(3), np.zeros(3)
         for p, value in zip(self.parameters, values, strict=True):
             if p.bodies == (body,) and p.kind in ("height", "tilt"):
@@ -347,7 +353,7 @@ class Problem:
         return pose.from_rotvec(turn), shift
 
     def applied(self, values: np.ndarray, bodies: Bodies, state: State, count: int) -> tuple[Bodies, State]:
-        """`count` copies of the moving bodies, and the static ones behind them, with these parameters."""
+        """`count` copies of the moving bodies, followed by the static ones, with these parameters."""
         many = len(self.moving)
         total = many * count
         names = (*HIGH, "scale", "com", "inertia", "mass", "inverse_mass", "bounds", "size", "radius")
@@ -386,13 +392,13 @@ class Problem:
 
 
 def _groups(frames: np.ndarray, every: int) -> list[np.ndarray]:
-    """Frames by `every` so many."""
+    """Frames in groups of `every`."""
     return [rows for rows in np.split(frames, np.flatnonzero(np.diff(frames // every)) + 1) if len(rows)]
 
 
 class Windows:
-    """Windows of `length` model times, which begin in these recordings at these frames, side by side as a few sets of
-    bodies, one a core; each window is a world of its own."""
+    """Windows of `length` model times that begin in these recordings at these frames, side by side as a few sets of
+    bodies, one per core; each window is a world of its own."""
 
     def __init__(self, problem: Problem, length: float, begin: Sequence[tuple[int, int]]) -> None:
         self.problem, parts = problem, []
@@ -408,14 +414,14 @@ class Windows:
         self.recording = np.array([k for k, _ in begin])
 
     def run(self, values: np.ndarray) -> list[np.ndarray]:
-        """Of every part [L, W, D, 6] the differences from the recording, model lengths: of positions, and of turns at
-        half of a body's size; NaN where there is no pose to compare with."""
+        """For every part [L, W, D, 6] the differences from the recording in model lengths: of positions, and of
+        rotations times half of a body's size; NaN if there is no recorded pose."""
         jobs = [(part, values) for part in self.parts]
         done = dict(threads(_Part.errors, jobs)) if len(jobs) > 1 else {0: self.parts[0].errors(values)}
         return [done[k] for k in range(len(jobs))]
 
     def errors(self, values: np.ndarray) -> np.ndarray:
-        """[R] differences for a fit, in units of `OUTLIER`; 0 where there is nothing to compare with."""
+        """[R] differences for a fit, in units of `OUTLIER`; 0 if there is no recorded pose."""
         found = []
         for part, off in zip(self.parts, self.run(values), strict=True):
             most = FAR * part.size[None, None, :, None]
@@ -426,7 +432,7 @@ class Windows:
 
     @cached_property
     def group(self) -> np.ndarray:
-        """[R] which recording an error is of; which window, where recordings are few."""
+        """[R] the recording of each error; its window, if there are few recordings."""
         few, at, found = len(set(self.recording.tolist())) < 8, 0, []
         for part in self.parts:
             count = len(part.begin)
@@ -436,7 +442,7 @@ class Windows:
         return np.concatenate(found)
 
     def off(self, values: np.ndarray) -> np.ndarray:
-        """[W, 2] of each window: root mean square distance in % of the size, and mean turn in degrees."""
+        """[W, 2] for each window: root mean square distance in % of the size, and mean rotation error in degrees."""
         found = []
         for part, off in zip(self.parts, self.run(values), strict=True):
             way = np.linalg.norm(off[..., :3], axis=-1) / part.size
@@ -447,8 +453,8 @@ class Windows:
         return np.concatenate(found)
 
     def touched(self) -> list[tuple[int, int, int, np.ndarray, bool]]:
-        """Window, pair of bodies and points [P, 3] of all contacts, and whether one was an impact; static bodies count
-        on from those that move."""
+        """Window, pair of bodies and points [P, 3] of all contacts, and whether one was an impact; static bodies are
+        numbered after the moving ones."""
         found, at = [], 0
         for part in self.parts:
             found += [(at + w, *rest) for w, *rest in part.touched()]
@@ -500,7 +506,8 @@ class _Part:
         return np.where(np.isnan(self.goal[..., :1]), np.nan, np.nan_to_num(off, nan=1e3))
 
     def touched(self) -> list[tuple[int, int, int, np.ndarray, bool]]:
-        """See `Windows.touched`. Inner steps one by one: what rebounds is away again at the end of a frame."""
+        """See `Windows.touched`. Inner steps are made one by one, as a rebounding body may have left again at the end
+        of a frame."""
         many, total, inner = self.shape[2], self.shape[1] * self.shape[2], self.options.substeps
         there = np.asarray(~np.isnan(self.goal[..., 0]).all(-1))
         fine = self.options._replace(dt=self.options.dt / inner, substeps=1)
@@ -519,7 +526,7 @@ class _Part:
                         at = pose.rotate(state.orientation[a], points[:count, FIRST : FIRST + 3]) + state.position[a]
                         found.setdefault((a // many, low, high), []).append(at)
                         now.add((a, (a // many, low, high)))
-            # A change in the first frame may be of a start that is a little wrong.
+            # A change in the first frame may come from a slightly wrong start.
             change = np.square(state.velocity - before - pull).sum(-1)
             sudden = set(np.flatnonzero(change > IMPACT**2 * (pull @ pull)).tolist())
             impacts |= {key for a, key in now if t and a in sudden}
@@ -532,11 +539,11 @@ class _Part:
 def identify(
     recordings: Sequence[Recording], scene: Scene, *, profiles: bool = False, on_progress: Progress = silent
 ) -> Identified:
-    """Find the parameters with which the contact solve repeats recordings, and by how much they may be otherwise; with
-    `profiles` also how the loss goes with each.
+    """Find the parameters with which the contact solve reproduces recordings, and their intervals; with `profiles` also
+    the loss as a function of each.
 
-    Those of the static body that is touched most count as the scene has them, as contacts show products only. Raises
-    SdfsimError for recordings that are too short, or in which nothing touches.
+    The coefficients of the static body that is touched most are taken from the scene, as contacts show products only.
+    Raises SdfsimError for recordings that are too short, or in which nothing touches.
     """
     from scipy.optimize import least_squares
 
@@ -548,11 +555,11 @@ def identify(
     low, high = problem.bounds
 
     def alike(**given: float) -> np.ndarray:
-        """All coefficients of moving bodies of these products, the others as the scene has them."""
+        """All coefficients of moving bodies set to give these products, the other parameters as in the scene."""
         values = [given[p.kind] if p.kind in given else p.start for p in problem.parameters]
         return np.clip(values, low, high)
 
-    # A sweep over all coefficients alike finds the valley; the fit goes down in it.
+    # A sweep over common coefficients finds the valley; the fit descends in it.
     tried = [start, *(alike(friction=f, restitution=e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95))]
     costs = []
     for k, trial in enumerate(tried):
@@ -568,7 +575,7 @@ def identify(
     nudge = width * [NUDGE[p.kind] for p in problem.parameters]
 
     def slope(windows: Windows, values: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """[R, F] by central differences of `NUDGE`, one-sided at the bounds."""
+        """[R, F] derivatives by central differences of `NUDGE`, one-sided at the bounds."""
         columns = []
         for k in free:
             one, other = values.copy(), values.copy()
@@ -590,7 +597,7 @@ def identify(
         found = least_squares(of, values[free], by, limits, x_scale=width[free], loss="soft_l1", max_nfev=most)
         return whole(found.x)
 
-    # First what contacts do, with the bodies and the ground as the scene has them; then all.
+    # First fit the contacts, with bodies and ground as in the scene; then everything.
     every = np.arange(len(width))
     usual = np.flatnonzero([p.kind in (*HIGH, "mass", *OF_JOINTS) for p in problem.parameters])
     best = settled(short, tried[int(np.argmin(costs))], usual, TRIES[0])
@@ -619,8 +626,8 @@ def identify(
 
 
 def repeated(recordings: Sequence[Recording], scene: Scene, frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """How the solve moves a scene from where recordings begin: positions [K, T, D, 3] m of the centres of mass, and
-    orientations [K, T, D, 4], in the `frames` T that follow the first of each."""
+    """The solve's motion of a scene from the start of each recording: positions [K, T, D, 3] m of the centres of mass,
+    and orientations [K, T, D, 4], in the T = `frames` frames after the first."""
     problem = Problem(recordings, scene)
     windows = Windows(problem, frames * recordings[0].dt / problem.units.time, [(k, 0) for k in range(len(recordings))])
     found = []
@@ -636,8 +643,8 @@ def repeated(recordings: Sequence[Recording], scene: Scene, frames: int) -> tupl
 def _searched(
     windows: Windows, best: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The parameters about `best` of the least cost (long motions have so many dips that slopes lead into the next),
-    and the covariance of the best tries for other draws of the same recordings, in widths."""
+    """The parameters near `best` with the lowest cost (for long motions the cost has so many minima that slopes lead
+    into the nearest one), and the covariance, in widths, of the best tries over random draws of the same recordings."""
     from scipy.optimize import differential_evolution
 
     tries: list[np.ndarray] = []
@@ -662,13 +669,14 @@ def _searched(
 def _estimates(
     problem: Problem, values: np.ndarray, group: np.ndarray, slope: np.ndarray, errors: np.ndarray, scatter: np.ndarray
 ) -> list[Estimate]:
-    """Values with their intervals, from the curvature of the robust cost and how recordings (few: windows) pull apart
-    (a sandwich); none where an error of `OUTLIER` a number would leave one of them unknown."""
+    """Values with their intervals, from the curvature of the robust cost and the scatter between recordings, or windows
+    if recordings are few (a sandwich estimator). No value if noise of `OUTLIER` per number would leave it
+    undetermined."""
     parameters, width = problem.parameters, problem.width
     data, slope = errors[: -len(values)], slope[: -len(values)] * width
     weight = (1.0 + data**2) ** -0.5  # of the soft L1 loss
     curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(values))
-    # Errors within a group go together: groups, not single poses, are what is independent.
+    # Errors within a group are correlated: groups, not single poses, are independent.
     which, group = np.unique(group, return_inverse=True)
     pull = np.zeros((len(which), len(values)))
     np.add.at(pull, group, (weight * data)[:, None] * slope)
@@ -681,7 +689,7 @@ def _estimates(
     shown &= [p.kind != "restitution" or bool(problem.hit & set(p.bodies)) for p in parameters]
 
     def estimate(kind: str, name: str, value: float, gradient: dict[int, float]) -> Estimate:
-        """Of a value with these derivatives by parameters."""
+        """The estimate of a value with these derivatives with respect to parameters."""
         at, by = list(gradient), np.array(list(gradient.values())) * width[list(gradient)]
         if not shown[at][by != 0.0].all():
             return Estimate(kind, name, "", None, None)
@@ -707,7 +715,7 @@ def _estimates(
 
 
 def _own(problem: Problem, p: Parameter, value: float) -> tuple[str, str, float]:
-    """Kind of the estimate, unit and value in it of a parameter by itself."""
+    """Kind of the estimate, unit, and value in that unit, of a single parameter."""
     if p.kind in HIGH:
         return f"own_{p.kind}", "", value
     if p.kind in OF_JOINTS:
@@ -724,8 +732,7 @@ def _profiles(
     problem: Problem, best: np.ndarray, slope: np.ndarray, errors: np.ndarray,
     errors_of: Callable[[np.ndarray], np.ndarray], estimates: Sequence[Estimate],
 ) -> list[Profile]:  # fmt: skip
-    """The loss along each parameter. The others go where the slopes at the best place say that they fit best, which is
-    a fit of one step."""
+    """The loss along each parameter. The others are fitted in one step, by the slopes at the best point."""
     found, (low, high), width = [], problem.bounds, problem.width
     weight = (1.0 + errors**2) ** -0.25  # of the soft L1 loss
     weighted = slope * width * weight[:, None]
@@ -733,11 +740,11 @@ def _profiles(
     def loss(values: np.ndarray) -> float:
         return float((np.sqrt(1.0 + errors_of(values) ** 2) - 1.0).sum())
 
-    least = max(loss(best), 1e-12)  # of a recording that is repeated exactly
+    least = max(loss(best), 1e-12)  # for a recording that is reproduced exactly
     for k, p in enumerate(problem.parameters):
         kind, unit, value = _own(problem, p, float(best[k]))
         interval = next(e.interval for e in estimates if (e.kind, e.name) == (kind, p.name))
-        by = (_own(problem, p, best[k] + 1e-6 * width[k])[2] - value) / 1e-6  # of the unit, in a width
+        by = (_own(problem, p, best[k] + 1e-6 * width[k])[2] - value) / 1e-6  # units per width
         half = 0.5 * (interval[1] - interval[0]) / by if interval else 0.5 / BEYOND
         half = max(half, NUDGE[p.kind] / BEYOND)
         others = np.delete(np.arange(len(best)), k)
@@ -757,19 +764,19 @@ def _profiles(
 
 
 def _notes(recordings: Sequence[Recording]) -> list[str]:
-    """What trackers did, and what recordings lack."""
+    """Notes on faults of trackers, and on what recordings lack."""
     lost, jumps = sum(r.lost for r in recordings), sum(r.jumps for r in recordings)
     notes = []
     if lost or jumps:
         worst = max(recordings, key=lambda r: r.lost + r.jumps)
-        notes.append(f"left out: {lost} poses that are missing or no numbers, {jumps} jumps (most in {worst.name})")
+        notes.append(f"left out: {lost} poses that are missing or not numbers, {jumps} jumps (most in {worst.name})")
     if noise := [r.noise for r in recordings if r.noise[0] > 0.0]:
         place, turn = np.median(noise, axis=0)
         notes.append(f"noise of the poses: {1e3 * place:.2g} mm and {math.degrees(turn):.2g} degrees")
     if still := [r.name for r in recordings if not r.known.any()]:
-        notes.append(f"not used, as nowhere smooth: {', '.join(still[:3])}" + (" ..." if still[3:] else ""))
+        notes.append(f"not used, as never smooth:  {', '.join(still[:3])}" + (" ..." if still[3:] else ""))
     if len(recordings) < ENOUGH:
-        notes.append(f"with {ENOUGH} recordings or more some are kept to confirm what the others show")
+        notes.append(f"with {ENOUGH} recordings or more, some are kept to confirm what the others show")
     return notes
 
 
@@ -777,8 +784,8 @@ def _notes(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Body (of copies: their common name) -> key of the scene file -> value; of all parameters of the fit, as those
-    that are not shown one by one may be together."""
+    """Body (for copies, their common name) -> key of the scene file -> value, for all parameters of the fit: parameters
+    that are not determined one by one may be so together."""
     found: dict[str, dict[str, Any]] = {}
     many = len(problem.moving)
     for p, value in zip(problem.parameters, values, strict=True):
@@ -796,7 +803,7 @@ def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, A
         elif p.kind == "inertia":
             entry["inertia_factor"] = problem.inertia_factor(p.bodies[0]) * math.exp(value)
         if p.bodies[0] < many:
-            entry.setdefault("mass", b.mass)  # a density would make another mass of another size
+            entry.setdefault("mass", b.mass)  # with a density another size would mean another mass
     for body, ground in problem.ground.items():
         b, (turn, shift) = problem.bodies[body], problem.lie(values, body)
         centre, length = ground.centre * problem.units.length, problem.units.length
@@ -804,7 +811,7 @@ def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, A
         found.setdefault(b.name, {}).update(
             position=position.tolist(), quat_xyzw=pose.normalise(pose.multiply(turn, b.quat_xyzw)).tolist()
         )
-    # A scene has no restitution above 1; contacts show products, so that what stands still can have more of it.
+    # A scene has no restitution above 1; as contacts show products, the static body can have more of it.
     moving = {re.sub(r"\[\d+\]$", "", b.name) for b in problem.moving}
     most = max((entry.get("restitution", 0.0) for name, entry in found.items() if name in moving), default=0.0)
     if most > 1.0:
@@ -830,7 +837,8 @@ INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
 
 
 def write_scene(found: Identified, scene_file: Path, out: Path) -> list[str]:
-    """A copy of a scene file with what was found; all else is as the file has it, but for comments. Returns notes."""
+    """Write a copy of a scene file with the values that were found; everything else is as in the file, except comments.
+    Returns notes."""
     root, notes = cast("Any", yaml.compose(scene_file.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)), []
     for entry in _value(root, "bodies").value:
         values = dict(found.scene_values.get(_value(entry, "name").value, {}))
@@ -881,8 +889,8 @@ PANEL = (3.0, 2.2)  # inches
 
 
 def picture(found: Identified, path: Path) -> str:
-    """Write a panel for every parameter as a PNG: the loss with the others fitted again, and the interval of 95 %.
-    Returns what to install where matplotlib is not, else nothing."""
+    """Write a PNG with a panel for every parameter: the loss with the others fitted again, and the interval of 95 %.
+    Returns what to install if matplotlib is missing, else an empty string."""
     try:
         plots = pyplot()
     except NotInstalled as error:
@@ -900,7 +908,7 @@ def picture(found: Identified, path: Path) -> str:
             axis.axvspan(*profile.interval, color="tab:blue", alpha=0.15, linewidth=0)
         axis.plot(profile.x, profile.loss, "o-", markersize=3, linewidth=1.2, color="tab:blue" if shown else "0.6")
         axis.axvline(profile.value, color="0.4", linewidth=0.8, linestyle=":")
-        # What is flat looks flat: the scale holds a tenth of the loss at least.
+        # A flat curve should look flat: the scale covers at least a tenth of the loss.
         low, high = axis.get_ylim()
         axis.set_ylim(min(low, 0.99), max(high, 1.1))
         axis.set_title(title(profile), fontsize=8, color="black" if shown else "0.4")

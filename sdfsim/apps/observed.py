@@ -1,5 +1,5 @@
-"""Recorded motions of a scene as trackers and runs give them: read, cleaned of what trackers do, and the velocities
-that fits through smooth stretches tell."""
+"""Recorded motions of a scene from trackers and runs: reads them, removes faults of trackers, and finds velocities by
+fits through smooth stretches."""
 
 import csv
 import re
@@ -25,43 +25,43 @@ from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Scene
 
 COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
-ARRAYS = ("position", "quat_xyzw")  # of an npz of poses, besides `dt` or `time`, and `names` and `start`
-EVEN = 0.1  # of the spacing: how far a time may be off an even grid
-NEAR, LEAST = 3, 5  # frames on either side that tell whether one is in smooth motion; frames of the shortest flight
-BEYOND = 5.0  # deviations of the noise that are no noise
-# Trackers that smooth are off more in a flight than from frame to frame: by so much of a size (and rad) at most, and
-# so many deviations of that.
+ARRAYS = ("position", "quat_xyzw")  # arrays in an npz of poses, besides `dt` or `time`, and `names` and `start`
+EVEN = 0.1  # relative to the spacing: how far a time may be off an even grid
+NEAR, LEAST = 3, 5  # frames on each side that decide whether a frame is in smooth motion; frames of the shortest flight
+BEYOND = 5.0  # standard deviations beyond which a difference is not noise
+# Trackers that smooth have larger errors over a flight than from frame to frame: at most this much, relative to the
+# size (and in rad), and this many standard deviations of that.
 ROUGH, SMOOTHED = 3e-3, 30.0
-LEVER = 2.0  # of what trackers are off on one body: where the bodies of a tree are depends on each other's turns
-FINEST = 2e-6  # of a body's size (and rad): poses are not expected to be more exact
-WEIGHTLESS = 0.25  # of gravity: who accelerates so nearly as it does may be in free flight
-ROUNDS = 4  # of Gauss and Newton, for a flight's rotation
-TOGETHER = 32  # flights of trees that are fitted side by side: their paths fill memory
-LOST = 3  # frames: the longest excursion of a tracker that is told from an impact
+LEVER = 2.0  # factor on trackers' errors for trees: the positions of its bodies depend on each other's rotations
+FINEST = 2e-6  # relative to a body's size (and in rad): poses are not expected to be more exact
+WEIGHTLESS = 0.25  # relative to gravity: a body whose acceleration differs by less may be in free flight
+ROUNDS = 4  # Gauss-Newton rounds for a flight's rotation
+TOGETHER = 32  # flights of trees that are fitted side by side, limited by the memory for their paths
+LOST = 3  # frames: the longest excursion of a tracker that can be distinguished from an impact
 
 
 @dataclass(frozen=True)
 class Recording:
-    """T poses of the D bodies that move, evenly spaced in time, and the velocities that were found."""
+    """T poses of the D moving bodies, evenly spaced in time, and the velocities that were found."""
 
     name: str
     dt: float  # s
-    position: np.ndarray  # [T, D, 3] m, of the centres of mass; that of the fit where there is one
+    position: np.ndarray  # [T, D, 3] m, of the centres of mass; from the fit if there is one
     orientation: np.ndarray  # [T, D, 4] xyzw, likewise
     # velocity, angular_velocity: [T, D, 3] m/s and rad/s
     velocity: np.ndarray
     angular_velocity: np.ndarray
-    known: np.ndarray  # [T] bool, whether the velocities of all bodies are to be trusted
+    known: np.ndarray  # [T] bool, whether the velocities of all bodies can be trusted
     flying: np.ndarray  # [T, D] bool, whether a body is in free flight
-    seen: np.ndarray  # [T, D] bool, whether there is a pose at all
+    seen: np.ndarray  # [T, D] bool, whether there is a pose
     goal: tuple[np.ndarray, np.ndarray]  # the poses as recorded, [T, D, 3] and [T, D, 4]
-    noise: tuple[float, float] = (0.0, 0.0)  # m and rad, standard deviations of poses about smooth motion
-    lost: int = 0  # poses that were missing or not a number
-    jumps: int = 0  # poses that were left out because no motion leads there and back
+    noise: tuple[float, float] = (0.0, 0.0)  # m and rad, standard deviations of poses from smooth motion
+    lost: int = 0  # number of poses that were missing or not numbers
+    jumps: int = 0  # number of poses that were left out because no motion leads there and back
 
 
 def movers(scene: Scene) -> list[Body]:
-    """The bodies that a recording tells of. Raises SdfsimError if none moves."""
+    """The moving bodies of a scene, which recordings are about. Raises SdfsimError if none moves."""
     found = [b for b in scene.bodies if b.motion == "dynamic"]
     if not found:
         raise SdfsimError(f"{scene.path}: bodies: none moves")
@@ -76,10 +76,10 @@ def load_recordings(
     allow_outside: bool = False,
     on_progress: Progress = silent,
 ) -> tuple[list[Recording], Scene]:
-    """Recordings of one scene, and the scene: of run folders and `rollout.npz`, whose scene is known; of CSVs and
-    `npz` files of poses, whose positions are those of the shapes' own origins, as in a scene file; and of folders of
-    these. `only` is which of those in a file of many is wanted. Raises SdfsimError for no scene, unreadable files, or a
-    recording that is not of this scene."""
+    """Read recordings of one scene, and the scene. They may be run folders and `rollout.npz` files, whose scene is
+    known; CSVs and `npz` files of poses, with positions of the shapes' own origins, as in a scene file; and folders of
+    these. `only` selects one recording of a file with many. Raises SdfsimError if there is no scene, if files are
+    unreadable, or if a recording is not of this scene."""
     files = [file for path in paths for file in _files(path)]
     scene, found = None, []
     if scene_file is not None:
@@ -96,7 +96,7 @@ def load_recordings(
             dt, sure = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0, np.ones(place.shape[:2], bool)
             found.append(Recording(str(file), dt, place, turn, speed, spin, sure[:, 0], ~sure, sure, (place, turn)))
         elif scene is None:
-            raise SdfsimError(f"{file}: a recording without its scene", "give it: --scene scene.yaml")
+            raise SdfsimError(f"{file}: a recording without its scene", "give its scene: --scene scene.yaml")
         else:
             names = [body.name for body in movers(scene)]
             read = _csv(file, names) if file.suffix == ".csv" else _npz(file, names)
@@ -110,17 +110,17 @@ def load_recordings(
 
 
 def load_beside(path: Path, scene_file: Path, *, allow_outside: bool = False, on_progress: Progress = silent) -> Beside:
-    """One recording, to simulate a scene beside it: a run, a file of poses, or `FILE[K]` for that one of many in it. It
-    begins with the first frame whose velocities are known. Raises SdfsimError as `load_recordings` does, where which of
-    many is meant is not said, and where no velocities are known."""
+    """Read one recording, to simulate a scene beside it: a run, a file of poses, or `FILE[K]` for one of many in a
+    file. It begins with the first frame whose velocities are known. Raises SdfsimError as `load_recordings` does, and
+    also if the file has several recordings and none is selected, or if no velocities are known."""
     numbered = None if path.exists() else re.fullmatch(r"(.+)\[(\d+)\]", str(path))
     file, only = (Path(numbered[1]), int(numbered[2])) if numbered else (path, None)
     found, scene = load_recordings([file], scene_file, only=only, allow_outside=allow_outside, on_progress=on_progress)
     if len(found) > 1:
-        raise SdfsimError(f"{path}: {len(found)} recordings", f"say which one, as {found[0].name}")
+        raise SdfsimError(f"{path}: {len(found)} recordings", f"say which one, such as {found[0].name}")
     one = found[0]
     if not one.known.any():
-        raise SdfsimError(f"{one.name}: no stretch is smooth enough to tell a velocity", "give a longer recording")
+        raise SdfsimError(f"{one.name}: no stretch is smooth enough to find a velocity", "give a longer recording")
     first = int(one.known.argmax())
     frames = first + np.flatnonzero(one.seen[first:].all(1))
     return Beside(
@@ -139,7 +139,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _csv(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
-    """Spacing s and poses [T, D, 7] of the bodies, positions [m] before quaternions; NaN where there is none."""
+    """Spacing in s and poses [T, D, 7] of the bodies, positions [m] before quaternions; NaN for missing poses."""
     rows: dict[tuple[float, str], list[float]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -173,7 +173,7 @@ def _csv(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
 
 
 def _npz(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
-    """As `_csv`; of many recordings end to end where there is a `start` [K+1]."""
+    """As `_csv`; many recordings, stored end to end, if there is a `start` [K+1]."""
     data = read_arrays(path, "a recording")
 
     def wrong(name: str, what: str) -> SdfsimError:
@@ -190,7 +190,7 @@ def _npz(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
         arrays.append(values.astype(np.float64))
     names = [str(name) for name in data["names"]] if "names" in data else moving
     if len({len(names), *(array.shape[1] for array in arrays)}) > 1 or len(arrays[0]) != len(arrays[1]):
-        raise wrong(ARRAYS[1], f"must be of as many poses as position, and of {len(names)} bodies")
+        raise wrong(ARRAYS[1], f"must have as many poses as position, and {len(names)} bodies")
     if missing := set(moving) - set(names):
         raise wrong("names", f"no body {min(missing)!r}, which the scene has")
     poses = np.concatenate(arrays, -1)[:, [names.index(name) for name in moving]]
@@ -206,14 +206,14 @@ def _npz(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
     elif np.size(data.get("dt", ())) == 1 and 0.0 < float(data["dt"]) < np.inf:
         times = float(data["dt"]) * np.arange(len(poses))
     else:
-        raise wrong("dt", "must be one number of s above 0, where there is no time")
+        raise wrong("dt", "must be one number above 0, in s, if there is no time")
     cuts = [slice(a, b) for a, b in pairwise(ends)]
     names = [f"{path}[{k}]" if len(cuts) > 1 else str(path) for k in range(len(cuts))]
     return [(name, *_on_grid(name, times[cut], poses[cut])) for name, cut in zip(names, cuts, strict=True)]
 
 
 def _on_grid(path: Path | str, times: np.ndarray, poses: np.ndarray) -> tuple[float, np.ndarray]:
-    """Spacing s, and poses at even times, NaN at those that are missing."""
+    """Spacing in s, and poses at even times, NaN for missing ones."""
     if len(times) < LEAST:
         raise SdfsimError(f"{path}: time: {len(times)} times (at least {LEAST})")
     gaps = np.diff(times)
@@ -225,7 +225,7 @@ def _on_grid(path: Path | str, times: np.ndarray, poses: np.ndarray) -> tuple[fl
     off = np.abs((times - times[0]) / dt - frame)
     if off.max() > EVEN or (np.diff(frame) < 1).any():
         told = f"they are {gaps.min():.4g} to {gaps.max():.4g} s apart"
-        raise SdfsimError(f"{path}: time: must be evenly spaced, but for frames that are missing ({told})")
+        raise SdfsimError(f"{path}: time: must be evenly spaced, except for missing frames ({told})")
     if frame[-1] + 1 > 100 * len(times):
         raise SdfsimError(f"{path}: time: {frame[-1] + 1 - len(times)} of {frame[-1] + 1} frames are missing")
     whole = np.full((frame[-1] + 1, *poses.shape[1:]), np.nan)
@@ -234,8 +234,8 @@ def _on_grid(path: Path | str, times: np.ndarray, poses: np.ndarray) -> tuple[fl
 
 
 def cleaned(name: str, dt: float, poses: np.ndarray, scene: Scene) -> Recording:
-    """A recording of poses [T, D, 7] without what trackers do: rows without numbers, signs of quaternions that flip,
-    and excursions of up to `LOST` frames. Its velocities are still to be found."""
+    """A recording of poses [T, D, 7] without faults of trackers: rows without numbers, flipping signs of quaternions,
+    and excursions of up to `LOST` frames. Its velocities are not found yet."""
     bodies = movers(scene)
     length = np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
     seen = np.isfinite(poses).all(-1) & (length[..., 0] > 0.0) & np.isfinite(length[..., 0])
@@ -261,14 +261,14 @@ def cleaned(name: str, dt: float, poses: np.ndarray, scene: Scene) -> Recording:
 
 
 def _same_sign(turn: np.ndarray) -> np.ndarray:
-    """Quaternions [T, 4], each with the sign that is nearer to the one before."""
+    """Quaternions [T, 4], each with the sign nearer to the one before."""
     signs = np.where((turn[1:] * turn[:-1]).sum(1) < 0.0, -1.0, 1.0)
     return turn * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
 
 
 def _excursions(x: np.ndarray) -> np.ndarray:
-    """[T] bool: poses x [T, 7] that are farther from the line between those before and after an excursion than any
-    motion with the speeds there leads: an impact changes a velocity and not a place."""
+    """[T] bool: poses x [T, 7] of an excursion. They are farther from the line between the poses before and after than
+    a motion with the speeds there can lead: an impact changes a velocity, but not a position."""
     away, floor = np.zeros(len(x), bool), 20.0 * FINEST
     for part in (x[:, :3], x[:, 3:]):
         step = np.linalg.norm(np.diff(part, axis=0), axis=1)
@@ -277,7 +277,7 @@ def _excursions(x: np.ndarray) -> np.ndarray:
             for t in range(1, len(x) - count):
                 if away[t : t + count].any():
                     continue
-                # Ends have a neighbour on one side only, and a neighbour that is away itself tells nothing.
+                # Ends have a neighbour on one side only, and a neighbour that is itself on an excursion tells nothing.
                 ahead = step[t - 2] if t > 1 and not away[t - 2] else usual
                 behind = step[t + count] if t + count < len(step) and not away[t + count + 1] else usual
                 bound = 2.0 * (ahead + behind + usual) * 0.5 * (count + 1)
@@ -293,9 +293,9 @@ def _excursions(x: np.ndarray) -> np.ndarray:
 
 
 def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording]:
-    """The recordings with the velocities of their smooth stretches: of flights by a parabola and a torque-free rotation
-    through all of a flight (of bodies that joints hold together, by the motion of all of them), elsewhere (a slide, a
-    roll, rest) by a polynomial through the frames nearby. Those of a run are known."""
+    """The recordings with the velocities of their smooth stretches. In flights they come from a parabola and a
+    torque-free rotation through the whole flight (for bodies that joints hold together, from the motion of all of
+    them); elsewhere (sliding, rolling, rest) from a polynomial through the frames nearby. Those of a run are known."""
     bodies = movers(scene)
     inertia = from_scene(replace(scene, bodies=tuple(bodies), joints=()), scene_units(scene))[0].inertia
     size = [largest_extent(scene.shapes[b.shape]) * b.scale for b in bodies]
@@ -337,8 +337,8 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
 
 
 def _swings(done: list[Recording], numbers: Sequence[int], rows: list[int], scene: Scene) -> None:
-    """Write the flights of bodies that joints hold together: their mass centre falls along a parabola, and they swing
-    about it as the solve moves them. What does not fly so stays as it is."""
+    """Write the flights of bodies that joints hold together: their common centre of mass falls along a parabola, and
+    they swing about it as the solve moves them. Stretches that do not fit this stay as they are."""
     tree = tree_of(scene, rows)
     mass = np.array([b.mass for b in tree.bodies])
     size = max(largest_extent(tree.shapes[b.shape]) * b.scale for b in tree.bodies)
@@ -380,7 +380,7 @@ def _held(r: Recording, scene: Scene) -> Recording:
 
 
 def _noise(x: np.ndarray, seen: np.ndarray, least: float) -> float:
-    """Standard deviation of a coordinate about smooth motion, of x [T, C]: by third differences, of which few are of
+    """Standard deviation of the coordinates x [T, C] from smooth motion, by third differences, few of which are at
     impacts."""
     rows = np.flatnonzero(seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3])
     third = x[rows + 3] - 3.0 * x[rows + 2] + 3.0 * x[rows + 1] - x[rows]
@@ -390,17 +390,17 @@ def _noise(x: np.ndarray, seen: np.ndarray, least: float) -> float:
 def _nearby(
     p: np.ndarray, q: np.ndarray, seen: np.ndarray, dt: float, gravity: np.ndarray, sigma: tuple[float, float]
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Pose and velocities of every frame by parabolas through `NEAR` frames on either side (more where they are noisy;
+    """Pose and velocities of every frame by parabolas through `NEAR` frames on each side (more if they are noisy;
     one-sided at ends and impacts), whether these fit [T], and whether the frame may be in free flight [T]."""
     count, rows = len(p), np.flatnonzero(seen)
     out = p.copy(), q.copy(), np.zeros((count, 3)), np.zeros((count, 3))
     fits, flies = np.zeros(count, bool), np.zeros(count, bool)
     base = q[rows[np.clip(np.searchsorted(rows, np.arange(count)), 0, len(rows) - 1)]]
     strength = float(np.linalg.norm(gravity))
-    # So many that their noise leaves the acceleration sure to a sixteenth of gravity.
+    # As many as needed for an acceleration that is certain to a sixteenth of gravity, given their noise.
     wanted = (430.0 * sigma[0] / (dt**2 * strength)) ** 0.4 if strength else 0.0
     near = int(np.clip(wanted / 2.0, NEAR, 5 * NEAR))
-    for shift in (0, -near, near):  # symmetric first, then what lies before, and what comes after
+    for shift in (0, -near, near):  # symmetric first, then frames before, then frames after
         offset = np.arange(shift - near, shift + near + 1)
         frame = np.arange(count)[:, None] + offset
         there = (frame >= 0) & (frame < count)
@@ -432,7 +432,7 @@ def _nearby(
 def _flights(
     flies: np.ndarray, seen: np.ndarray, p: np.ndarray, dt: float, gravity: np.ndarray, most: float
 ) -> list[tuple[int, int]]:
-    """First and last (exclusive) frames of the longest stretches that a parabola each fits by `most` everywhere."""
+    """First and last (exclusive) frames of the longest stretches that a parabola fits to within `most` everywhere."""
     found, a, rows = [], 0, np.flatnonzero(flies & seen)
     while a + LEAST <= len(rows):
         b = a + LEAST
@@ -452,8 +452,8 @@ def _flights(
 def _parabola(
     rows: np.ndarray, p: np.ndarray, dt: float, gravity: np.ndarray, at: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], float]:
-    """Positions and velocities at frames `at` of a flight through p [K, 3] at frames `rows`, and how far the farthest
-    is off it."""
+    """Positions and velocities at frames `at` of a flight through p [K, 3] at frames `rows`, and the largest deviation
+    from it."""
     time, later = (dt * (f - at[0])[:, None] for f in (rows, at))
     even = np.concatenate([np.ones_like(time), time], 1)
     level = p - 0.5 * time**2 * gravity
@@ -463,7 +463,7 @@ def _parabola(
 
 
 def _rotations(done: list[Recording], flights: list[tuple], inertia: np.ndarray) -> None:
-    """Write the torque-free rotations that fit flights best, by Gauss and Newton, all at once."""
+    """Write the torque-free rotations that fit flights best, by Gauss-Newton, all at once."""
     if not flights:
         return
     longest = max(b - a for _, _, a, b, *_ in flights)
@@ -479,7 +479,7 @@ def _rotations(done: list[Recording], flights: list[tuple], inertia: np.ndarray)
         q = pose.multiply(pose.from_rotvec(moved[..., :3]), start[:, None]).reshape(-1, 4)
         w = (rate[:, None] + moved[..., 3:]).reshape(-1, 3)
         paths = [(q, w)]
-        for _ in range(longest - 1):  # one step of each flight's own length: inertia and time scale together
+        for _ in range(longest - 1):  # one step of each flight's own length, as inertia and time scale together
             q, spin = torque_free(q, w * np.repeat(steps, 7)[:, None], own, 1.0)
             w = spin / np.repeat(steps, 7)[:, None]
             paths.append((q, w))

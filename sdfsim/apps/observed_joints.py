@@ -1,4 +1,4 @@
-"""Recordings of scenes with joints: poses and velocities that these allow, near those that were seen."""
+"""Recordings of scenes with joints: poses and velocities that the joints allow, near the observed ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +14,10 @@ from sdfsim.scene.scene import Scene
 from sdfsim.simulate.batch import Copies, inner_of_frame
 from sdfsim.simulate.steppers import Frames as Moved
 
-ROUNDS = 5  # of Gauss and Newton, for the flight of a tree
-BEGIN = 8  # frames of a flight that tell where its fit begins
-SINGULAR = 1e-3  # of the strongest way to change a flight: ways that joints do not allow are weaker
-OUTLIER = 3.0  # deviations: poses that are farther off count less than squared
+ROUNDS = 5  # Gauss-Newton rounds for the flight of a tree
+BEGIN = 8  # frames of a flight from which its fit starts
+SINGULAR = 1e-3  # relative to the strongest way to change a flight: weaker ways are those that joints do not allow
+OUTLIER = 3.0  # standard deviations: poses that are farther off count less than squared
 
 Frames = tuple[
     np.ndarray, np.ndarray, np.ndarray, np.ndarray
@@ -25,14 +25,15 @@ Frames = tuple[
 
 
 def jointed(scene: Scene) -> list[bool]:
-    """Of the bodies that move, whether a joint holds one: such do not fly freely."""
+    """For each moving body, whether a joint holds it, so that it does not fly freely."""
     rows = {k for joint in scene.joints for k in joint.bodies}
     return [k in rows for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
 
 
 def held_together(seen: Frames, scene: Scene) -> Frames:
-    """Poses and velocities [T, D, *] of the bodies that move, as the joints of trees let them be: each as it was seen
-    against that which holds it, but for what the joint does not allow. Loops and distances are left as they are."""
+    """Poses and velocities [T, D, *] of the moving bodies, corrected so that the joints of trees allow them: each is as
+    observed relative to its parent, except for motion that the joint does not allow. Loops and distances are
+    ignored."""
     tree = trees(scene)
     number = {k: d for d, k in enumerate(k for k, b in enumerate(scene.bodies) if b.motion == "dynamic")}
     arrays = [array.copy() for array in seen]
@@ -63,7 +64,7 @@ def _com(scene: Scene, k: int) -> np.ndarray:
 
 
 def _allowed(one: Held, child: Frames, parent: Frames, com: np.ndarray, com_of_parent: np.ndarray) -> Frames:
-    """Pose and velocities of a child, by its joint with a parent."""
+    """Pose and velocities of a child that its joint with the parent allows."""
     (place, turn, speed, spin), (base, lie, carried, turned) = child, parent
     own, theirs = one.frame.as_quat(), one.parent_frame.as_quat()
     frame = pose.multiply(lie, np.tile(theirs, (len(lie), 1)))
@@ -85,7 +86,7 @@ def _allowed(one: Held, child: Frames, parent: Frames, com: np.ndarray, com_of_p
     rate = turned + relative
     arm = pose.rotate(lie, np.tile(one.parent_anchor - com_of_parent, (len(lie), 1)))
     anchor = base + arm
-    # From the child's anchor to its centre of mass, as it was seen and as it is.
+    # From the child's anchor to its centre of mass, as observed and as corrected.
     was, lever = (pose.rotate(q, np.tile(com - one.anchor, (len(q), 1))) for q in (turn, orientation))
     along, sliding = np.zeros_like(anchor), np.zeros_like(anchor)
     if kind == "slider":
@@ -102,17 +103,17 @@ def _allowed(one: Held, child: Frames, parent: Frames, com: np.ndarray, com_of_p
 
 @dataclass(frozen=True)
 class Swing:
-    """A flight of bodies that joints hold together, as it was seen in N frames; D bodies."""
+    """A flight of D bodies that joints hold together, as observed in N frames."""
 
-    time: np.ndarray  # [N] s, from its first frame on
+    time: np.ndarray  # [N] s, since its first frame
     position: np.ndarray  # [N, D, 3] m, of the centres of mass
     orientation: np.ndarray  # [N, D, 4]
     noise: tuple[float, float]  # m and rad
 
 
 def flying_trees(scene: Scene) -> list[list[int]]:
-    """Numbers, among the bodies that move, of those that joints hold together and nothing else holds. Loops and
-    distances are none of them."""
+    """Groups of moving bodies (by their numbers among these) that joints hold together and nothing else holds. Groups
+    with loops or distances are left out."""
     if scene.effects.joints == "off":
         return []
     tree = trees(scene)
@@ -125,7 +126,7 @@ def flying_trees(scene: Scene) -> list[list[int]]:
 
 
 def tree_of(scene: Scene, rows: Sequence[int]) -> Scene:
-    """A scene of these bodies that move, and of their joints, alone and without gravity."""
+    """A scene with only these moving bodies and their joints, without gravity."""
     moving = [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
     new = {moving[row]: at for at, row in enumerate(rows)}
     joints = [j for j in scene.joints if set(j.bodies) <= set(new)]
@@ -136,22 +137,22 @@ def tree_of(scene: Scene, rows: Sequence[int]) -> Scene:
 
 
 def swung(swings: Sequence[Swing], dt: float, scene: Scene) -> list[tuple[Frames, float, float]]:
-    """The motions of the tree `scene` in free flight that are nearest to what was seen, frame by frame at `dt` s up to
-    the last one of each; and how far poses are off, root mean square, m and rad. Positions and velocities are those
-    about the mass centre of all, which flies on its own."""
+    """The motions of the tree `scene` in free flight that are nearest to the observed ones, frame by frame at `dt` s up
+    to the last frame of each; and the root mean square errors of poses, m and rad. Positions and velocities are
+    relative to the common centre of mass, which flies separately."""
     mass = np.array([b.mass for b in scene.bodies])
     share = mass / mass.sum()
     count, many = len(swings), len(mass)
     last = [round(float(s.time[-1]) / dt) for s in swings]
     guess = [np.stack(arrays) for arrays in zip(*(_begun(s, share) for s in swings), strict=True)]
-    # Each is turned and spun, and moved along where a joint lets it slide; joints take away what they do not allow.
+    # Each body is rotated and spun, and moved where a joint lets it slide; joints remove what they do not allow.
     slides = [b for j in scene.joints if j.kind == "slider" for b in j.bodies]
     ways = [(array, d, c) for array, rows in ((1, range(many)), (3, range(many)), (0, slides), (2, slides))
             for d in rows for c in range(3)]  # fmt: skip
     length = scene_units(scene).length
     for turn in range(ROUNDS + 1):
         tried = [np.repeat(array[:, None], 1 + len(ways), 1) for array in guess]
-        # Rates are changed by so much that it shows at the end.
+        # Rates are changed by enough to show at the end.
         step = np.empty((count, len(ways)))
         for w, (array, d, c) in enumerate(ways):
             step[:, w] = 1e-4 * (length if array in (0, 2) else 1.0)
@@ -166,7 +167,7 @@ def swung(swings: Sequence[Swing], dt: float, scene: Scene) -> list[tuple[Frames
             break
         for f, swing in enumerate(swings):
             off = _off(swing, [path[f] for path in paths], dt, share).reshape(1 + len(ways), -1)
-            slope = off[1:] - off[0]  # by a step each, which makes turns and rates comparable
+            slope = off[1:] - off[0]  # per step each, which makes rotations and rates comparable
             usual = max(1.0, 1.48 * float(np.median(np.abs(off[0]))))  # trackers are less exact in motion than at rest
             weight = (1.0 + np.square(off[0] / (OUTLIER * usual))) ** -0.25
             change = np.linalg.lstsq((slope * weight).T, -off[0] * weight, rcond=SINGULAR)[0]
@@ -182,7 +183,7 @@ def swung(swings: Sequence[Swing], dt: float, scene: Scene) -> list[tuple[Frames
 
 
 def _nudge(arrays: list[np.ndarray], flight: int | slice, at: int | None, way: tuple[int, int, int], by) -> None:
-    """Change a number of a body in flights: a turn by a rotation about an axis of the world."""
+    """Change a number of a body in flights; an orientation, by a rotation about a world axis."""
     array, d, c = way
     rows = arrays[array][flight] if at is None else arrays[array][flight, at]
     if array == 1:
@@ -194,8 +195,8 @@ def _nudge(arrays: list[np.ndarray], flight: int | slice, at: int | None, way: t
 
 
 def _begun(swing: Swing, share: np.ndarray) -> Frames:
-    """[D, *] a first guess of a flight's start: parabolas through its first frames, of places about the mass centre
-    and of turns."""
+    """[D, *] a first guess of a flight's start, by parabolas through its first frames, for positions about the centre
+    of mass and for rotations."""
     time = swing.time[:BEGIN, None]
     powers = time ** np.arange(3)
     about = swing.position - (share[:, None] * swing.position).sum(1, keepdims=True)
@@ -207,14 +208,14 @@ def _begun(swing: Swing, share: np.ndarray) -> Frames:
 
 
 def _centred(arrays: Sequence[np.ndarray], scene: Scene, share: np.ndarray) -> Frames:
-    """As joints let them be, the mass centre of all at rest at zero."""
+    """Poses and velocities that joints allow, with the common centre of mass at rest at zero."""
     place, turn, speed, spin = held_together(cast("Frames", tuple(arrays)), scene)
     about, drift = ((share[:, None] * array).sum(1, keepdims=True) for array in (place, speed))
     return place - about, turn, speed - drift, spin
 
 
 def _flown(begun: tuple[np.ndarray, ...], dt: float, frames: int, scene: Scene) -> list[np.ndarray]:
-    """[F, P, T, D, *] poses and velocities of flights [F, P, D, *] from their starts on, these first."""
+    """[F, P, T, D, *] poses and velocities of flights from their starts [F, P, D, *], which come first."""
     count, many = begun[0].shape[0] * begun[0].shape[1], len(scene.bodies)
     copies = Copies(scene, count)
     u, solver, step = copies.units, copies.solver, dt / copies.units.time
@@ -231,7 +232,8 @@ def _flown(begun: tuple[np.ndarray, ...], dt: float, frames: int, scene: Scene) 
 
 
 def _off(swing: Swing, paths: Sequence[np.ndarray], dt: float, share: np.ndarray) -> np.ndarray:
-    """[P, N, D, 6] of paths [P, T, D, *]: how far poses are off those seen, about the mass centre, in deviations."""
+    """[P, N, D, 6] for paths [P, T, D, *]: differences from the observed poses, relative to the centre of mass, in
+    standard deviations."""
     rows = np.round(swing.time / dt).astype(int)
     about = swing.position - (share[:, None] * swing.position).sum(1, keepdims=True)
     away = pose.to_rotvec(pose.multiply(paths[1][:, rows], pose.conjugate(swing.orientation)[None]))

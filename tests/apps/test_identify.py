@@ -437,8 +437,8 @@ def test_bad_csv_is_one_line_of_file_line_and_field(tmp_path, what):
     [
         ({"quat_xyzw": None}, "quat_xyzw: there is no such array"),
         ({"position": np.zeros((8, 2))}, r"position: must be numbers \[T, bodies, 3\]"),
-        ({"dt": None}, "dt: must be one number of s above 0"),
-        ({"dt": 0.0}, "dt: must be one number of s above 0"),
+        ({"dt": None}, "dt: must be one number above 0, in s"),
+        ({"dt": 0.0}, "dt: must be one number above 0, in s"),
         ({"start": [0, 5, 7]}, "start: must be whole numbers from 0 to 8"),
         ({"names": ["cup"]}, "names: no body 'ball'"),
         ({"time": np.zeros(8)}, "time: must increase"),
