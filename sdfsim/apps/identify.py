@@ -76,10 +76,8 @@ FARTHEST = {
 }
 SHELL = 5.0 / 3.0  # inertia of a hollow cube or ball over that of a solid one: the most that such a body can have
 FACTORS = ("mass", "inertia", "size")
-OF_JOINTS = {
-    "joint_friction": DRAG,
-    "joint_damping": DAMPING,
-}  # largest values, in weights of a joint's lighter body, see `heft`
+# Columns of joints; the parameters are in units of `heft`.
+OF_JOINTS = {"joint_friction": DRAG, "joint_damping": DAMPING}
 
 
 @dataclass(frozen=True)

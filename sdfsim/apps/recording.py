@@ -1,4 +1,4 @@
-"""Rollout -> rerun. A live run and a file go through the same calls: a live step is a chunk of one frame."""
+"""From rollouts to rerun recordings. A live run and a file use the same calls: a live step is a chunk of one frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.steppers import PHASES
 
-if TYPE_CHECKING:  # these take their time to load
+if TYPE_CHECKING:  # these are slow to load
     import rerun as rr
     import rerun.blueprint as rrb
     from PIL import Image
@@ -36,7 +36,7 @@ JOINTS = "world/joints"
 FORCES = "world/forces"
 STILL = "world/still"
 BESIDE = "world/recorded"
-# What is plotted: the counters of a view by their legends.
+# The plots: counters of a view, by their legends.
 VIEWS = {
     "kinetic energy (J)": {"kinetic_energy": "kinetic energy (J)"},
     "worst penetration (m)": {"worst_penetration": "worst penetration (m)"},
@@ -47,34 +47,36 @@ VIEWS = {
 }
 PLOTS = {key: legend for view in VIEWS.values() for key, legend in view.items()}
 STATIC_COLOR = (150, 150, 155)
-HUES = 32  # colours of bodies that move
+HUES = 32  # number of colours for moving bodies
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _FORCE_COLOR = (255, 170, 0)
 _STILL_COLOR = (60, 110, 230)
 _PHOTO_PIXELS = 320
 _TEXTURE_PIXELS = 2048
-MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
-COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
+MANY = 24  # number of moving bodies of one shape from which they are drawn as a crowd
+COLORS = 4  # copies share their mesh's colour, so a crowd is split into groups of different colours
 _CREASE = np.cos(np.radians(40.0))
-# Of a plane in which scenery lies: cells along the longer side of that, and points on it that tell which it covers.
+# For a plane in which scenery lies: cells along the scenery's longer side, and points on it that show which cells it
+# covers.
 _FLOOR_CELLS, _FLOOR_POINTS = 48, 40_000
-_MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
-LONGEST = 5.0  # sizes of its body, an arrow
-LEAST, TOLD, MANY_LEAST = 0.05, 100, 3.0  # weights that an arrow stands for at least; of more bodies only for hits
-FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
+_MOST_CORNER_PAIRS = 1_000_000  # with more (about 10,000 vertices) a mesh counts as smooth: splitting triples it
+LONGEST = 5.0  # longest arrow, in sizes of its body
+# Least force of an arrow, in weights; number of bodies above which only hits get arrows; the least force of a hit.
+LEAST, TOLD, MANY_LEAST = 0.05, 100, 3.0
+FARTHEST = 1.0  # a body that leaves the scene for good must not shrink it to a dot
 # Of joints.
-MOST_SHOWN = 256  # joints of a scene, beyond which none is shown: each takes bodies out of the crowds
-SIZE = 0.4  # of marks, relative to the smaller of the two bodies
+MOST_SHOWN = 256  # largest number of joints that are shown: each takes bodies out of the crowds
+SIZE = 0.4  # size of marks, relative to the smaller of the two bodies
 AROUND = 24  # points on a full circle
-UNKNOWN = 0.1  # m, of marks between things without an end
+UNKNOWN = 0.1  # m, size of marks between infinite bodies
 AXIS_COLOR, LIMIT_COLOR = (255, 140, 0), (255, 210, 90)
 
 
 class Playback:
-    """One recording of one scene, to be written to a file, or streamed to a viewer. Its first view shows all of the
-    scene, and where the motion is known already all of that; then there are only the plots that have something to show.
-    `network` is whether there is one in the run; a recorded motion `beside` it is shown too, bodies to look through."""
+    """One recording of one scene, to write to a file or to stream to a viewer. Its first view shows the whole scene
+    and, if the motion is known already, all of the motion; then only plots that have something to show are made.
+    `network`: whether the run uses one. A recorded motion `beside` it is shown with translucent bodies."""
 
     def __init__(
         self, scene: Scene, motion: Rollout | None = None, *, network: bool = True, beside: Beside | None = None
@@ -108,7 +110,7 @@ class Playback:
 
     def blueprint(self) -> rrb.Blueprint:
         """The layout: the scene on the left, plots of the counters on the right. Nodes, contact points, forces and the
-        marks of bodies that stand still are hidden until somebody switches them on."""
+        marks of bodies at rest are hidden until a user switches them on."""
         import rerun.blueprint as rrb
 
         hidden = [CONTACTS, FORCES, STILL, *(f"{path}/nodes" for _, path in self._alone)]
@@ -132,7 +134,7 @@ class Playback:
         )
 
     def log_static(self) -> None:
-        """Everything that does not change: meshes, surface nodes, and the names of the plots."""
+        """Log everything that does not change: meshes, surface nodes, and the names of the plots."""
         rr, scene = self._rr, self._scene
         self.stream.send_blueprint(self.blueprint())
         self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -152,7 +154,7 @@ class Playback:
             if len(shape.nodes):
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
                 self.stream.log(f"{path}/nodes", nodes, static=True)
-            if body.motion == "static":  # it has one pose for good
+            if body.motion == "static":  # its pose never changes
                 centre = body.position + _turned(com, body.quat_xyzw)
                 pose = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
                 self.stream.log(path, pose, static=True)
@@ -179,8 +181,8 @@ class Playback:
             self.stream.log(f"plots/{key}", rr.SeriesLines(names=name), static=True)
 
     def log_steps(self, chunk: Rollout) -> None:
-        """Poses, contact points, forces, who stands still, and counters of the frames of `chunk`, which follow the
-        frames logged before."""
+        """Log poses, contact points, forces, marks of bodies at rest, and counters of the frames of `chunk`, which
+        follow the frames logged before."""
         rr, frames = self._rr, len(chunk.time)
         steps = np.arange(self._step, self._step + frames)
         self._step += frames
@@ -214,9 +216,10 @@ class Playback:
                 self.stream.send_columns(f"plots/{key}", times, rr.Scalars.columns(scalars=values))
 
     def _log_forces(self, chunk: Rollout, times: list[Any]) -> None:
-        """At the centres of bodies, what others have pushed them with since the frame before: mass times change of
-        velocity, less gravity. An arrow as long as its body is the body's weight, or where there is no gravity that of
-        the Earth; at most `LONGEST` of it. And a point on each body that has not moved at all since then."""
+        """Log the mean force on each body from others since the frame before (mass times change of velocity, minus
+        gravity), as an arrow at the body's centre. An arrow as long as its body is the body's weight (on Earth, in a
+        scene without gravity); arrows are at most `LONGEST` bodies long. Also log a point on each body that has not
+        moved since then."""
         rr, rows = self._rr, self._movers
         ahead = self._before
         parts = [chunk] if ahead is None else [ahead, chunk]
@@ -233,7 +236,7 @@ class Playback:
         moved = (np.diff(place, axis=0) != 0).any(-1) | (np.diff(turn, axis=0) != 0).any(-1)
         still = ~(moved | (speed[1:] != 0).any(-1) | (spin[1:] != 0).any(-1))
         pushed = length[..., 0] > (LEAST if len(rows) <= TOLD else MANY_LEAST)
-        first = np.zeros((len(chunk.time) - len(change), len(rows)), bool)  # of the very first frame nothing is known
+        first = np.zeros((len(chunk.time) - len(change), len(rows)), bool)  # for the very first frame nothing is known
         pushed, still = np.concatenate([first, pushed]), np.concatenate([first, still])
         at = place[len(place) - len(chunk.time) :]
         arrows = np.concatenate([np.zeros((len(first), len(rows), 3)), arrows])
@@ -243,15 +246,15 @@ class Playback:
 
 
 class Crowd(NamedTuple):
-    """Bodies drawn as copies of one mesh, whose poses at a step are one row."""
+    """Bodies that are drawn as copies of one mesh; their poses at a step are one row."""
 
     path: str  # entity path
     shape: int  # index into `Scene.shapes`
-    bodies: np.ndarray  # [C] int64, which
+    bodies: np.ndarray  # [C] int64, indices of the bodies
 
 
 def _crowds(scene: Scene) -> list[Crowd]:
-    """The crowds of a scene; bodies in none of them are drawn one by one, and so are those whose joints are shown."""
+    """The crowds of a scene. Other bodies are drawn one by one, and so are those whose joints are shown."""
     import rerun as rr
 
     found = []
@@ -266,10 +269,10 @@ def _crowds(scene: Scene) -> list[Crowd]:
 
 
 def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Beside | None = None) -> None:
-    """Write `rollout` as a rerun recording, with a recorded motion `beside` it. Raises SdfsimError if the file
-    cannot be written."""
+    """Write `rollout` as a rerun recording, with a recorded motion `beside` it. Raises SdfsimError if the file cannot
+    be written."""
     playback = Playback(scene, rollout, beside=beside)
-    encoded = playback.stream.binary_stream()  # since rerun's own sink only logs a full disk
+    encoded = playback.stream.binary_stream()  # because rerun's own sink only logs an error if the disk is full
     playback.log_static()
     playback.log_steps(rollout)
     write_bytes(path, encoded.read() or b"")
@@ -279,14 +282,14 @@ def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Beside | No
 class PosedPhoto:
     """One camera of a reconstruction."""
 
-    name: str  # what the viewer calls it
+    name: str  # its name in the viewer
     image: Path | None  # photo file, or None to show the camera alone
     focal: float  # px
     principal: tuple[float, float]  # (cx, cy) px
     size: tuple[int, int]  # (width, height) px
     rotation: np.ndarray  # [3, 3] world to camera (x right, y down, z forward)
     translation: np.ndarray  # [3] m, world to camera
-    color: tuple[int, int, int] | None = None  # RGB of its frame, or None for the viewer's own
+    color: tuple[int, int, int] | None = None  # RGB of its frame, or None for the viewer's default
 
 
 def save_reconstruction(
@@ -294,10 +297,10 @@ def save_reconstruction(
     skins: Mapping[str, Mesh] = MappingProxyType({}), trust: Mapping[str, Mesh] = MappingProxyType({}),
 ) -> None:  # fmt: skip
     """Write cameras with their photos, sparse points [P, 3] m with colours [P, 3] uint8, and the surface as one rerun
-    recording; raises SdfsimError where it cannot be written.
+    recording. Raises SdfsimError if it cannot be written.
 
-    Parts with textures (`skins`, by name) are shown in place of the mesh. With `trust`, parts in colours that tell how
-    far each place can be trusted, the viewer has a second tab that shows these.
+    Parts with textures (`skins`, by name) are shown in place of the mesh. With `trust` (parts whose colours show how
+    far each place can be trusted) the viewer has a second tab for these.
     """
     import rerun as rr
     import rerun.blueprint as rrb
@@ -306,11 +309,11 @@ def save_reconstruction(
     encoded = stream.binary_stream()
     rotations = [np.asarray(photo.rotation) for photo in photos]
     centres = [-turn.T @ photo.translation for turn, photo in zip(rotations, photos, strict=True)]
-    # Cameras surround what matters; sparse points also lie on whatever is behind it.
+    # Cameras surround the subject; sparse points also lie on things behind it.
     around = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
     low, high = (around.min(0), around.max(0)) if len(around) else (-np.ones(3), np.ones(3))
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
-    # Before there is a surface, z need not be up: photographers mostly hold the camera level.
+    # Before there is a surface, z may not be up: use the cameras, as photographers mostly hold them level.
     up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
     hidden = {"reconstruction": "trust"} | ({"trust": "surface"} if trust else {})
     tabs = [
@@ -351,10 +354,10 @@ def save_reconstruction(
 
 @dataclass(frozen=True)
 class Eye:
-    """From where a view looks."""
+    """The eye of a view."""
 
     position: np.ndarray  # [3] m
-    target: np.ndarray  # [3] m, the point in the middle
+    target: np.ndarray  # [3] m, the point in the middle of the view
     up: np.ndarray  # [3] unit vector
 
 
@@ -365,7 +368,7 @@ def _controls(eye: Eye) -> rrb.EyeControls3D:
 
 
 def eye_around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
-    """An eye from which a ball is in sight."""
+    """An eye that has a ball in sight."""
     length = np.linalg.norm(up)
     up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
     side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
@@ -375,29 +378,29 @@ def eye_around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
 
 
 def body_colors(scene: Scene) -> list[tuple[int, ...]]:
-    """An RGB colour (0 to 255) for every body: grey where it stays put, else one of `HUES`, in turn."""
+    """An RGB colour (0 to 255) for every body: grey if it never moves, else one of `HUES`, in turn."""
     hues = map(_color, cycle(range(HUES)))
     return [STATIC_COLOR if body.motion == "static" else next(hues) for body in scene.bodies]
 
 
 def _color(number: int) -> tuple[int, ...]:
-    """RGB (0 to 255), the hues of one number and the next a golden angle apart."""
+    """RGB (0 to 255); the hues of consecutive numbers are a golden angle apart."""
     rgb = colorsys.hsv_to_rgb((0.58 + number * 0.61803398875) % 1.0, 0.62, 0.9 if number % 2 == 0 else 0.75)
     return tuple(round(255 * c) for c in rgb)
 
 
 def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
-    """Centre [3] m and radius m of a ball about `extent`."""
+    """Centre [3] m and radius m of a ball around `extent`."""
     low, high = extent(scene, motion)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
 def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
-    """[2, 3] m: the lowest and highest coordinates of what the first view has to show.
+    """[2, 3] m: the lowest and highest coordinates that the first view must show.
 
-    The bodies at the start, planes left out, and the places on planes that they are over, as what is held up by
-    nothing falls there; and, where the motion is known, their way. What flies farther than `FARTHEST` times the size
-    of all this is followed so far only.
+    These are the bodies at the start, except planes; the points on planes below them, as free bodies fall there; and,
+    if the motion is known, the bodies' paths. A body that flies farther than `FARTHEST` times the size of all this is
+    followed only up to there.
     """
     boxes: dict[int, np.ndarray] = {}
     planes = []
@@ -425,14 +428,14 @@ def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
 
 
 def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
-    """Vectors [..., 3] turned by a unit quaternion [4]."""
-    axis, real = quat_xyzw[:3], quat_xyzw[3]  # by hand, because scipy's Rotation takes a fifth of a second to load
+    """Vectors [..., 3] rotated by a unit quaternion [4]."""
+    axis, real = quat_xyzw[:3], quat_xyzw[3]  # written out, because scipy's Rotation takes a fifth of a second to load
     across = 2.0 * np.cross(axis, vectors)
     return vectors + real * across + np.cross(axis, across)
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
-    """With its own texture or colours, or `color` where it has neither."""
+    """The mesh with its own texture or colours, or with `color` if it has neither."""
     from PIL import Image
 
     mesh, normals = with_normals(mesh)
@@ -448,7 +451,7 @@ def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
 
 
 def _reduced(image: Image.Image, longest: int) -> np.ndarray:
-    """Pixels [H, W, 3] small enough for a recording, which holds every one of them."""
+    """Pixels [H, W, 3], reduced for a recording, which stores every image."""
     image = image.convert("RGB")
     image.thumbnail((longest, longest))
     return np.asarray(image)
@@ -459,10 +462,10 @@ def is_infinite(shape: Shape) -> bool:
 
 
 def shown(scene: Scene, row: int, half: float) -> Mesh:
-    """The mesh that is shown of a body at scale 1; of a plane a square, `half` m to each side.
+    """The mesh that is shown for a body, at scale 1; for a plane a square, `half` m to each side.
 
-    A plane is shown where it collides, but lower where other scenery lies in it, as a floor that photos show lies in
-    the one that ends nowhere: the two would flicker through each other.
+    A plane is shown where it collides, but lower where other scenery lies in it, such as a photographed floor in an
+    infinite one: the two would flicker.
     """
     body = scene.bodies[row]
     shape = scene.shapes[body.shape]
@@ -478,7 +481,7 @@ def shown(scene: Scene, row: int, half: float) -> Mesh:
             mesh = Mesh(_turned(places - body.position, back), of.shown.faces)
             flat = mesh.faces[(np.abs(mesh.vertices[mesh.faces, 2]) < most).all(1)]
             found += [mesh.vertices[np.abs(mesh.vertices[:, 2]) < most]]
-            if len(flat):  # the insides of large faces, too
+            if len(flat):  # also the insides of large faces
                 found += [sample_surface(Mesh(mesh.vertices, flat), _FLOOR_POINTS, np.random.default_rng(0))[0]]
     near = np.concatenate(found)
     if not len(near):
@@ -487,9 +490,9 @@ def shown(scene: Scene, row: int, half: float) -> Mesh:
     low, high = near[:, :2].min(0), near[:, :2].max(0)
     cell = max(float((high - low).max()) / _FLOOR_CELLS, most)
     count = np.ceil((high - low) / cell).astype(int) + 1
-    covered = np.zeros(count + 2, dtype=bool)  # with a border around them
+    covered = np.zeros(count + 2, dtype=bool)  # with a border
     covered[tuple(((near[:, :2] - low) / cell).astype(int).T + 1)] = True
-    beside = np.pad(covered, 1)  # and the cells around them, so that no gap is seen
+    beside = np.pad(covered, 1)  # and the cells around them, so that no gap is visible
     beside = np.any([np.roll(beside, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)[1:-1, 1:-1]
     x, y = (
         np.clip(np.r_[-half, start + cell * np.arange(-1, n + 2), half], -half, half)
@@ -507,9 +510,9 @@ def shown(scene: Scene, row: int, half: float) -> Mesh:
 
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
-    """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    """The mesh with smooth normals [V, 3]; vertices are split along creases, so that boxes keep their edges."""
     welded, label = mesh, np.arange(len(mesh.vertices))
-    if mesh.uv is not None:  # its vertices are doubled where its texture is cut, and that is no crease
+    if mesh.uv is not None:  # its vertices are doubled where the texture is cut, which is not a crease
         _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
         label = label.reshape(-1)
         welded = Mesh(mesh.vertices[first], label[mesh.faces])
@@ -517,7 +520,7 @@ def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     if normals is None:
         return mesh, vertex_normals(welded)[label]
     corners = mesh.faces.reshape(-1)
-    if mesh.uv is not None:  # no more vertices than creases ask for
+    if mesh.uv is not None:  # only as many vertices as creases need
         rows = np.column_stack([corners, np.round(normals, 4)])
         _, kept, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         kept, faces = corners[kept], place.reshape(-1, 3)
@@ -529,8 +532,8 @@ def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
 
 
 def _corner_normals(mesh: Mesh) -> np.ndarray | None:
-    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle. None for
-    a mesh so fine that it may pass as smooth."""
+    """[3 F, 3] for every face corner the mean normal of the faces at its vertex that differ by less than the crease
+    angle. None for a mesh that is fine enough to count as smooth."""
     owner = mesh.faces.reshape(-1)
     order = np.argsort(owner, kind="stable")
     valence = np.bincount(owner, minlength=len(mesh.vertices))
@@ -552,10 +555,10 @@ def _corner_normals(mesh: Mesh) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class Mark:
-    """What is drawn of a joint in one of its bodies."""
+    """The drawing of a joint in one of its bodies."""
 
     body: int  # -1: the world
-    strips: list[np.ndarray]  # [P, 3] m, from the body's centre of mass in its axes; in the world as they are
+    strips: list[np.ndarray]  # [P, 3] m, about the body's centre of mass in body axes; for the world, world coordinates
     color: tuple[int, int, int]
 
 
@@ -564,9 +567,9 @@ def shown_joints(scene: Scene) -> tuple[Joint, ...]:
 
 
 def marks(scene: Scene, joint: Joint) -> list[Mark]:
-    """The axis in the second body, beside the limits: of a hinge an arc, along which a needle in the first body goes;
-    of a slider the way of its point; of a ball the rim of its cone. A fixed joint, and the ends of a distance, are a
-    small cross each."""
+    """The axis, in the second body, and the limits: for a hinge an arc, along which a needle in the first body moves;
+    for a slider the path of its point; for a ball the rim of its cone. Fixed joints, and the ends of distances, are
+    small crosses."""
     smaller = min(_extent(scene, k) for k in joint.bodies)
     size = SIZE * smaller if np.isfinite(smaller) else UNKNOWN
     axis, limits, needle = [], [], []
@@ -596,8 +599,8 @@ def marks(scene: Scene, joint: Joint) -> list[Mark]:
 
 
 def ends(joints: Sequence[Joint], place: np.ndarray, turn: np.ndarray, scene: Scene) -> np.ndarray:
-    """[T, J, 2, 3] m: the ends of distances, of bodies whose centres of mass are at `place` [T, N, 3] with the
-    orientations `turn` [T, N, 4]."""
+    """[T, J, 2, 3] m: the ends of distances, for bodies with centres of mass `place` [T, N, 3] and orientations `turn`
+    [T, N, 4]."""
     found = np.zeros((len(place), len(joints), 2, 3))
     for j, joint in enumerate(joints):
         for side, k in enumerate(joint.bodies):
@@ -612,7 +615,7 @@ def _mark_of(scene: Scene, joint: Joint, side: int, strips: list[np.ndarray], co
 
 
 def _from_com(scene: Scene, joint: Joint, side: int) -> np.ndarray:
-    """[3] m, the joint's end from the centre of mass of the body, in its axes."""
+    """[3] m, the joint's end relative to the body's centre of mass, in body axes."""
     k = joint.bodies[side]
     if k < 0:
         return joint.anchor[side]
@@ -620,7 +623,7 @@ def _from_com(scene: Scene, joint: Joint, side: int) -> np.ndarray:
 
 
 def _extent(scene: Scene, k: int) -> float:
-    """m, of a body; infinite of the world and of planes."""
+    """Extent of a body, m; infinite for the world and for planes."""
     if k < 0:
         return np.inf
     box = np.ptp(scene.shapes[scene.bodies[k].shape].sdf.bounds, axis=0).max() * scene.bodies[k].scale

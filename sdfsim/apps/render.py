@@ -1,4 +1,4 @@
-"""A run as a movie or a picture without a screen or a graphics driver: rays are cast on the processor."""
+"""A run as a movie or a picture, without a screen or a graphics driver: rays are cast on the CPU."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ if TYPE_CHECKING:
     from sdfsim.scene.builder import SceneBuilder
 
 Place = Sequence[float] | np.ndarray
-_Model = tuple[Mesh, np.ndarray]  # what is drawn of a body about its centre of mass, with normals [V, 3]
+_Model = tuple[Mesh, np.ndarray]  # the mesh of a body about its centre of mass, with normals [V, 3]
 SIZE = (960, 540)  # px, width and height
-FRAMES = 30  # a second
+FRAMES = 30  # per second
 FORMATS = (".mp4", ".png")
 _TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at distance 1
-_MARGIN = 0.95  # of the picture is filled, where the camera is chosen here
-_SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
-_SKY = np.array([236.0, 240.0, 245.0], np.float32)  # what nothing is in front of
-_SHADE = 0.45  # light where the sun does not shine
-_SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
+_MARGIN = 0.95  # part of the picture that is filled if the camera is chosen automatically
+_SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # direction to the sun, in a frame with z up
+_SKY = np.array([236.0, 240.0, 245.0], np.float32)  # colour of the background
+_SHADE = 0.45  # light in the shadow
+_SUB = np.array(
+    [[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]
+)  # px, offsets of the extra samples at edges
 _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
 
 
@@ -44,11 +46,12 @@ def render(
     camera: Place | None = None, look_at: Place | None = None, at: float | None = None, beside: Beside | None = None,
     on_progress: Progress = silent,
 ) -> None:  # fmt: skip
-    """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.
+    """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, at the time `at` s, by default the end) of a
+    run.
 
-    Camera and what it looks at, [3] m each, are as in `eye_of`. A recorded motion `beside` the run is shown too, bodies
-    to look through. Raises SdfsimError for another ending, a time outside
-    of the run, a camera where it looks at, or a file that cannot be written.
+    The camera and the point that it looks at, [3] m each, are as in `eye_of`. A recorded motion `beside` the run is
+    shown with translucent bodies. Raises SdfsimError for another ending, a time outside the run, a camera at the point
+    that it looks at, or a file that cannot be written.
     """
     out, scene = Path(out), loaded(scene)
     check_format(out)
@@ -79,8 +82,8 @@ def render(
 def eye_of(
     scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
 ) -> Eye:
-    """The camera of a scene. Where its position or target, [3] m each, is not given, one is chosen that has the whole
-    scene in sight. Raises SdfsimError if the two are one point, or not finite."""
+    """The camera of a scene. If its position or target, [3] m each, is not given, one is chosen that shows the whole
+    scene. Raises SdfsimError if the two are the same point, or not finite."""
     centre, radius = framed(scene, motion)
     eye = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
     if camera is None:
@@ -90,7 +93,7 @@ def eye_of(
     sight = eye.target - eye.position
     if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
         raise SdfsimError("--camera and --look-at: must be two different points")
-    # Straight down, the direction up is undefined.
+    # Looking straight down, the direction up is undefined.
     if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):
         aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
         eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
@@ -98,7 +101,7 @@ def eye_of(
 
 
 def _far_enough(eye: Eye, points: np.ndarray) -> Eye:
-    """The eye at the least distance from its target, along its line of sight, from which it sees all points [P, 3]."""
+    """The eye, moved along its line of sight to the least distance from which it sees all points [P, 3]."""
     axes = _axes(eye)
     right, down, ahead = axes @ (points - eye.target).T
     aside = np.maximum(np.abs(right) * SIZE[1] / SIZE[0], np.abs(down))
@@ -107,7 +110,7 @@ def _far_enough(eye: Eye, points: np.ndarray) -> Eye:
 
 
 def _axes(eye: Eye) -> np.ndarray:
-    """[3, 3]: unit vectors right and down in the picture, and into it."""
+    """[3, 3]: unit vectors to the right, down, and into the picture."""
     forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
     right = np.cross(forward, eye.up)
     right /= np.linalg.norm(right)
@@ -115,7 +118,7 @@ def _axes(eye: Eye) -> np.ndarray:
 
 
 def check_format(out: Path) -> None:
-    """Raises SdfsimError if the ending of a file says neither movie nor picture."""
+    """Raises SdfsimError if the ending of a file is neither that of a movie nor of a picture."""
     if out.suffix not in FORMATS:
         raise SdfsimError(f"{out}: must end with {' or '.join(FORMATS)}")
 
@@ -133,8 +136,8 @@ def write_movie(out: Path, pictures: Iterator[np.ndarray]) -> None:
 
 
 class _Cast:
-    """The triangles of all bodies, each a mesh about its centre of mass with normals [V, 3], at places [N, 3] m and
-    turns [N, 3, 3]; `body` [F] is which one a face is of."""
+    """The triangles of all bodies, each a mesh about its centre of mass with normals [V, 3], at places [N, 3] m with
+    rotations `turns` [N, 3, 3]; `body` [F] is the body of each face."""
 
     def __init__(self, models: list[_Model], places: np.ndarray, turns: np.ndarray) -> None:
         self._meshes = [mesh for mesh, _ in models]
@@ -148,7 +151,7 @@ class _Cast:
         self.caster = Caster(Mesh(vertices, self._faces))
 
     def surface(self, face: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normals [R, 3] and colours [R, 3] at places of faces."""
+        """Normals [R, 3] and colours [R, 3] at points on faces."""
         share = np.stack([1.0 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], -1)
         corners = self._faces[face]
         normal, color = (np.einsum("rk,rkc->rc", share, of[corners]) for of in (self._normals, self._colors))
@@ -164,9 +167,9 @@ class _Cast:
 
 
 class Studio:
-    """A scene with a camera and a sun, of which pictures are taken; `radius` m is that of all that is shown, `beside` a
-    recorded motion that is shown too. `axes` [3, 3] are unit vectors right and down in the picture, and into it; `sun`
-    [3] is one towards the sun."""
+    """A scene with a camera and a sun, for taking pictures. `radius` m is the radius of everything shown, `beside` a
+    recorded motion that is shown too. `axes` [3, 3] are unit vectors to the right, down, and into the picture; `sun`
+    [3] points to the sun."""
 
     def __init__(self, scene: Scene, eye: Eye, radius: float, beside: Beside | None = None) -> None:
         self._eye, self._radius, self._beside = eye, radius, beside
@@ -188,7 +191,7 @@ class Studio:
         self._through = self._rays(_GRID)
 
     def picture_at(self, rollout: Rollout, time: float) -> np.ndarray:
-        """[H, W, 3] uint8 of a moment of a run, and of what was recorded then."""
+        """[H, W, 3] uint8 for a moment of a run, with the recorded motion at that time."""
         place, turn = (p[0] for p in between(rollout.time, rollout.position, rollout.orientation, np.array([time])))
         if self._beside is None:
             return self.picture(place, turn)
@@ -197,7 +200,7 @@ class Studio:
         return self.picture(place, turn, _Cast(self._ghosts, place_beside[0], matrix))
 
     def picture(self, position: np.ndarray, orientation: np.ndarray, ghosts: _Cast | None = None) -> np.ndarray:
-        """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4], and of `ghosts`."""
+        """[H, W, 3] uint8 for bodies with these centres of mass [N, 3] m and orientations [N, 4], and `ghosts`."""
         cast = _Cast(self._models, position, Rotation.from_quat(orientation).as_matrix())
         wide, tall = SIZE
         pixels, label = self._look(cast, ghosts, self._through)
@@ -213,14 +216,14 @@ class Studio:
         return np.clip(pixels + 0.5, 0, 255).astype(np.uint8)
 
     def _rays(self, at: np.ndarray) -> np.ndarray:
-        """[R, 6] float32 origins and unit directions through places [R, 2] px of the picture."""
+        """[R, 6] float32 origins and unit directions through points [R, 2] px of the picture."""
         flat = (at - np.array(SIZE) / 2) / (SIZE[1] / 2) * _TALL
         direction = np.concatenate([flat, np.ones((len(at), 1))], 1) @ self.axes
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
 
     def _look(self, cast: _Cast, ghosts: _Cast | None, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ."""
+        """Colours [R, 3] along rays [R, 6], and numbers [R] that differ between bodies, and between light and shade."""
         far, face, uv = cast.caster.cast(rays)
         away, there = far, np.flatnonzero(np.isfinite(far))
         away, face, direction = away[there, None], face[there], rays[there, 3:]
@@ -228,7 +231,7 @@ class Studio:
         normal, color = cast.surface(face, uv[there])
         facing = np.where(np.einsum("rc,rc->r", normal, direction)[:, None] > 0.0, -normal, normal)
         point, toward = rays[there, :3] + away * direction, facing @ self.sun.astype(np.float32)
-        # Infinite planes are checked, so that motion over them is seen.
+        # Infinite planes get a checkerboard, so that motion over them is visible.
         floor = np.flatnonzero(self._floors[body])
         square = np.floor(point[floor] / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4).sum(1)
         color[floor[square % 2 != 0]] *= 0.93
@@ -236,13 +239,13 @@ class Studio:
         to_sun = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1, dtype=np.float32)
         dark = (toward <= 0.0) | cast.caster.anything(to_sun)
         light = _SHADE + 0.1 * (facing @ self._eye.up.astype(np.float32)) + np.where(dark, 0.0, (1.0 - _SHADE) * toward)
-        # Far away the floor fades into the sky.
+        # Far away the floor fades into the background.
         clear = 2.0 * (self._radius + float(np.linalg.norm(self._eye.target - self._eye.position)))
         fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
         pixels, label = np.tile(_SKY, (len(rays), 1)), np.full(len(rays), -1)
         pixels[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
         label[there] = 2 * body + dark
-        if ghosts is not None:  # they take light and throw no shadow
+        if ghosts is not None:  # they are lit, but cast no shadow
             away, face, uv = ghosts.caster.cast(rays)
             front = np.flatnonzero(away < far - 1e-4 * self._radius)
             normal, color = ghosts.surface(face[front], uv[front])

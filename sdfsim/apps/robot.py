@@ -1,5 +1,5 @@
-"""Links and joints, as files of robots have them -> a scene: its scene.yaml, and a Shape folder for each link that is
-more than one primitive. `urdf` and `mjcf` read the files."""
+"""From the links and joints of robot files to a scene: its scene.yaml, and a Shape folder for each link that is more
+than one primitive. `urdf` and `mjcf` read the files."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,14 +19,14 @@ from sdfsim.shape.make import analytic_shape, fit_pieces, mesh_shape
 from sdfsim.shape.shape import Shape
 
 FLOOR = "floor"
-SMALL_PART = 0.02  # of a link's mass, that a ball between two of its joints has
-EVEN = 1e-5  # relative, by which mass may be off from what is spread evenly, to be written as such
-CONVEX = 1e-3  # relative, by which a convex mesh may have less volume than its hull
-OVERLAP = 2e-3  # of the smaller size: links that are deeper in each other at the start do not touch
-SWATCH = 16  # pixels of a colour in the texture of what is shown
-MOST_NAMED = 6  # in a line of the report
+SMALL_PART = 0.02  # relative to a link's mass: mass of a ball between two of its joints
+EVEN = 1e-5  # relative: largest deviation from evenly spread mass at which it is written as such
+CONVEX = 1e-3  # relative: how much less volume than its hull a convex mesh may have
+OVERLAP = 2e-3  # relative to the smaller size: links that overlap deeper at the start do not touch each other
+SWATCH = 16  # pixels of a colour's patch in the texture of a shown mesh
+MOST_NAMED = 6  # names in a line of the report
 GREY = (180, 180, 185)
-UNBOUNDED = 1e6  # N m or N, of a motor that the file gives no bound
+UNBOUNDED = 1e6  # N m or N, for a motor without a limit in the file
 
 PartKind = Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh"]
 
@@ -49,8 +49,8 @@ class Link:
 
     name: str
     pose: np.ndarray  # [4, 4] in the world
-    solid: tuple[Part, ...] = ()  # what touches others
-    shown: tuple[Part, ...] = ()  # what is seen; without any, the solid
+    solid: tuple[Part, ...] = ()  # parts that touch others
+    shown: tuple[Part, ...] = ()  # parts that are shown; if empty, the solid
     mass: float = 0.0  # kg
     com: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3] m, in the link
     # [3, 3] kg m^2 about the centre of mass, axes of the link; None: the mass is spread evenly in its parts
@@ -69,8 +69,7 @@ class Link:
 
 @dataclass(frozen=True)
 class LinkJoint:
-    """A joint: how the link `child` is held by the link `parent` (-1: by the world), in the world as all is at the
-    start."""
+    """A joint by which the link `parent` (-1: the world) holds the link `child`, in world coordinates at the start."""
 
     name: str
     kind: Literal["hinge", "slider", "ball", "fixed", "distance"]
@@ -79,9 +78,9 @@ class LinkJoint:
     anchor: np.ndarray | None = None  # [3] m
     axis: np.ndarray | None = None  # [3]
     start: float = 0.0  # rad or m
-    limits: tuple[float, float] | None = None  # rad or m; of a ball the cone, of a distance a rope
-    spring: tuple[float, float] | None = None  # stiffness, and where it is at rest
-    motor: dict[str, float] | None = None  # speed or position (rad or m) or neither, most, time
+    limits: tuple[float, float] | None = None  # rad or m; for a ball the cone, for a distance a rope
+    spring: tuple[float, float] | None = None  # stiffness, and rest position
+    motor: dict[str, float] | None = None  # speed or position (rad or m) or neither; most; time
     others: dict[str, Any] = field(default_factory=dict)  # further keys of scene.yaml
     loop: bool = False  # closes a loop: its links may touch
 
@@ -92,9 +91,9 @@ class Robot:
     links: tuple[Link, ...]
     joints: tuple[LinkJoint, ...]
     gravity: np.ndarray | None = None  # [3] m/s^2
-    # pairs of links, the lower number first, that never touch; None: those that overlap at the start
+    # pairs of links that never touch, the lower number first; None: those that overlap at the start
     apart: frozenset[tuple[int, int]] | None = None
-    left_out: tuple[str, ...] = ()  # what is not carried over, one line each
+    left_out: tuple[str, ...] = ()  # what is left out, one line each
     notes: tuple[str, ...] = ()  # what was made otherwise, one line each
 
 
@@ -114,7 +113,7 @@ def pose_of(place: Any = (0.0, 0.0, 0.0), turn: Rotation | None = None) -> np.nd
 
 
 def moved(mesh: Mesh, pose: np.ndarray) -> Mesh:
-    """A mesh in the frame in which its own has the `pose`."""
+    """A mesh, transformed by `pose`."""
     return replace(mesh, vertices=mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
 
 
@@ -124,10 +123,11 @@ def moved(mesh: Mesh, pose: np.ndarray) -> Mesh:
 def write_scene(
     robot: Robot, out: Path, *, floor: bool = False, on_progress: Progress = silent
 ) -> tuple[list[Path], list[str]]:
-    """Write a scene.yaml, and Shape folders in `NAME_shapes/` beside it: the files and folders, and notes on what was
-    made otherwise, one line each. With a `floor`, a plane at z = 0, all is raised or lowered to stand on it.
+    """Write a scene.yaml, and Shape folders in `NAME_shapes/` beside it. Returns the files and folders, and notes on
+    what was changed, one line each. With `floor`, a plane at z = 0 is added, and everything is raised or lowered to
+    stand on it.
 
-    Raises SdfsimError for a link that cannot be a body, or if files cannot be written.
+    Raises SdfsimError if a link cannot be a body, or if files cannot be written.
     """
     whole, notes = _apart(_merged(robot, {WORLD, FLOOR} if floor else {WORLD}))
     folder = out.with_name(f"{out.stem}_shapes")
@@ -175,14 +175,14 @@ def write_scene(
 
 
 def _round(values: Any) -> Any:
-    """Numbers of twelve digits."""
+    """Numbers rounded to twelve digits."""
     found = np.vectorize(lambda value: float(f"{value:.12g}") + 0.0)(np.asarray(values, np.float64))
     return found.tolist()
 
 
 def _merged(robot: Robot, taken: set[str]) -> Robot:
-    """Links that can be no bodies of their own go into those that they are fixed to, and what is fixed to what never
-    moves is still itself, without a joint."""
+    """Merge links that cannot be bodies of their own into those to which they are fixed. Links fixed to one that never
+    moves become static themselves, without a joint."""
     links, joints, notes = list(robot.links), list(robot.joints), list(robot.notes)
     into = list(range(len(links)))
     frames: list[str] = []
@@ -196,7 +196,7 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         one, other = home(joint.child), home(joint.parent)
         if links[other].still or (links[one].whole and links[other].whole):
             continue
-        # The one that is a body stays. Where neither is one, that nearer to the root does.
+        # The one that can be a body stays; if neither can, the one nearer to the root.
         keep, gone = (one, other) if links[one].whole else (other, one)
         if links[gone].solid or links[gone].shown or links[gone].mass:
             notes.append(f"link {links[gone].name} is part of {links[keep].name}, to which it is fixed")
@@ -211,12 +211,12 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         if into[k] == k and not link.still and not link.mass and k not in held:
             links[k] = replace(link, still=True)
             if link.solid or link.shown:
-                notes.append(f"link {link.name} has no mass and is held by none: it stands still")
+                notes.append(f"link {link.name} has no mass and no joint holds it: it stands still")
     while bound := [j for j in joints if j.kind == "fixed" and not j.loop and (j.parent < 0 or links[j.parent].still)]:
         for joint in bound:
             links[joint.child] = replace(links[joint.child], still=True)
         joints = [joint for joint in joints if joint not in bound]
-    # What never moves and is not seen is the world.
+    # A link that never moves and is not shown is the world.
     gone = {k for k, link in enumerate(links) if into[k] != k or (link.still and not (link.solid or link.shown))}
     frames += [links[k].name for k in sorted(gone) if into[k] == k and links[k].name != WORLD]
     kept = [k for k in range(len(links)) if k not in gone]
@@ -227,7 +227,7 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         if not links[joint.child].still
     ]
     if frames:
-        notes.append(named("links without mass and shape are no bodies", frames))
+        notes.append(named("links without mass and shape are left out", frames))
     apart = robot.apart
     if apart is not None:
         pairs = {tuple(sorted((number.get(home(a), -1), number.get(home(b), -1)))) for a, b in apart}
@@ -242,7 +242,7 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
 
 
 def _renamed(links: list[Link], taken: set[str]) -> Iterator[Link]:
-    """Links with names that are not taken, nor those of others."""
+    """Links, renamed if their names are taken or occur twice."""
     names = {link.name for link in links} | taken
     for link in links:
         name = link.name
@@ -278,12 +278,12 @@ def _with(keep: Link, gone: Link) -> Link:
 
 
 def _shifted(inertia: np.ndarray, mass: float, away: np.ndarray) -> np.ndarray:
-    """An inertia about a point that is `away` [3] m from the centre of mass."""
+    """An inertia, moved to a point that is `away` [3] m from the centre of mass."""
     return inertia + mass * (away @ away * np.eye(3) - np.outer(away, away))
 
 
 def _apart(robot: Robot) -> tuple[Robot, list[str]]:
-    """Links that are held by several joints get small balls between these, which hold a little of their mass."""
+    """Insert small balls with a little of the mass between the joints of links that have several."""
     links, joints, notes = list(robot.links), [], list(robot.notes)
     chains: dict[tuple[int, int], list[LinkJoint]] = {}
     for joint in robot.joints:
@@ -319,7 +319,7 @@ def _apart(robot: Robot) -> tuple[Robot, list[str]]:
 
 
 def _spread(link: Link) -> np.ndarray:
-    """[3, 3] kg m^2, an inertia that a link has about; of no known one, that of a ball of its size."""
+    """[3, 3] kg m^2, the approximate inertia of a link; if unknown, that of a ball of its size."""
     if link.inertia is not None:
         return link.inertia
     parts = [_mesh(part).vertices for part in (link.solid or link.shown) if part.kind != "plane"]
@@ -337,20 +337,22 @@ def _primitive(part: Part, name: str) -> Shape:
 
 
 def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], np.ndarray, dict[str, Any]]:
-    """The shape of a link, its keys in scene.yaml, its frame [4, 4] in the link, and the keys of its mass."""
+    """The shape of a link, the shape's keys in scene.yaml, its frame [4, 4] in the link, and the keys of its mass."""
     parts = list(link.solid or link.shown)
     flat = [part for part in parts if part.kind == "plane"]
     if flat and (not link.still or len(parts) > 1):
         what = "moves" if not link.still else "has other parts"
-        raise SdfsimError(f"{flat[0].where}: a plane goes with links of its own that never move ({link.name} {what})")
+        raise SdfsimError(
+            f"{flat[0].where}: only a static link without other parts can have a plane ({link.name} {what})"
+        )
     if flat:
         return None, {"plane": {}}, flat[0].pose, {}
     if not parts:
         if not link.mass > 0:
-            told = "has neither a mass nor a shape, and a joint that moves"
+            told = "has neither mass nor shape, but a movable joint"
             raise SdfsimError(f"{link.where}: link {link.name} {told}", "give it an inertial with a mass, or fix it")
         radius = np.sqrt(2.5 * np.trace(_spread(link)) / 3.0 / link.mass)
-        notes.append(f"link {link.name} has no shape: a ball of {radius:.3g} m that touches nothing stands for it")
+        notes.append(f"link {link.name} has no shape: a ball of {radius:.3g} m that touches nothing replaces it")
         parts = [Part("sphere", pose_of(link.com), {"radius": radius})]
     density = 1000.0
     if len(parts) == 1 and parts[0].mesh is None:
@@ -387,11 +389,11 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
 
 
 def _possible(link: Link, tensor: np.ndarray, even: np.ndarray, notes: list[str]) -> np.ndarray:
-    """An inertia that a body can have, or else that of its mass spread evenly."""
+    """The given inertia if a body can have it, else that of the mass spread evenly."""
     principal = np.linalg.eigvalsh(tensor)
     if principal[0] <= 1e-9 * principal[2]:
         told = f"moments of {', '.join(f'{value:.3g}' for value in principal)} kg m^2 are not all above zero"
-        notes.append(f"link {link.name}: its inertia is not possible ({told}): its mass is spread evenly instead")
+        notes.append(f"link {link.name}: its inertia is impossible ({told}): its mass is spread evenly instead")
         return even
     if principal[2] > (1.0 + 1e-6) * (principal[0] + principal[1]):
         told = f"{principal[2]:.3g} kg m^2 is above the sum of {principal[0]:.3g} and {principal[1]:.3g}"
@@ -400,7 +402,8 @@ def _possible(link: Link, tensor: np.ndarray, even: np.ndarray, notes: list[str]
 
 
 def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
-    """The shape of several parts, or of a mesh, in the link's frame. Where all are convex, bodies meet these."""
+    """The shape of several parts, or of a mesh, in the link's frame. If all parts are convex, they are the pieces that
+    collide."""
     meshes, convex = [], []
     for part in parts:
         mesh = _mesh(part)
@@ -411,7 +414,9 @@ def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
         try:
             hull = convex_hull(mesh.vertices)
         except SdfsimError as error:
-            raise SdfsimError(f"{part.where}: the mesh is flat, so it is no body", "give it a thickness") from error
+            raise SdfsimError(
+                f"{part.where}: the mesh is flat, so it cannot be a body", "give it a thickness"
+            ) from error
         closed = is_closed(mesh)
         if closed and abs(signed_volume(mesh)) >= (1.0 - CONVEX) * signed_volume(hull):
             convex.append(hull)
@@ -421,7 +426,7 @@ def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
     try:
         shape = mesh_shape(joined(meshes), name=link.name, kind="mesh")
     except SdfsimError as error:
-        notes.append(f"link {link.name}: its convex hull stands for it ({error.message})")
+        notes.append(f"link {link.name}: its convex hull replaces it ({error.message})")
         hulls = [convex_hull(mesh.vertices) for mesh in meshes]
         shape = fit_pieces(hulls, name=link.name, kind="grid")
     source = {key: value for key, value in shape.source.items() if key != "notes"}
@@ -429,7 +434,7 @@ def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
 
 
 def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> Shape:
-    """A shape with what is seen of its link, where that is not the solid itself: a mesh whose texture has a patch for
+    """A shape with the shown mesh of its link, if that is not the solid itself: a mesh whose texture has a patch for
     each colour."""
     parts = [part for part in (link.shown if link.solid else ()) if part.kind != "plane"]
     if not parts or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
@@ -447,7 +452,7 @@ def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> Shape:
 
 
 def _same(part: Part) -> tuple:
-    """What parts that are alike have in common."""
+    """A key that is equal for equal parts."""
     mesh = None if part.mesh is None else part.mesh.digest()
     sizes = [(key, np.round(value, 9).tolist()) for key, value in sorted(part.sizes.items())]
     return part.kind, tuple(np.round(part.pose, 9).ravel() + 0.0), str(sizes), mesh
@@ -459,9 +464,9 @@ def _same(part: Part) -> tuple:
 def _avoided(
     robot: Robot, shapes: list[Shape | None], poses: list[np.ndarray], notes: list[str]
 ) -> list[list[str] | None]:
-    """What each link `avoids`; None: nothing, an empty list: all. Jointed bodies do not touch anyway."""
+    """The links that each link `avoids`; None: nothing, an empty list: all. Jointed bodies do not touch anyway."""
     links, count = robot.links, len(robot.links)
-    rigid = list(range(count))  # what moves as one, and all that is still
+    rigid = list(range(count))  # groups of links that move together, and all static ones
     still = [k for k, link in enumerate(links) if link.still]
     for k in still:
         rigid[k] = still[0]
@@ -482,7 +487,7 @@ def _avoided(
     for joint in tree:
         own |= {(joint.child, joint.parent), (joint.parent, joint.child)}
         parent = joint.parent
-        while parent >= 0 and bare[parent] and parent in above:  # what holds a chain of small balls
+        while parent >= 0 and bare[parent] and parent in above:  # skips a chain of small balls
             parent = above[parent]
         if parent >= 0 and links[parent].still:
             denied |= {(joint.child, parent), (parent, joint.child)}
@@ -501,10 +506,12 @@ def _avoided(
                 denied.add((a, b))
                 overlapping.append(f"{links[a].name} and {links[b].name}")
     if overlapping:
-        notes.append(named("links that overlap at the start do not touch each other", overlapping))
+        notes.append(named("links that overlap at the start will not touch each other", overlapping))
     found: list[list[str] | None] = [[] if alone else None for alone in bare]
     for k in (k for k in range(count) if not bare[k]):
-        others = {b if a == k else a for a, b in denied - own if k in (a, b)}  # what a joint holds is kept apart by it
+        others = {
+            b if a == k else a for a, b in denied - own if k in (a, b)
+        }  # the joint already keeps its bodies from touching
         others = sorted(j for j in others if not bare[j])
         if others and "plane" not in {part.kind for part in links[k].solid or links[k].shown}:
             found[k] = [links[j].name for j in others]
@@ -528,7 +535,7 @@ def _overlap(one: Shape | None, pose: np.ndarray, other: Shape | None, place: np
 
 
 def _join(scene: SceneBuilder, joint: LinkJoint, names: list[str], lift: np.ndarray) -> None:
-    """Write a joint; angles are in degrees there."""
+    """Write a joint, with angles in degrees."""
     turns = joint.kind in ("hinge", "ball")
 
     def told(name: str, value: Any) -> dict[str, Any]:

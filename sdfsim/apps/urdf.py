@@ -1,4 +1,4 @@
-"""URDF -> links and joints, as `robot` turns them into a scene."""
+"""From URDF to links and joints, which `robot` turns into a scene."""
 
 import os
 import re
@@ -20,7 +20,7 @@ from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
 from sdfsim.scene.scene import WORLD
 
 MOST_BYTES = 64 * 2**20  # of a file
-OPTIONAL = re.compile(rb"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: a variable of the environment, or else the rest
+OPTIONAL = re.compile(rb"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: an environment variable, or else the rest
 KINDS = {
     "revolute": "hinge",
     "continuous": "hinge",
@@ -39,11 +39,11 @@ _OF_CONTACT = ("lateral_friction", "restitution")
 
 
 def read_urdf(path: Path, *, packages: Sequence[Path] = (), fixed: bool = False) -> Robot:
-    """The robot of a URDF file at its zero pose, or, where limits do not allow that, as near to it as they do. With
-    `fixed`, its root never moves; a root that is called world never does. `packages` are folders in which package://
-    paths are looked for, beside those around the file and of ROS_PACKAGE_PATH.
+    """The robot of a URDF file at its zero pose, or as near to it as joint limits allow. With `fixed`, its root never
+    moves; a root called world never does. `packages` are folders in which package:// paths are searched, besides the
+    folders around the file and those of ROS_PACKAGE_PATH.
 
-    Raises SdfsimError with file, line and element for what is not URDF, is missing, or is no tree.
+    Raises SdfsimError, with file, line and element, for anything that is not URDF, is missing, or is not a tree.
     """
     return _Reader(path, packages).robot(fixed)
 
@@ -80,7 +80,7 @@ class _Reader:
         parser.StartElementHandler, parser.CharacterDataHandler = start, builder.data
         parser.EndElementHandler = lambda tag: builder.end(tag)
         try:
-            # Blanks before the first element and zero bytes after the last are no XML, but common.
+            # Blanks before the first element and zero bytes after the last are not valid XML, but common.
             text = content.lstrip().rstrip(b"\0 \t\r\n")
             self.skipped = content[: len(content) - len(text)].count(b"\n")
             parser.Parse(OPTIONAL.sub(_environment, text), True)
@@ -130,7 +130,7 @@ class _Reader:
         return value
 
     def child(self, element: Element, tag: str) -> Element | None:
-        """The only child of a kind."""
+        """The only child with this tag."""
         found = element.findall(tag)
         if len(found) > 1:
             raise self.wrong(found[1], f"a second one in <{element.tag}>: one is allowed")
@@ -166,7 +166,7 @@ class _Reader:
         seen: dict[str, Element] = {}
         for element in self.root.findall("joint"):
             if element.find("parent") is None and element.find("child") is None and element.get("type") is None:
-                continue  # of a transmission that is not in one
+                continue  # belongs to a transmission, but is written outside one
             name = self.text(element, "name")
             if name in seen:
                 first = self.line[id(seen[name])] + self.skipped
@@ -183,7 +183,7 @@ class _Reader:
                 ends.append(number[link])
             parent, child = ends
             if child in by_child:
-                told = f"link {links[child].name!r} is held by two joints: URDF knows trees only"
+                told = f"link {links[child].name!r} is held by two joints: URDF supports trees only"
                 raise self.wrong(element, told, "close loops in MJCF (equality connect), or in scene.yaml")
             by_child[child] = element, parent
         joints: list[LinkJoint] = []
@@ -193,7 +193,7 @@ class _Reader:
             order += children[k]
         if len(order) < len(links):
             k = next(k for k in range(len(links)) if k not in order)
-            raise self.wrong(by_child[k][0], f"link {links[k].name!r} holds itself: URDF knows trees only")
+            raise self.wrong(by_child[k][0], f"link {links[k].name!r} holds itself: URDF supports trees only")
         for k in order[len(roots) :]:
             element, parent = by_child[k]
             links[k], made = self._joint(element, links, k, parent)
@@ -293,7 +293,7 @@ class _Reader:
         return Part(form.tag, pose, sizes, mesh, self.where(form), color)  # type: ignore[arg-type]
 
     def _mesh(self, element: Element, *, needed: bool) -> Mesh | None:
-        """None where it is only shown and cannot be."""
+        """None if it is only for display and cannot be read."""
         name, scale = self.text(element, "filename"), self.numbers(element, "scale", 3, (1.0, 1.0, 1.0))
         place = self._find(name)
         try:
@@ -309,7 +309,7 @@ class _Reader:
         except SdfsimError as error:
             if needed:
                 raise
-            self.missed.append(f"what is shown at line {self.line[id(element)] + self.skipped}: {error.message}")
+            self.missed.append(f"the visual at line {self.line[id(element)] + self.skipped}: {error.message}")
             return None
         if not np.all(scale):
             raise self.wrong(element, f"scale must not be zero (got {element.get('scale')!r})")
@@ -334,7 +334,7 @@ class _Reader:
             return None
 
     def _joint(self, element: Element, links: list[Link], child: int, parent: int) -> tuple[Link, list[LinkJoint]]:
-        """The child where it is at the start, and what holds it."""
+        """The child with its pose at the start, and the joint that holds it."""
         name, kind = self.text(element, "name"), self.text(element, "type")
         if kind not in KINDS:
             raise self.wrong(element, f"type must be one of {', '.join(KINDS)} (got {kind!r}{nearest(kind, KINDS)})")
@@ -380,12 +380,12 @@ class _Reader:
         return replace(links[child], pose=pose), [LinkJoint(kind=KINDS[kind], **held)]  # type: ignore[arg-type]
 
     def _effort(self, element: Element) -> float:
-        """N m or N, the most that its motor gives; 0 where the file tells none."""
+        """N m or N, the largest effort of its motor; 0 if the file gives none."""
         limit = self.child(element, "limit")
         if limit is None or "effort" not in limit.attrib:
             return 0.0
         effort = limit.get("effort", "").strip().lower().removeprefix("+")
-        # Written by programs that mean: any.
+        # Some programs write this for "unlimited".
         return UNBOUNDED if effort in ("inf", "infinity") else min(self.number(limit, "effort", least=0.0), UNBOUNDED)
 
     def _limits(self, element: Element, name: str, kind: str) -> tuple[float, float] | None:
@@ -398,7 +398,7 @@ class _Reader:
             self.notes.append(f"joint {name} has no <limit>: nothing bounds it")
             return None
         low, high = self.number(limit, "lower", 0.0), self.number(limit, "upper", 0.0)
-        if low > high:  # PyBullet's way to say so
+        if low > high:  # PyBullet's way to say "no limits"
             self.notes.append(f"joint {name} has its lower limit above its upper one: nothing bounds it")
             return None
         return low, high
