@@ -35,9 +35,7 @@ _MARGIN = 0.95  # part of the picture that is filled if the camera is chosen aut
 _SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # direction to the sun, in a frame with z up
 _SKY = np.array([236.0, 240.0, 245.0], np.float32)  # colour of the background
 _SHADE = 0.45  # light in the shadow
-_SUB = np.array(
-    [[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]
-)  # px, offsets of the extra samples at edges
+_SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, extra samples at edges
 _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
 
 

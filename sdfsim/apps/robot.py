@@ -509,9 +509,8 @@ def _avoided(
         notes.append(named("links that overlap at the start will not touch each other", overlapping))
     found: list[list[str] | None] = [[] if alone else None for alone in bare]
     for k in (k for k in range(count) if not bare[k]):
-        others = {
-            b if a == k else a for a, b in denied - own if k in (a, b)
-        }  # the joint already keeps its bodies from touching
+        # Without those that a joint already keeps from touching.
+        others = {b if a == k else a for a, b in denied - own if k in (a, b)}
         others = sorted(j for j in others if not bare[j])
         if others and "plane" not in {part.kind for part in links[k].solid or links[k].shown}:
             found[k] = [links[j].name for j in others]
