@@ -8,14 +8,14 @@ import typer
 from pipeline.commands import distill, fit, joint, measure, mesh, poses, reconstruct
 from sdfsim import commands
 
-YOUNG = 100_000  # so many new objects may exist before Python looks for cycles
+YOUNG = 100_000  # number of new objects after which Python looks for cycles
 
 app = typer.Typer(
     name="sdfsim", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
 )
 
 
-def _tell_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from sdfsim.base.version import __version__
 
@@ -26,7 +26,7 @@ def _tell_version(wanted: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and stop.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
     """Rigid-body simulation over learned signed-distance functions, from photos to commands."""

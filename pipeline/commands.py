@@ -11,7 +11,7 @@ import typer
 from pydantic_core import PydanticUndefined
 
 from pipeline.options import Options, form_of
-from sdfsim.base.arguments import Budget, Cluster, Out, command, tell_failed
+from sdfsim.base.arguments import Budget, Cluster, Out, command, print_failed
 from sdfsim.base.console import Session, duration
 from sdfsim.base.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
 
@@ -210,7 +210,7 @@ def fit(
             sources, out, recipe=options["recipe"] or "default", budget=budget, cap=cap, thicken=thicken, units=units,
             device=device, on_progress=session.progress,
         )  # fmt: skip
-    tell_failed(session, report)
+    print_failed(session, report)
     if any("error" in shape for shape in report.get("shapes", {}).values()):
         session.exit_code = EXIT_ERROR
     session.report(report, fitting.fit_lines(report))
@@ -240,5 +240,5 @@ def _report_stages(session: Session, report: dict, folder: Path) -> None:
         lines.append(f"next: sdfsim simulate {report['paths']['scene']} -o RUN")
     for note in report.get("notes", []):
         session.say(note)
-    tell_failed(session, report)
+    print_failed(session, report)
     session.report(report, lines)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, tell_failed
+from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, print_failed
 from sdfsim.base.console import Session, columns, duration
 from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
@@ -65,7 +65,7 @@ def simulate(
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"usable, not exact: {line}" for line in report["caveats"]),
     ]
-    tell_failed(session, report)
+    print_failed(session, report)
     if "recording" in report:
         lines.append(f"watch it: sdfsim view {out}   (or: rerun {report['recording']})")
     lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
@@ -413,7 +413,7 @@ def stress(
     pyplot()
     found = study.stress(**session.given("model"), models=model or [], on_progress=session.progress)
     report = study.write_report(found, out)
-    tell_failed(session, report)
+    print_failed(session, report)
     table = columns(study.rows(found, {"missed": "!", "behind": "<"}))
     notes = ["! beyond what is wanted, < worse than the teacher", *study.loss_lines(found), f"wrote {out}"]
     session.report(report, [*table, *notes])

@@ -14,7 +14,7 @@ from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 
-FILE = "beside.npz"  # in a run folder
+FILE = "beside.npz"  # its name in a run folder
 COLOR = (245, 140, 20)  # RGB of the recorded bodies
 OPACITY = 0.5
 

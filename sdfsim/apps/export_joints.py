@@ -23,7 +23,7 @@ class Held:
     joint: Joint
     parent: int  # -1: the world
     anchor: np.ndarray  # [3] m, in the child
-    frame: Rotation  # of the joint's axes, in the child
+    frame: Rotation  # the joint's axes, in the child
     parent_anchor: np.ndarray  # [3] m, in the parent
     parent_frame: Rotation
     sense: float  # -1 if it is reversed: its axis then points the other way

@@ -158,7 +158,8 @@ HEADS = {
     "joint_damping": "damping of a joint",
 }  # fmt: skip
 UNITS = {"mass": " kg", "height": " m", "tilt": " degrees"}
-OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}  # of hinges and balls, and others
+# Units for hinges and balls, and for sliders.
+OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}
 
 
 def report_lines(found: Identified) -> list[str]:
@@ -672,7 +673,7 @@ def _estimates(
     undetermined."""
     parameters, width = problem.parameters, problem.width
     data, slope = errors[: -len(values)], slope[: -len(values)] * width
-    weight = (1.0 + data**2) ** -0.5  # of the soft L1 loss
+    weight = (1.0 + data**2) ** -0.5  # weights of the soft L1 loss
     curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(values))
     # Errors within a group are correlated: groups, not single poses, are independent.
     which, group = np.unique(group, return_inverse=True)
@@ -732,7 +733,7 @@ def _profiles(
 ) -> list[Profile]:  # fmt: skip
     """The loss along each parameter. The others are fitted in one step, by the slopes at the best point."""
     found, (low, high), width = [], problem.bounds, problem.width
-    weight = (1.0 + errors**2) ** -0.25  # of the soft L1 loss
+    weight = (1.0 + errors**2) ** -0.25  # weights of the soft L1 loss
     weighted = slope * width * weight[:, None]
 
     def loss(values: np.ndarray) -> float:

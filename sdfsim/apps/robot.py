@@ -94,7 +94,7 @@ class Robot:
     # pairs of links that never touch, the lower number first; None: those that overlap at the start
     apart: frozenset[tuple[int, int]] | None = None
     left_out: tuple[str, ...] = ()  # what is left out, one line each
-    notes: tuple[str, ...] = ()  # what was made otherwise, one line each
+    notes: tuple[str, ...] = ()  # what was changed, one line each
 
 
 def named(what: str, names: Sequence[str]) -> str:
@@ -458,7 +458,7 @@ def _same(part: Part) -> tuple:
     return part.kind, tuple(np.round(part.pose, 9).ravel() + 0.0), str(sizes), mesh
 
 
-# --- who touches whom ---
+# --- which links touch ---
 
 
 def _avoided(

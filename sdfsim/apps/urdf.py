@@ -19,7 +19,7 @@ from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
 from sdfsim.scene.scene import WORLD
 
-MOST_BYTES = 64 * 2**20  # of a file
+MOST_BYTES = 64 * 2**20  # largest size of a file
 OPTIONAL = re.compile(rb"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: an environment variable, or else the rest
 KINDS = {
     "revolute": "hinge",

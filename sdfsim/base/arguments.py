@@ -59,7 +59,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def tell_failed(session: Session, report: dict) -> None:
+def print_failed(session: Session, report: dict) -> None:
     """Print every failed check; with one or more the exit code is 3."""
     for check in report["failed_checks"]:
         session.exit_code = EXIT_QUALITY

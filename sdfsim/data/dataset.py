@@ -29,7 +29,7 @@ FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane 
 LONGEST_STEP = 10.0  # s, between recorded frames
 LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
 EXACTLY = 1e-3  # relative to the change of velocity by gravity in a step: largest deviation in free flight
-_NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
+_NAME = re.compile(r"(?!\.)[\w. -]+")  # name of a folder, never a path
 IN_FILE = {"orientation": "quat_xyzw"}  # names of arrays that differ in files
 _AXES = {  # T frames, N bodies
     "position": ("T", "N", 3), "quat_xyzw": ("T", "N", 4), "velocity": ("T", "N", 3), "angular_velocity": ("T", "N", 3),

@@ -40,7 +40,7 @@ VHACD_TIME = 600  # s
 class Origin:
     """The origin of a shape: a mesh that V-HACD cuts, convex pieces with a mesh to show, or a primitive."""
 
-    name: str  # of the Shape folder
+    name: str  # name of the Shape folder
     mesh: Path | None = None  # file of the solid, which is also the mesh that is shown
     pieces: Path | None = None  # OBJ with one convex piece per group
     primitive: str = ""  # name of a primitive, in place of files
@@ -64,7 +64,7 @@ class Origin:
 class ShapeSource:
     """One shape in the form that recipes and fits need."""
 
-    name: str  # of the Shape folder
+    name: str  # name of the Shape folder
     urdf: Path  # engine file, its base frame at the centre of mass
     volume: float  # m^3 at scale 1
     vertices: np.ndarray  # [V, 3] m about the centre of mass, at scale 1

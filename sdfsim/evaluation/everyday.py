@@ -35,7 +35,7 @@ SIZES = (0.02, 0.1, 1.0)  # m
 KINDS = ("analytic", "mesh", "grid")
 DENSITY = 500.0  # kg/m^3
 JUDGED = 60  # frames of a run, evenly spaced, in which surfaces are measured
-FACETS = 48  # of round meshes by default
+FACETS = 48  # number of facets of round meshes, by default
 STILL = Rotation.identity()
 
 
@@ -193,7 +193,7 @@ class Ran(engines.Ran):
     """A motion, turned back by the setting's yaw, and checks on it."""
 
     at: Setting = Setting()
-    label: str = ""  # of the scene
+    label: str = ""  # label of the scene
 
     def near(self, what: str, *numbers: Any) -> Check:
         return near(f"{self.label}: {what}", *numbers)
@@ -814,7 +814,7 @@ def main(arguments: Iterable[str] | None = None) -> int:
     parser.add_argument("--yaw", type=float, nargs="*", default=[0.0])
     parser.add_argument("--kind", nargs="*", choices=KINDS, default=["analytic"])
     parser.add_argument("--full", action="store_true", help="all random scenes and long runs")
-    parser.add_argument("--failed", action="store_true", help="print what does not hold only")
+    parser.add_argument("--failed", action="store_true", help="print only checks that do not hold")
     given = parser.parse_args(None if arguments is None else list(arguments))
     held = total = 0
     for row in given.row or ROWS:

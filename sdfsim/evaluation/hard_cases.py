@@ -31,7 +31,7 @@ from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primit
 from sdfsim.shape.shape import Shape
 
 G = 10.0  # m/s^2
-FRICTION, RESTITUTION = 0.8, 0.5  # of a body
+FRICTION, RESTITUTION = 0.8, 0.5  # coefficients of a body
 FLOOR_FRICTION, FLOOR_RESTITUTION = 0.5, 0.5
 FIXED: dict[str, Any] = {"motion": "static", "mass": 0.0, "friction": FLOOR_FRICTION, "restitution": FLOOR_RESTITUTION}
 NUDGE = 1e-3  # m and rad: how far repetitions of a case start from the exact one
@@ -331,7 +331,7 @@ def tossed(seed: Sequence[int]) -> Scene:
     return on_floor(shapes, bodies)
 
 
-# --- measures: what `Case.measure` is made of; sizes are mean largest extents ---
+# --- measures: functions for `Case.measure`; sizes are mean largest extents ---
 
 
 def size(scene: Scene) -> float:

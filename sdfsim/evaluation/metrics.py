@@ -7,7 +7,7 @@ from sdfsim.data.dataset import Trajectory
 
 HORIZONS = (50, 100)  # steps; Rubanova et al. 2024 report errors over all steps up to there
 REST_SPEED = 0.05  # m/s, bodies at rest in a recording are slower than this
-REST_STEPS = 10  # in this many last steps
+REST_STEPS = 10  # number of last steps in which they must be
 LIMITS = (0.1, 0.25, 0.5)  # m, translation errors up to which a body survives
 
 Motions = list[Trajectory]

@@ -15,7 +15,7 @@ from sdfsim.evaluation.harness import markdown
 from sdfsim.learned.model import BUNDLED, Model, load_model
 from sdfsim.training.presets import PRESETS
 
-MODEL = "this model"  # in the tables of a card
+MODEL = "this model"  # its name in the tables of a card
 SHOWN = 10  # rows of a learning curve
 
 

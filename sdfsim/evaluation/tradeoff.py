@@ -157,7 +157,7 @@ def _centred(shape: Shape, name: str) -> Shape:
     return replace(shape, name=name, mesh=mesh, sdf=sdf, nodes=shape.nodes - shape.com, com=np.zeros(3), pieces=pieces)
 
 
-# --- who takes part ---
+# --- models and engines ---
 
 
 @dataclass(frozen=True)

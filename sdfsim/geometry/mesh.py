@@ -9,7 +9,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 
-FARTHEST = 1e12  # from the origin, m: beyond it, double precision cannot separate the vertices of a room-sized mesh
+FARTHEST = 1e12  # m from the origin: beyond, double precision cannot separate the vertices of a room-sized mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import numpy as np
 
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, lattice
 
-BOWL_WALL = 0.12  # of the bowl, relative to its outer radius
+BOWL_WALL = 0.12  # wall of the bowl, relative to its outer radius
 PACKED = 0.6  # part of a space that packed balls fill
 
 

@@ -74,7 +74,7 @@ def _endless(shape: Shape) -> bool:
 class Family:
     """Everything that is specific to one network, except its weights."""
 
-    layout: Layout  # of its graphs
+    layout: Layout  # layout of its graphs
     # the shape with the nodes that the network uses (at most the given number, None for all)
     surface: Callable[[Shape, int | None], Shape]
     # finds the near parts of bodies, from bodies, state, gravity, reach, time step and the compiled scene of a run

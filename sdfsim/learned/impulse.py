@@ -26,8 +26,8 @@ LEVER = 0.5  # relative to the distance from a centre of mass to a contact: how 
 
 @dataclass(frozen=True)
 class ImpulseConfig:
-    width: int = 64  # of every latent and hidden layer
-    rounds: int = 6  # of message passing, each with its own weights
+    width: int = 64  # width of every latent and hidden layer
+    rounds: int = 6  # rounds of message passing, each with its own weights
     # 1 for a network that gets the contacts, but not the solve's impulses, and is not bounded: learning alone, for
     # comparison
     alone: int = 0

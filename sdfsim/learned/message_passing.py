@@ -51,7 +51,7 @@ class EdgeSet:
 @dataclass(frozen=True)
 class MultiGraph:
     nodes: dict[str, Tensor]  # features [n, F] float32 of each set
-    edges: dict[str, EdgeSet]  # of each kind
+    edges: dict[str, EdgeSet]  # edges of each kind
 
     def __len__(self) -> int:
         return sum(len(features) for features in self.nodes.values())
@@ -86,8 +86,8 @@ def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> Edg
 class GraphConfig:
     """Sizes of a network (published, all of them: width 128; SDF-Sim, FIGNet, MeshGraphNets: 10 to 15 steps)."""
 
-    width: int = 128  # of every latent and hidden layer
-    steps: int = 10  # of message passing, each with its own weights
+    width: int = 128  # width of every latent and hidden layer
+    steps: int = 10  # steps of message passing, each with its own weights
 
 
 def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn.Sequential:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # slow to load
     from torch import nn
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
-MOST = 4096  # of any size of a network
+MOST = 4096  # largest value of any size of a network
 MODEL_VERSION = 3  # 2: networks without the contact solve; 1: trained on data of an earlier version of the teacher
 SOLVER = "solver"
 LEARNED = ("gnn", "sdf-sim")  # bundled networks that use learning alone, without the solve

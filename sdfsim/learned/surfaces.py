@@ -14,12 +14,12 @@ from sdfsim.learned import pose
 from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, GraphNetwork, MultiGraph
 from sdfsim.learned.tensors import BodyTensors, StateTensors
 
-NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
-INTRA = Features(8, (0, 4))  # of edges within a body
+NODE = Features(13, (0, 3, 6))  # features of surface nodes and of body nodes
+INTRA = Features(8, (0, 4))  # features of edges within a body
 NODES = {"body": NODE, "node": NODE}
 STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
 MESH = EdgeKind("node", "node", INTRA)
-TARGET = Features(3, (0,))  # of accelerations
+TARGET = Features(3, (0,))  # accelerations
 # Weight of staying at `start`, relative to the nodes' spread. It is far below the weight of any extent beyond rounding,
 # so it decides only about rotations that the nodes do not define.
 STAY = 1e-12

@@ -11,8 +11,8 @@ from sdfsim.base.errors import SceneError
 from sdfsim.base.files import not_read
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 
-MOST_BYTES = 16 * 2**20  # of a file
-MOST_VALUES = 500_000  # of a file; a value that an alias repeats counts each time
+MOST_BYTES = 16 * 2**20  # largest size of a file
+MOST_VALUES = 500_000  # largest number of values in a file; a value that an alias repeats counts each time
 _LEVELS = 8  # no key is nested deeper
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _NULL = ("", "~", "null", "Null", "NULL")
@@ -43,7 +43,7 @@ class Document:
 
     def __init__(self, path: Path, text: str | None = None) -> None:
         self._path = path
-        self._line: dict[Loc, int] = {}  # of every key, and of every entry of a list
+        self._line: dict[Loc, int] = {}  # line of every key, and of every entry of a list
         self._found: dict[tuple[int, str], None] = {}  # in the order in which they were found, each once
         root = _compose(path, _text_of(path) if text is None else text)
         self.data = self._read(root, (), root.start_mark.line + 1)

@@ -34,7 +34,7 @@ class Plan:
     static: tuple[str, ...]  # names of the bodies that are static; the next two likewise
     dynamic: tuple[str, ...]
     kinematic_bodies: tuple[str, ...]
-    pairs: PairCounts  # which pairs of bodies may touch
+    pairs: PairCounts  # numbers of pairs of bodies, by whether they may touch
     nodes: int  # surface nodes of all bodies; infinite planes have none
 
     def effects(self) -> dict[str, Effect]:

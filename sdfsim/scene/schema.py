@@ -85,7 +85,7 @@ def _problem(text: str) -> PydanticCustomError:
     return PydanticCustomError("value", "{text}", {"text": text})
 
 
-def _told(error: Any, table: "type[Table]") -> str:
+def _message(error: Any, table: "type[Table]") -> str:
     """A message in our words for what pydantic found in a table."""
     kind, known = error["type"], table.model_fields
     if kind == "value":
@@ -212,7 +212,7 @@ class Table(BaseModel):
             made = handler(data)
             found += made.check_values()
         except ValidationError as error:
-            found += [(e["loc"], _told(e, cls)) for e in error.errors(include_url=False)]
+            found += [(e["loc"], _message(e, cls)) for e in error.errors(include_url=False)]
         if found:
             details = [InitErrorDetails(type=_problem(text), loc=loc, input=None) for loc, text in found]
             raise ValidationError.from_exception_data(cls.__name__, details)

@@ -60,7 +60,7 @@ class MlpSdf:
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; evaluated in float32, cast back. See `everywhere`
-        for what is far."""
+        for points outside the box."""
         return in_metres(self._inside, self.frame, self.bounds, points, PREPARED)
 
     def _inside(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -76,7 +76,7 @@ class Carry:
     bodies: Bodies
     options: Options
     checked: bool = False  # whether `advance` ends at an invalid state
-    counts: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*COUNTS, *PHASES), 0.0))  # of a step
+    counts: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*COUNTS, *PHASES), 0.0))  # of the last step
     done: int = 0  # steps that the latest `advance` has made
     fault: Fault | None = None  # the fault of the state after these, if it is invalid
     given: float = 0.0  # work of pulls in these steps, model units

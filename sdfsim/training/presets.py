@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Preset:
     kind: str  # "impulse", or a network on surface nodes: "sdf-sim", "fignet", "fignet-star", "mgn", "dpi"
     config: dict[str, int]  # sizes of the network
-    steps: int  # of the optimiser
+    steps: int  # steps of the optimiser
     batch: int  # contact frames (impulse) or recorded steps (others) a step
     rate: float  # peak learning rate of Adam; it falls to a hundredth along a cosine
     reach: float = 0.1  # m, contact radius D
@@ -27,7 +27,7 @@ RADII = {"sdf-sim": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-la
 PRESETS = {
     "small": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "alone": Preset("impulse", LITTLE | {"alone": 1}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
-    # on the solve, for recordings of real motions
+    # A network on the solve, for recordings of real motions.
     "impacts": Preset(
         "impulse", {"width": 32, "rounds": 2, "impacts": 1}, steps=1_000, batch=32, rate=2e-3, matrix_rate=0.01
     ),

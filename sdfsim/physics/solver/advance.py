@@ -128,7 +128,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
         end_step(world, work, motion, rules, joints)
     if rules.options.sleep:
         put_to_sleep(world, motion, rules, reference(manifolds), joints)
-    met = 0  # of bodies that are still awake
+    met = 0  # number of bodies that contacts moved and that are still awake
     for b in world.going:
         met += work.met[b] and motion.island[b] < 0
     return manifolds, edges, (len(near.start), contacts, met)

@@ -24,7 +24,7 @@ from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot,
 
 RIM = 24  # points on the circle of a drum's end that bound its contact
 MOST = 160  # largest number of corners of a clipped face
-CHOSEN = 4  # of them, those that carry the contact
+CHOSEN = 4  # largest number of them that carry the contact
 STEEP = 0.1  # cosine between a face's normal and the contact's, below which the face does not bound the contact
 LEVEL = 1e-3  # slope of a drum's end relative to the normal, below which its circle is cut at fixed points
 ASIDE = 0.002  # relative to the thickness: edges touch along their length if they are no farther aside

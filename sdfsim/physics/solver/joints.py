@@ -86,7 +86,7 @@ from sdfsim.physics.solver.vectors import (
 
 ROWS = 6
 STRETCH = 1e-7  # model lengths (and rad): rows with a larger error are repaired by moving bodies
-REACH = 0.05  # by at most this much in an inner step
+REACH = 0.05  # largest repair in an inner step, model lengths (and rad)
 HOLDS = 1e-11  # model lengths (and rad): rows need not hold more exactly
 ROUNDS = 6  # rounds of the search for impulses after which rows hold
 BREAKS = 4  # rounds in which joints may break in one inner step
@@ -1104,10 +1104,10 @@ def _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island,
             struck = rows.kind[r] == STOP_ROW and rows.strong[r] == math.inf
             touched = touched or ((rows.kind[r] == NORMAL_ROW or struck) and rows.impulse[r] > 0.0)
         for i in range(lo, hi):
-            _told(world, work, motion, rules, graph, each, lines, held.calm, comps[i], touched or deep)
+            _record_held(world, work, motion, rules, graph, each, lines, held.calm, comps[i], touched or deep)
         for r in range(count):
             if rows.kind[r] >= STOP_ROW:
-                _tell(world, work, motion, rules, each, rows, r)
+                _record_bounded(world, work, motion, rules, each, rows, r)
         broke = False
         for i in range(lo, hi):
             if _broken(graph, each, lines, comps[i]):
@@ -1134,7 +1134,7 @@ def _seen(rows, count):
 
 
 @njit(**BARE)
-def _told(world, work, motion, rules, graph, each, lines, calm, c, touched):
+def _record_held(world, work, motion, rules, graph, each, lines, calm, c, touched):
     """Record the forces and torques of the rows that hold."""
     h, state = rules.substep_dt, each.state
     for k in range(graph.comp[c], graph.comp[c + 1]):
@@ -1173,7 +1173,7 @@ def _add_pull(matrix, each, j, row, force):
 
 
 @njit(**BARE)
-def _tell(world, work, motion, rules, each, rows, r):
+def _record_bounded(world, work, motion, rules, each, rows, r):
     """Record the impulse of a bounded row of a joint."""
     j, kind, impulse, h, state = rows.of[r], rows.kind[r], rows.impulse[r], rules.substep_dt, each.state
     _add_pull(work.matrix, each, j, rows.row[r], impulse / h)

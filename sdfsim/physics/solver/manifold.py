@@ -27,8 +27,8 @@ from sdfsim.physics.solver.world import (
 )
 
 FOUND = 128  # contact points that may be found for a pair at once
-CANDIDATES = 256  # leaves of nodes that may touch
-SIDE = 40  # of them, at most this many become points
+CANDIDATES = 256  # largest number of leaves of nodes that may touch
+SIDE = 40  # largest number of them that become points
 EACH = 4  # points of a manifold for the same two patches
 ALIKE = 0.9  # cosine between normals, above which they count as equal
 EVEN = 1e-9  # two lengths, or their squares, count as equal if they differ by less

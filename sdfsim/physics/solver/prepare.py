@@ -204,7 +204,7 @@ class Steps:
     done: int  # how many steps were made
     fault: Fault | None  # fault of the state after them, which is not kept
     given: float  # work of pulls
-    kept: Kept  # of each step
+    kept: Kept  # data of each step
     pair: np.ndarray  # [C, 2] int64, bodies that touched in the kept steps, one step after the other
     point: np.ndarray  # [C, 3] the points where they touched
 

@@ -24,7 +24,7 @@ from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SI
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # largest number of patches of a shape
-ROUNDS = 12  # of refinement
+ROUNDS = 12  # rounds of refinement
 NEAR = 2.0  # cells: a grid is fine within this distance of its surface
 FARTHER = 2.0  # cells: elsewhere its distance may be too large by this much, at a tip
 ONTO, BESIDE = 3, 0.05  # number of steps back onto the body's own surface, and how near, in strides, they must get

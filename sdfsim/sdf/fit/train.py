@@ -48,10 +48,10 @@ class FitOptions:
     some hundredths of the size; without both, the far field would be wrong by as much.
     """
 
-    # of the hidden layers. "relu" is trained as in the paper: by Adam, on both sides of every mirror plane, with signs
-    # only where the paper's rule trusts them
+    # activation of the hidden layers. "relu" is trained as in the paper: by Adam, on both sides of every mirror plane,
+    # with signs only where the paper's rule trusts them
     activation: Activation = "wave"
-    width: int = 64  # of the hidden layers
+    width: int = 64  # width of the hidden layers
     layers: int = 6  # linear layers, the last one included
     lr: float = 1e-2  # step size
     decay: float = 0.5  # part of the steps, at the end, over which the step size falls to zero (0: constant)
