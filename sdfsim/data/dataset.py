@@ -72,9 +72,9 @@ def at_instants(recorded: Trajectory, substep: float) -> Trajectory:
     """The trajectory with velocities at the instants of its positions.
 
     The recording engine's position step already uses the new velocity (symplectic Euler). Its flights are exact
-    parabolas, but for velocities that are further by half an inner step (`substep` s) of gravity than the recorded
-    ones. Bodies that fly before or after an instant get the velocity of their parabola; bodies that lie or slide keep
-    the recorded one.
+    parabolas, but those of velocities that are ahead of the recorded ones by half an inner step (`substep` s) of
+    gravity. Bodies that fly before or after an instant get the velocity of their parabola; bodies that lie or slide
+    keep the recorded one.
     """
     added = np.diff(recorded.velocity, axis=0) - recorded.gravity * recorded.dt
     flies = np.linalg.norm(added, axis=-1) < EXACTLY * np.linalg.norm(recorded.gravity) * recorded.dt

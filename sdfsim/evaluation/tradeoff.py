@@ -139,7 +139,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
         raise SdfsimError(f"{scene.path}: {next(problem for problem, there in problems.items() if there)}")
     shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}
     t = start.motion
-    # The engine's bodies fly as if their velocities were further by half an inner step of gravity.
+    # The engine's bodies fly as if their velocities were ahead by half an inner step of gravity.
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
