@@ -138,9 +138,9 @@ def export(
             f"--collide {collide}: is for MuJoCo", "leave it out; USD always uses it for bodies without pieces"
         )
     if fps is not None and (FORMATS[kind] in (_mjcf, _urdf) or not 0.0 < fps <= 1e4):
-        told = f"--fps {fps:g}: " + ("no motion in it" if 0.0 < fps <= 1e4 else "must be above 0, at most 10,000")
+        message = f"--fps {fps:g}: " + ("no motion in it" if 0.0 < fps <= 1e4 else "must be above 0, at most 10,000")
         raise SdfsimError(
-            told, "formats with it: " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf))
+            message, "formats with it: " + " ".join(e for e, f in FORMATS.items() if f not in (_mjcf, _urdf))
         )
     if FORMATS[kind] is _usd:
         _pxr("Usd")  # checked before fitting shapes, which takes minutes
@@ -591,8 +591,8 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         add(contact, "pair", **pair)
     if scene.joints:
         ends = [nodes[k] for k in range(len(take.names))] + [world]
-        controls, told = jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names)
-        left_out += told
+        controls, lines = jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names)
+        left_out += lines
     if places:
         start = {"qpos": " ".join(places), "qvel": " ".join(speeds)} | (
             {"ctrl": _numbers(controls)} if controls else {}

@@ -198,7 +198,7 @@ def mjcf_rest(
     """Write loops, distances, motors and excluded contacts. Returns the controls [U] at the start, and what is left
     out. `sites` are the elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and
     joints."""
-    told, controls = left_out(scene.joints), []
+    lines, controls = left_out(scene.joints), []
     tags = ("equality", "tendon", "actuator", "contact")
     into = {tag: Element(tag) for tag in tags}
 
@@ -227,7 +227,7 @@ def mjcf_rest(
         if joint.kind == "fixed":
             add(into["equality"], "weld", name=name, **ends, anchor=_text(np.zeros(3)))
         elif joint.kind == "slider":
-            told.append(f"slider {joint.name}, which closes a loop")
+            lines.append(f"slider {joint.name}, which closes a loop")
         else:  # a hinge is held at two points of its axis
             points = [one.anchor] if joint.kind == "ball" else [one.anchor + s * 0.1 * one.axis() for s in (-1.0, 1.0)]
             for number, point in enumerate(points):
@@ -236,11 +236,11 @@ def mjcf_rest(
                     anchor=_text(point),
                 )  # fmt: skip
             if joint.limits or joint.damping or joint.friction or joint.spring or joint.motor:
-                told.append(f"limits, damping, friction, spring and motor of {joint.name}, which closes a loop")
+                lines.append(f"limits, damping, friction, spring and motor of {joint.name}, which closes a loop")
     for joint in scene.joints:
         first, second = joint.bodies
         if joint.collides and any(one.joint is joint for one in tree.above.values()):
-            told.append(f"that bodies of {joint.name} touch each other")
+            lines.append(f"that bodies of {joint.name} touch each other")
         elif not joint.collides and second >= 0 and "dynamic" == scene.bodies[first].motion:
             add(into["contact"], "exclude", body1=bodies[first], body2=bodies[second])
         if joint.motor is None or joint in tree.loops:
@@ -258,14 +258,14 @@ def mjcf_rest(
             add(into["actuator"], "motor", **keys)
             controls.append(0.0)
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
-        told.append("that a cone bounds only the lean of a ball: MuJoCo bounds its whole rotation")
+        lines.append("that a cone bounds only the lean of a ball: MuJoCo bounds its whole rotation")
     for tag in tags:
         before = root.find(tag)
         if len(into[tag]) and before is not None:
             before.extend(into[tag])
         elif len(into[tag]):
             root.append(into[tag])
-    return controls, told
+    return controls, lines
 
 
 # --- URDF ---
@@ -294,20 +294,22 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
 
 def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
     """What a URDF leaves out of joints, one line each."""
-    told = left_out(scene.joints, spring_of=("hinge", "slider"))
-    told += [f"joint {joint.name}: URDF supports trees only" for joint in tree.loops if joint.kind in NESTING]
-    told += [
+    lines = left_out(scene.joints, spring_of=("hinge", "slider"))
+    lines += [f"joint {joint.name}: URDF supports trees only" for joint in tree.loops if joint.kind in NESTING]
+    lines += [
         f"joint {joint.name}: URDF has no {joint.kind} joints" for joint in tree.loops if joint.kind not in NESTING
     ]
     if any(joint.motor for joint in scene.joints):
-        told.append("motors of joints: only their largest force is exported, as the effort")
+        lines.append("motors of joints: only their largest force is exported, as the effort")
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
-        told.append("cones of balls")
+        lines.append("cones of balls")
     for k, one in tree.above.items():
         if abs(start := start_of(scene, one, k)) > 1e-9:
             unit = "m" if one.joint.kind == "slider" else "rad"
-            told.append(f"that joint {one.joint.name} starts at {start:.6g} {unit}: in a URDF all joints start at zero")
-    return told
+            lines.append(
+                f"that joint {one.joint.name} starts at {start:.6g} {unit}: in a URDF all joints start at zero"
+            )
+    return lines
 
 
 # --- USD ---
@@ -321,7 +323,7 @@ def usd_joints(
         "hinge": physics.RevoluteJoint, "slider": physics.PrismaticJoint, "ball": physics.SphericalJoint,
         "fixed": physics.FixedJoint, "distance": physics.DistanceJoint,
     }  # fmt: skip
-    told = left_out(scene.joints, breaks=False)
+    lines = left_out(scene.joints, breaks=False)
     stage.DefinePrim("/World/joints", "Scope")
     for joint in scene.joints:
         made = made_of[joint.kind].Define(stage, f"/World/joints/{names[joint.name]}")
@@ -349,18 +351,18 @@ def usd_joints(
             low, high = (joint.length, joint.length) if joint.length is not None else joint.limits or (-1.0, -1.0)
             made.CreateMinDistanceAttr(low if low > 0 else -1.0)
             made.CreateMaxDistanceAttr(high)
-        told += _usd_drive(made, physics, joint, degrees)
-    return told
+        lines += _usd_drive(made, physics, joint, degrees)
+    return lines
 
 
 def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[str]:
     """Write motor, spring and damping of a hinge or slider, and return what is left out; a drive's numbers are in
     degrees."""
-    told = [f"friction of joint {joint.name}"] if joint.friction else []
+    lines = [f"friction of joint {joint.name}"] if joint.friction else []
     if joint.kind not in ("hinge", "slider"):
-        return [*told, *([f"spring and damping of joint {joint.name}"] if joint.spring or joint.damping else [])]
+        return [*lines, *([f"spring and damping of joint {joint.name}"] if joint.spring or joint.damping else [])]
     if not (joint.motor or joint.spring or joint.damping):
-        return told
+        return lines
     drive = physics.DriveAPI.Apply(made.GetPrim(), "angular" if joint.kind == "hinge" else "linear")
     drive.CreateTypeAttr("force")
     if joint.motor is not None:
@@ -374,11 +376,11 @@ def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[st
         elif joint.motor.position is not None:
             drive.CreateTargetPositionAttr(joint.motor.position * degrees)
         return [
-            *told,
+            *lines,
             *([f"spring and damping beside the motor of joint {joint.name}"] * bool(joint.spring or joint.damping)),
         ]
     drive.CreateDampingAttr(joint.damping / degrees)
     if joint.spring is not None:
         drive.CreateStiffnessAttr(joint.spring.stiffness / degrees)
         drive.CreateTargetPositionAttr(joint.spring.rest * degrees)
-    return told
+    return lines

@@ -82,12 +82,12 @@ def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_pr
     where, loaded = pick_device(device), load_textured(mesh_file)
     mesh = loaded.mesh
     metres = UNITS[options.units or "m"]
-    told = remarks(mesh_file, mesh, metres, given=options.units is not None)
+    remarked = remarks(mesh_file, mesh, metres, given=options.units is not None)
     mesh = replace(mesh, vertices=mesh.vertices * metres)
     # A mesh file may name others, so its own bytes are not enough.
     skin, lost = dressed(loaded, thicken=options.thicken)
     skin = skin and replace(skin, vertices=skin.vertices * metres)
-    told = [*lost, *told]
+    remarked = [*lost, *remarked]
     described = mesh.digest() + ("" if skin is None else skin.digest())
     request = hashlib.sha256(f"{described}|{options}|{FIT_VERSION}".encode()).hexdigest()
     check_writable(out)
@@ -106,7 +106,7 @@ def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_pr
             shape = replace(shape, source=source, certificate=certificate, skin=skin)
             shape.save(out)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
-    notes = [*shape.source.get("notes", []), *told]
+    notes = [*shape.source.get("notes", []), *remarked]
     known = {"folder": str(out), "volume_m3": shape.volume, "nodes": len(shape.nodes), "notes": notes}
     return known | shape.certificate | {"failed_checks": missed}
 

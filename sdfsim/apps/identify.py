@@ -142,10 +142,10 @@ class Identified:
 
     def report(self) -> dict[str, Any]:
         kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(WIDTH)[2:])
-        told: dict[str, Any] = {kind: {} for kind in kinds}
+        values: dict[str, Any] = {kind: {} for kind in kinds}
         for e in self.estimates:
-            told[e.kind][e.name] = {"value": e.value, "interval": e.interval}
-        return told | {
+            values[e.kind][e.name] = {"value": e.value, "interval": e.interval}
+        return values | {
             "windows": self.windows, "error_m": self.error_m, "held_out": self.held_out, "notes": self.notes,
             "scene": self.scene_values, "joints": self.joint_values,
         }  # fmt: skip
@@ -211,8 +211,8 @@ class Problem:
             near = np.flatnonzero(r.known[: max(0, last)])
             begin += [(k, int(rows[0])) for rows in _groups(near, every)]
         if not begin:
-            told = "give longer ones, of more frames a second"
-            raise SdfsimError("the recordings are too short, or never smooth", told)
+            hint = "give longer ones, of more frames a second"
+            raise SdfsimError("the recordings are too short, or never smooth", hint)
         windows = Windows(self, WINDOW, begin[:: -(-len(begin) // (2 * MOST))])
         touched = windows.touched()
         if not touched and not self.joints:
@@ -647,19 +647,19 @@ def _searched(
     from scipy.optimize import differential_evolution
 
     tries: list[np.ndarray] = []
-    told: list[np.ndarray] = []
+    losses: list[np.ndarray] = []
 
     def cost(values: np.ndarray) -> float:
         tries.append(values.copy())
-        told.append(np.bincount(windows.group, np.sqrt(1.0 + windows.errors(values) ** 2) - 1.0))
-        return float(told[-1].sum())
+        losses.append(np.bincount(windows.group, np.sqrt(1.0 + windows.errors(values) ** 2) - 1.0))
+        return float(losses[-1].sum())
 
     rng = np.random.default_rng(0)
     crowd = best + AROUND * width * rng.standard_normal((CROWD, len(best)))
     crowd[0] = best
     limits, begun = list(zip(*bounds, strict=True)), cast("Any", np.clip(crowd, *bounds))
     found = differential_evolution(cost, limits, init=begun, maxiter=ROUNDS, tol=0.0, polish=False, rng=0).x
-    costs = np.array(told)[:, np.unique(windows.group)]
+    costs = np.array(losses)[:, np.unique(windows.group)]
     drawn = rng.multinomial(costs.shape[1], np.full(costs.shape[1], 1.0 / costs.shape[1]), DRAWS)
     best_of = np.array(tries)[np.argmin(costs @ drawn.T, axis=0)] / width
     return found, np.cov(best_of.T).reshape(len(best), len(best))
@@ -683,8 +683,8 @@ def _estimates(
     spread = max(1.0, len(which) / max(1, len(which) - len(values)))
     covariance = spread * inverse @ (pull.T @ pull) @ inverse + scatter
     noise = max(1.0, float(np.mean(np.abs(data))) ** 2)
-    told = np.linalg.inv((slope.T @ slope) * len(which) / len(group) / noise + np.eye(len(values)))
-    shown = np.sqrt(np.diag(told)) < SHOWN
+    posterior = np.linalg.inv((slope.T @ slope) * len(which) / len(group) / noise + np.eye(len(values)))
+    shown = np.sqrt(np.diag(posterior)) < SHOWN
     shown &= [p.kind != "restitution" or bool(problem.hit & set(p.bodies)) for p in parameters]
 
     def estimate(kind: str, name: str, value: float, gradient: dict[int, float]) -> Estimate:

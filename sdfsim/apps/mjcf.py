@@ -41,10 +41,10 @@ def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, RuntimeError) as error:
-        told = "; ".join(part.strip() for part in str(error).splitlines() if part.strip())
-        line = re.search(r"\bline (\d+)", told)
+        message = "; ".join(part.strip() for part in str(error).splitlines() if part.strip())
+        line = re.search(r"\bline (\d+)", message)
         where = f"{path}:{line[1]}" if line else str(path)
-        raise SdfsimError(f"{where}: MuJoCo refuses it ({told})", "a URDF needs the ending .urdf") from error
+        raise SdfsimError(f"{where}: MuJoCo refuses it ({message})", "a URDF needs the ending .urdf") from error
     return _Reader(path, mujoco, model, key).robot()
 
 
@@ -84,8 +84,8 @@ class _Reader:
         roots = [b for b in range(1, model.nbody) if model.body_weldid[b] == 0 and model.body_mocapid[b] < 0]
         held = [b for b in roots if any(p == b and model.body_weldid[c] for c, p in enumerate(model.body_parentid))]
         if held:
-            told = "bodies without a joint to the world stand still, and hold others (<freejoint/> lets them go)"
-            self.notes.append(named(told, [self._body_name(b) for b in held]))
+            message = "bodies without a joint to the world stand still, and hold others (<freejoint/> lets them go)"
+            self.notes.append(named(message, [self._body_name(b) for b in held]))
         if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):
             self.left.append("air: density, viscosity and wind")
         if np.any(model.body_gravcomp):
@@ -172,8 +172,8 @@ class _Reader:
             return {}
         frictions = {float(self.model.geom_friction[g, 0]) for g in geoms}
         if len(frictions) > 1:
-            told = ", ".join(f"{value:g}" for value in sorted(frictions))
-            self.notes.append(f"body {name}: its geoms have different friction ({told}): the largest is used")
+            values = ", ".join(f"{value:g}" for value in sorted(frictions))
+            self.notes.append(f"body {name}: its geoms have different friction ({values}): the largest is used")
         friction = float(np.sqrt(max(frictions)))
         return {"friction": friction, "restitution": max(_restitution(self.model.geom_solref[g]) for g in geoms)}
 
@@ -320,8 +320,8 @@ class _Reader:
         if freely:
             self.notes.append(named(f"actuators without a force limit get one of {UNBOUNDED:g}", freely))
         if others:
-            told = "actuators other than motor, position and velocity of a hinge or slide"
-            self.left.append(named(told, others))
+            what = "actuators other than motor, position and velocity of a hinge or slide"
+            self.left.append(named(what, others))
         return found
 
     def _loops(self) -> list[LinkJoint]:

@@ -224,8 +224,8 @@ def _on_grid(path: Path | str, times: np.ndarray, poses: np.ndarray) -> tuple[fl
     frame = np.round((times - times[0]) / dt).astype(int)
     off = np.abs((times - times[0]) / dt - frame)
     if off.max() > EVEN or (np.diff(frame) < 1).any():
-        told = f"they are {gaps.min():.4g} to {gaps.max():.4g} s apart"
-        raise SdfsimError(f"{path}: time: must be evenly spaced, except for missing frames ({told})")
+        found = f"they are {gaps.min():.4g} to {gaps.max():.4g} s apart"
+        raise SdfsimError(f"{path}: time: must be evenly spaced, except for missing frames ({found})")
     if frame[-1] + 1 > 100 * len(times):
         raise SdfsimError(f"{path}: time: {frame[-1] + 1 - len(times)} of {frame[-1] + 1} frames are missing")
     whole = np.full((frame[-1] + 1, *poses.shape[1:]), np.nan)

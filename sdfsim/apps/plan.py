@@ -57,7 +57,7 @@ def describe(
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),
-        "failed_checks": [f"fit of shape {told}" for told in scene.missed],
+        "failed_checks": [f"fit of shape {line}" for line in scene.missed],
         "notes": list(scene.notes),
     }
 

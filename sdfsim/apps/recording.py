@@ -90,8 +90,8 @@ class Playback:
         self._before: Rollout | None = None  # the last frame that was logged
         self._views = {name: list(keys) for name, keys in VIEWS.items() if network or name != "network"}
         if motion is not None:
-            told = {key for key in PLOTS if np.any(motion.counters.get(key, 0.0))}
-            shown_of = {name: [key for key in keys if key in told] for name, keys in self._views.items()}
+            plotted = {key for key in PLOTS if np.any(motion.counters.get(key, 0.0))}
+            shown_of = {name: [key for key in keys if key in plotted] for name, keys in self._views.items()}
             self._views = {name: keys for name, keys in shown_of.items() if keys}
         self._movers = np.array([k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"], dtype=int)
         self._mass = np.array([scene.bodies[k].mass for k in self._movers])

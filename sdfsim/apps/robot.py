@@ -349,8 +349,8 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
         return None, {"plane": {}}, flat[0].pose, {}
     if not parts:
         if not link.mass > 0:
-            told = "has neither mass nor shape, but a movable joint"
-            raise SdfsimError(f"{link.where}: link {link.name} {told}", "give it an inertial with a mass, or fix it")
+            reason = "has neither mass nor shape, but a movable joint"
+            raise SdfsimError(f"{link.where}: link {link.name} {reason}", "give it an inertial with a mass, or fix it")
         radius = np.sqrt(2.5 * np.trace(_spread(link)) / 3.0 / link.mass)
         notes.append(f"link {link.name} has no shape: a ball of {radius:.3g} m that touches nothing replaces it")
         parts = [Part("sphere", pose_of(link.com), {"radius": radius})]
@@ -392,12 +392,12 @@ def _possible(link: Link, tensor: np.ndarray, even: np.ndarray, notes: list[str]
     """The given inertia if a body can have it, else that of the mass spread evenly."""
     principal = np.linalg.eigvalsh(tensor)
     if principal[0] <= 1e-9 * principal[2]:
-        told = f"moments of {', '.join(f'{value:.3g}' for value in principal)} kg m^2 are not all above zero"
-        notes.append(f"link {link.name}: its inertia is impossible ({told}): its mass is spread evenly instead")
+        reason = f"moments of {', '.join(f'{value:.3g}' for value in principal)} kg m^2 are not all above zero"
+        notes.append(f"link {link.name}: its inertia is impossible ({reason}): its mass is spread evenly instead")
         return even
     if principal[2] > (1.0 + 1e-6) * (principal[0] + principal[1]):
-        told = f"{principal[2]:.3g} kg m^2 is above the sum of {principal[0]:.3g} and {principal[1]:.3g}"
-        notes.append(f"link {link.name}: no solid has its inertia ({told}); it is kept")
+        reason = f"{principal[2]:.3g} kg m^2 is above the sum of {principal[0]:.3g} and {principal[1]:.3g}"
+        notes.append(f"link {link.name}: no solid has its inertia ({reason}); it is kept")
     return tensor
 
 
@@ -537,7 +537,7 @@ def _join(scene: SceneBuilder, joint: LinkJoint, names: list[str], lift: np.ndar
     """Write a joint, with angles in degrees."""
     turns = joint.kind in ("hinge", "ball")
 
-    def told(name: str, value: Any) -> dict[str, Any]:
+    def with_unit(name: str, value: Any) -> dict[str, Any]:
         return {f"{name}_deg" if turns else name: _round(np.rad2deg(value) if turns else value)}
 
     keys: dict[str, Any] = {}
@@ -546,20 +546,20 @@ def _join(scene: SceneBuilder, joint: LinkJoint, names: list[str], lift: np.ndar
     if joint.axis is not None:
         keys["axis"] = _round(joint.axis)
     if joint.start and joint.kind in ("hinge", "slider"):
-        keys |= told("start", joint.start)
+        keys |= with_unit("start", joint.start)
     if joint.limits is not None:
         if joint.kind == "ball":
-            keys |= told("cone", joint.limits[1])
+            keys |= with_unit("cone", joint.limits[1])
         elif joint.kind == "distance":
             keys["rope"] = _round(joint.limits[1])
         else:
-            keys |= told("limits", joint.limits)
+            keys |= with_unit("limits", joint.limits)
     if joint.spring is not None:
-        keys["spring"] = {"stiffness": _round(joint.spring[0]), **told("rest", joint.spring[1])}
+        keys["spring"] = {"stiffness": _round(joint.spring[0]), **with_unit("rest", joint.spring[1])}
     if joint.motor is not None:
         place = {key: value for key, value in joint.motor.items() if key != "position"}
         keys["motor"] = {key: _round(value) for key, value in place.items()}
-        keys["motor"] |= told("position", joint.motor["position"]) if "position" in joint.motor else {}
+        keys["motor"] |= with_unit("position", joint.motor["position"]) if "position" in joint.motor else {}
     keys |= {
         key: _round(value) if isinstance(value, float | np.ndarray) else value for key, value in joint.others.items()
     }

@@ -175,8 +175,8 @@ def simulate(
             "status": "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted",
             "folder": out,
             "identity": kept.identity,
-            "failed_checks": [f"fit of shape {told}" for told in scene.missed],
-            "caveats": [f"fit of shape {told}" for told in scene.caveats],
+            "failed_checks": [f"fit of shape {reason}" for reason in scene.missed],
+            "caveats": [f"fit of shape {reason}" for reason in scene.caveats],
             "notes": list(scene.notes),
         }
         if until_settled:
@@ -215,15 +215,15 @@ def read_run(
         try:
             scene_file = Path(yaml.safe_load((file.parent / CONFIG).read_text(encoding="utf-8"))["scene"])
         except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError) as error:
-            told = f"{file.parent}: not the folder of a simulation ({error})"
-            raise SdfsimError(told, "give its scene: --scene") from error
+            message = f"{file.parent}: not the folder of a simulation ({error})"
+            raise SdfsimError(message, "give its scene: --scene") from error
     scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
     if tuple(body.name for body in scene.bodies) != rollout.names:
         raise SdfsimError(f"{file}: its bodies are not those of {scene.path}", "give its scene: --scene")
     known, now = rollout.meta.get("scene", {}), fingerprints(scene)
     if other := [what for what in compared if known.get(what, now[what]) != now[what]]:
-        told = f"{file}: {scene.path} is not the scene that it was made from: other {' and '.join(other)}"
-        raise SdfsimError(told, "simulate it anew, or give the scene as it was: --scene")
+        message = f"{file}: {scene.path} is not the scene that it was made from: other {' and '.join(other)}"
+        raise SdfsimError(message, "simulate it anew, or give the scene as it was: --scene")
     return scene, rollout
 
 
@@ -250,7 +250,7 @@ def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
     rows, (centre, radius) = _dynamic(scene), framed(scene)
     place, speed = rollout.position[-1, rows], np.linalg.norm(rollout.velocity[-1, rows], axis=-1)
     left = np.linalg.norm(place - centre, axis=-1) > FAR * radius
-    told = zip(rows, place, speed, resting(scene, rollout)[-1], left, strict=True)
+    endings = zip(rows, place, speed, resting(scene, rollout)[-1], left, strict=True)
     costs = {name: counters[name][1:] for name in (*COUNTS, *PHASES, "step_ms")}
     return {
         "model": rollout.meta["model"],
@@ -268,7 +268,7 @@ def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
         "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
         "ended": [
             {"name": scene.bodies[k].name, "centre_m": at, "speed_m_s": fast, "rests": rests, "left": gone}
-            for k, at, fast, rests, gone in told
+            for k, at, fast, rests, gone in endings
         ],
         "meta": rollout.meta,
     }
@@ -364,8 +364,8 @@ def finished(report_file: Path, identity: str, steps: int, *, until_settled: boo
         raise SdfsimError(f"{folder}: this run has ended: {report['error']}", _ANEW)
     settled = until_settled and report.get("settled") and report["steps"] < steps
     if report["steps"] != steps and not settled:
-        told = f"{report['steps']} steps, {report['simulated_s']:.4g} s"
-        raise SdfsimError(f"{folder}: finished after {told}; its length cannot be changed", "choose a new -o")
+        done = f"{report['steps']} steps, {report['simulated_s']:.4g} s"
+        raise SdfsimError(f"{folder}: finished after {done}; its length cannot be changed", "choose a new -o")
     return report
 
 

@@ -97,8 +97,8 @@ class _Reader:
     def where(self, element: Element) -> str:
         return f"{self.path}:{self.line[id(element)] + self.skipped}: <{element.tag}>"
 
-    def wrong(self, element: Element, told: str, hint: str = "") -> SdfsimError:
-        return SdfsimError(f"{self.where(element)} {told}", hint)
+    def wrong(self, element: Element, fault: str, hint: str = "") -> SdfsimError:
+        return SdfsimError(f"{self.where(element)} {fault}", hint)
 
     # --- values ---
 
@@ -183,8 +183,8 @@ class _Reader:
                 ends.append(number[link])
             parent, child = ends
             if child in by_child:
-                told = f"link {links[child].name!r} is held by two joints: URDF supports trees only"
-                raise self.wrong(element, told, "close loops in MJCF (equality connect), or in scene.yaml")
+                fault = f"link {links[child].name!r} is held by two joints: URDF supports trees only"
+                raise self.wrong(element, fault, "close loops in MJCF (equality connect), or in scene.yaml")
             by_child[child] = element, parent
         joints: list[LinkJoint] = []
         roots = [k for k in range(len(links)) if k not in by_child]

@@ -91,16 +91,16 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
     if not web:
         check_screen("native")
     options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
-    viewer, told = subprocess.Popen(_command(port, [str(recording), *options])), False
+    viewer, announced = subprocess.Popen(_command(port, [str(recording), *options])), False
     try:
         if web and _started(viewer, page_port):  # before that, the address does not work
             say(f"watch it at {_page(page_port, port)}")
             say("the page stays up until Ctrl-C")
-            told = True
+            announced = True
         code = viewer.wait()
     except BaseException as error:
         _end(viewer)
-        if told and isinstance(error, KeyboardInterrupt):
+        if announced and isinstance(error, KeyboardInterrupt):
             return
         raise
     if code not in (0, -signal.SIGINT, 130, _WINDOWS_CTRL_C):

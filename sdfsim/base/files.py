@@ -98,8 +98,8 @@ def not_read(error: Exception, what: str = "") -> str:
     """Why a file cannot be read (as `what`), without its name, which the system's message would repeat."""
     if isinstance(error, FileNotFoundError):
         return "no such file"
-    told = error.strerror if isinstance(error, OSError) and error.strerror else error
-    return f"cannot be read{what and ' as '}{what}: {told}"
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+    return f"cannot be read{what and ' as '}{what}: {reason}"
 
 
 def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True) -> None:

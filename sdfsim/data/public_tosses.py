@@ -87,8 +87,8 @@ def public_tosses(name: Path, on_progress: Progress = silent) -> Path:
         found = fetched(known.url, f"put it into {by_hand.parent} by hand, as {by_hand.name}", known.folder, by_hand)
         files = [found.get(f"{k}.pt", b"") for k in range(known.count)]
         if (got := hashlib.sha256(b"".join(files)).hexdigest()) != known.checksum:
-            told = f"its {known.count} files have the SHA-256 {got}, not {known.checksum}"
-            raise SdfsimError(f"{known.url}: not the expected tosses: {told}", f"remove {by_hand}, if it is there")
+            reason = f"its {known.count} files have the SHA-256 {got}, not {known.checksum}"
+            raise SdfsimError(f"{known.url}: not the expected tosses: {reason}", f"remove {by_hand}, if it is there")
         arrays, scene = (_cube if name.name.endswith("cube") else _elbow)([_tensor(content) for content in files])
         folder.mkdir(parents=True, exist_ok=True)
         write_arrays(folder / "tosses.npz", arrays)

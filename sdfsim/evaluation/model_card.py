@@ -26,8 +26,8 @@ def bundle(model: Path, data: Path, name: Annotated[str, typer.Option()], folder
     report = evaluate(data, model=found, chaos_floor=True)
     kept = ("model", "ballistic", "chaos_floor", "median_survival_s", "penetration", "energy_gain", "resting_speed")
     log = model.parent / "log.jsonl"
-    told = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()] if log.exists() else []
-    curve = {"curve": [[line["step"], line["held_out_loss"]] for line in told]} if told else {}
+    records = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()] if log.exists() else []
+    curve = {"curve": [[line["step"], line["held_out_loss"]] for line in records]} if records else {}
     results = curve | {"errors": {what: report[what] for what in kept}, "test_trajectories": report["trajectories"]}
     found = replace(found, name=name, card=found.card | results)
     folder.mkdir(parents=True, exist_ok=True)

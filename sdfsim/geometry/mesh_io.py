@@ -63,9 +63,9 @@ def load_textured(path: str | Path) -> Loaded:
         raise SdfsimError(f"{path}: no such mesh file{near}", f"sdfsim looked for it in {path.parent.resolve()}")
     if suffix not in MESH_SUFFIXES:
         kind = OTHERS.get(suffix)
-        told = f"{kind} is not supported" if kind else f"not a mesh file ({path.suffix or 'no suffix'})"
+        fault = f"{kind} is not supported" if kind else f"not a mesh file ({path.suffix or 'no suffix'})"
         how = "export glb from Blender; " if kind else ""
-        raise SdfsimError(f"{path}: {told}", f"{how}use " + " ".join(MESH_SUFFIXES))
+        raise SdfsimError(f"{path}: {fault}", f"{how}use " + " ".join(MESH_SUFFIXES))
     try:
         mesh, painted = _read(path, suffix)
         mesh = clean(mesh, name=str(path))

@@ -11,7 +11,7 @@ SUBSTEPS = 5  # inner steps in one step of PyBullet in the training data; some r
 # Penetration that is not resolved, so that contacts of bodies at rest persist: at most SLOP model lengths, and less in
 # inner steps shorter than the usual 4 ms, which scenes of slender bodies have: SLOP_A_TIME times the inner step.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
-SLOW = 2.0  # inner steps: an approach at the speed that gravity gives in this time ends without a rebound
+SLOW = 2.0  # inner steps: an approach no faster than what gravity gives in this time ends without a rebound
 ROUNDS, PYBULLET_ROUNDS = 100, 50  # largest number of sweeps of sequential impulses in an inner step; PyBullet's number
 COARSE = 0.01  # model times: in longer inner steps, points that bodies hit during the step are recorded too
 

@@ -324,7 +324,7 @@ def _lowest(
             found[rows], gradient[rows] = d, g
         return found * other.scale[pair], np.einsum("pij,pj->pi", other.turn[pair], gradient)
 
-    def told(pair: np.ndarray, found: np.ndarray, at: np.ndarray, gradient: np.ndarray) -> None:
+    def keep_lowest(pair: np.ndarray, found: np.ndarray, at: np.ndarray, gradient: np.ndarray) -> None:
         order = np.lexsort((found, pair))
         first = order[np.concatenate([[True], pair[order][1:] != pair[order][:-1]])]
         better = first[found[first] < best[pair[first]]]
@@ -366,7 +366,7 @@ def _lowest(
                 middle[rows] = solids[k].onto(middle[rows])
         at, corners_at = world(pair, middle), world(pair, corner)
         found, gradient = ask(pair, at)
-        told(pair, found, at, gradient)
+        keep_lowest(pair, found, at, gradient)
         offset = corners_at - at[:, None]
         reach = np.linalg.norm(offset, axis=2).max(1)
         scale = mine.scale[pair]
@@ -384,7 +384,7 @@ def _lowest(
         if worth.any():
             rows = np.flatnonzero(worth)
             value, tilt = ask(pair[rows], tip[rows])
-            told(pair[rows], value, tip[rows], tilt)
+            keep_lowest(pair[rows], value, tip[rows], tilt)
         left = (lower < best[pair] - fine[pair]) & (lower <= most[pair])
         # Triangles that are no longer cut are at least this far.
         np.minimum.at(missed, pair[~left], lower[~left])

@@ -91,13 +91,13 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
 def check_nodes(scene: Scene) -> None:
     """Raises SdfsimError if a dynamic body's nodes are one point or one line, so that they do not define its rotation,
     or if a shape has more convex pieces than contacts can distinguish."""
-    told = set()
+    seen = set()
     for shape in scene.shapes:
         check_pieces(f"shape {shape.name!r}", shape.pieces)
     for body in scene.bodies:
-        if body.motion != "dynamic" or body.shape in told:
+        if body.motion != "dynamic" or body.shape in seen:
             continue
-        told.add(body.shape)
+        seen.add(body.shape)
         nodes = scene.shapes[body.shape].nodes
         extents = np.linalg.svd(nodes - nodes.mean(0), compute_uv=False) if len(nodes) > 1 else np.zeros(2)
         if extents[0] == 0 or len(extents) < 2 or extents[1] <= LINE * extents[0]:

@@ -141,8 +141,8 @@ def loaded(scene: Any, on_progress: Progress = silent) -> Scene:
         return scene.load(on_progress)
     if isinstance(scene, str | Path):
         return load_scene(scene, on_progress)
-    told = f"scene: must be a Scene, the path of a scene.yaml or the name of a sample (got a {type(scene).__name__})"
-    raise SdfsimError(told)
+    message = f"scene: must be a Scene, the path of a scene.yaml or the name of a sample (got a {type(scene).__name__})"
+    raise SdfsimError(message)
 
 
 def _refuse(data: dict[str, Any], what: str, places: dict[tuple, str]) -> None:

@@ -30,10 +30,10 @@ def find_scene(given: Path | str, *, or_run: bool = False) -> Path:
     known = samples()
     if path.name not in known:
         if or_run:
-            told = f"{path}: no run folder, Shape folder, scene file or sample has this name"
-            raise SdfsimError(told + nearest(path.name, known), "sdfsim samples lists the samples")
-        told = f"{path}: neither a scene file nor a sample{nearest(path.name, known)}"
-        raise SdfsimError(told, f"give a scene.yaml, or one of {', '.join(known)}")
+            message = f"{path}: no run folder, Shape folder, scene file or sample has this name"
+            raise SdfsimError(message + nearest(path.name, known), "sdfsim samples lists the samples")
+        message = f"{path}: neither a scene file nor a sample{nearest(path.name, known)}"
+        raise SdfsimError(message, f"give a scene.yaml, or one of {', '.join(known)}")
     return sample_folder() / f"{path.name}.yaml"
 
 

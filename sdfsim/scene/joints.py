@@ -60,7 +60,7 @@ def joints_of(
     """The joints of a scene file. Calls `wrong` for points that do not fit the joint."""
     number = {body.name: k for k, body in enumerate(bodies)}
     return tuple(
-        _joint(table, bodies, number, lambda key, told, i=i: wrong(("joints", i, key), told))
+        _joint(table, bodies, number, lambda key, message, i=i: wrong(("joints", i, key), message))
         for i, table in enumerate(tables)
     )
 

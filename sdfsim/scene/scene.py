@@ -206,13 +206,13 @@ def _held(joints: Sequence[Joint]) -> list:
     """The properties of joints for a digest; an empty list if there are no joints."""
     if not joints:
         return []
-    told = [f"{j.kind} {j.bodies} {j.collides} {j.limits is None} {j.spring is None} {j.motor}" for j in joints]
+    kinds = [f"{j.kind} {j.bodies} {j.collides} {j.limits is None} {j.spring is None} {j.motor}" for j in joints]
     limits = _six_digits([j.limits or (0.0, 0.0) for j in joints])
     springs = _six_digits([(j.spring.stiffness, j.spring.rest) if j.spring else (0.0, 0.0) for j in joints])
     known = [_six_digits([getattr(j, name) for j in joints]) for name in ("anchor", "quat_xyzw", "restitution")]
     drags = _six_digits([(j.damping, j.friction, j.length or 0.0) for j in joints])
     bears = _six_digits([[min(most, 1e30) for most in (j.breaks_force, j.breaks_torque)] for j in joints])
-    return [told, limits, springs, *known, drags, bears]
+    return [kinds, limits, springs, *known, drags, bears]
 
 
 def _described(shape: Shape) -> list:

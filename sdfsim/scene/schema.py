@@ -77,8 +77,8 @@ _MEANT = {
 def meant(name: str, known: Iterable[str]) -> str:
     """A suggestion for an unknown key, for a message; an empty string if there is none."""
     known = list(known)
-    told = _MEANT.get(name.lower(), "")
-    return f" (give {told})" if any(key in known for key in re.findall(r"\w+", told)) else nearest(name, known)
+    hint = _MEANT.get(name.lower(), "")
+    return f" (give {hint})" if any(key in known for key in re.findall(r"\w+", hint)) else nearest(name, known)
 
 
 def _problem(text: str) -> PydanticCustomError:
@@ -622,18 +622,18 @@ class JointTable(Table):
 
     def check_values(self) -> Iterator[Fault]:
         if self.frame not in (WORLD, *self.bodies):
-            told = f"must be {WORLD}, {self.bodies[0]} or {self.bodies[1]} (got {self.frame!r})"
-            yield ("frame",), told
+            fault = f"must be {WORLD}, {self.bodies[0]} or {self.bodies[1]} (got {self.frame!r})"
+            yield ("frame",), fault
         for ends, start, name, unit in (
             (self.limits, self.start, "start", "m"), (self.limits_deg, self.start_deg, "start_deg", "degrees"),
         ):  # fmt: skip
             if ends is not None and not ends[0] <= start <= ends[1]:
-                told = f"is beyond the limits, {ends[0]:g} to {ends[1]:g} {unit} (got {start:g} {unit})"
-                yield (name if name in self.model_fields_set else f"limits{name[5:]}",), told
+                fault = f"is beyond the limits, {ends[0]:g} to {ends[1]:g} {unit} (got {start:g} {unit})"
+                yield (name if name in self.model_fields_set else f"limits{name[5:]}",), fault
             goal = getattr(self.motor, f"position{name[5:]}", None)
             if ends is not None and goal is not None and not ends[0] <= goal <= ends[1]:
-                told = f"is beyond the limits, {ends[0]:g} to {ends[1]:g} {unit} (got {goal:g} {unit})"
-                yield ("motor", f"position{name[5:]}"), told
+                fault = f"is beyond the limits, {ends[0]:g} to {ends[1]:g} {unit} (got {goal:g} {unit})"
+                yield ("motor", f"position{name[5:]}"), fault
 
 
 def _named(bodies: list, joints: Any) -> Iterator[tuple[Loc, str]]:
@@ -713,8 +713,8 @@ class SceneTable(Table):
         first: dict[str, int] = {}
         for i, joint in enumerate(self.joints):
             if first.setdefault(joint.name, i) != i:
-                told = f"two joints are called {joint.name!r} (the first is joints[{first[joint.name]}])"
-                yield ("joints", i, "name"), told
+                fault = f"two joints are called {joint.name!r} (the first is joints[{first[joint.name]}])"
+                yield ("joints", i, "name"), fault
             known = True
             for k, name in enumerate(joint.bodies):
                 where, known = ("joints", i, "bodies", k), known and (name in motion or (k == 1 and name == WORLD))

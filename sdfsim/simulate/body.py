@@ -50,13 +50,13 @@ class LiveScene(ABC):
     def _fits(self, state: State) -> None:
         """Raises SdfsimError if `state` is not a state of this scene."""
         if not isinstance(state, State):
-            told = f"state: must be a State, such as simulator.state was before (got a {type(state).__name__})"
-            raise SdfsimError(told, "what step() returns is in metres and seconds, and not enough to continue from")
+            message = f"state: must be a State, such as simulator.state was before (got a {type(state).__name__})"
+            raise SdfsimError(message, "what step() returns is in metres and seconds, and not enough to continue from")
         given = len(state.position), 0 if state.joints is None else len(state.joints)
         known = len(self.bodies), 0 if self.bodies.joints is None else len(self.bodies.joints)
         if given != known:
-            told = "state: is of another scene (it has {} bodies and {} joints, this one {} and {})"
-            raise SdfsimError(told.format(*given, *known))
+            message = "state: is of another scene (it has {} bodies and {} joints, this one {} and {})"
+            raise SdfsimError(message.format(*given, *known))
 
     @property
     def now(self) -> State:

@@ -97,8 +97,8 @@ class JointHandle:
         ends = self._joint.limits
         if does == TO_PLACE and ends is not None and not ends[0] <= aim <= ends[1]:
             # Only a warning: a target out of reach is a way to press against a limit.
-            told = f"joint {self.name!r}: target {aim:g} is beyond the limits, {ends[0]:.4g} to {ends[1]:.4g}"
-            warnings.warn(told, stacklevel=2)
+            message = f"joint {self.name!r}: target {aim:g} is beyond the limits, {ends[0]:.4g} to {ends[1]:.4g}"
+            warnings.warn(message, stacklevel=2)
         return self._tell({MOTOR: does}, aim / unit)
 
     @property
@@ -212,11 +212,11 @@ class JointHandle:
             return
         state, joints = simulator.now, simulator.bodies.joints
         assert state.joints is not None and joints is not None
-        told, drive = state.joints.copy(), (joints.number if state.drive is None else state.drive).copy()
-        told[row], drive[row] = known, number
+        states, drive = state.joints.copy(), (joints.number if state.drive is None else state.drive).copy()
+        states[row], drive[row] = known, number
         for body in self._joint.bodies:
             if body >= 0 and simulator.bodies.moves[body]:
-                simulator.change(body, joints=told, drive=drive)
+                simulator.change(body, joints=states, drive=drive)
 
     def _finite(self, name: str, value: float, *, least: float = -np.inf) -> float:
         if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(value) or value < least:

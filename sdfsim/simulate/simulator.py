@@ -271,9 +271,9 @@ class Simulator(LiveScene):
         """A joint by its name. Raises SdfsimError if no joint has that name."""
         names = [joint.name for joint in self.scene.joints]
         if name not in names:
-            told = nearest(name, names)
+            suggestion = nearest(name, names)
             known = f"joints are {', '.join(names[:20])}" if names else "the scene has no joints"
-            raise SdfsimError(f"there is no joint {name!r}{told}", known)
+            raise SdfsimError(f"there is no joint {name!r}{suggestion}", known)
         return JointHandle(self, names.index(name))
 
     def contact_points(self) -> list[ContactPoint]:
@@ -463,8 +463,8 @@ def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
     pulled = [np.zeros((1, 6)) if one.load is None else one.load for one in (state, other)]
     found |= np.any(pulled[0] != pulled[1], axis=-1)
     if bodies.joints is not None and state.joints is not None and other.joints is not None:
-        told = [bodies.joints.number if one.drive is None else one.drive for one in (state, other)]
-        driven = (state.joints[:, TARGET] != other.joints[:, TARGET]) | np.any(told[0] != told[1], axis=-1)
+        numbers = [bodies.joints.number if one.drive is None else one.drive for one in (state, other)]
+        driven = (state.joints[:, TARGET] != other.joints[:, TARGET]) | np.any(numbers[0] != numbers[1], axis=-1)
         held = bodies.joints.body[driven]
         found[held[held >= 0]] = True
     return found

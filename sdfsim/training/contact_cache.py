@@ -87,22 +87,22 @@ class ContactFrames:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays, by names in which a slash leads to the entries of a field."""
-        told: dict[str, np.ndarray] = {}
+        flat: dict[str, np.ndarray] = {}
         for name, value in vars(self).items():
-            told |= {f"{name}/{of}": v for of, v in value.items()} if isinstance(value, dict) else {name: value}
-        return told
+            flat |= {f"{name}/{of}": v for of, v in value.items()} if isinstance(value, dict) else {name: value}
+        return flat
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray]) -> ContactFrames:
         """The reverse. Raises TypeError if a field is missing or unknown."""
-        told: dict[str, Any] = {}
+        fields: dict[str, Any] = {}
         for name, value in arrays.items():
             of, _, inside = name.partition("/")
             if inside:
-                told.setdefault(of, {})[inside] = value
+                fields.setdefault(of, {})[inside] = value
             else:
-                told[of] = value
-        return cls(**told)
+                fields[of] = value
+        return cls(**fields)
 
     def save(self, path: Path) -> None:
         write_arrays(path, self.arrays() | {"version": np.array(FRAMES_VERSION)}, compressed=False)
@@ -185,8 +185,8 @@ def _fingerprint(files: list[Path], how: Solved) -> str:
     solved."""
     info = [home / INFO] if (home := home_of(files[0].parent)) else []
     records = [*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))]
-    told = [record.read_text(encoding="utf-8") for record in records]
-    return digest(FRAMES_VERSION, how, [[f.name, f.stat().st_size] for f in files], told)[:12]
+    contents = [record.read_text(encoding="utf-8") for record in records]
+    return digest(FRAMES_VERSION, how, [[f.name, f.stat().st_size] for f in files], contents)[:12]
 
 
 def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:

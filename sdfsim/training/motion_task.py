@@ -158,9 +158,9 @@ class MotionTask:
         return begin, weight / weight.sum()
 
     def digest(self) -> str:
-        told = [(r.goal, r.position, r.velocity, r.angular_velocity) for r in self.recordings]
+        motions = [(r.goal, r.position, r.velocity, r.angular_velocity) for r in self.recordings]
         of = ("name", "scale", "mass", "friction", "restitution", "position", "quat_xyzw")
-        return digest(told, [[getattr(b, name) for name in of] for b in self.scene.bodies])[:16]
+        return digest(motions, [[getattr(b, name) for name in of] for b in self.scene.bodies])[:16]
 
     def ranges(self) -> dict[str, list[float]]:
         """The ranges of the recordings, in the solver's units; see `ranges_of`."""

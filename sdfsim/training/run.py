@@ -53,8 +53,8 @@ class Run:
         if first is not None:
             self.origin["first"] = digest(first.network)
             if (first.kind, first.network.config) != (plan.kind, self.network.config):  # type: ignore[union-attr]
-                told = f"{first.name}: a network of another kind or size than the preset's"
-                raise SdfsimError(told, "use the preset that it was trained with")
+                message = f"{first.name}: a network of another kind or size than the preset's"
+                raise SdfsimError(message, "use the preset that it was trained with")
             self.network.load_state_dict(first.network.state_dict())
         self.network = self.network.to(device)
         if hasattr(task, "prepare") and first is None:  # weights from another training include statistics

@@ -19,13 +19,13 @@ from numba.core import config
 
 
 def _cache() -> Path:
-    told = hashlib.sha256()
+    hashed = hashlib.sha256()
     here = Path(__file__).parent
     for file in [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]:
         if file.name != "prepare.py":
-            told.update(file.read_bytes())
+            hashed.update(file.read_bytes())
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return home / "sdfsim" / "kernels" / told.hexdigest()[:16]
+    return home / "sdfsim" / "kernels" / hashed.hexdigest()[:16]
 
 
 @contextmanager

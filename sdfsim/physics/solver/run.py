@@ -63,7 +63,7 @@ def run_steps(
         of bodies that touch [C, 2] and the points [C, 3] where they touch.
     """
     shapes, world, work = reference(shapes), reference(world), reference(work)
-    motion, rules, told = reference(motion), reference(rules), reference(kept)
+    motion, rules, written = reference(motion), reference(rules), reference(kept)
     going, dt = world.going, rules.substep_dt * rules.options.substeps
     place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
     pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
@@ -106,16 +106,16 @@ def run_steps(
             pulled += given(held.each)
         total += pulled
         if len(kept.depth):
-            _keep(told, k, world, motion, rules, counts, pulled)
+            _keep(written, k, world, motion, rules, counts, pulled)
             if held is not None:
-                _keep_joints(told, k, held.each)
+                _keep_joints(written, k, held.each)
             here = touching(manifolds, motion.position, motion.orientation, within)
             pair, point = _with_room(pair, point, found, found + len(here.pair))
-            told.count[k, 4], told.depth[k] = len(here.pair), 0.0
+            written.count[k, 4], written.depth[k] = len(here.pair), 0.0
             for e in range(len(here.pair)):
                 pair[found, 0], pair[found, 1] = here.pair[e, 0], here.pair[e, 1]
                 put(point, found, get(here.point, e))
-                told.depth[k] = max(told.depth[k], -here.gap[e])
+                written.depth[k] = max(written.depth[k], -here.gap[e])
                 found += 1
     return manifolds, edges, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
 
