@@ -146,8 +146,8 @@ def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
 
 
 def read_info(folder: Path) -> dict:
-    """`dataset.json` of a dataset folder. Raises SdfsimError if it is absent, not a JSON object, or made by `sdfsim
-    dataset` with another version of the teacher."""
+    """`dataset.json` of a dataset folder. Raises SdfsimError if it is missing, not a JSON object, or if another version
+    of `sdfsim dataset`'s teacher made it."""
     info = read_json(folder / INFO, "a dataset folder is what `sdfsim dataset` writes")
     if not isinstance(info, dict):
         raise SdfsimError(f"{folder / INFO}: must be a JSON object")

@@ -81,8 +81,8 @@ class SceneBuilder:
         """Add a joint between two bodies, and return the scene. The second body may be "world", which is also the
         default.
 
-        The keys are those of `joints` in docs/scene.md: `join("door", "hinge", "leaf", anchor=(0, 0, 1), axis=(0, 0,
-        1))`. Raises SceneError for an unknown key or an invalid value; `load` checks whether the bodies exist.
+        The keys are those of `joints` in docs/scene.md, as in `join("door", "hinge", "leaf", anchor=(0, 0, 1), ...)`.
+        Raises SceneError for an unknown key or an invalid value; `load` checks whether the bodies exist.
         """
         given = ("name", "type", "bodies")
         _check(keys, [key for key in JointTable.model_fields if key not in given], f"joint {name!r}")

@@ -43,7 +43,7 @@ class Plan:
 
 
 def plan(scene: Scene) -> Plan:
-    """Decide every effect of a scene. `on` and `off` in the file win; `auto` is on where it can change the motion."""
+    """Decide every effect of a scene. `on` and `off` in the file win; `auto` is on if it can change the motion."""
     names = {m: tuple(b.name for b in scene.bodies if b.motion == m) for m in ("static", "dynamic", "kinematic")}
     pairs, asked = count_pairs(scene.bodies), scene.effects
     size, moving = float(np.linalg.norm(scene.gravity)), len(names["dynamic"])

@@ -237,7 +237,7 @@ def _one_of(data: dict, keys: Iterable[str], *, required: bool = False) -> Itera
 
 
 class EffectsTable(Table):
-    """Which effects to compute; `auto` is on where it can change the motion. `sdfsim plan` shows the decisions."""
+    """Which effects to compute; `auto` is on if it can change the motion. `sdfsim plan` shows the decisions."""
 
     contact: Switch = key("bodies touch", "auto")
     friction: Switch = key("contacts have friction", "auto")

@@ -36,8 +36,8 @@ class LiveScene(ABC):
         with the targets of their motors, and the time. `restore` continues from it, and `state.save("state.npz")`
         writes it to a file. It contains neither `options` (such as gravity) nor the scene.
 
-        Set it to start from another state, or to change bodies: `simulator.state = replace(simulator.state,
-        velocity=...)`. Its arrays must not be written to. Raises SimulationError if the new state is invalid.
+        Set it to start from another state, or to change bodies, as in `simulator.state = replace(simulator.state,
+        time=0.0)`. Its arrays must not be written to. Raises SimulationError if the new state is invalid.
         """
         self._accept()  # a saved state must include every change, or sleeping bodies would sleep on
         return self._state
