@@ -21,8 +21,7 @@ WALL = 2.0  # cells: a wall must be this thick for a grid to hold both of its si
 CHUNK = 2**18  # points evaluated at once
 BESIDE = 0.05  # cells: points farther from a surface are not on it
 SPREAD = 512  # number of places spread over a surface
-# How near these places are at first, as a part of the largest extent, and the number of steps towards the surface after
-# that.
+# How near these places are at first and in the end, relative to the largest extent, and the number of steps in between.
 CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
 
 
