@@ -64,7 +64,7 @@ _MOST_CORNER_PAIRS = 1_000_000  # with more (about 10,000 vertices) a mesh count
 LONGEST = 5.0  # longest arrow, in sizes of its body
 # Least force of an arrow, in weights; number of bodies above which only hits get arrows; the least force of a hit.
 LEAST, TOLD, MANY_LEAST = 0.05, 100, 3.0
-FARTHEST = 1.0  # a body that leaves the scene for good must not shrink it to a dot
+FARTHEST = 1.0  # in sizes of the scene: a body that leaves the scene must not shrink it to a dot
 # Of joints.
 MOST_SHOWN = 256  # largest number of joints that are shown: each takes bodies out of the crowds
 SIZE = 0.4  # size of marks, relative to the smaller of the two bodies

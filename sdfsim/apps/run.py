@@ -49,7 +49,7 @@ FAR = 10.0  # times the size of the scene: a body farther away at the end has le
 _REPORT = "report.json"
 _RESULTS = (_REPORT, "rollout.npz", "rollout.rrd", FILE)
 _STATE = "state.npz"
-_ANEW = "leave --resume away to start anew"
+_ANEW = "leave out --resume to start again"
 _OTHER = "is of another scene, model or seed"
 
 
@@ -223,7 +223,7 @@ def read_run(
     known, now = rollout.meta.get("scene", {}), fingerprints(scene)
     if other := [what for what in compared if known.get(what, now[what]) != now[what]]:
         message = f"{file}: {scene.path} is not the scene that it was made from: other {' and '.join(other)}"
-        raise SdfsimError(message, "simulate it anew, or give the scene as it was: --scene")
+        raise SdfsimError(message, "simulate it again, or give the original scene: --scene")
     return scene, rollout
 
 

@@ -104,5 +104,5 @@ def check_nodes(scene: Scene) -> None:
             where = "in one place" if extents[0] == 0 else "on one line"
             raise SdfsimError(
                 f"body {body.name!r} moves: its {len(nodes)} surface nodes are {where}, so its rotation is not defined",
-                "sample nodes anew: nodes: 7 at its shape in the scene file",
+                "sample its nodes: give nodes: 7 at its shape in the scene file",
             )

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 # m, sizes of meshes that need no remark. If the units are not given the upper limit is lower, as few moving things are
 # larger.
 USUAL, LARGE = (1e-3, 100.0), 5.0
-# Largest part of the nodes of convex pieces that are vertices of the pieces, and that are vertices or points on edges.
+# For convex pieces: largest share of nodes that are vertices, and largest share that are vertices or points on edges.
 OWN_SHARE, EDGE_SHARE = 0.6, 0.85
 # Distance of points on the edges of convex pieces, relative to the size of the whole shape.
 EDGE_SPACING = 0.06

@@ -121,7 +121,7 @@ class Run:
 
     def load(self, path: Path) -> None:
         """Load a saved run. Raises SdfsimError if it has another preset, seed or data, or is unreadable."""
-        arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
+        arrays = read_arrays(path, "a checkpoint", "delete it to start again")
         try:
             info: dict[str, Any] = json.loads(str(arrays.pop("run")))
             if any(info[name] != self.origin[name] for name in ("plan", "seed")) or info["total"] != self.total:
@@ -142,7 +142,7 @@ class Run:
             self.close()
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise SdfsimError(
-                f"{path}: not a checkpoint of this training: {error}", "delete it to start anew"
+                f"{path}: not a checkpoint of this training: {error}", "delete it to start again"
             ) from error
 
     def export(self, name: str, data: list[dict[str, Any]]):
