@@ -225,7 +225,7 @@ def growth(found: Motion, truth: Motion, flights: Sequence[int]) -> dict[int, tu
 
 def table(result: dict[str, tuple[np.ndarray, np.ndarray]]) -> str:
     """Of each engine's errors [3, B] on the tosses that its parameters were found on, and on the others; best first."""
-    heads = "links apart, % of a link", "turned, degrees", "hinge, degrees", "sdfsim less it", "the same on the 60"
+    heads = "position, % of a link", "rotation, degrees", "hinge, degrees", "sdfsim minus it", "the same on the 60"
     rows: list[tuple[str, ...]] = [("", *heads)]
     for name, (fitted, judged) in sorted(result.items(), key=lambda item: item[1][1][0].mean()):
         cells = [f"{np.mean(e):.1f} +- {interval(e)[1] - np.mean(e):.1f}" for e in judged]

@@ -529,7 +529,7 @@ def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
 
 def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     """Whom we lose to comes first, then ours, then the others."""
-    head = ("engine", "position, % of the side", "rotation, degrees", "sdfsim less it", "on those 60", "found")
+    head = ("engine", "position, % of the side", "rotation, degrees", "sdfsim minus it", "on those 60", "found")
 
     def lost(name: str) -> float:
         return float(np.mean(result[name]["test"][0]) - np.mean(result[OURS]["test"][0]))
