@@ -34,7 +34,7 @@ def cost(scene: Scene) -> tuple[float, np.ndarray]:
 
 
 def main() -> None:
-    rows = [("scene", "off", "ms a step", "of all on", "bodies end")]
+    rows = [("scene", "off", "ms a step", "relative to all on", "where bodies end")]
     for name in SCENES:
         scene = load_scene(ROOT / "samples" / f"{name}.yaml")
         size = min(largest_extent(scene.shapes[b.shape]) * b.scale for b in scene.bodies if b.motion == "dynamic")

@@ -193,8 +193,8 @@ def table(results: Results) -> str:
     for row in rows:
         for check in results[row, OURS].get("missed", ()):
             by = held_by(results, row, check)
-            lost.append(f"- {check.rpartition(' [')[0]}: held by {', '.join(by) or 'none'}")
-    parts.append("\n".join(["What ours misses:", "", *(lost or ["- nothing"])]) + "\n")
+            lost.append(f"- {check.rpartition(' [')[0]}: passed by {', '.join(by) or 'no other engine'}")
+    parts.append("\n".join(["Checks that sdfsim misses:", "", *(lost or ["- nothing"])]) + "\n")
     absent = [f"- {name}: {why}, {n} checks" for name, one in sums.items() for why, n in one["not_run"].items()]
     if absent:
         parts.append("\n".join(["Not run:", "", *absent]) + "\n")

@@ -114,7 +114,7 @@ def differing(data: Path) -> None:
         rows.append((kind, *shares, *(number(float(r)) for r in np.sqrt(square.mean(0)))))
     worst = np.sort(np.square(np.concatenate([some[:, 0] for some in errors.values()])))[::-1]
     share = worst[: len(worst) // 100].sum() / worst.sum()
-    told = f"{count:,} contacts of {len(recorded)} trajectories; 1 % of them has {100 * share:.0f} % of the error."
+    told = f"{count:,} contacts of {len(recorded)} trajectories; 1 % of them have {100 * share:.0f} % of the error."
     write_section("MOVi-B contacts", f"{COMMAND} --contacts", f"{markdown(rows)}\n{told}")
 
 

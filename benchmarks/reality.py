@@ -480,8 +480,9 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bo
     write_json(out / "reality.json", kept)
     pictures(moved, test_truth, dt, out)
     text = (
-        f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
-        f"95 % intervals; sdfsim less the other is toss by toss. Starts fit the free flight to {off:.2f} mm "
+        f"Parameters are from {FIT} tosses, errors from {TEST} others (seed {SEED}), over the first {FRAMES} frames: "
+        "means over tosses with 95 % intervals. Differences between engines are paired by toss. The starts fit the "
+        f"free flight to {off:.2f} mm "
         f"and {turned_off:.2f} degrees (medians of root mean squares); recorded cubes fall with {falls:.3f} +- "
         f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
     )
@@ -529,7 +530,14 @@ def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
 
 def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
     """Whom we lose to comes first, then ours, then the others."""
-    head = ("engine", "position, % of the side", "rotation, degrees", "sdfsim minus it", "on those 60", "found")
+    head = (
+        "engine",
+        "position, % of the side",
+        "rotation, degrees",
+        "sdfsim minus it",
+        "the same on the 60",
+        "parameters",
+    )
 
     def lost(name: str) -> float:
         return float(np.mean(result[name]["test"][0]) - np.mean(result[OURS]["test"][0]))
@@ -550,20 +558,20 @@ def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path,
     found = networks(groups, out / "identified.yaml", gravity, out / "networks")
     chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
     text = (
-        f"Networks in the scene that was identified: {STEPS} steps of a training where its row does not say how many "
-        f"({SURFACE_STEPS} of networks on surface nodes), of which the best of {LOOKS} states on {chosen} tosses is "
-        f"taken, and judged once on {TEST} others. Means over the seeds that are listed, with 95 % intervals over "
-        "tosses. Less the solve: toss by toss. Seconds of one core, for one training.\n\n"
+        f"These are networks in the identified scene. A training has {STEPS} steps unless its row says otherwise "
+        f"({SURFACE_STEPS} for networks on surface nodes). {chosen} tosses choose the best of its {LOOKS} states, "
+        f"which is measured once on {TEST} others. Means are over the listed seeds, with 95 % intervals over tosses. "
+        "Differences to the solve are paired by toss. Times are seconds of one core for one training.\n\n"
         f"{markdown(network_table(found))}"
     )
     write_section("reality networks", f"{COMMAND} --networks-only", text)
 
 
 def network_table(found: Results) -> list[tuple[str, ...]]:
-    """Means over seeds, and what networks change of the solve alone, toss by toss; whoever loses most comes first."""
+    """Means over seeds, and their difference to the solve alone, paired by toss; the worst comes first."""
     solve = found["-", SOLVE]
     own = np.array(solve["test"])
-    head = ("network", "position, %", "rotation, degrees", "less the solve", "position, % / degrees of each seed")
+    head = ("network", "position, %", "rotation, degrees", "minus the solve", "position, % / degrees of each seed")
     rows = []
     for name in dict.fromkeys(method for _, method in found if method != SOLVE):
         seeds = [one for (_, method), one in found.items() if method == name]
@@ -578,7 +586,7 @@ def network_table(found: Results) -> list[tuple[str, ...]]:
         taken = number(float(np.mean([one["seconds"] for one in seeds])))
         rows.append((float((mean - own).sum(0).mean()), (name, *map(_told, mean), less, each, on, taken)))
     rows.sort(key=lambda row: -row[0])
-    on = f"both errors on the tosses that choose (solve: {number(solve['chosen'])})"
+    on = f"sum of both errors on the tosses that choose (solve: {number(solve['chosen'])})"
     return [(*head, on, "s"), *(row for _, row in rows), (SOLVE, *map(_told, own), "", "", "", "")]
 
 

@@ -66,6 +66,6 @@ def main(*, rounds: int = 7) -> None:
             "the same in MuJoCo": [sys.executable, "-c", MUJOCO],
         }
         found = np.median(in_turn([lambda some=some: ended(some) for some in cases.values()], rounds), axis=0)
-    rows = [("from nothing", "s", "s of the processor", "MiB")]
+    rows = [("cold start", "s", "processor s", "MiB")]
     rows += [(name, *map(number, values)) for name, values in zip(cases, found, strict=True)]
     write_section("start", "python -m benchmarks start", markdown(rows))

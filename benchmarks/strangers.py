@@ -36,7 +36,7 @@ from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 PAGE = ROOT / "docs" / "notes" / "strangers.md"
 SIZE, SECONDS = 0.2, 5.0  # m, how wide a mesh is made that is dropped; s, that it may take to come to rest
 PROGRAM = "from cli import app; app()"
-HEAD = ("input", "is", "became", "s", "exact to", "rests", "what is wrong")
+HEAD = ("input", "kind", "result", "s", "error", "at rest", "faults")
 
 
 @dataclass(frozen=True)
