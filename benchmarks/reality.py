@@ -104,7 +104,7 @@ class FittedStart(Start):
 
 
 def load_tosses(folder: Path) -> list[Toss]:
-    """The tosses of `cube.npz`. Raises SdfsimError where it is absent or holds no such recordings."""
+    """The tosses of `cube.npz`. Raises SdfsimError if it is absent or holds no such recordings."""
     dt, tosses = read_tosses(folder / "cube.npz", "position", "quat_xyzw")
     return [Toss(dt, **arrays) for arrays in tosses]
 

@@ -69,7 +69,7 @@ def pages() -> list[Path]:
 
 
 def page_of(name: str) -> Path:
-    """The page that holds a section. Raises ValueError where none does."""
+    """The page that holds a section. Raises ValueError if none does."""
     found = [page for page in pages() if f"<!-- {name} -->" in page.read_text(encoding="utf-8")]
     if not found:
         raise ValueError(f"no section {name} in RESULTS.md, docs/notes or docs")

@@ -100,7 +100,7 @@ def mug() -> Mesh:
 
 
 def rugged() -> Mesh:
-    """Ground 6 m wide of 200,000 triangles, in place of a scan: hills, an arch to fall through and noise of 2 mm."""
+    """Ground 6 m wide of 200,000 triangles, instead of a scan: hills, an arch to fall through and noise of 2 mm."""
     rng = np.random.default_rng(0)
     waves = [(rng.uniform(1, 5, 2), rng.uniform(0, 6.3), rng.uniform(0.03, 0.12)) for _ in range(12)]
 

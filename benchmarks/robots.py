@@ -151,7 +151,7 @@ def _set(
 
 def _bare(source: Path) -> str:
     """A URDF without geometry: MuJoCo finds no meshes by ROS paths, and masses and joints do not need them. Without
-    what no XML has around it, and with ROS' defaults in place of variables of the environment."""
+    what no XML has around it, and with ROS' defaults instead of variables of the environment."""
     text = source.read_bytes().decode(errors="replace").strip(" \t\r\n\0")
     root = ElementTree.fromstring(re.sub(r"\$\(optenv +\w+([^()]*)\)", r"\1", text).encode())
     for link in root.findall("link"):

@@ -45,7 +45,7 @@ print(time.perf_counter() - began, used.ru_utime + used.ru_stime, used.ru_maxrss
 
 
 def ended(command: list[str]) -> tuple[float, ...]:
-    """s by the clock and of the processor that a command takes, and MiB at most. Raises SdfsimError where it fails."""
+    """s by the clock and of the processor that a command takes, and MiB at most. Raises SdfsimError if it fails."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     started = [sys.executable, "-c", LAUNCH, *command]
     done = subprocess.run(started, cwd=ROOT, env=kept, capture_output=True, text=True, check=False)

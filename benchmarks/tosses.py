@@ -72,7 +72,7 @@ Engine = Callable[[Sequence[Start], float, np.ndarray, dict[str, float]], Motion
 
 
 def read_tosses(file: Path, *names: str) -> tuple[float, list[dict[str, np.ndarray]]]:
-    """Frame spacing s, and of each toss in a file the arrays `names`. Raises SdfsimError where one is absent."""
+    """Frame spacing s, and of each toss in a file the arrays `names`. Raises SdfsimError if one is absent."""
     found = read_arrays(file, "recorded tosses", f"give the folder that holds {file.name}")
     if missing := {"start", "dt", *names} - set(found):
         raise SdfsimError(f"{file}: there is no array {min(missing)!r}", f"it has {', '.join(sorted(found))}")

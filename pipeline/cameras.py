@@ -140,7 +140,7 @@ def save_views(views: Sequence[View], path: Path) -> None:
 
 
 def load_views(path: Path) -> list[View]:
-    """The views of a poses folder, or of a file that `save_views` wrote. Raises SdfsimError where it is absent or
+    """The views of a poses folder, or of a file that `save_views` wrote. Raises SdfsimError if it is absent or
     damaged."""
     path = path / "cameras.json" if path.is_dir() else path
     data = read_json(path, "run the poses stage first")

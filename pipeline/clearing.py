@@ -129,7 +129,7 @@ class _Way:
         return found
 
     def out(self, up: np.ndarray) -> np.ndarray | None:
-        """The shift [3] m that takes the body out; None where none does that is short."""
+        """The shift [3] m that takes the body out; None if none does that is short."""
         straight, shortest = self._along(up), self._shortest()
         if straight is None or (shortest is not None and straight > UPRIGHT * np.linalg.norm(shortest)):
             return shortest

@@ -25,7 +25,7 @@ Stage = Literal["photos", "poses", "distill", "mesh", "fit", "scene"]
 
 
 def options(*names: str, kept: bool = False) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command these options of `Options`, as keywords, None where they are not given; it has to take
+    """Gives a command these options of `Options`, as keywords, None if they are not given; it has to take
     `**options`. Where they are `kept`, those that are not given stay as they are in the folder."""
 
     def added(work: Callable[..., None]) -> Callable[..., None]:

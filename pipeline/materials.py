@@ -71,7 +71,7 @@ class Choice:
 
 def materials_of(given: dict[str, str]) -> dict[str, Choice]:
     """Looks up what bodies are made of: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a
-    hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError where this makes no sense."""
+    hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError if this makes no sense."""
     found = {}
     for body, text in given.items():
         name, colon, thickness = text.partition(":")

@@ -23,8 +23,8 @@ def measure(given: Path | str, out: Path | str, *, on_progress: Progress = silen
     """Write one HTML file that holds the photos (what `reconstruct` takes) and needs nothing else, nor a network.
 
     Two clicks in it give `--distance PLACE PLACE METRES`, one gives `--body NAME=PHOTO:X,Y`; pixels count in the
-    user's upright photo, whatever size it has on the page. Returns `page`, `photos` and `mib`. Raises SdfsimError where
-    `reconstruct` would refuse the photos, and where the page cannot be written.
+    user's upright photo, whatever size it has on the page. Returns `page`, `photos` and `mib`. Raises SdfsimError if
+    `reconstruct` would refuse the photos, and if the page cannot be written.
     """
     given, out = Path(given), Path(out)
     if out.suffix.lower() not in (".html", ".htm"):

@@ -148,7 +148,7 @@ def write_scene(
     """Writes scene.yaml for the meshes of a mesh folder and the shapes beside it; returns the stage's report.
 
     A file that the user has changed (it has another hash than `written`, that of what this function last wrote) is kept
-    as `scene.yaml.bak`. Raises SdfsimError where a material is for a body that there is not.
+    as `scene.yaml.bak`. Raises SdfsimError if a material is for a body that there is not.
     """
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
     names = [entry["name"] for entry in parts["objects"]]
@@ -218,7 +218,7 @@ def moved_line(name: str, one: Cleared, unsure: float) -> str:
 
 
 def holder_of(part: Mesh, others: dict[str, Mesh]) -> str | None:
-    """Name of what a part that moves is beside, of which it was cut off; None where there is nothing else."""
+    """Name of what a part that moves is beside, of which it was cut off; None if there is nothing else."""
 
     def beside(mesh: Mesh) -> float:
         away = np.linalg.norm(ClosestPoint(mesh)(part.vertices)[0] - part.vertices, axis=1)
@@ -351,7 +351,7 @@ class Slab:
 
 def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     """Chooses a place for a slab from geometry alone: level, flat, seen in the photos, high and central. Both meshes
-    are in metres, z up; `solid` is closed. Raises SdfsimError (exit code 3) where there is no place at all."""
+    are in metres, z up; `solid` is closed. Raises SdfsimError (exit code 3) if there is no place at all."""
     low, high = shown.vertices.min(0), shown.vertices.max(0)
     side = SIDE * float((high - low).max())
     axes = [np.arange(low[k], high[k] + side / 4, side / 2) for k in range(2)]

@@ -28,7 +28,7 @@ FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 
 @dataclass(frozen=True)
 class Instead:
-    """What is done in place of a stage's own work, and on what its result depends besides options and inputs."""
+    """What is done instead of a stage's own work, and on what its result depends besides options and inputs."""
 
     run: Callable[[Project, Path], dict]
     depends: Any
@@ -172,7 +172,7 @@ def reconstruct(
 
 def wanted_stages(from_stage: str | None, until_stage: str | None) -> dict[str, bool]:
     """The stages up to one, and whether each is to be done even where nothing changed, as those from another one on
-    are. Raises SdfsimError where there is no such stage, or they are in the wrong order."""
+    are. Raises SdfsimError if there is no such stage, or they are in the wrong order."""
     first, last = number_of(from_stage or "scene"), number_of(until_stage or "scene")
     if from_stage and first > last:
         raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
@@ -219,7 +219,7 @@ def number_of(stage: str) -> int:
 
 def run_all(project: Project, stages: dict[str, bool]) -> dict:
     """Runs stages, those whose value is True also when nothing changed, and returns the report. Raises SdfsimError
-    before anything is written where the device is missing, or where files that sdfsim did not write would be lost."""
+    before anything is written if the device is missing, or if files that sdfsim did not write would be lost."""
     if project.options.device == "cuda":
         project.device()
     check_own(project.folder, COMMAND, "report.json", "report.md")
@@ -237,7 +237,7 @@ def run_all(project: Project, stages: dict[str, bool]) -> dict:
 
 
 def check_apart(project: Project) -> None:
-    """Raises SdfsimError where there are no photos, or a file of the user's lies where a result will replace it."""
+    """Raises SdfsimError if there are no photos, or a file of the user's lies where a result will replace it."""
     from pipeline.inputs.sources import find_source
 
     given = Path(project.options.photos)
@@ -321,7 +321,7 @@ def current(folder: Path) -> dict[str, dict]:
 
 
 def read_record(place: Path) -> dict | None:
-    """The record of a finished stage; None where it has not finished."""
+    """The record of a finished stage; None if it has not finished."""
     try:
         known = json.loads((place / RECORD).read_text(encoding="utf-8"))
         return known if {"fingerprint", "inputs", "made", "report", "seconds"} <= set(known) else None
@@ -330,7 +330,7 @@ def read_record(place: Path) -> dict | None:
 
 
 def check_replaceable(place: Path) -> None:
-    """Raises SdfsimError where anything but an earlier result lies at a stage's place: that is never replaced."""
+    """Raises SdfsimError if anything but an earlier result lies at a stage's place: that is never replaced."""
     if os.path.lexists(place) and read_record(place) is None:
         message = f"{place}: exists and is not replaced, as sdfsim did not write it (no {RECORD} in it)"
         raise SdfsimError(message, "choose another folder to write to, or move it away")
@@ -354,10 +354,10 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
 
 
 def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seconds: float) -> None:
-    """Writes the record and moves the finished folder to its place, in place of an earlier result of the stage.
+    """Writes the record and moves the finished folder to its place, instead of an earlier result of the stage.
 
     Each result gets a name of its own, `made`: two of the same fingerprint may differ (time budgets, GPUs). Raises
-    SdfsimError where a stage did not write what lies at the place.
+    SdfsimError if a stage did not write what lies at the place.
     """
     check_replaceable(place)
     # Where the record cannot be written, the one with the fingerprint alone stays, and the next run goes on from here.

@@ -59,7 +59,7 @@ def reconstruct(
     Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
     `out` (of two states also a folder each), and returns the report. Skips a stage whose inputs, options and version
     are those of its last run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises
-    SdfsimError for bad photos or options (exit code 1), or where poses, surface or joint are not good enough (3).
+    SdfsimError for bad photos or options (exit code 1), or if poses, surface or joint are not good enough (3).
     """
     given: Any = {"from_stage": from_stage, "until_stage": until_stage, "progress": progress, **options}
     return (
@@ -77,7 +77,7 @@ def reconstruct_states(
 
     Takes stages and options as `reconstruct` does, for both states; the size is that of the first state's scene.
     Returns the report of the scene, or of the last stage that was wanted, and its folder. Raises SdfsimError as
-    `reconstruct`, `tie` and `find_joint` do, and where the photos come with masks.
+    `reconstruct`, `tie` and `find_joint` do, and if the photos come with masks.
     """
     out, given = Path(out), (Path(first), Path(second))
     if given[0].resolve() == given[1].resolve():
@@ -137,7 +137,7 @@ def _record(project: Project, stage: str) -> dict:
 
 
 def check_unmasked(state: Project) -> None:
-    """Raises SdfsimError where the photos of a state come with masks: what stands still is mostly outside of them."""
+    """Raises SdfsimError if the photos of a state come with masks: what stands still is mostly outside of them."""
     folder = state.place("photos")
     if all(photo.mask for photo in load_photos(folder)) or load_names(folder):
         message = "--joint takes no masks: what stands still around the thing ties both states"

@@ -125,7 +125,7 @@ def render(
     samples: int = 32, backdrop: Tensor | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Renders rays [R, 3] as `composite` does, without gradients and the same every time; a `backdrop` [3] is a
-    constant colour in place of the background model."""
+    constant colour instead of the background model."""
     middle = torch.full((len(origins), samples), 0.5, device=origins.device)
     chosen = choose_samples(cache, origins, directions, beta, middle)
     behind = backdrop

@@ -43,7 +43,7 @@ class DepthPoints:
 
 def depth_points(views: Sequence[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:
     """All pixels with depth, times `scale`, in the world of the poses, whose unit is the metre as far as the cameras
-    know. Raises SdfsimError where a file of the photos stage is missing."""
+    know. Raises SdfsimError if a file of the photos stage is missing."""
     by_name = {photo.name: photo for photo in photos}
     xyz, pixel, index = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, np.int32)]
     for number, view in enumerate(views):
@@ -71,7 +71,7 @@ def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
 
     Returns `scale`, the factor of the depth that makes both agree; `spread`, the median share by which a pixel differs
     after that; `points`, how many were compared: with fewer than `FEWEST` the depth is taken as it is. Raises
-    SdfsimError where they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
+    SdfsimError if they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
     """
     ratios, sparse = [], poses.sparse
     for number, view in enumerate(poses.views):

@@ -157,7 +157,7 @@ def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor
 
 def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
     """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. With masks, a view without one
-    counts as all object. Raises SdfsimError where a photo is missing."""
+    counts as all object. Raises SdfsimError if a photo is missing."""
     rgb, mask, view_of, pixel, intrinsics, sizes = [], [], [], [], [], []
     for index, view in enumerate(views):
         try:
@@ -412,7 +412,7 @@ class Trainer:
         write_bytes(path, safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
 
     def load(self, path: Path) -> bool:
-        """Goes on from a checkpoint; False where there is none. Raises SdfsimError where there is one that cannot be
+        """Goes on from a checkpoint; False where there is none. Raises SdfsimError if there is one that cannot be
         read or is of another field; then the training is as before its first step."""
         if not path.exists():
             return False
@@ -514,7 +514,7 @@ def train(
 
     The poses are as structure-from-motion left them. The budget, s, includes training before a kill: the number of
     steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Where the checkpoint of a killed run
-    cannot be read, training begins again, and a note of the report says so. Raises SdfsimError where the loss is no
+    cannot be read, training begins again, and a note of the report says so. Raises SdfsimError if the loss is no
     longer finite.
     """
     photos = load_photos(photos_folder)

@@ -68,7 +68,7 @@ def deep_header(path: Path) -> Deep | None:
 
 
 def deep_values(path: Path, header: Deep) -> np.ndarray:
-    """The numbers of a file, as stored: grey [H, W], RGB [H, W, 3] or RGBA [H, W, 4]. Raises SdfsimError where it is
+    """The numbers of a file, as stored: grey [H, W], RGB [H, W, 3] or RGBA [H, W, 4]. Raises SdfsimError if it is
     damaged, or stores them in a way that is not read."""
     import cv2
 

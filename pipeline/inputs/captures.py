@@ -47,8 +47,8 @@ class Capture:
 
 
 def find_capture(folder: Path, *, deep: bool = False) -> Path | None:
-    """The folder of a Record3D or Polycam export in `folder`, where `deep` also farther below; None where there is
-    none. Raises SdfsimError where there are several."""
+    """The folder of a Record3D or Polycam export in `folder`, where `deep` also farther below; None if there is
+    none. Raises SdfsimError if there are several."""
     near = [folder, folder / "EXR_RGBD", folder / "keyframes"]
     for places in [*([place] for place in near), *(levels(folder) if deep else [])]:
         found = [place for place in places if _is_capture(place)]
@@ -84,7 +84,7 @@ def levels(folder: Path) -> Iterator[list[Path]]:
 
 def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
     """What a Record3D or Polycam export says of its world, and its cameras, whose names are paths in `folder`. Raises
-    SdfsimError where it is damaged."""
+    SdfsimError if it is damaged."""
     try:
         if _metadata(folder).is_file():
             return Capture("Record3D", UP), _record3d(folder)
@@ -157,7 +157,7 @@ def _images_of(cameras: Path) -> Path:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks the files of a zipped capture. Raises SdfsimError where it is damaged or no zip, too large once unpacked,
+    """Unpacks the files of a zipped capture. Raises SdfsimError if it is damaged or no zip, too large once unpacked,
     or has names that lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
@@ -206,7 +206,7 @@ def load_capture(folder: Path) -> Capture | None:
 
 def read_depth(file: DepthFile) -> np.ndarray:
     """Depth [H, W] m along the optical axis; 0 where the sensor had none, was not sure, or saw an edge. Raises
-    SdfsimError where the file is absent, damaged, or needs a package that is not installed."""
+    SdfsimError if the file is absent, damaged, or needs a package that is not installed."""
     counts = _read(file.path, file.shape, np.float32)
     unit = file.unit or (1e-3 if counts.dtype.kind in "ui" else 1.0)
     depth = counts.astype(np.float32) * np.float32(unit)

@@ -69,7 +69,7 @@ def read_photo(
 
     Where a known camera has another `shape`, width over height, than the upright photo, the photo stays as stored.
     `white` is what a file of more than 8 bits has for white (see `common_white`), else what its own range says. Raises
-    SdfsimError, with the file's name, where it is no image, truncated, too small or too large.
+    SdfsimError, with the file's name, if it is no image, truncated, too small or too large.
     """
     image, original, focal, camera = shown(path, long_side, white)
     turned = ImageOps.exif_transpose(image)
@@ -96,7 +96,7 @@ def read_photo(
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     """A mask [H, W] uint8, grey or with alpha, white is the object, at the size (width, height) of its upright photo;
-    of 0 and 1 alone, 1 is the object. Raises SdfsimError where it cannot be read or is not shaped like the photo."""
+    of 0 and 1 alone, 1 is the object. Raises SdfsimError if it cannot be read or is not shaped like the photo."""
     image = turned_like(shown(path, max(size))[0], size, path)
     grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
     if grey.getextrema() == (0, 1):
@@ -105,7 +105,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image.Image:
-    """A mask as its photo of this size (width, height) is turned: upright, or as stored. Raises SdfsimError where
+    """A mask as its photo of this size (width, height) is turned: upright, or as stored. Raises SdfsimError if
     neither is shaped like the photo."""
     for image in (ImageOps.exif_transpose(stored), stored):
         if misfit(image, size[0] / size[1]) < 0.02:
@@ -133,7 +133,7 @@ def shown(
 
 
 def stored_size(path: Path) -> tuple[int, int]:
-    """Width and height, px, of a photo as stored. Raises OSError where it is no image."""
+    """Width and height, px, of a photo as stored. Raises OSError if it is no image."""
     with Image.open(path, formats=FORMATS) as image:
         return image.size
 

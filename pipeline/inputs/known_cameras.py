@@ -17,7 +17,7 @@ from pipeline.inputs.images import ReadPhoto
 from sdfsim.base.errors import SdfsimError
 
 # COLMAP's camera models, by number: name, and the names of their parameters; none of those that OpenCV does not know.
-# A transforms.json has the same names, with fl_x and fl_y in place of f, fx and fy.
+# A transforms.json has the same names, with fl_x and fl_y instead of f, fx and fy.
 MODELS = {
     0: ("SIMPLE_PINHOLE", "f cx cy"), 1: ("PINHOLE", "fx fy cx cy"), 2: ("SIMPLE_RADIAL", "f cx cy k1"),
     3: ("RADIAL", "f cx cy k1 k2"), 4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
@@ -114,7 +114,7 @@ def below(folder: Path, name: str) -> Path:
 
 def read_cameras(path: Path) -> list[KnownCamera]:
     """The cameras of a transforms.json or of a COLMAP model's folder, in the order of their names. Raises SdfsimError
-    where it is damaged or no such file, or where a lens is not known."""
+    if it is damaged or no such file, or if a lens is not known."""
     read = read_model if path.is_dir() else read_transforms
     try:
         return sorted(read(path), key=lambda camera: camera.name)

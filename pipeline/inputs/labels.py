@@ -36,7 +36,7 @@ class Labels:
         """Number of the object at each pixel [H, W] uint8 of a photo that is width x height upright; None: not given.
 
         Where some objects have no mask of this photo, a pixel outside the others is `UNKNOWN`; so is one in two masks.
-        Raises SdfsimError where a file cannot be read or is not shaped like the photo.
+        Raises SdfsimError if a file cannot be read or is not shaped like the photo.
         """
         if photo in self.images:
             found = read_label_image(self.images[photo], size)
@@ -66,7 +66,7 @@ def find_masks(photos: list[Path]) -> dict[Path, Path]:
 
 def find_labels(photos: list[Path]) -> Labels:
     """Looks for `masks/NAME/` (white is the object of that name) and `labels/` (label images) in and beside the photos'
-    folders. Raises SdfsimError where both are given, for a name that no body can have, or where no file is of use."""
+    folders. Raises SdfsimError if both are given, for a name that no body can have, or if no file is of use."""
     masks: dict[Path, dict[str, Path]] = {}
     images: dict[Path, Path] = {}
     notes: list[str] = []
@@ -125,7 +125,7 @@ def _of_photos(root: Path, folder: Path, photos: list[Path]) -> tuple[dict[Path,
 
 def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """A label image [H, W] int, palette or grey of 8 or 16 bits, at the size (width, height) of its upright photo, else
-    as stored. Raises SdfsimError where it cannot be read, is in colour, or is not shaped like the photo."""
+    as stored. Raises SdfsimError if it cannot be read, is in colour, or is not shaped like the photo."""
     stored = decoded(path, 1 << 20)[0]
     if stored.mode not in ("1", "L", "P") and not stored.mode.startswith("I"):
         raise SdfsimError(f"{path}: a label image has one number per pixel, this one is {stored.mode}",

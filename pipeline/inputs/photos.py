@@ -36,8 +36,8 @@ class Photo:
     height: int  # prepared height, px
     # width and height of the user's photo, px, turned as the prepared one is; of a frame of a video those prepared
     original: tuple[int, int]
-    lens: Lens | None  # what the photo was freed from; None where nothing was straightened
-    focal: float | None  # from EXIF, px of the prepared photo; None where EXIF has none
+    lens: Lens | None  # what the photo was freed from; None if nothing was straightened
+    focal: float | None  # from EXIF, px of the prepared photo; None if EXIF has none
     camera: str  # make and model from EXIF, empty where unknown
     mask: bool  # whether a mask came with it, as alpha or as a file
     sharpness: float  # see `sharpness`; 0.2 to 0.6 for photos in focus
@@ -179,7 +179,7 @@ def save_photos(photos: list[Photo], folder: Path) -> None:
 
 
 def load_photos(folder: Path) -> list[Photo]:
-    """The photos that `prepare_photos` wrote to `folder`. Raises SdfsimError where the photos stage has not run."""
+    """The photos that `prepare_photos` wrote to `folder`. Raises SdfsimError if the photos stage has not run."""
     path = Path(folder) / "photos.json"
     data = read_json(path, "run the photos stage first")
     try:

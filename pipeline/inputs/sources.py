@@ -59,7 +59,7 @@ def find_source(given: Path, *, unpacked: bool = False) -> Source:
 
     A folder holds photos (in it, or in its subfolder `images`), or is a COLMAP model, or a phone's capture (see
     `find_capture`); a file is a video, a transforms.json, or a zipped capture. Of an `unpacked` archive the photos may
-    lie in any one folder. Masks and labels: see `find_masks` and `find_labels`. Raises SdfsimError where nothing is
+    lie in any one folder. Masks and labels: see `find_masks` and `find_labels`. Raises SdfsimError if nothing is
     there, of fewer than three photos, or of two cameras of a photo.
     """
     given = Path(given)
@@ -114,7 +114,7 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
 
 def photos_in(folder: Path) -> list[Path]:
     """The photo files of a folder in name order, or those of its subfolder `images`, beside which there may be a few
-    previews. Raises SdfsimError where the folder cannot be read."""
+    previews. Raises SdfsimError if the folder cannot be read."""
     own = _images(folder)
     inner = _images(folder / "images") if (folder / "images").is_dir() else []
 

@@ -72,7 +72,7 @@ def choose_frames(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
 
 
 def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
-    """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError where the video
+    """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError if the video
     cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
     import cv2
 

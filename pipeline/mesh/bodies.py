@@ -99,7 +99,7 @@ class FoundBody:
     layer: float  # thickness of the contact layer, in which the field cannot separate body and plane
     hollow: np.ndarray  # [A, B] bool on the plane: places that the body goes around at the top of the contact layer
     corner: np.ndarray  # [2] of the first of these, in the axes of `frame_of` the plane
-    seam: Volume | None = None  # where it ends against what it touches, negative within; None where it ends by itself
+    seam: Volume | None = None  # where it ends against what it touches, negative within; None if it ends by itself
 
     def part_of(self, volume: Volume) -> tuple[slice, ...]:
         """The samples of `own` among those of the whole volume."""
@@ -331,7 +331,7 @@ def without_bodies(volume: Volume, bodies: list[FoundBody], field: Distance) -> 
 class Parts:
     """What a scene is made of, in normalised space."""
 
-    solid: Mesh | None  # closed mesh of the scenery; None where there are bodies alone
+    solid: Mesh | None  # closed mesh of the scenery; None if there are bodies alone
     shown: Mesh | None  # what is displayed of it: its visible surface, and the places where bodies stood
     bodies: dict[str, Mesh]  # closed mesh of each body by name, with colours; the largest first
     smallest: float  # what rises less than this above its plane stayed part of the scenery
@@ -345,7 +345,7 @@ class Parts:
 def split(surface: FieldSurface, distance: Distance, finest: float, poses: PosedPhotos, photos_folder: Path,
           up: np.ndarray, *, alone: bool, clicked: dict[str, np.ndarray] | None = None) -> Parts:  # fmt: skip
     """Finds bodies, takes them out of the scenery and separates those that touch. Points [K, 3] of the surface that
-    were `clicked` give bodies their names. Raises SdfsimError where masks do so as well.
+    were `clicked` give bodies their names. Raises SdfsimError if masks do so as well.
 
     All is in normalised space: the poses, `up` [3] and the signed distance that the surface is of; `finest` is the
     width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.

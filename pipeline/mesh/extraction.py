@@ -70,7 +70,7 @@ class Volume:
 
     def mesh(self) -> Mesh:
         """The zero surface by marching cubes, faces counter-clockwise from outside. Raises SdfsimError (exit code 3)
-        where the values have one sign everywhere."""
+        if the values have one sign everywhere."""
         if not self.values.min() < 0 < self.values.max():
             raise SdfsimError("mesh: the field holds no surface", exit_code=EXIT_QUALITY)
         from skimage.measure import marching_cubes
@@ -170,7 +170,7 @@ def surface_of(
 ) -> FieldSurface:  # fmt: skip
     """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
     poses are in normalised space. Points [P, 3] that are `known` [P] count as seen, whoever sees them. Raises
-    SdfsimError (exit code 3) where the field has no surface, or hardly any of it is in the photos."""
+    SdfsimError (exit code 3) if the field has no surface, or hardly any of it is in the photos."""
     raw, cell = volume.mesh(), volume.cell
     found = look(Visibility(raw, LIFT * cell), poses.views, photos_folder, on_progress)
     far = KDTree(poses.sparse.xyz).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS

@@ -23,7 +23,7 @@ class Hollow:
     depth: float  # m below its rim
     below: float  # m, how thick what is below the hollow is
     seen: int  # photos that see its bottom: the median over it, by rays
-    wall: float | None  # m, the median thickness of the wall around it; None where there is none
+    wall: float | None  # m, the median thickness of the wall around it; None if there is none
     wall_seen: float  # share of the wall, by vertices, of which photos see both sides
 
     def to_dict(self) -> dict:
@@ -33,7 +33,7 @@ class Hollow:
 
 
 def hollow(mesh: Mesh, least: float, evidence: Evidence | None = None) -> Hollow | None:
-    """The hollow of a body, a closed mesh in metres with z up; None where it holds no water, or none deeper than
+    """The hollow of a body, a closed mesh in metres with z up; None if it holds no water, or none deeper than
     `least` m. `evidence` is what photos say about the vertices; without it nothing counts as seen."""
     from skimage.morphology import reconstruction
 

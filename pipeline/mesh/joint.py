@@ -101,7 +101,7 @@ def find_joint(
     through: what moves has left such a place, or come to it. Without it all that has no surface is empty. `paired`
     gives places that are alike, some of them wrongly, from the points [P, 3] m that move in the one and in the other.
 
-    Raises SdfsimError where nothing moves, all does, several things do, no motion carries the one part onto the other,
+    Raises SdfsimError if nothing moves, all does, several things do, no motion carries the one part onto the other,
     or the motion is that of neither a hinge nor a slider.
     """
     rng = np.random.default_rng(seed)
@@ -235,7 +235,7 @@ class HeldPart:
 
 
 def load_held(path: Path) -> HeldPart | None:
-    """What `HeldPart.save` wrote; None where nothing is there. Raises SdfsimError: damaged."""
+    """What `HeldPart.save` wrote; None if nothing is there. Raises SdfsimError: damaged."""
     if not path.exists():
         return None
     known = read_json(path)
@@ -342,7 +342,7 @@ def _patches(points: Points, gap: float) -> Points:
 
 
 def _agreed(pairs: Pairs, near: float) -> tuple[Similarity | None, Pairs]:
-    """The motion that most pairs of places agree on, None where too few do, and these pairs."""
+    """The motion that most pairs of places agree on, None if too few do, and these pairs."""
     import pycolmap
 
     options = pycolmap.RANSACOptions(max_error=near, max_num_trials=100_000, random_seed=0)
@@ -437,7 +437,7 @@ class _Surfaces:
         return replace(self, part=some[0], there=some[1])
 
     def _step(self, motion: Similarity, reach: float, turns: bool) -> tuple[Similarity, float] | None:
-        """A step of ICP and how long it is, m; None where too little has a partner."""
+        """A step of ICP and how long it is, m; None if too little has a partner."""
         turn, shift = motion.rotation, motion.translation
         here, facing = self.part[0] @ turn.T + shift, self.part[1] @ turn.T
         goal, normal = self.on[1](here) if len(here) else (here, facing)

@@ -43,7 +43,7 @@ def make_meshes(
     on_progress: Progress = silent,
 ) -> dict:  # fmt: skip
     """Writes the files that docs/objects.md lists and returns the stage's report. Vertices in the PLY files have
-    `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) where there is hardly any surface, or
+    `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) if there is hardly any surface, or
     (1) for a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
@@ -205,7 +205,7 @@ def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
 
 def axis_ends(parts: Parts, held: HeldPart | None) -> np.ndarray | None:
     """[2, 3] ends of a line that shows a joint, all in normalised space: a hinge's axis along its part, or the way of a
-    slider; None where there is none."""
+    slider; None if there is none."""
     if held is None or PART not in parts.bodies:
         return None
     points = parts.bodies[PART].vertices @ held.turn.T + held.shift  # in the first state

@@ -151,7 +151,7 @@ def alike(one: State, other: State) -> Callable[[np.ndarray, np.ndarray], tuple[
 
 def tie(state: State, onto: State) -> tuple[Similarity, int]:
     """The similarity that moves a state onto another where they look alike, and how many places agree with it. Each
-    patch of the surface has one vote, however much there is to see on it. Raises SdfsimError (exit code 3) where too
+    patch of the surface has one vote, however much there is to see on it. Raises SdfsimError (exit code 3) if too
     few agree."""
     return tied(*matched(landmarks(state), landmarks(onto)), CELLS * state.cell, CELLS * onto.cell)
 

@@ -81,7 +81,7 @@ def plane_up(
 ) -> tuple[np.ndarray, float] | None:
     """The largest plane (RANSAC) among surface samples [P, 3] with unit normals [P, 3] and areas [P], whose normal is
     within `MAX_ANGLE` of a unit guess [3] and whose samples lie within `tolerance`: its unit normal [3] and the slope
-    in degrees that its unevenness amounts to; None where none is large enough."""
+    in degrees that its unevenness amounts to; None if none is large enough."""
     near = normals @ guess > np.cos(np.radians(MAX_ANGLE))
     if near.sum() <= 10:
         return None

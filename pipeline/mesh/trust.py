@@ -102,7 +102,7 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
 
 def summary(mesh: Mesh, evidence: Evidence) -> dict:
     """Of a mesh's area: `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
-    lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed."""
+    lines of sight that are parallel; `uncertainty_m`, the median of the rest, None if all is guessed."""
     area, uncertainty = vertex_areas(mesh), evidence.uncertainty
     known = np.isfinite(uncertainty)
     median = None

@@ -12,7 +12,7 @@ FINEST = 0.2  # px; poses that put matches closer than this or so need not be be
 def agreement(pairs: list, views: list[dict]) -> list[dict]:
     """What the poses make of the matches (names, and pixels [M, 2] in both) of every pair with enough of them.
 
-    An entry has medians (px) of how far they lie from the lines that the poses put them on (`error`, None where one of
+    An entry has medians (px) of how far they lie from the lines that the poses put them on (`error`, None if one of
     the photos has no pose) and from the best lines that there are for this pair alone (`own`); and the share that the
     poses leave unexplained, each match by how far it lies (`cost`).
     """

@@ -91,7 +91,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
 
     Makes `ATTEMPTS` until poses of all photos can be trusted, for at most `timeout` s each; each has a folder of its
     own, in which a killed run goes on. Cameras that came with the photos are kept and checked. Raises SdfsimError (exit
-    code 3) where too few photos could be posed, or the result is not plausible.
+    code 3) if too few photos could be posed, or the result is not plausible.
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
@@ -153,7 +153,7 @@ def seen_together(views: list[View]) -> list[list[str]]:
 
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
     """Runs the COLMAP child process on one job, unless the folder holds its result already; returns `result.json`.
-    Raises SdfsimError, which names its log, where it crashed or ran out of time."""
+    Raises SdfsimError, which names its log, if it crashed or ran out of time."""
     before: Any = None
     with suppress(SdfsimError):  # absent, or cut short
         before = read_json(folder / "job.json")

@@ -77,7 +77,7 @@ def stereo(
     poses: PosedPhotos, photos_folder: Path, long_side: int, *, on_progress: Progress = silent
 ) -> list[DepthMap]:  # fmt: skip
     """Depth of every photo in the space of the poses, no larger than `long_side` px, for what lies in the unit sphere
-    and behind it. Raises SdfsimError where a photo is missing. None where there are fewer than three photos."""
+    and behind it. Raises SdfsimError if a photo is missing. None if there are fewer than three photos."""
     views = poses.views
     if len(views) <= FEWEST:
         return []
@@ -160,7 +160,7 @@ def stereo_summary(maps: Sequence[DepthMap], poses: PosedPhotos) -> dict[str, fl
 
 
 def pinhole(view: View, photos_folder: Path, long_side: int) -> Pinhole:
-    """The photo of a view, grey, made smaller and straight. Raises SdfsimError where it is missing."""
+    """The photo of a view, grey, made smaller and straight. Raises SdfsimError if it is missing."""
     grey, matrix = straightened(view, photos_folder, long_side, "L")
     return Pinhole(view, np.ascontiguousarray(grey - grey.mean(), np.float32), matrix)
 
@@ -168,7 +168,7 @@ def pinhole(view: View, photos_folder: Path, long_side: int) -> Pinhole:
 def straightened(view: View, photos_folder: Path, long_side: int, mode: str) -> tuple[np.ndarray, np.ndarray]:
     """The photo of a view, made smaller and straight, in a mode of PIL: [H, W] float32 (grey, L) or [H, W, 3] uint8
     (RGB), and the matrix [3, 3] from camera axes to its pixels, whose centres are at whole numbers. Raises SdfsimError
-    where it is missing."""
+    if it is missing."""
     import cv2
 
     try:

@@ -47,7 +47,7 @@ def fuse(
     maps: Sequence[DepthMap], side: int, photos_folder: Path, *, on_progress: Progress = silent
 ) -> Fused | None:  # fmt: skip
     """Fuses depth maps in the space of the unit sphere, `side` samples along each side and twice as many near the
-    surface, and the colours of their photos there; None where they show no surface."""
+    surface, and the colours of their photos there; None if they show no surface."""
     given = _prepared(maps)
     line = np.linspace(-1, 1, side, dtype=np.float32)
     cell = float(line[1] - line[0])
