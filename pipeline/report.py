@@ -1,4 +1,4 @@
-"""What a run reports: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
+"""The reports of a run: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
 
 from collections.abc import Collection
 from contextlib import suppress
@@ -15,7 +15,7 @@ from pipeline.options import Options
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json, write_text
 
-# What a person looks for, and the stage that writes it.
+# What users look for, and the stage that writes it.
 RESULTS = {
     "scene": ("scene.yaml", "scene"), "shape": ("assets/scene", "fit"), "mesh": ("mesh/mesh.ply", "mesh"),
     "textured": ("mesh/textured.glb", "mesh"),
@@ -26,13 +26,13 @@ RECORDING = "reconstruction.rrd"
 NAMED = 10  # photos left out that the notes name; the page has them all
 PROPOSED = (255, 40, 200)  # RGB of the cameras that are proposed
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
-GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
+GUESSED_SHARE = 0.01  # of a body's surface: from here on a note reports it
 
 
 def write_report(
     folder: Path, options: Options, records: dict[str, dict], failed: tuple[str, SdfsimError] | None = None
 ) -> dict:
-    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, and the
+    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, with the
     error."""
     stages = {stage: known["report"] for stage, known in records.items()}
     seconds = {stage: round(known["seconds"], 1) for stage, known in records.items()}
@@ -64,7 +64,7 @@ def write_report(
 
 
 def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]:
-    """Each photo with what became of it: posed, held out, left out (and why), or not posed yet."""
+    """Each photo with its outcome: posed, held out, left out (and why), or not posed yet."""
     photos = []
     if "photos" in stages:
         with suppress(SdfsimError):
@@ -80,7 +80,7 @@ def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]
 
 
 def improvements(report: dict, options: Options) -> list[str]:
-    """What to do for a better result, most useful first; one line each."""
+    """Advice for a better result, most useful first; one line each."""
     poses, stages = report["poses"], report["stages"]
     lines = [*poses.get("causes", [])]
     if 0 < len(report["photos"]) < FEW_PHOTOS:
@@ -101,7 +101,7 @@ def improvements(report: dict, options: Options) -> list[str]:
 
 
 def notes(stages: dict[str, dict]) -> list[str]:
-    """What a person should know about a run: what was passed over, assumed or is uncertain; one line each."""
+    """Notes for users about a run: what was skipped, assumed or is uncertain; one line each."""
     poses, scene = stages.get("poses", {}), stages.get("scene", {})
     lines = [*stages.get("photos", {}).get("notes", []), *poses.get("warnings", [])]
     lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in poses.get("left_out", [])[:NAMED]]
@@ -154,7 +154,7 @@ def mesh_notes(mesh: dict) -> list[str]:
 
 
 def material_line(body: dict) -> str:
-    """What a body is made of and what it weighs, from an entry of `bodies_of`."""
+    """A line with a body's material and mass, from an entry of `bodies_of`."""
     line = f"{body['material']}, friction {body['friction']:g}, restitution {body['restitution']:g}"
     if "mass" not in body:
         return line
@@ -186,7 +186,7 @@ def page(report: dict, folder: Path) -> str:
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
     if report["psnr"] is not None:
-        side = stages["distill"].get("psnr_px", "a third of the trained")  # older runs did not record it
+        side = stages["distill"].get("psnr_px", "a third of the trained")  # absent in older runs
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB at {side} px"))
     if mesh:
         rows += [
@@ -218,7 +218,7 @@ def page(report: dict, folder: Path) -> str:
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
-    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras show; then in metres.
+    Before the mesh stage it is in the units of the camera poses, with z up according to the cameras; later in metres.
     Returns its path, or None before the poses stage.
     """
     from pipeline.field.training import load_field
