@@ -172,7 +172,7 @@ def reconstruct(
 
 
 def wanted_stages(from_stage: str | None, until_stage: str | None) -> dict[str, bool]:
-    """The stages up to `until`, and whether each must run even if nothing changed, which holds for those from `start`
+    """The stages up to `until_stage`, and whether each must run even if nothing changed, which holds from `from_stage`
     on. Raises SdfsimError if there is no such stage, or they are in the wrong order."""
     first, last = number_of(from_stage or "scene"), number_of(until_stage or "scene")
     if from_stage and first > last:
