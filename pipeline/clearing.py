@@ -1,6 +1,7 @@
-"""Moves reconstructed bodies out of their support, or out of each other. A field does not separate bodies that touch:
-each surface is off by a part of a cell, so a jar may start some millimetres deep in its table. A simulation would throw
-it out at once, with energy from nothing.
+"""Moves reconstructed bodies out of their support, or out of each other.
+
+A field does not separate bodies that touch: each surface is off by a part of a cell, so a jar may start some
+millimetres deep in its table. A simulation would throw it out at once, with energy from nothing.
 """
 
 from dataclasses import dataclass
@@ -34,10 +35,11 @@ class Cleared:
 
 def cleared(scene: Scene, solids: dict[str, Mesh]) -> dict[str, Cleared]:
     """Bodies that overlap others at the start, by name, with the shortest moves that separate them: upwards, unless
-    another direction is much shorter. Lower bodies are moved first, and the bodies on them follow. Bodies in joints
-    stay at their place, and others move away from them. A body also stays if it would have to move by more than its own
-    thickness, as out of a hollow that is too tight. `solids` are closed meshes of bodies, in their own frames, for
-    shapes with an open mesh. Depth is measured on these and on the simulated distances.
+    another direction is much shorter. Lower bodies are moved first, and the bodies on them follow.
+
+    Bodies in joints stay at their place, and others move away from them. A body also stays if it would have to move by
+    more than its own thickness, as out of a hollow that is too tight. `solids` are closed meshes of bodies, in their
+    own frames, for shapes with an open mesh. Depth is measured on these and on the simulated distances.
     """
     holders = {frozenset(joint.bodies) for joint in scene.joints if not joint.collides}
     held = {index for joint in scene.joints for index in joint.bodies}

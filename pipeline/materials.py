@@ -18,10 +18,11 @@ _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 @dataclass(frozen=True)
 class Material:
-    """A material, with typical numbers. A contact has the product of its two bodies' friction, and the product of their
-    restitution. So `friction` is the square root of the material's friction on itself, adjusted within the published
-    range for its other common pairs. `restitution` times concrete's 0.8 is the value for a ball of the material on a
-    hard floor.
+    """A material, with typical numbers.
+
+    A contact has the product of its two bodies' friction, and the product of their restitution. So `friction` is the
+    square root of the material's friction on itself, adjusted within the published range for its other common pairs.
+    `restitution` times concrete's 0.8 is the value for a ball of the material on a hard floor.
     """
 
     density: float  # kg/m^3

@@ -357,6 +357,7 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
 
 def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seconds: float) -> None:
     """Writes the record and moves the finished folder to its place, where it replaces an earlier result of the stage.
+
     Each result gets its own name, `made`, because two results with the same fingerprint may differ (time budgets,
     GPUs). Raises SdfsimError if the place holds files that no stage wrote.
     """

@@ -1,9 +1,13 @@
-"""Photos of one object in two states, such as a door shut and open -> a scene with the joint of the moving part. Each
-state is reconstructed separately, because nothing moves within a state. Most surfaces that look alike in both are
+"""Photos of one object in two states, such as a door shut and open -> a scene with the joint of the moving part.
+
+Each state is reconstructed separately, because nothing moves within a state. Most surfaces that look alike in both are
 static and align the two. The remaining difference gives the joint. The scene is made from the state that shows most of
-the part; the part's pixels are its labels. Posing the photos of both states together would fail if the part fills the
-photos, because the cameras would follow it. Folders: `first` and `second` hold a reconstruction of each state up to its
-meshes, and the folder itself a whole reconstruction of one of them, with the joint.
+the part; the part's pixels are its labels.
+
+Posing the photos of both states together would fail if the part fills the photos, because the cameras would follow it.
+
+Folders: `first` and `second` hold a reconstruction of each state up to its meshes, and the folder itself a whole
+reconstruction of one of them, with the joint.
 """
 
 from __future__ import annotations
@@ -50,11 +54,12 @@ def reconstruct(
     `joint` are photos of the same object in another state, for example with its door open: the moving part becomes a
     separate body, called `part`, on a hinge or a slider. `options` are those of `sdfsim reconstruct --help` with the
     same names, and `seed` and `recipe` (see `OptionKeys`); `from_stage` and `until_stage` are its --from and --until.
-    `progress` is called with the stage, its finished share, and a line. Writes one folder per stage, Shape folders in
-    `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to `out` (for two states also a folder for
-    each), and returns the report. Skips a stage if its inputs, options and version are those of its last run, and
-    resumes a killed one. Photos (see `find_source`) are never written to. Raises SdfsimError for bad photos or options
-    (exit code 1), or if poses, surface or joint are not good enough (3).
+    `progress` is called with the stage, its finished share, and a line.
+
+    Writes one folder per stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md`
+    to `out` (for two states also a folder for each), and returns the report. Skips a stage if its inputs, options and
+    version are those of its last run, and resumes a killed one. Photos (see `find_source`) are never written to. Raises
+    SdfsimError for bad photos or options (exit code 1), or if poses, surface or joint are not good enough (3).
     """
     given: Any = {"from_stage": from_stage, "until_stage": until_stage, "progress": progress, **options}
     return (
@@ -69,6 +74,7 @@ def reconstruct_states(
     until_stage: str | None = None, progress: StageProgress | None = None, **options: Any,
 ) -> tuple[dict, Path]:  # fmt: skip
     """Photos of an object in two states -> a scene in which the moving part is a separate body, on a hinge or a slider.
+
     Takes the stages and options of `reconstruct` for both states; the size is that of the first state's scene. Returns
     the report of the scene, or of the last wanted stage, and its folder. Raises the SdfsimErrors of `reconstruct`,
     `tie` and `find_joint`, and one if the photos come with masks.

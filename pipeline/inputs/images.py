@@ -65,10 +65,11 @@ def exif_focal(image: Image.Image) -> tuple[float | None, str]:
 def read_photo(
     path: Path, long_side: int, mask: Path | None = None, shape: float | None = None, white: float | None = None
 ) -> ReadPhoto:
-    """Reads one photo upright and no larger than `long_side` px; a mask file has priority over an alpha channel. If a
-    known camera has a different `shape`, width over height, from the upright photo, the photo stays as stored. `white`
-    is the value of white in a file of more than 8 bits (see `common_white`), by default from its own range. Raises
-    SdfsimError, with the file's name, if it is no image, truncated, too small or too large.
+    """Reads one photo upright and no larger than `long_side` px; a mask file has priority over an alpha channel.
+
+    If a known camera has a different `shape`, width over height, from the upright photo, the photo stays as stored.
+    `white` is the value of white in a file of more than 8 bits (see `common_white`), by default from its own range.
+    Raises SdfsimError, with the file's name, if it is no image, truncated, too small or too large.
     """
     image, original, focal, camera = shown(path, long_side, white)
     turned = ImageOps.exif_transpose(image)
@@ -203,9 +204,10 @@ def block_means(values: np.ndarray, blocks: int) -> np.ndarray:
 
 
 def sharpness(pixels: np.ndarray) -> float:
-    """Strength of edges at the finest scale relative to a scale eight times as coarse, in RGB [H, W, 3] uint8. Uses
-    only the tenth of the picture's blocks with the most edges, so that an object in focus in front of a soft background
-    counts as sharp. 0 if there are no edges.
+    """Strength of edges at the finest scale relative to a scale eight times as coarse, in RGB [H, W, 3] uint8.
+
+    Uses only the tenth of the picture's blocks with the most edges, so that an object in focus in front of a soft
+    background counts as sharp. 0 if there are no edges.
     """
     import cv2
 

@@ -273,9 +273,10 @@ def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
 
 
 def rectified(picture: ReadPhoto, known: KnownCamera, name: str, source: str) -> tuple[ReadPhoto, View, Lens | None]:
-    """A photo as a pinhole camera in the same place would have taken it, that camera, and the removed lens. A lens
-    without distortion needs no resampling, and no lens is returned. Otherwise the photo is cropped to the region of the
-    pinhole's picture that the lens covers completely.
+    """A photo as a pinhole camera in the same place would have taken it, that camera, and the removed lens.
+
+    A lens without distortion needs no resampling, and no lens is returned. Otherwise the photo is cropped to the region
+    of the pinhole's picture that the lens covers completely.
     """
     height, width = picture.pixels.shape[:2]
     matrix, bent, lens = scaled(known, width, height), known.lens, None

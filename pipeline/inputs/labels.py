@@ -34,6 +34,7 @@ class Labels:
 
     def of(self, photo: Path, size: tuple[int, int]) -> np.ndarray | None:
         """Number of the object at each pixel [H, W] uint8 of a photo that is width x height upright; None: not given.
+
         If some objects have no mask for this photo, a pixel outside the other masks is `UNKNOWN`; so is a pixel in two
         masks. Raises SdfsimError if a file cannot be read or is not shaped like the photo.
         """

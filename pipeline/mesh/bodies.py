@@ -163,6 +163,7 @@ def find_level_planes(shown: Mesh, up: np.ndarray, width: float, share: float = 
 def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, smallest: float,
                 named: np.ndarray | None = None, clicked: np.ndarray = NOWHERE) -> list[FoundBody]:  # fmt: skip
     """Bodies without names that stand on level planes, completely within the trained space; touching ones count as one.
+
     A piece that carries a level plane itself, like a table, is scenery, and so is one that reaches the end of the
     trained space. A piece that rises less than `smallest` above its plane stays part of it, unless its vertices are
     `named` [V] bool by masks, or a point of it was `clicked` [K, 3].
@@ -495,8 +496,10 @@ def _loose(surface: FieldSurface, votes: Votes, number: int, bodies: list[FoundB
 
 
 def _noise(meshes: dict[FoundBody, Mesh], points: np.ndarray, width: float) -> list[FoundBody]:
-    """The bodies that are only noise: dark or blurred places that the training filled. They are small, have no masks,
-    and almost none of the sparse points [P, 3] lies within `width` of them, while other bodies are covered with points.
+    """The bodies that are only noise: dark or blurred places that the training filled.
+
+    They are small, have no masks, and almost none of the sparse points [P, 3] lies within `width` of them, while other
+    bodies are covered with points.
     """
     area = np.array([face_normals(mesh)[1].sum() for mesh in meshes.values()])
     trees = [KDTree(mesh.vertices) for mesh in meshes.values()]

@@ -1,7 +1,8 @@
-"""Bodies that users point at: from a few clicked places to the body of each part of a connected surface. A part that
-the shape separates and that has no click is a separate body. The rest is divided between the clicked bodies, first by
-distance along the surface, which grooves and changes of colour lengthen; then the borders are found in photos (GrabCut,
-Rother et al. 2004).
+"""Bodies that users point at: from a few clicked places to the body of each part of a connected surface.
+
+A part that the shape separates and that has no click is a separate body. The rest is divided between the clicked
+bodies, first by distance along the surface, which grooves and changes of colour lengthen; then the borders are found in
+photos (GrabCut, Rother et al. 2004).
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """Moves the vertices of bodies to where photos agree best; the accuracy of the field's own surface is limited by its
-cells. Around a vertex lies a patch in the tangent plane. On the true surface, this patch looks the same in all photos
-that show it; so the patch is moved along the normal until it does (normalised cross-correlation). At edges patches give
-no information: there the surface is the smallest one between known places on both sides, which removes bulges.
+cells.
+
+Around a vertex lies a patch in the tangent plane. On the true surface, this patch looks the same in all photos that
+show it; so the patch is moved along the normal until it does (normalised cross-correlation). At edges patches give no
+information: there the surface is the smallest one between known places on both sides, which removes bulges.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -181,8 +183,10 @@ def patches(
     sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray, most: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """The patches around vertices [P], moved [M] along normals [P, 3], in the photos with the best viewing angle, at
-    most `most`, and only those that are `clear` [K, P]. Yields batches of vertices [S], the number of each photo [most,
-    S], -1 for none, and grey levels [S, M, most, G] as in `normalised`; only vertices that `FEWEST` photos show.
+    most `most`, and only those that are `clear` [K, P].
+
+    Yields batches of vertices [S], the number of each photo [most, S], -1 for none, and grey levels [S, M, most, G] as
+    in `normalised`; only vertices that `FEWEST` photos show.
     """
     cosine = np.zeros((len(pictures), len(normal)), np.float32)
     for number, picture in enumerate(pictures):
@@ -235,8 +239,10 @@ def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.nd
 def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray, trust: np.ndarray,
             stay: np.ndarray) -> tuple[np.ndarray, bool]:  # fmt: skip
     """The move of each vertex [V] along its normal [V, 3]: the wanted one [V], weighted by trust [V], and smooth
-    between. And whether the equations are solved. Shorter normals make vertices move less; `mean` [V, V] takes the mean
-    of the neighbours, `stay` [V] is the trust in the old positions.
+    between. And whether the equations are solved.
+
+    Shorter normals make vertices move less; `mean` [V, V] takes the mean of the neighbours, `stay` [V] is the trust in
+    the old positions.
     """
     bend = mean - diags(np.ones(len(trust)))
     inwards = ((bend @ mesh.vertices) * normal).sum(1)

@@ -10,8 +10,9 @@ FINEST = 0.2  # px; poses with smaller distances than this need not be better
 
 
 def agreement(pairs: list, views: list[dict]) -> list[dict]:
-    """Compares the poses with the matches (names, and pixels [M, 2] in both) of every pair that has enough of them. An
-    entry has the median distances (px) of matches from the epipolar lines of the poses (`error`, None if one of the
+    """Compares the poses with the matches (names, and pixels [M, 2] in both) of every pair that has enough of them.
+
+    An entry has the median distances (px) of matches from the epipolar lines of the poses (`error`, None if one of the
     photos has no pose) and from the best lines for this pair alone (`own`); and the share that the poses leave
     unexplained, with each match weighted by its distance (`cost`).
     """

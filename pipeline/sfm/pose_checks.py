@@ -65,10 +65,11 @@ def views_of(result: dict, photos: list[Photo]) -> list[View]:
 
 
 def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, known: bool = False) -> dict:
-    """Decides whether a reconstruction can be trusted, for the report: `failures` is empty if the poses may be used. A
-    complete reconstruction may be wrong: with repeating textures or several zooms, matches contradict the poses, or lie
-    farther from their lines than necessary. `ordinary` is the result at ordinary thresholds, if `result` is not: its
-    matches show best how the camera moved. `known` cameras may be off by some pixels.
+    """Decides whether a reconstruction can be trusted, for the report: `failures` is empty if the poses may be used.
+
+    A complete reconstruction may be wrong: with repeating textures or several zooms, matches contradict the poses, or
+    lie farther from their lines than necessary. `ordinary` is the result at ordinary thresholds, if `result` is not:
+    its matches show best how the camera moved. `known` cameras may be off by some pixels.
     """
     views = views_of(result, photos)
     posed = {view.name for view in views}

@@ -174,9 +174,10 @@ def fresh(folder: Path) -> Path:
 
 
 def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
-    """The reconstruction that explains the matches best, or None; and the photos of each of its cameras. Photos of one
-    size are first treated as those of one camera. If the matches contradict the result, every photo gets its own focal
-    length, then each zoom that these show. The same matches compare all results.
+    """The reconstruction that explains the matches best, or None; and the photos of each of its cameras.
+
+    Photos of one size are first treated as those of one camera. If the matches contradict the result, every photo gets
+    its own focal length, then each zoom that these show. The same matches compare all results.
     """
     shared = [group["names"] for group in job["groups"]]
     tried = [(mapped(pycolmap, job, database, out), shared)]
@@ -281,10 +282,11 @@ def known_cameras(pycolmap, job: dict, database: Path):
 
 
 def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
-    """Moves known cameras to agree with the matches between their photos, by bundle adjustment. A phone tracks its
-    poses to about a centimetre, which is many pixels. The first points may have such errors, later ones less. A prior
-    ties every camera to its given position, which decides if matches do not; as a whole the cameras keep their place
-    and scale.
+    """Moves known cameras to agree with the matches between their photos, by bundle adjustment.
+
+    A phone tracks its poses to about a centimetre, which is many pixels. The first points may have such errors, later
+    ones less. A prior ties every camera to its given position, which decides if matches do not; as a whole the cameras
+    keep their place and scale.
     """
     given = {key: image.projection_center() for key, image in model.images.items()}
     cartesian = pycolmap.PosePriorCoordinateSystem.CARTESIAN

@@ -1,7 +1,9 @@
-"""Depth from photos alone: the depth of every pixel, by comparison with neighbouring photos. Planes are swept through
-the scene at a small photo size. Then depths around the result are tried at the full size, along the slope of that
-surface; so windows follow slopes, unlike planes in front of the camera. Near edges the surface behind is tried too,
-because windows mix the surfaces in front of and behind an edge. A pixel counts if other photos agree.
+"""Depth from photos alone: the depth of every pixel, by comparison with neighbouring photos.
+
+Planes are swept through the scene at a small photo size. Then depths around the result are tried at the full size,
+along the slope of that surface; so windows follow slopes, unlike planes in front of the camera. Near edges the surface
+behind is tried too, because windows mix the surfaces in front of and behind an edge. A pixel counts if other photos
+agree.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Depth maps -> a signed distance: the mean over all photos that see a place (TSDF). A place that no photo sees takes
-the sign of the nearest place that one does: the inside of a table's leg is solid, the air beyond a picture's edge is
-empty.
+"""Depth maps -> a signed distance: the mean over all photos that see a place (TSDF).
+
+A place that no photo sees takes the sign of the nearest place that one does: the inside of a table's leg is solid, the
+air beyond a picture's edge is empty.
 """
 
 from __future__ import annotations

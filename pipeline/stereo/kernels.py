@@ -207,10 +207,12 @@ def paint(places: Any, colors: Any, inverse: Any, sizes: Any, trust: Any, lines:
 def carve(places: Any, inverse: Any, sizes: Any, slopes: Any, trust: Any, lines: Any, tilts: Any,
           back: float, total: Any, weight: Any, past: Any) -> None:  # fmt: skip
     """Adds the evidence of depth maps for places [P, 3] to the sums of distances and weights [P], and to the weights
-    [P] of photos that see past a place. For the N photos `inverse` [N, h, w] is inverse depth (0: none), `slopes` [N,
-    h, w, 2] its change from pixel to pixel, `tilts` [N, h, w] the distance from the surface's tangent plane per depth,
-    and `trust` [N, h, w] a weight. `lines` [N, 3, 4] map places to homogeneous pixels. Distances count up to `back` in
-    front of a surface, and with falling weight down to `back` behind it: farther behind is unknown.
+    [P] of photos that see past a place.
+
+    For the N photos `inverse` [N, h, w] is inverse depth (0: none), `slopes` [N, h, w, 2] its change from pixel to
+    pixel, `tilts` [N, h, w] the distance from the surface's tangent plane per depth, and `trust` [N, h, w] a weight.
+    `lines` [N, 3, 4] map places to homogeneous pixels. Distances count up to `back` in front of a surface, and with
+    falling weight down to `back` behind it: farther behind is unknown.
     """
     for n in range(len(inverse)):
         line = lines[n]
