@@ -3,7 +3,7 @@
     python -m benchmarks effects
 
 Sample scenes with one effect at a time switched off; one thread, processor time, medians of five runs of 300 steps.
-"The same" says whether the bodies end, to a hundredth of their size, where they end with all effects on.
+"The same" means that the bodies end at the same places as with all effects on, to a hundredth of their size.
 """
 
 from dataclasses import fields, replace
