@@ -97,10 +97,11 @@ def to_truth(folder: Path, points: np.ndarray, move: Similarity) -> np.ndarray:
 
 
 def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str, Any]]:
-    """Measured errors, mm, and the run's uncertainty at the same places. Each displayed vertex counts by its area: the
-    displayed scenery, and the closed bodies. First the vertices that photos show, in quarters from the most certain on,
-    and the least certain twentieth; then the guessed ones among them, and the guessed ones on all surfaces of the
-    scene, displayed or not.
+    """Measured errors, mm, and the run's uncertainty at the same places.
+
+    Each displayed vertex counts by its area: the displayed scenery, and the closed bodies. First the vertices that
+    photos show, in quarters from the most certain on, and the least certain twentieth; then the guessed ones among
+    them, and the guessed ones on all surfaces of the scene, displayed or not.
     """
     truth = _scene(_read(photos / "truth.ply"))
     bodies = [f"objects/{entry['name']}.ply" for entry in read_parts(folder / "mesh")["objects"]]

@@ -83,8 +83,9 @@ def section(name: str, page: Path | None = None) -> str:
 
 
 def write_section(name: str, command: str, content: str, page: Path | None = None) -> None:
-    """Print `content`, and write it between the marks of a section, below the command that repeats it and the day. The
-    default page is the one of `pages` that has the section.
+    """Print `content`, and write it between the marks of a section, below the command that repeats it and the day.
+
+    The default page is the one of `pages` that has the section.
 
     Raises:
         ValueError: the page, or every page, has no such section.

@@ -219,8 +219,10 @@ def point_weights(sparse: Sparse, count: int) -> np.ndarray:
 
 def unit_sphere_of(poses: PosedPhotos, *, masked: bool = False) -> Similarity:
     """The similarity that moves the scene in front of the cameras into the unit sphere; `masked`: all points lie on the
-    object. The centre is where the optical axes meet, with a weak pull to the points' median. The radius fits the
-    longer side of most photos, is smaller if nearly all points are nearer, and never reaches the nearest cameras.
+    object.
+
+    The centre is where the optical axes meet, with a weak pull to the points' median. The radius fits the longer side
+    of most photos, is smaller if nearly all points are nearer, and never reaches the nearest cameras.
     """
     views, sparse = poses.views, poses.sparse
     centers = np.array([v.center for v in views])

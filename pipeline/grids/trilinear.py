@@ -1,6 +1,7 @@
-"""Trilinear interpolation and its gradient, compiled for the CPU: `interpolation.py` has the same in torch. A grid of
-`side` points per side is a table [R, C] of its rows: all of them in z, y, x order, or those of existing bricks.
-`bricks` [m, m, m] int32 has the brick's number at each place, -1 for none; it is empty if all rows exist.
+"""Trilinear interpolation and its gradient, compiled for the CPU: `interpolation.py` has the same in torch.
+
+A grid of `side` points per side is a table [R, C] of its rows: all of them in z, y, x order, or those of existing
+bricks. `bricks` [m, m, m] int32 has the brick's number at each place, -1 for none; it is empty if all rows exist.
 """
 
 from typing import Any
@@ -53,8 +54,9 @@ def gather(table: Any, bricks: Any, side: int, points: Any, found: Any, first: i
 
 @njit(cache=True)
 def scatter(gradient: Any, bricks: Any, side: int, points: Any, given: Any, shares: int, share: int) -> None:
-    """Adds gradients [P, C] at points [P, 3] to `gradient` [R, C] of each row of a grid. Each share has every n-th
-    layer and adds in the order of points, so that sums do not depend on the number of shares.
+    """Adds gradients [P, C] at points [P, 3] to `gradient` [R, C] of each row of a grid.
+
+    Each share has every n-th layer and adds in the order of points, so that sums do not depend on the number of shares.
     """
     for p in range(len(points)):
         i, j, k, x, y, z = _cell(points, p, side)

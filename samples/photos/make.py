@@ -642,6 +642,7 @@ def render(parts: list[Part], caster, pose: np.ndarray, rng: np.random.Generator
 
 class Room:
     """The parts in realistic light: soft light from above, light from all around, and reflections between objects.
+
     Light is computed once, at the vertices of meshes that are fine enough for its shadows, and is the same in all
     photos.
     """
