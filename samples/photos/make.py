@@ -762,7 +762,7 @@ def main() -> None:
     """Renders a set into the given folder (default: table_vase next to this file)."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("set", nargs="?", choices=SETS, default=BUNDLED, help=f"default: {BUNDLED}, the bundled one")
-    parser.add_argument("--out", type=Path, help=f"default for {BUNDLED}: table_vase beside this file")
+    parser.add_argument("--out", type=Path, help=f"default for {BUNDLED}: table_vase next to this file")
     parser.add_argument("--views", type=int, default=None, help="render only the first N views")
     arguments = parser.parse_args()
     if arguments.out is None and arguments.set != BUNDLED:
