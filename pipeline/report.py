@@ -89,14 +89,14 @@ def improvements(report: dict, options: Options) -> list[str]:
         lines.append("keep zoom and focus fixed, and nothing moving in view: the photos agree only within "
                      f"{poses['mean_error']:.1f} px")  # fmt: skip
     if report["psnr"] is not None and report["psnr"] < LOW_PSNR:
-        lines.append(f"photos that were not trained on come out at {report['psnr']:.1f} dB only: {options.longer()}, "
+        lines.append(f"held-out photos have a PSNR of only {report['psnr']:.1f} dB: {options.longer()}, "
                      "and keep light and exposure the same in all photos")  # fmt: skip
     for number, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1):
         place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
         lines.append(f"{number}. of the photos that would help most: {photo['words']} (camera at {place} m, aimed at "
-                     f"{target} m); it makes up for {photo['gain']:.0%} of what is weak")  # fmt: skip
+                     f"{target} m); it improves {photo['gain']:.0%} of the weak surface")  # fmt: skip
     if report["failed_checks"]:
-        lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
+        lines.append("fit for longer (a larger --budget), or repair the mesh: a shape is not usable")
     return lines
 
 
@@ -115,31 +115,31 @@ def notes(stages: dict[str, dict]) -> list[str]:
 
 
 def mesh_notes(mesh: dict) -> list[str]:
-    """Those of the mesh stage, from its report."""
+    """The notes of the mesh stage, from its report."""
     lines = []
     if mesh.get("up_from") == "cameras":
-        lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
+        lines.append("no level plane found: up comes from the cameras and may be off by some degrees")
     if mesh.get("up_confidence") == "low":
         lines.append(f"up is uncertain, within {mesh['up_within_degrees']:.0f} degrees: check it before simulating")
     if mesh.get("size_assumed"):
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
-        lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
+        lines.append(f"separate bodies: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
     how = {
         "masks": "split where their masks end",
-        "clicks": "split where photos show a border between the places that you gave",
+        "clicks": "split where photos show a border between your places",
         "shape": "split along a seam by shape; give masks to be sure",
     }
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
     lines += [f"no body was found for {name}, which {by} name" for by in ("masks", "places")
               for name in mesh.get(f"{by}_without_surface", [])]  # fmt: skip
-    lines += [f"{name}: its surface was not moved all the way to where the photos agree: {why}"
+    lines += [f"{name}: its surface was not fully refined by photos: {why}"
               for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
     lines += [hollow_line(name, found) for name, found in mesh.get("hollows", {}).items()]
     if "smallest_object_m" in mesh:
-        lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
-    lines += [f"{area:.2g} m^2 of a level surface without texture were completed as a plane, from what is seen around: "
-              "nothing measured its height there" for area in mesh.get("completed_m2", [])]  # fmt: skip
+        lines.append(f"pieces lower than {mesh['smallest_object_m']:.2g} m stay part of their support")
+    lines += [f"{area:.2g} m^2 of a level surface without texture were completed as a plane from the visible surface "
+              "around: nothing measured its height there" for area in mesh.get("completed_m2", [])]  # fmt: skip
     if mesh.get("left_out_m"):
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
@@ -147,9 +147,9 @@ def mesh_notes(mesh: dict) -> list[str]:
         if part["guessed"] > GUESSED_SHARE and name != SCENERY:
             lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
     if "weak" in mesh:
-        more = "" if mesh["next_photos"] else "; no one photo would help much"
-        lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
-                     f"all from nearly one direction{more}")  # fmt: skip
+        more = "" if mesh["next_photos"] else "; no single photo would help much"
+        lines.append(f"{mesh['weak']:.1%} of the surface that photos could show is weak: fewer than three photos see "
+                     f"it, or all from nearly one direction{more}")  # fmt: skip
     return lines
 
 

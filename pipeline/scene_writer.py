@@ -208,12 +208,13 @@ def moved_line(name: str, one: Cleared, unsure: float) -> str:
     there = " and ".join(one.into)
     if one.left:
         if one.held:
-            return f"{name}: is {one.left:.2g} m in {there}, where its joint holds it: these do not touch"
-        return f"{name}: starts {one.left:.2g} m in {there}, as no short way leads out: expect that it is thrown out"
+            return f"{name}: is {one.left:.2g} m deep in {there}, where its joint holds it: these do not touch"
+        why = "because there is no short way out: it will probably be thrown out"
+        return f"{name}: starts {one.left:.2g} m deep in {there}, {why}"
     away = float(np.linalg.norm(one.shift))
     line = f"{name}: moved {'up ' if one.shift[2] > 0.99 * away else ''}by {away:.2g} m, out of {there}"
     if away > unsure:
-        line += f": more than the {unsure:.2g} m that photos leave open where bodies touch, so look at mesh/objects.png"
+        line += f": more than the {unsure:.2g} m that photos cannot resolve, so look at mesh/objects.png"
     return line
 
 

@@ -94,5 +94,5 @@ def hollow_line(name: str, found: dict) -> str:
     if found["wall"] is None:
         return line
     if found["wall_seen"] < KNOWN:
-        return f"{line}; how thick its wall is, is unknown: photos see both sides of {found['wall_seen']:.0%} of it"
+        return f"{line}; the thickness of its wall is unknown: photos see both sides of {found['wall_seen']:.0%} of it"
     return f"{line}; its wall is {1000 * found['wall']:.2g} mm thick"

@@ -252,14 +252,14 @@ def _told(joint: FoundJoint | HeldPart, size: float) -> str:
     """The result in words; the compared surfaces have a size, m."""
     axis = ", ".join(f"{value:.3f}" for value in joint.axis)
     where = ", ".join(f"{value:.4g}" for value in joint.anchor)
-    doubt = f"the axis is sure to {math.degrees(joint.doubt.axis):.2g} degrees"
+    doubt = f"the uncertainty of the axis is {math.degrees(joint.doubt.axis):.2g} degrees"
     if joint.kind == "hinge":
         way = f"turns by {math.degrees(joint.travel):.1f} degrees about"
         doubt += f" and {joint.doubt.place:.2g} m"
     else:
         way = f"slides by {joint.travel:.3g} m along"
-    rest = f"; {1 - joint.follows:.0%} of what moved does not go with it" if joint.follows < SURE else ""
-    fit = f"the two states fit with {100.0 * joint.off / size:.2g} % of the size off"
+    rest = f"; {1 - joint.follows:.0%} of the moved surface does not follow the motion" if joint.follows < SURE else ""
+    fit = f"the two states fit to {100.0 * joint.off / size:.2g} % of the size"
     return f"{joint.kind}: a part {way} ({axis}) through ({where}) m; {fit}; {doubt}{rest}"
 
 

@@ -96,7 +96,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
             failures.append(f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)")
         elif around < ONE_SIDE:
             warnings.append(f"the photos show the scene from one side ({around:.0f} degrees around it): what they do "
-                            "not show is guessed, so no closed object can come of it: walk further around")  # fmt: skip
+                            "not show is guessed, so the result is not closed: walk further around")  # fmt: skip
     return {
         "photos": len(photos), "posed": len(posed), "left_out": left_out,
         "mean_error": round(result.get("mean_error", 0.0), 4), "points": result.get("points", 0),
