@@ -142,13 +142,13 @@ def contact_kinds(recorded: Trajectory, ours: Trajectory, shapes: dict[str, Shap
             slides = np.linalg.norm(recorded.velocity[0, b]) > RESTS
             what = "sliding or rolling" if slides else "resting"
         elif mine < LESS * theirs:
-            what = "impact that ours has not had yet"
+            what = "impact only in the recording"
         elif theirs < LESS * mine:
-            what = "impact that only ours has had"
+            what = "impact only in ours"
         else:
             what = "impact in both"
         body = "several pieces" if len(shapes[str(recorded.shape[b])].pieces) > 1 else "one hull"
-        kinds.append(f"{body}, {'beside another' if away[b].min() < BESIDE else 'on the floor alone'}: {what}")
+        kinds.append(f"{body}, {'near another body' if away[b].min() < BESIDE else 'near only the floor'}: {what}")
     return kinds, errors[touched]
 
 

@@ -1,13 +1,13 @@
 """Time and memory of large scenes, and of many scenes at once: RESULTS.md.
 
     python -m benchmarks scale growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
-        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, beside networks and two engines
+        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, with networks and two engines
     python -m benchmarks scale large -o DIR
         heaps, shoes and knots to the end on all cores, each with a movie
     python -m benchmarks scale many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
     python -m benchmarks scale roofline
-        what a distance, a contact and a row of impulses cost, beside what the machine could do: docs/scale.md
+        cost of a distance, a contact and a row of impulses, compared with the limits of the machine: docs/scale.md
 
 Every case of the first command runs in a separate process on one thread; times are processor times. Results in DIR are
 not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
@@ -226,16 +226,16 @@ def roofline() -> None:
     """Write the section of docs/scale.md: the machine's bandwidth and arithmetic on one thread, and ours."""
     flops, bandwidth, latency = arithmetic(), memory(), chain()
     rows: list[tuple[str, ...]] = [
-        ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "of the arithmetic", "of the bandwidth")
+        ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "share of arithmetic", "share of bandwidth")
     ]
     for name, (operations, moved), seconds in (
-        ("the machine: products of matrices", (1, 0), 1 / flops),
-        ("the machine: sums that wait for each other", (1, 0), latency),
-        ("the machine: copies of 256 MiB", (0, 1), 1 / bandwidth),
-        ("a distance of a grid, places in turn", DISTANCE, distance_time(scattered=False)),
-        ("a distance of a grid, places anywhere", DISTANCE, distance_time(scattered=True)),
-        ("a contact: its three rows", CONTACT, contact_time()),
-        ("a row of impulses, and its change", ROW, row_time()),
+        ("machine: matrix products", (1, 0), 1 / flops),
+        ("machine: dependent sums", (1, 0), latency),
+        ("machine: copies of 256 MiB", (0, 1), 1 / bandwidth),
+        ("grid distance, neighbouring points in order", DISTANCE, distance_time(scattered=False)),
+        ("grid distance, points in random order", DISTANCE, distance_time(scattered=True)),
+        ("contact: its three rows", CONTACT, contact_time()),
+        ("row of impulses, one update", ROW, row_time()),
     ):
         rate, speed = operations / seconds, moved / seconds
         told = ((operations, rate / 1e9, rate / flops), (moved, speed / 1e9, speed / bandwidth))
