@@ -82,7 +82,7 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
     with peak_memory() as memory:
         published = stepper_of(load_model(model, weights=False)).on_surfaces
         simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
-        frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
+        frames.extend(simulator.frames(1))  # not timed: it loads compiled code
         began = time.process_time()
         try:
             frames.extend(simulator.frames(steps - 1))

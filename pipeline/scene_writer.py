@@ -145,7 +145,7 @@ def write_scene(
     mesh_folder: Path, scene_file: Path, *, drop: str = "box", materials: dict[str, Choice] | None = None,
     written: str | None = None, seed: int = 0,
 ) -> dict:  # fmt: skip
-    """Writes scene.yaml for the meshes of a mesh folder and the shapes beside it; returns the stage's report.
+    """Writes scene.yaml for the meshes of a mesh folder and the shapes next to it; returns the stage's report.
 
     A file that the user has changed (its hash differs from `written`, the hash of this function's last output) is kept
     as `scene.yaml.bak`. Raises SdfsimError if a material names an unknown body.

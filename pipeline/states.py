@@ -85,7 +85,7 @@ def reconstruct_states(
     resolved = options_of(photos=str(given[0].absolute()), **options)
     for name in WITHOUT:
         if getattr(resolved, name):
-            message = f"--{name} goes without --joint"
+            message = f"--{name} cannot be combined with --joint"
             raise SdfsimError(message, "give it to `sdfsim mesh` afterwards", exit_code=EXIT_USAGE)
     again = wanted_stages(from_stage, until_stage)
 
@@ -140,7 +140,7 @@ def check_unmasked(state: Project) -> None:
     """Raises SdfsimError if the photos of a state come with masks, because most static surfaces are outside of them."""
     folder = state.place("photos")
     if all(photo.mask for photo in load_photos(folder)) or load_names(folder):
-        message = "--joint takes no masks: what stands still around the thing ties both states"
+        message = "--joint takes no masks: the static surfaces around the object align both states"
         raise SdfsimError(f"{state.options.photos}: {message}", "give the photos without them")
 
 

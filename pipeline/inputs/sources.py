@@ -32,7 +32,7 @@ class Source:
     frames: dict[Path, KnownCamera] = field(default_factory=dict)  # camera of each photo in `cameras`
     capture: Capture | None = None  # the world of a capture with depth
     archive: Path | None = None  # a zipped capture that has to be unpacked first; the other fields are then empty
-    notes: tuple[str, ...] = ()  # what was passed over, for the report
+    notes: tuple[str, ...] = ()  # skipped files, for the report
 
     @property
     def folder(self) -> Path:

@@ -33,7 +33,8 @@ from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write
 
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
 RESOLUTION = {"quick": 256, "standard": 320, "fine": 512, "volsdf": 448}  # samples per side, by preset
-# The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
+# The picture of names: largest number of photos, their width while they are chosen and in the picture, px, and the
+# tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 AXIS = (255, 255, 0)  # colour of a joint's axis there
 

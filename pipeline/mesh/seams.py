@@ -142,7 +142,7 @@ class ConnectedSolid:
 
     @property
     def border(self) -> np.ndarray:
-        """[X, Y, Z] bool, samples within it beside others that are not."""
+        """[X, Y, Z] bool, samples within it next to samples outside."""
         return self.inside & np.logical_not(ndimage.binary_erosion(self.inside))
 
 

@@ -79,9 +79,9 @@ class Completed:
 
 def complete(surface: FieldSurface, up: np.ndarray, finest: float, poses: PosedPhotos, photos_folder: Path
              ) -> list[Completed]:  # fmt: skip
-    """Where level planes go on beyond what is seen of them: in plain squares that hang together with it, look alike
-    from everywhere, are hidden by nothing, and through which no photo sees a point below. `up` [3] is unit, `finest`
-    the width of a cell of the field's finest grid."""
+    """Extends level planes beyond their visible parts: over plain squares that are connected to these, look alike from
+    everywhere, are not hidden, and through which no photo sees a point below. `up` [3] is unit, `finest` the width of a
+    cell of the field's finest grid."""
     levels = find_level_planes(surface.visible, up, finest, SUPPORTS)
     pictures = _pictures(poses, photos_folder)
     blocking = Caster(surface.visible)
@@ -102,7 +102,7 @@ def _complete(surface: FieldSurface, level: LevelPlane, poses: PosedPhotos, pict
     corner = np.full(2, -count * step / 2)
 
     def squares(points: np.ndarray, least: int = 1) -> np.ndarray:
-        """Those [A, B] bool below or above at least so many points [P, 3]."""
+        """Squares [A, B] bool below or above at least this many points [P, 3]."""
         index = np.floor((points @ frame[:2].T - corner) / step).astype(int)
         index = index[((index >= 0) & (index < count)).all(1)]
         return np.bincount(index[:, 0] * count + index[:, 1], minlength=count * count).reshape(count, count) >= least
@@ -135,7 +135,7 @@ def _complete(surface: FieldSurface, level: LevelPlane, poses: PosedPhotos, pict
     core = (beside >= RIM_SQUARES)[region]
     if core.sum() * step**2 < LEAST * level.area:
         return None
-    # A patch reaches past the edge of what is plain: there it is the square alone that has to look the same.
+    # A patch reaches past the edge of the plain region: there only the square itself has to look the same.
     narrow, own = alike(NARROW)
     nearest: Any = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
     same = narrow & (np.abs(own - color[tuple(nearest)]).max(2) < SAME)

@@ -243,7 +243,7 @@ def _best(
 
 
 def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
-    """A camera at a place [3] that looks at another [3], held level (z up), with the lens of another."""
+    """A camera at a place [3] that looks at a target [3], held level (z up), with the lens of a given camera."""
     forward = target - place
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])

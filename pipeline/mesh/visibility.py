@@ -31,7 +31,7 @@ class PhotoColors:
 
 
 def heights(mesh: Mesh, at: np.ndarray) -> np.ndarray:
-    """Heights [...] m of a mesh's topmost surface over the points `at` [..., 2] m; NaN where there is none."""
+    """Heights [...] m of a mesh's topmost surface over the points `at` [..., 2] m; NaN where no surface is."""
     top = float(mesh.vertices[:, 2].max() + 0.1 * np.ptp(mesh.vertices, axis=0).max())
     origin = np.insert(at.reshape(-1, 2), 2, top, axis=1)
     distance, _ = Caster(mesh).hits(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))

@@ -1,4 +1,4 @@
-"""Can a set of poses be trusted, and if not, what is wrong with the photos?"""
+"""Checks whether poses can be trusted, and diagnoses problems of the photos."""
 
 from dataclasses import dataclass, replace
 

@@ -35,7 +35,7 @@ ORDINARY: dict[str, Any] = {
 # photos.
 ATTEMPTS = {
     "ordinary": ORDINARY,
-    "without what stands still": {**ORDINARY, "moving_only": True},
+    "without static matches": {**ORDINARY, "moving_only": True},
     "more features": {
         **ORDINARY, "pixels": 1600, "max_features": 12000, "peak_threshold": 0.003, "max_ratio": 0.88, "guided": True,
         "min_inliers": 12, "min_inlier_ratio": 0.25, "init_inliers": 40, "init_angle": 6.0, "pose_inliers": 15,
