@@ -3,12 +3,12 @@
     python -m benchmarks contact_step DATA [--repeats 5]
     python -m benchmarks contact_step --check
 
-Writes its section of RESULTS.md, and the ratios into contact_step_ratchet.json. A slow test holds later steps to these:
-it asks for --check, which fails where a ratio has slipped back. DATA is a MOVi-B dataset; without one its row is left
-out. One thread, and its processor time, which other programs change less; but for many scenes in a call, whose time is
-the clock's. PyBullet and the solve take turns, each through its own API; every figure is the median of the repeats.
-PyBullet collides convex pieces (a bowl of 144), the solve those or baked distances; both make five inner steps a step.
-Loading, and what a simulator keeps for its recording, is left out.
+Writes its section of RESULTS.md, and the ratios into contact_step_ratchet.json. A slow test runs --check, which fails
+if a ratio has become worse. DATA is a MOVi-B dataset; without it the row is left out. Times are processor times of one
+thread, which other programs change less, except for many scenes in a call, which have wall-clock times. PyBullet and
+the solve alternate, each through its own API; every figure is the median of the repeats. PyBullet collides convex
+pieces (144 for the bowl), the solve those or baked distances; both make five inner steps per step. Loading and the
+recording of a simulator are not included.
 """
 
 import tempfile
@@ -37,13 +37,13 @@ from sdfsim.scene.scene import Scene
 from sdfsim.simulate.simulator import Simulator, run_all
 
 RATCHET = Path(__file__).with_name("contact_step_ratchet.json")
-SLACK = 0.35  # of a ratio: what machines and their load make of it
-LEAST = 0.05  # ratios below are alike: what is left of a step takes no time to speak of
+SLACK = 0.35  # of a ratio: variation between machines and loads
+LEAST = 0.05  # ratios below this count as equal, because the step takes almost no time
 TRAJECTORIES, STEPS = 10, 100
 BALLS, FALL = (16, 512), 200
 GROWN = (256, 512)  # bodies far apart
-SLIDE = 100  # steps of a body beside static ones, and of what rests
-REST = 60  # steps in which it falls asleep
+SLIDE = 100  # steps of a body near static ones, and of bodies at rest
+REST = 60  # steps until they fall asleep
 WORLDS = 200
 FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static bodies, and where
 
@@ -64,7 +64,7 @@ def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
 
 
 def asleep(scene: Scene) -> tuple[float, float]:
-    """Milliseconds a step of what rests: awake, and asleep."""
+    """Milliseconds a step of bodies at rest: awake, and asleep."""
     taken = []
     for sleep in (False, True):
         simulator = Simulator(scene, "solver")
@@ -75,8 +75,8 @@ def asleep(scene: Scene) -> tuple[float, float]:
 
 
 def worlds(data: Path) -> tuple[float, float]:
-    """Milliseconds a step of MOVi-B scenes that are simulated one after the other, and many in one call on all cores,
-    their recordings included."""
+    """Milliseconds a step of MOVi-B scenes simulated one after the other, and many in one call on all cores, including
+    recordings."""
     recorded, shapes = load_recorded(data, "test", most=TRAJECTORIES, as_recorded=True)
     floor = conditions_of(data).floor
     scenes = [scene_of([t], [0], shapes, floor)[0] for t in recorded]
@@ -110,7 +110,7 @@ def bowl(count: int, folder: Path) -> tuple[float, float]:
 
 @one_thread()
 def user_steps(model: str) -> tuple[float, float]:
-    """Milliseconds a step of `Simulator`, whose Python looks at all bodies, beside few and many static bodies."""
+    """Milliseconds a step of `Simulator`, including its Python code, with few and with many static bodies."""
     taken = []
     for count in FAR:
         simulator = Simulator(with_far(count), model)
@@ -121,7 +121,7 @@ def user_steps(model: str) -> tuple[float, float]:
 
 
 def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable[[], tuple[float, float]]]]:
-    """What is compared, by name: what the two are called, and a call that gives the milliseconds a step of both."""
+    """The comparisons by name: labels of the two sides, and a call that gives the milliseconds per step of both."""
     found: dict[str, tuple[str, str, Callable[[], tuple[float, float]]]] = {}
     if data:
         found["a MOVi-B step"] = ("PyBullet", "sdfsim", lambda: movi_b(data))

@@ -3,7 +3,7 @@
     python -m benchmarks effects
 
 Sample scenes with one effect at a time switched off; one thread, processor time, medians of five runs of 300 steps.
-"The same" says whether the bodies end, to a hundredth of their size, where they end with all effects on.
+"The same" means that the bodies end at the same places as with all effects on, to a hundredth of their size.
 """
 
 from dataclasses import fields, replace
@@ -34,7 +34,7 @@ def cost(scene: Scene) -> tuple[float, np.ndarray]:
 
 
 def main() -> None:
-    rows = [("scene", "off", "ms a step", "of all on", "bodies end")]
+    rows = [("scene", "off", "ms a step", "relative to all on", "where bodies end")]
     for name in SCENES:
         scene = load_scene(ROOT / "samples" / f"{name}.yaml")
         size = min(largest_extent(scene.shapes[b.shape]) * b.scale for b in scene.bodies if b.motion == "dynamic")

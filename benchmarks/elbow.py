@@ -1,10 +1,11 @@
-"""How far engines are from real tosses of an elbow, two links on a hinge, each with its own best parameters.
+"""Errors of engines on real tosses of an elbow, two links on a hinge, each engine with its own best parameters.
 
     python -m benchmarks elbow TOSSES -o DIR [--rounds N]
 
-TOSSES holds `elbow.npz`: tosses of two printed links onto a table, tracked at 148 Hz (dair_pll). Ours are the numbers
-that `sdfsim identify` finds on 60 tosses; other engines' are found on the same ones by a search over as many, as
-`benchmarks/reality.py` does for the cube. All are judged on 100 others, over the first 75 frames, from the same starts.
+TOSSES holds `elbow.npz`: tosses of two printed links onto a table, tracked at 148 Hz (dair_pll). `sdfsim identify`
+finds our parameters on 60 tosses. A search like that of `benchmarks/reality.py` for the cube finds the same number of
+parameters for other engines on the same tosses. Errors are measured on 100 others, over the first 75 frames, from the
+same starts.
 """
 
 from collections.abc import Sequence
@@ -51,11 +52,11 @@ from sdfsim.scene.scene import Scene
 
 MASS = 0.37  # kg of a link
 EVEN = MASS / 12.0 * np.array([LINK[b] ** 2 + LINK[c] ** 2 for b, c in ((1, 2), (2, 0), (0, 1))])  # kg m^2, solid
-LONGEST, HELD = 10, 0.002  # frames and m: flights that tell gravity are longer, and nearer to a parabola
+LONGEST, HELD = 10, 0.002  # frames and m: flights used for gravity are longer, and nearer to a parabola
 
 
 def load_tosses(folder: Path) -> tuple[float, list[Links]]:
-    """Frame spacing s, and both links' poses in every toss, in axes that stand on the table."""
+    """Frame spacing s, and both links' poses in every toss, in axes aligned with the table."""
     file = folder / "elbow.npz"
     dt, tosses = read_tosses(file, "position", "quat_xyzw", "hinge")
     links = (links_of(t["position"], Rotation.from_quat(t["quat_xyzw"]), t["hinge"]) for t in tosses)
@@ -66,14 +67,14 @@ def load_tosses(folder: Path) -> tuple[float, list[Links]]:
 
 
 def flight(toss: Links) -> int:
-    """How many frames pass before the lowest corner is as near to the table as `CLEAR`."""
+    """Number of frames before the lowest corner is as near to the table as `CLEAR`."""
     near = np.any(lowest(toss) < CLEAR, axis=1)
     return int(np.argmax(near)) if near.any() else len(toss.position)
 
 
 def gravity_of(tosses: Sequence[Links], dt: float) -> np.ndarray:
-    """[3] m/s^2, with which recorded elbows fall: the median over tosses of the acceleration of the mass centre of both
-    links until the first impact, where a parabola fits it. Some begin in the hand."""
+    """[3] m/s^2, the acceleration of recorded elbows in flight: the median over tosses of that of the mass centre of
+    both links until the first impact, if a parabola fits it. Some tosses begin in the hand."""
     found = []
     for toss in tosses:
         count = flight(toss)
@@ -89,8 +90,8 @@ def gravity_of(tosses: Sequence[Links], dt: float) -> np.ndarray:
 
 
 def begun(tosses: Sequence[Links], dt: float, scene: Scene) -> list[tuple[Links, Recording]]:
-    """Tosses, and what `sdfsim identify` makes of them, from the first frame of the flight that ends in the first
-    impact: those that have such a flight, and last long enough."""
+    """Tosses, and their starts by `sdfsim identify`, from the first frame of the flight before the first impact: only
+    tosses with such a flight and of sufficient length."""
     poses = [np.concatenate(toss, -1) for toss in tosses]
     found = []
     for toss, r in zip(
@@ -132,8 +133,8 @@ def errors(found: Motion, truth: Motion) -> np.ndarray:
 # --- what recordings say without any engine ---
 
 CORNERS = 0.5 * LINK * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-ALONE, AWAY = 0.008, 0.003  # m: how much lower an impact's corner is than the next; how high all are after it
-BEFORE, AFTER = 9, 6  # frames that tell the velocities before and after an impact
+ALONE, AWAY = 0.008, 0.003  # m: how much lower an impact's corner is than the next; how high all corners are after it
+BEFORE, AFTER = 9, 6  # frames for the velocities before and after an impact
 
 
 class Moving(NamedTuple):
@@ -180,9 +181,9 @@ def moving(toss: Links, frames: np.ndarray, at: float, dt: float, gravity: np.nd
 
 
 def impacts(tosses: Sequence[Links], dt: float, gravity: np.ndarray) -> dict[str, list[float]]:
-    """Of first impacts of one corner after which nothing touches for a while, each as quartiles and their number:
-    restitution of that corner, impulse along the table over that across it, and how much of the change of angular
-    momentum an impulse at that corner does not make."""
+    """Quartiles, with the number of impacts, over first impacts of one corner with no contact for a while after:
+    restitution of that corner, impulse along the table over that across it, and the share of the change of angular
+    momentum that an impulse at that corner does not explain."""
     found: dict[str, list[float]] = {}
     for toss in tosses:
         first = flight(toss)
@@ -199,7 +200,7 @@ def impacts(tosses: Sequence[Links], dt: float, gravity: np.ndarray) -> dict[str
         a, b = (moving(toss, k, at - 0.2, dt, gravity) for k in (np.arange(first - BEFORE - 1, first - 1), after))
         link, corner = divmod(int(height[at].argmin()), 8)
         push, arm = 2.0 * MASS * (b.speed - a.speed), a.corner(link, corner)
-        if push[2] < 0.3:  # N s; the table throws back at least so much
+        if push[2] < 0.3:  # N s; the least impulse of the table
             continue
         turned = b.turning() - a.turning()
         came, went = (one.velocity_of(link, one.corner(link, corner))[2] for one in (a, b))
@@ -212,7 +213,7 @@ def impacts(tosses: Sequence[Links], dt: float, gravity: np.ndarray) -> dict[str
 
 
 def growth(found: Motion, truth: Motion, flights: Sequence[int]) -> dict[int, tuple[float, float]]:
-    """By frames after the last before the first impact: medians of the distance of the links in mm and of their turn in
+    """By frames since the last one before the first impact: medians of the links' errors in position, mm, and rotation,
     degrees."""
     way, angle = apart(found, truth)
     way, angle = 1e3 * np.sqrt(np.square(way).mean(-1)), np.degrees(angle.mean(-1))
@@ -224,8 +225,8 @@ def growth(found: Motion, truth: Motion, flights: Sequence[int]) -> dict[int, tu
 
 
 def table(result: dict[str, tuple[np.ndarray, np.ndarray]]) -> str:
-    """Of each engine's errors [3, B] on the tosses that its parameters were found on, and on the others; best first."""
-    heads = "links apart, % of a link", "turned, degrees", "hinge, degrees", "sdfsim less it", "the same on the 60"
+    """The table of each engine's errors [3, B] on the tosses of its fit, and on the others; best first."""
+    heads = "position, % of a link", "rotation, degrees", "hinge, degrees", "sdfsim minus it", "the same on the 60"
     rows: list[tuple[str, ...]] = [("", *heads)]
     for name, (fitted, judged) in sorted(result.items(), key=lambda item: item[1][1][0].mean()):
         cells = [f"{np.mean(e):.1f} +- {interval(e)[1] - np.mean(e):.1f}" for e in judged]

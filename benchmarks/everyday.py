@@ -1,12 +1,13 @@
-"""Everyday scenes with our solver and with other engines, held to the same checks: RESULTS.md.
+"""Everyday scenes with our solver and with other engines, with the same checks: RESULTS.md.
 
     python -m benchmarks everyday -o DIR [--full]
 
-The scenes and checks are those of `python -m sdfsim.evaluation.everyday` at 10 cm, of closed forms where a shape has
-one. Engines take inner steps of 4 ms (of bodies of a metre; smaller ones in proportion to the root of their size), ours
-its default, which is the same. Closed forms are native to each engine; meshes that are not convex are given in pieces
-of CoACD's (tetrahedra in Drake). Engines do not sleep. What an engine cannot express, or takes longer than a minute
-for, is not run, and no check of it counts. DIR keeps results. All takes five minutes of a core.
+The scenes and checks are those of `python -m sdfsim.evaluation.everyday` at 10 cm, with closed forms for shapes that
+have one. Engines use inner steps of 4 ms (for bodies of a metre; for smaller ones in proportion to the square root of
+their size), ours its default, which is the same. Closed forms are native to each engine; meshes that are not convex
+become pieces by CoACD (tetrahedra in Drake). Engines do not sleep. Scenes that an engine cannot express, or that take
+longer than a minute, are not run, and their checks do not count. DIR keeps results. All scenes take five minutes on one
+core.
 """
 
 import importlib.util
@@ -38,7 +39,7 @@ from sdfsim.shape.convex_pieces import convex_vertices
 from sdfsim.shape.shape import own_pieces
 
 OURS, DRAKE = "sdfsim", "Drake"
-ENGINES: dict[str, tuple[str, Engine | None]] = {  # their package, and how they run
+ENGINES: dict[str, tuple[str, Engine | None]] = {  # package and runner of each
     OURS: ("sdfsim", None),
     "PyBullet": ("pybullet", engines.bullet),
     "MuJoCo": ("mujoco", partial(engines.mujoco, elliptic=True)),
@@ -54,7 +55,7 @@ class NotRun(SdfsimError):
 
 
 def runner(name: str, folder: Path) -> Runner:
-    """Runs scenes with an engine, whose files are in `folder`; raises NotRun where it cannot."""
+    """Runs scenes with an engine, with its files in `folder`; raises NotRun if it cannot."""
 
     def run(scene: Scene, seconds: float) -> Ran:
         began, engine = time.process_time(), ENGINES[name][1]
@@ -76,7 +77,7 @@ def runner(name: str, folder: Path) -> Runner:
 
 
 def unknown_to(name: str, scene: Scene) -> str:
-    """Which coefficients of a scene an engine has no way to say; empty where it has."""
+    """The coefficients of a scene that an engine cannot express; empty if there are none."""
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     others = [b for b in scene.bodies if b.motion == "static"]
     if name in ("MuJoCo", DRAKE) and len({(b.friction, b.restitution) for b in moving}) > 1:
@@ -84,15 +85,15 @@ def unknown_to(name: str, scene: Scene) -> str:
     bounces = [one.restitution * other.restitution for one in moving[:1] for other in (*others, *moving[1:])]
     if name == DRAKE and any(bounces):
         return "restitution"
-    # Of two coefficients the harmonic mean is less than twice the smaller one.
+    # The harmonic mean of two coefficients is less than twice the smaller one.
     if name == DRAKE and len(moving) > 1 and any(b.friction > 2.0 * moving[0].friction for b in others):
         return "friction of two materials that are so different"
     return ""
 
 
 def in_parts(scene: Scene, folder: Path) -> Scene:
-    """The scene with convex pieces for shapes without a closed form: their own vertices where they are convex, else
-    those that `in_pieces` finds, kept in a folder."""
+    """The scene with convex pieces for shapes without a closed form: their own vertices if they are convex, else the
+    pieces of `in_pieces`, kept in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     shapes = []
     for shape in scene.shapes:
@@ -107,14 +108,15 @@ def in_parts(scene: Scene, folder: Path) -> Scene:
 
 
 def judged(row: str, at: Setting, run: Runner) -> Iterator[tuple[str, Check, str, str]]:
-    """Every check of a row with its full name; why one of the scenes that it is of was not run, and why one broke."""
+    """Every check of a row with its full name; the reason if one of its scenes was not run, and the reason if one
+    failed."""
     absent: list[str] = []
     broken: list[str] = []
     seen = False
 
     def watched(scene: Scene, seconds: float) -> Ran:
         nonlocal seen
-        if seen:  # a check is of the scenes that were run since the checks before it
+        if seen:  # a check belongs to the scenes that were run since the previous check
             seen = False
             absent.clear()
             broken.clear()
@@ -133,8 +135,8 @@ def judged(row: str, at: Setting, run: Runner) -> Iterator[tuple[str, Check, str
 
 @one_thread()
 def counted(row: str, at: Setting, name: str, folder: Path) -> dict[str, Any]:
-    """Of an engine in a row: the names of checks that hold and of those that do not, and how many were not run by the
-    reason. Where a motion breaks, nothing holds of it."""
+    """For an engine and a row: the names of checks that hold and of those that do not, and the number not run by
+    reason. If a motion fails, none of its checks hold."""
     held, missed, absent = [], [], Counter()
     began = time.process_time()
     for full, check, why, broke in judged(row, at, runner(name, folder)):
@@ -157,7 +159,7 @@ def held_by(results: Results, row: str, check: str) -> list[str]:
 
 
 def losses(results: Results, row: str) -> tuple[float, float]:
-    """How many checks ours misses in a row that another engine holds, and how many it misses."""
+    """The number of checks in a row that ours misses and another engine passes, and the number that ours misses."""
     ours = results[row, OURS]
     if "failed" in ours:
         return np.inf, np.inf
@@ -175,8 +177,8 @@ def cell(result: dict[str, Any] | None) -> str:
 
 
 def table(results: Results) -> str:
-    """A row a kind of scene, those first in which ours misses most of what others hold; what ours misses, and what was
-    not run."""
+    """One row per kind of scene, first those in which ours misses most checks that others pass; then the checks that
+    ours misses, and those not run."""
     there = [row for row in ROWS if (row, OURS) in results]
     rows = sorted(there, key=lambda row: losses(results, row), reverse=True)
     lines = [("checks that hold, of those run", *ENGINES)]
@@ -193,8 +195,8 @@ def table(results: Results) -> str:
     for row in rows:
         for check in results[row, OURS].get("missed", ()):
             by = held_by(results, row, check)
-            lost.append(f"- {check.rpartition(' [')[0]}: held by {', '.join(by) or 'none'}")
-    parts.append("\n".join(["What ours misses:", "", *(lost or ["- nothing"])]) + "\n")
+            lost.append(f"- {check.rpartition(' [')[0]}: passed by {', '.join(by) or 'no other engine'}")
+    parts.append("\n".join(["Checks that sdfsim misses:", "", *(lost or ["- nothing"])]) + "\n")
     absent = [f"- {name}: {why}, {n} checks" for name, one in sums.items() for why, n in one["not_run"].items()]
     if absent:
         parts.append("\n".join(["Not run:", "", *absent]) + "\n")

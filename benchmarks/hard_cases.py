@@ -2,9 +2,9 @@
 
     python -m benchmarks hard_cases -o DIR [--quick]
 
-Runs the hard cases in DIR (their short form in DIR/quick), as far as it does not hold their results yet; then writes
-the table and the pictures of docs/stability.md, and benchmarks/hard_cases_ratchet.json from the short form, which is
-what the slow test runs. With --quick the table is that of the short form too.
+Runs the hard cases in DIR (their short form in DIR/quick) that have no results there yet; then writes the table and the
+pictures of docs/stability.md, and benchmarks/hard_cases_ratchet.json from the short form, which the slow test runs.
+With --quick the table is that of the short form too.
 """
 
 from dataclasses import replace
@@ -22,12 +22,12 @@ ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
 DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
 SPREADS = 3.0  # standard deviations that count as noise
-SHARE = 0.05  # of a figure: what another machine's rounding may change where repetitions agree
+SHARE = 0.05  # of a figure: possible change by another machine's rounding if repetitions agree
 PICTURES = {"bounce": "stability_bounces.png", "slope": "stability_slopes.png"}
 
 
 def accepted(study: Study) -> dict[str, Any]:
-    """What the ratchet file holds: each model's figures, and the cases in which it blew up."""
+    """The content of the ratchet file: each model's figures, and the cases in which it blew up."""
     models = {}
     for who, found in figures(study).items():
         if who in study.models:

@@ -1,10 +1,10 @@
-"""How long a joint takes, beside MuJoCo: a chain of a hundred links, and the ragdoll on its stairs: docs/joints.md.
+"""Time of joints compared with MuJoCo: a chain of a hundred links, and the ragdoll on its stairs: docs/joints.md.
 
     python -m benchmarks joints
 
-Rows are what joints hold: three for a ball, five for a hinge. MuJoCo gets the scenes as `export` writes them: it works
-in the coordinates that joints leave, at the inner step of ours, with its implicit integrator and its Newton solver.
-Both run in turn, and times are medians of the processor's, of one thread.
+Rows are the equations of joints: three for a ball, five for a hinge. MuJoCo gets the scenes from `export`: it works in
+joint coordinates, at our inner step, with its implicit integrator and its Newton solver. Both alternate, and times are
+medians of processor time on one thread.
 """
 
 import math
@@ -25,7 +25,7 @@ SECONDS, ROUNDS = 2.0, 7
 
 
 def chain(folder: Path, count: int = 100) -> Path:
-    """Links that are let go from a level line, held at one end."""
+    """Links that are released from a level line, fixed at one end."""
     built = Scene(model="solver", effects={"sleep": "off", "contact": "off"})
     for k in range(count):
         form = {"shape": "link0"} if k else {"box": {"size": (0.05, 0.01, 0.01)}}
@@ -35,7 +35,7 @@ def chain(folder: Path, count: int = 100) -> Path:
 
 
 def costs(file: Path, folder: Path) -> tuple[float, float, float]:
-    """Milliseconds of the processor a simulated second of ours and of MuJoCo's, and the inner step in ms."""
+    """Processor milliseconds per simulated second for ours and for MuJoCo, and the inner step in ms."""
     engine, scene = optional("mujoco", "MuJoCo", "bench"), load_scene(file)
     simulator = Simulator(scene)
     inner = simulator.dt / simulator.options.substeps

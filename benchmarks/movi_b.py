@@ -1,14 +1,14 @@
-"""Errors on recorded MOVi-B scenes, with what ignoring all contact gives and what chaos allows: RESULTS.md.
+"""Errors on recorded MOVi-B scenes, with those of free flight and of PyBullet itself from changed starts: RESULTS.md.
 
     python -m benchmarks movi_b DATA
     python -m benchmarks movi_b DATA --contacts
 
-DATA is a MOVi-B dataset; its test split is rolled out. Written `error [95 % interval over trajectories]`. Then the
-same at the steps next to the instants of which HOPNet reports errors. Its recordings have 240 frames a second
+DATA is a MOVi-B dataset; its test split is rolled out. Results have the form `error [95 % interval over trajectories]`.
+A second table has the steps nearest to the instants of HOPNet's errors. Its recordings have 240 frames a second
 (`frame_rate` in samples/MOVi-B/*/metadata.json of github.com/AmauryWEI/hopnet), so its frame 100 is 0.417 s.
 
-`--contacts` says instead which contacts differ: of DATA's test split every recorded frame is stepped once, so that no
-error of one step is handed to the next.
+`--contacts` measures instead which contacts differ: every recorded frame of DATA's test split is stepped once, so that
+errors do not accumulate.
 """
 
 from dataclasses import replace
@@ -28,13 +28,14 @@ from sdfsim.training.contact_cache import inner_steps
 
 COMMAND = "python -m benchmarks movi_b DATA"
 STEPS = ("50", "100")
-FLOWN = 1e-3  # m from free flight: what is farther has met something
-# m/s that contacts give a body in a step: more than the first is an impact, no more than the second is none
+FLOWN = 1e-3  # m from free flight: a body farther off has touched something
+# m/s, change of velocity by contacts in a step: above the first it is an impact, up to the second it is none
 HIT, UNTOUCHED = 0.4, 1e-3
-LESS = 0.25  # of an impact's change of velocity: who has less has not had this impact in this step
-RESTS = 0.05  # m/s, below which a body that touches rests, and else slides or rolls
-BESIDE = 0.02  # m between the balls around two bodies, up to which one is beside the other
-# HOPNet's frames -> metres and degrees there, as Dou et al. 2026 (arXiv 2605.09196) quote it on its own recordings
+LESS = 0.25  # of an impact's change of velocity: a body with less has not had this impact in this step
+RESTS = 0.05  # m/s: below this a touching body rests, above it slides or rolls
+BESIDE = 0.02  # m between the bounding balls of two bodies, up to which they are neighbours
+# HOPNet's frames -> its errors in metres and degrees on its own recordings, quoted by Dou et al. 2026 (arXiv
+# 2605.09196)
 RATE, HOPNET = 240, {50: (0.047, None), 75: (0.101, None), 100: (0.176, 17.9)}
 
 
@@ -65,7 +66,7 @@ def horizons(data: Path) -> None:
 
 
 def instants(data: Path) -> None:
-    """Write the section: errors at single instants, and the share of bodies that have met nothing by then."""
+    """Write the section: errors at single instants, and the share of bodies that have touched nothing by then."""
     recorded, _ = load_recorded(data, "test")
     columns: dict[str, dict[str, str]] = {}
     for frame, (metres, degrees) in HOPNET.items():
@@ -114,12 +115,12 @@ def differing(data: Path) -> None:
         rows.append((kind, *shares, *(number(float(r)) for r in np.sqrt(square.mean(0)))))
     worst = np.sort(np.square(np.concatenate([some[:, 0] for some in errors.values()])))[::-1]
     share = worst[: len(worst) // 100].sum() / worst.sum()
-    told = f"{count:,} contacts of {len(recorded)} trajectories; 1 % of them has {100 * share:.0f} % of the error."
+    told = f"{count:,} contacts of {len(recorded)} trajectories; 1 % of them have {100 * share:.0f} % of the error."
     write_section("MOVi-B contacts", f"{COMMAND} --contacts", f"{markdown(rows)}\n{told}")
 
 
 def contact_kinds(recorded: Trajectory, ours: Trajectory, shapes: dict[str, Shape]) -> tuple[list[str], np.ndarray]:
-    """Of one step [2 frames] the kind of contact of each body that something touched in either motion, and the errors
+    """For one step [2 frames], the kind of contact of each body that touched something in either motion, and the errors
     of its velocities at the end, [B, 2] m/s and rad/s."""
     given = [np.linalg.norm(np.diff(t.velocity, axis=0)[0] - t.gravity * t.dt, axis=1) for t in (recorded, ours)]
     errors = np.stack(
@@ -141,13 +142,13 @@ def contact_kinds(recorded: Trajectory, ours: Trajectory, shapes: dict[str, Shap
             slides = np.linalg.norm(recorded.velocity[0, b]) > RESTS
             what = "sliding or rolling" if slides else "resting"
         elif mine < LESS * theirs:
-            what = "impact that ours has not had yet"
+            what = "impact only in the recording"
         elif theirs < LESS * mine:
-            what = "impact that only ours has had"
+            what = "impact only in ours"
         else:
             what = "impact in both"
         body = "several pieces" if len(shapes[str(recorded.shape[b])].pieces) > 1 else "one hull"
-        kinds.append(f"{body}, {'beside another' if away[b].min() < BESIDE else 'on the floor alone'}: {what}")
+        kinds.append(f"{body}, {'near another body' if away[b].min() < BESIDE else 'near only the floor'}: {what}")
     return kinds, errors[touched]
 
 
@@ -157,7 +158,7 @@ def cell(found: dict) -> str:
 
 
 def flying(recorded: list[Trajectory], step: int) -> float:
-    """Share of the bodies that move which are still in free flight, by their positions."""
+    """Share of the moving bodies that are still in free flight, by their positions."""
     away = []
     for t in recorded:
         seconds = step * t.dt

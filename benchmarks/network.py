@@ -2,9 +2,9 @@
 
     python -m benchmarks network DATA [MORE ...] -o DIR [--seeds 3] [--steps N]
 
-Trains the presets *alone* and *small* with every seed on the training trajectories of DATA and MORE, then rolls
-them out beside the solver with as many inner steps, on validation and test trajectories of DATA. Trainings resume, and
-results that DIR holds are kept. Writes DIR/table.md.
+Trains the presets *alone* and *small* with every seed on the training trajectories of DATA and MORE, then rolls them
+out, and the solver with the same inner steps, on validation and test trajectories of DATA. Trainings resume, and
+results in DIR are kept. Writes DIR/table.md.
 """
 
 import statistics
@@ -32,7 +32,7 @@ from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
 from sdfsim.training.train import train
 
-HORIZON = "50"  # steps over which errors are taken
+HORIZON = "50"  # steps over which errors are measured
 SPLITS = ("validation", "test")
 TIMED, STEPS_TIMED = 5, 100  # scenes, and steps of each
 
@@ -55,7 +55,7 @@ METHODS = {
 
 
 def judged(model: str, method: Method, data: Path, split: str, floor: bool) -> dict[str, Any]:
-    """Errors up to `HORIZON`; of the teacher run again, where asked for."""
+    """Errors up to `HORIZON`; those of PyBullet run again, if requested."""
     report = evaluate(
         data, model=model, split=split, steps=int(HORIZON), substeps=method.substeps, chaos_floor=floor,
         errors_only=True,
@@ -75,7 +75,7 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
             simulator = Simulator(scene, used, dt=start.dt)
             substeps = method.substeps or used.inner or SUBSTEPS
             simulator.options = simulator.options._replace(substeps=substeps)
-            simulator.stepper = stepper_of(used)  # trusted, whatever the scene
+            simulator.stepper = stepper_of(used)  # accept the network for any scene
             taken.append(1e3 * timed_rollout(simulator, STEPS_TIMED)[1].cpu_ms)
     return {"us": statistics.median(taken)}
 
@@ -105,7 +105,7 @@ def _solve(g: ContactGraph, *, mirrored: bool = False) -> Velocities:
 
 
 def trained(folders: list[Path], out: Path, preset: str, seed: int, steps: int | None) -> str:
-    """The model of a preset and a seed; trained now, or on from where it was left."""
+    """The model of a preset and a seed; trained now, or resumed."""
     place = out / "runs" / f"{preset}-{seed}"
     if not (place / "model.safetensors").exists():
         resume = (place / "checkpoint.npz").exists()
@@ -114,7 +114,7 @@ def trained(folders: list[Path], out: Path, preset: str, seed: int, steps: int |
 
 
 def cell(found: list[dict[str, Any]]) -> str:
-    """Mean over seeds; in brackets their range, where there are several, and the first one's interval over scenes."""
+    """Mean over seeds; in brackets their range, if there are several, and the first one's interval over scenes."""
     if not found or "failed" in found[0]:
         return found[0]["failed"] if found else "-"
     metres, degrees = ([one[what] for one in found] for what in ("translation_rmse", "rotation_error"))
@@ -139,7 +139,7 @@ def main(data: list[Path], *, out: Path, seeds: int = 3, steps: int | None = Non
     results = measure(jobs, out / "results", on_progress=progress)
 
     def errors(name: str, who: str) -> list[list[dict[str, Any]]]:
-        """By split and seed, the errors of the model or of the teacher again."""
+        """By split and seed, the errors of the model or of PyBullet run again."""
         found = []
         for split in SPLITS:
             runs = [results.get((split, f"{name}, seed {seed}"), {}) for seed in range(seeds)]

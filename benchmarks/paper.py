@@ -1,4 +1,4 @@
-"""SDF-Sim and its baselines, all on one footing: docs/paper.md.
+"""SDF-Sim and its baselines under equal conditions: docs/paper.md.
 
     python -m benchmarks paper graphs DATA -o DIR
         edges, nodes, memory and time of a step, on recorded steps
@@ -9,10 +9,10 @@
     python -m benchmarks paper sdf DATA -o DIR
         rollouts of the solver on networks of distances of several widths
 
-DATA is a MOVi-B dataset with train, validation and test. Graphs have the published number of surface nodes, about 440 a
-body, and networks the published size. Networks of the last command have `NODES` nodes a body and the sizes `TRAINED`,
-so that an hour of a core is enough to learn something. Trainings go on where they were left, results that DIR holds
-are kept. Each command writes a table in Markdown into DIR.
+DATA is a MOVi-B dataset with train, validation and test. Graphs have the published number of surface nodes, about 440
+per body, and networks the published size. The trained networks have `NODES` nodes per body and the sizes `TRAINED`, so
+that an hour on one core is enough to learn something. Trainings resume, and results in DIR are kept. Each command
+writes a table in Markdown into DIR.
 """
 
 import resource
@@ -53,19 +53,19 @@ NAMES = {
     "sdf-sim": "SDF-Sim", "fignet": "FIGNet", "fignet-star": "FIGNet*", "mgn": "MGN", "mgn-large": "MGN, large radius",
     "dpi": "DPI",
 }  # fmt: skip
-STEPS_SEEN, STEPS_TIMED = 200, 20  # recorded steps whose graphs are counted, and passed through the network
-PUBLISHED_NODES = 440  # a body: what the published counts of edges leave
+STEPS_SEEN, STEPS_TIMED = 200, 20  # recorded steps whose graphs are counted, and those passed through the network
+PUBLISHED_NODES = 440  # per body, from the published numbers of edges
 BOWLS = (2, 8, 32, 128, 512)
 SETTLED = 200  # steps of the solver before the networks see the bowl
 MEMORY = 12  # GiB that a process may take
 TRAINED, BATCH = {"width": 32, "steps": 4}, 4
-NODES = 64  # a body, in training
+NODES = 64  # per body, in training
 FRAME = "50"
 CPU = torch.device("cpu")
 
 
 def untrained(name: str, nodes: int | None) -> Model:
-    """A network of the published size with random weights: what a step costs does not depend on them."""
+    """A network of the published size with random weights, because the cost of a step does not depend on them."""
     plan = PRESETS[name]
     torch.manual_seed(0)
     network = new_network(plan.kind, plan.config).eval().requires_grad_(False)
@@ -79,7 +79,7 @@ def recorded(name: str, data: Path) -> dict[str, float]:
 
     Returns:
         Means of edges between bodies (each once), of all edges and of the nodes of the graph; medians of the
-        milliseconds to find what is near and to pass the graph; peak memory.
+        milliseconds to find near pairs and to pass the graph; peak memory.
     """
     plan = replace(PRESETS[name], nodes=PUBLISHED_NODES)
     task, network = SurfaceTask(data, "test", plan), untrained(name, PUBLISHED_NODES).network
@@ -104,7 +104,7 @@ def recorded(name: str, data: Path) -> dict[str, float]:
 
 
 def grown(name: str, scene_file: Path) -> dict[str, float]:
-    """The same of one step of spheres that the solver has let settle in a bowl, all motion predicted."""
+    """The same for one step of spheres that the solver has let settle in a bowl, with all motion predicted."""
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY << 30, MEMORY << 30))
     scene = load_scene(scene_file)
     settled = Simulator(scene).step(SETTLED)  # a sphere's origin is its centre of mass
@@ -116,7 +116,7 @@ def grown(name: str, scene_file: Path) -> dict[str, float]:
     model = untrained(name, 64)
     with one_thread(), peak_memory() as memory:
         simulator = Simulator(replace(scene, bodies=bodies), model, free_flight="learned")
-        simulator.step()  # not timed: it loads what is compiled
+        simulator.step()  # not timed: it loads compiled code
         simulator.reset()
         found = next(simulator.frames(1)).counters
     known = ("contacts", "edges", "nodes", "contact_ms", "network_ms")
@@ -128,7 +128,7 @@ COMPARED = NAMES | {"sdf-sim-unsigned": "SDF-Sim, unsigned distances"}
 
 
 def plan_of(name: str) -> Preset:
-    """How a network is trained for the comparison: at equal sizes, with the schedule of the published ones."""
+    """The training plan of a network for the comparison: equal sizes, with the published schedule."""
     return replace(PRESETS[name.removesuffix("-unsigned")], config=TRAINED, batch=BATCH, nodes=NODES)
 
 
@@ -140,7 +140,7 @@ def judged(model: Path, data: Path, split: str, free_flight: str) -> dict[str, A
 
 
 def unsigned(data: Path, home: Path) -> Path:
-    """The dataset with unsigned distances: its shapes as grids of |d|, which have no inside."""
+    """The dataset with unsigned distances: its shapes as grids of |d|, without an inside."""
     (home / "shapes").mkdir(parents=True, exist_ok=True)
     for there in data.iterdir():
         if there.name != "shapes" and not (home / there.name).exists():
@@ -195,7 +195,7 @@ MINUTES = [5.0, 15.0, 30.0, 60.0]
 
 
 def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
-    """Train everything a little, then a little more, and write accuracy.md."""
+    """Train all networks for each number of minutes in order, and write accuracy.md."""
     results: dict[tuple[str, str], dict[str, Any]] = {}
     minutes = sorted(minutes)
     for spent in minutes:
@@ -223,8 +223,8 @@ def _case(name: str, minutes: float) -> str:
 
 
 def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
-    """Errors of the solver on validation data whose shapes are networks of `width` hidden units, refitted where they
-    are not 64 wide and kept in `home`; on the convex pieces themselves for None."""
+    """Errors of the solver on validation data whose shapes are networks of `width` hidden units, refitted if they are
+    not 64 wide and kept in `home`; on the convex pieces themselves for None."""
     torch.set_num_threads(1)
     recorded, shapes = load_recorded(data, "validation")
     recorded = [first_frames(t, int(FRAME) + 1) for t in recorded]
@@ -283,7 +283,7 @@ def _cell(found: dict[str, Any]) -> str:
 
 
 def _power_law(minutes: list[float], found: list[dict[str, Any]]) -> str:
-    """What a line through the logarithms of time and error says for ten hours of one core."""
+    """Extrapolation to ten hours of one core by a line through the logarithms of time and error."""
     known = line(
         "", [{"minutes": m} | f for m, f in zip(minutes, found, strict=True) if f], "minutes", "translation_rmse"
     )

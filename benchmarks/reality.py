@@ -1,13 +1,13 @@
-"""How far engines are from real tosses of a cube, each with its own best parameters: RESULTS.md.
+"""Errors of engines on real tosses of a cube, each with its own best parameters: RESULTS.md.
 
     python -m benchmarks reality TOSSES -o DIR
 
 TOSSES holds `cube.npz`: tosses of an acrylic cube onto a table, tracked at 148 Hz (ContactNets; Pfrommer, Halm and Posa
-2020). Starts are fitted to the flight before the first impact. Ours are the numbers that `sdfsim identify` finds on 60
-tosses; other engines' are found on the same ones by a search over as many parameters, with as many tries. Networks on
-our solve with these numbers are trained on 8 to 256 tosses, three of each, and chosen on others by how far whole
-motions are off. All are judged on 100 others, over the first 75 frames, from the same starts. Drake takes part where it
-is installed. Five minutes, about forty more for the networks, and ten more with Drake.
+2020). Starts are fitted to the flight before the first impact. `sdfsim identify` finds our parameters on 60 tosses; for
+other engines a search finds the same number of parameters on the same tosses, with the same number of tries. Networks
+on our solve with these parameters are trained on 8 to 256 tosses, three seeds of each, and chosen by the errors of
+whole motions on further tosses. Errors are measured on 100 others, over the first 75 frames, from the same starts.
+Drake takes part if it is installed. It takes five minutes, about forty more for the networks, and ten more with Drake.
 """
 
 from __future__ import annotations
@@ -73,12 +73,12 @@ from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run
 from sdfsim.training.surface_task import SurfaceTask
 
-SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as measured by those who tossed it
+SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as published
 THING = Thing(np.full(3, SIDE), MASS, np.full(3, INERTIA))
 GRAVITY = 9.81  # m/s^2
-FEW = 16  # of the first, that ours is found on too
-TRAINED, SEEDS = (8, 16, 64, 256), 3  # tosses that networks are trained on, and networks of each
-STEPS, LOOKS = 240, 4  # of a training, and looks at the tosses that choose among its states
+FEW = 16  # first tosses, for a second fit of ours
+TRAINED, SEEDS = (8, 16, 64, 256), 3  # training tosses of networks, and seeds of each
+STEPS, LOOKS = 240, 4  # of a training, and its states among which the choosing tosses decide
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Toss:
 
 @dataclass(frozen=True)
 class FittedStart(Start):
-    """A start, and how the flight that it was fitted to differs from it."""
+    """A start, with the error of its fit to the flight."""
 
     flight: int  # frames before the first impact
     # root mean square over these frames, m and rad
@@ -104,13 +104,13 @@ class FittedStart(Start):
 
 
 def load_tosses(folder: Path) -> list[Toss]:
-    """The tosses of `cube.npz`. Raises SdfsimError where it is absent or holds no such recordings."""
+    """The tosses of `cube.npz`. Raises SdfsimError if it is absent or holds no such recordings."""
     dt, tosses = read_tosses(folder / "cube.npz", "position", "quat_xyzw")
     return [Toss(dt, **arrays) for arrays in tosses]
 
 
 def flight(toss: Toss) -> int:
-    """How many frames pass before a cube is as near to the table as `CLEAR`; all, where it never is."""
+    """Number of frames before a cube is as near to the table as `CLEAR`; all, if it never is."""
     half = 0.5 * SIDE * np.abs(Rotation.from_quat(toss.quat_xyzw).as_matrix()[:, 2]).sum(1)
     near = toss.position[:, 2] - half < CLEAR
     return int(near.argmax()) if near.any() else len(near)
@@ -147,8 +147,8 @@ def fitted_start(toss: Toss, gravity: float = GRAVITY) -> FittedStart:
 
 
 def fall(tosses: Sequence[Toss]) -> tuple[float, float]:
-    """The acceleration with which recorded cubes fall, m/s^2, and its standard error: a parabola without a given one.
-    That of gravity, where lengths and times are as told."""
+    """The acceleration of recorded cubes in flight, m/s^2, from parabolas, and its standard error. It is that of
+    gravity if the recorded lengths and times are right."""
     known, weight = [], []
     for toss in tosses:
         time = toss.dt * np.arange(flight(toss))
@@ -163,7 +163,7 @@ def fall(tosses: Sequence[Toss]) -> tuple[float, float]:
 
 
 def split(tosses: Sequence[Toss]) -> tuple[list[Toss], list[Toss], list[Toss]]:
-    """As `drawn` has them, of such as are long enough, and fly long enough."""
+    """The result of `drawn`, from tosses that are long enough and fly long enough."""
     return drawn([toss for toss in tosses if len(toss.position) > FRAMES and flight(toss) >= FLIGHT])
 
 
@@ -195,7 +195,8 @@ def drake(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[
     lib.AddContactMaterial(0.0, 1e9, lib.CoulombFriction(1.0, 1.0), table)
     ground = lib.RigidTransform([0.0, 0.0, values["height"]])
     plant.RegisterCollisionGeometry(plant.world_body(), ground, lib.HalfSpace(), "table", table)
-    # Two coefficients a, b make 2 a b / (a + b) in Drake: with 1 for the table this one makes what is wanted.
+    # Drake combines two coefficients a, b to 2 a b / (a + b): with 1 for the table this value gives the wanted
+    # friction.
     mu = values["friction"] / (2.0 - values["friction"])
     touch = lib.ProximityProperties()
     lib.AddContactMaterial(values["dissipation"], 10.0 ** values["stiffness"], lib.CoulombFriction(mu, mu), touch)
@@ -243,8 +244,8 @@ def rolled(network: ImpulseNetwork, task: MotionTask, starts: Sequence[Start]) -
 
 
 def trained(how: Trained, seed: int, rows: Sequence[int], lesson: Lesson) -> tuple[Judged, float, float]:
-    """The state of a training on the recordings `rows` that leaves the least error on the tosses that choose: what
-    moves tosses with it, this error, and the seconds of processor time that all of it took."""
+    """The state of a training on the recordings `rows` with the least error on the choosing tosses: a function that
+    moves tosses with it, this error, and the seconds of processor time in total."""
     began = process_time()
     with TemporaryDirectory() as folder:
         plan, known = how.plan(), [lesson.known[k] for k in rows]
@@ -273,17 +274,17 @@ def trained(how: Trained, seed: int, rows: Sequence[int], lesson: Lesson) -> tup
 
 
 def summed(found: Motion, truth: Motion) -> float:
-    """By which states of a training are chosen: mean errors, % and degrees added up."""
+    """The criterion for choosing a state of a training: the sum of mean errors, % and degrees."""
     return float(sum(error.mean() for error in errors(found, truth)))
 
 
 @dataclass(frozen=True)
 class Lesson:
-    """What a network is trained on, and what chooses and judges it."""
+    """Data for a network: training, choosing and test tosses."""
 
-    known: list[Recording]  # that may be trained on
+    known: list[Recording]  # for training
     scene: Scene  # as identified
-    # starts and what was recorded from there: of the tosses that choose, and of those that judge
+    # starts with the recorded motion: of the choosing tosses, and of the test tosses
     chooses: tuple[Sequence[Start], Motion]
     judges: tuple[Sequence[Start], Motion]
 
@@ -295,11 +296,11 @@ class Trained:
     preset: str
     tosses: int
     steps: int = STEPS
-    teacher: bool = False  # whether it begins with what the engine has taught the networks of `TEACHERS`
+    teacher: bool = False  # whether it begins with the weights of `TEACHERS`, trained on an engine's recordings
 
     def plan(self) -> Preset:
-        """How it is trained: networks on surface nodes at the size of `sdf-sim-small`, with the lengths of their
-        presets times what this cube has of the size of MOVi-B's bodies."""
+        """Its training plan: networks on surface nodes have the size of `sdf-sim-small`, with the lengths of their
+        presets scaled from MOVi-B's bodies to this cube."""
         plan = PRESETS[self.preset]
         if plan.kind not in SURFACE:
             return plan
@@ -313,7 +314,7 @@ class Trained:
 Judged = Callable[[Sequence[Start]], Motion]
 BODIES = 1.87  # m, the middle of the sizes of MOVi-B's bodies
 NODES = 32  # of a cube, at most
-SURFACE_STEPS = 800  # of networks on surface nodes, which have one seed
+SURFACE_STEPS = 800  # for networks on surface nodes, which have one seed
 HERE = Path(__file__).with_name("models")
 TEACHERS = [
     HERE / "alone-0.safetensors",
@@ -331,7 +332,7 @@ NETWORKS |= {
 
 
 def learnt(how: Trained, seed: int, lesson: Lesson) -> dict[str, Any]:
-    """One network: errors [2, TEST] on the tosses that judge, and how far it is off on those that choose."""
+    """One network: errors [2, TEST] on the test tosses, and its error on the choosing tosses."""
     rows = np.random.default_rng([seed, how.tosses]).choice(len(lesson.known), how.tosses, replace=False)
     state, off, taken = trained(how, seed, rows.tolist(), lesson)
     starts, truth = lesson.judges
@@ -339,13 +340,13 @@ def learnt(how: Trained, seed: int, lesson: Lesson) -> dict[str, Any]:
 
 
 def _table(scene: Scene) -> tuple[Rotation, np.ndarray, Body]:
-    """How the table of a scene is turned, where it lies, and the cube."""
+    """Rotation and position of a scene's table, and the cube."""
     table, cube = scene.bodies
     return Rotation.from_quat(table.quat_xyzw), np.asarray(table.position), cube
 
 
 def dataset_of(recordings: Sequence[Recording], lesson: Lesson, folder: Path) -> Path:
-    """Recordings as a dataset, whose floor is z = 0: there the table lies."""
+    """Recordings as a dataset, with the table as its floor at z = 0."""
     (folder / "train").mkdir()
     shape = lesson.scene.shapes[_table(lesson.scene)[2].shape]
     shape.save(folder / "shapes" / "cube")
@@ -371,7 +372,7 @@ def trajectory_of(
 
 
 def on_surfaces(model: Model, lesson: Lesson, starts: Sequence[Start]) -> Motion:
-    """What a network on surface nodes makes of these starts; what touches nothing flies exactly."""
+    """The motion of a network on surface nodes from these starts; bodies without contact fly exactly."""
     lies, at, cube = _table(lesson.scene)
     table, dt = lesson.scene.bodies[0], lesson.known[0].dt
 
@@ -389,8 +390,8 @@ def on_surfaces(model: Model, lesson: Lesson, starts: Sequence[Start]) -> Motion
 
 
 def networks(groups: tuple[list[Toss], list[Toss], list[Toss]], scene: Path, gravity: float, out: Path) -> Results:
-    """Every network of `NETWORKS` with every seed by (seed, name), each kept in a file under `out`; and the solve
-    without any. The tosses that parameters were found on are trained on too."""
+    """Every network of `NETWORKS` with every seed by (seed, name), each kept in a file in `out`; and the solve without
+    a network. The tosses of the parameter fit are used for training too."""
     fit, test, rest = groups
     pool = [*fit, *rest]
     free, held = pool[: max(TRAINED)], pool[max(TRAINED) :]
@@ -411,7 +412,7 @@ SOLVE = "the solve alone"
 
 
 def solved(lesson: Lesson, scene: Scene) -> dict[str, Any]:
-    """The same of the solve without a network."""
+    """The same for the solve without a network."""
     found = [ours(starts, lesson.known[0].dt, scene) for starts, _ in (lesson.chooses, lesson.judges)]
     return {
         "test": np.array(errors(found[1], lesson.judges[1])).tolist(), "chosen": summed(found[0], lesson.chooses[1])
@@ -432,8 +433,8 @@ ENGINES: dict[str, tuple[Engine, Bounds]] = {
 
 @one_thread()
 def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bool = False) -> None:
-    """Identify and judge every engine; the section of the page, `reality.json` with every toss's errors, the scene that
-    was identified, and pictures. Then the networks; `networks_only` where DIR holds that scene already."""
+    """Fit and test every engine; write the section of the page, `reality.json` with every toss's errors, the identified
+    scene, and pictures. Then the networks; use `networks_only` if DIR already holds that scene."""
     known = load_tosses(tosses)
     groups = split(known)
     if networks_only:
@@ -480,8 +481,9 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bo
     write_json(out / "reality.json", kept)
     pictures(moved, test_truth, dt, out)
     text = (
-        f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
-        f"95 % intervals; sdfsim less the other is toss by toss. Starts fit the free flight to {off:.2f} mm "
+        f"Parameters are from {FIT} tosses, errors from {TEST} others (seed {SEED}), over the first {FRAMES} frames: "
+        "means over tosses with 95 % intervals. Differences between engines are paired by toss. The starts fit the "
+        f"free flight to {off:.2f} mm "
         f"and {turned_off:.2f} degrees (medians of root mean squares); recorded cubes fall with {falls:.3f} +- "
         f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
     )
@@ -494,9 +496,9 @@ COMMAND = "python -m benchmarks reality TOSSES -o DIR"
 
 
 def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
-    """What recordings say of contacts without any engine, each as quartiles and how many there are: of first impacts of
+    """Facts on contacts from recordings without any engine, each as quartiles with their number: for first impacts of
     one corner (the next one a centimetre higher) the restitution, the impulse along the table over that across it, and
-    the change of the spin over that of a rigid corner; of stretches of 8 frames in which a face slides, the
+    the change of the spin over that of a rigid corner; for stretches of 8 frames in which a face slides, the
     deceleration over gravity, by speed."""
     corners = 0.5 * SIDE * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     found: dict[str, list[float]] = {}
@@ -528,8 +530,15 @@ def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
 
 
 def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Whom we lose to comes first, then ours, then the others."""
-    head = ("engine", "position, % of the side", "rotation, degrees", "sdfsim less it", "on those 60", "found")
+    """Engines better than ours come first, then ours, then the others."""
+    head = (
+        "engine",
+        "position, % of the side",
+        "rotation, degrees",
+        "sdfsim minus it",
+        "the same on the 60",
+        "parameters",
+    )
 
     def lost(name: str) -> float:
         return float(np.mean(result[name]["test"][0]) - np.mean(result[OURS]["test"][0]))
@@ -546,24 +555,24 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path, gravity: float) -> None:
-    """Train and judge all networks on the scene that was identified; their section of the page."""
+    """Train and test all networks in the identified scene; write their section of the page."""
     found = networks(groups, out / "identified.yaml", gravity, out / "networks")
     chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
     text = (
-        f"Networks in the scene that was identified: {STEPS} steps of a training where its row does not say how many "
-        f"({SURFACE_STEPS} of networks on surface nodes), of which the best of {LOOKS} states on {chosen} tosses is "
-        f"taken, and judged once on {TEST} others. Means over the seeds that are listed, with 95 % intervals over "
-        "tosses. Less the solve: toss by toss. Seconds of one core, for one training.\n\n"
+        f"These are networks in the identified scene. A training has {STEPS} steps unless its row says otherwise "
+        f"({SURFACE_STEPS} for networks on surface nodes). {chosen} tosses choose the best of its {LOOKS} states, "
+        f"which is measured once on {TEST} others. Means are over the listed seeds, with 95 % intervals over tosses. "
+        "Differences to the solve are paired by toss. Times are seconds of one core for one training.\n\n"
         f"{markdown(network_table(found))}"
     )
     write_section("reality networks", f"{COMMAND} --networks-only", text)
 
 
 def network_table(found: Results) -> list[tuple[str, ...]]:
-    """Means over seeds, and what networks change of the solve alone, toss by toss; whoever loses most comes first."""
+    """Means over seeds, and their difference to the solve alone, paired by toss; the worst comes first."""
     solve = found["-", SOLVE]
     own = np.array(solve["test"])
-    head = ("network", "position, %", "rotation, degrees", "less the solve", "position, % / degrees of each seed")
+    head = ("network", "position, %", "rotation, degrees", "minus the solve", "position, % / degrees of each seed")
     rows = []
     for name in dict.fromkeys(method for _, method in found if method != SOLVE):
         seeds = [one for (_, method), one in found.items() if method == name]
@@ -578,7 +587,7 @@ def network_table(found: Results) -> list[tuple[str, ...]]:
         taken = number(float(np.mean([one["seconds"] for one in seeds])))
         rows.append((float((mean - own).sum(0).mean()), (name, *map(_told, mean), less, each, on, taken)))
     rows.sort(key=lambda row: -row[0])
-    on = f"both errors on the tosses that choose (solve: {number(solve['chosen'])})"
+    on = f"sum of both errors on the tosses that choose (solve: {number(solve['chosen'])})"
     return [(*head, on, "s"), *(row for _, row in rows), (SOLVE, *map(_told, own), "", "", "", "")]
 
 

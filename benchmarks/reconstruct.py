@@ -1,26 +1,26 @@
-"""How far from the truth a reconstruction of the rendered photo set is.
+"""Errors of a reconstruction of a rendered photo set.
 
     python -m benchmarks reconstruct -o DIR [--preset quick] [--budget MINUTES]
     python -m benchmarks reconstruct -o DIR --capture record3d      # the same photos as a phone with depth exports them
     python -m benchmarks reconstruct room -o DIR [--capture record3d]    # or patches
 
-Runs the whole chain on samples/photos/table_vase, or on one of the sets that samples/photos/make.py draws, rendered
-into DIR-NAME (or takes what is already in the folder), moves the result onto the true cameras by a similarity, and
-prints pose errors, surface errors, how these go with the uncertainty that the run gave, how far a ball falls into the
-vase, and times. A folder of photos without `transforms.json` and `truth.ply` gets the report only.
+Runs all stages on samples/photos/table_vase, or on one of the sets of samples/photos/make.py, rendered into DIR-NAME
+(or takes an existing result in the folder), moves the result onto the true cameras by a similarity, and prints pose
+errors, surface errors, their relation to the run's uncertainty, how deep a ball falls into the vase, and times. A
+folder of photos without `transforms.json` and `truth.ply` gets only the report.
 
     python -m benchmarks reconstruct touching -o DIR
     python -m benchmarks reconstruct shelf -o DIR [--kind clicks]
 
-render a set with truth of tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies, without
-(`plain`) and with one clicked place for each (`clicks`: the middle of where a photo shows most of it), or in one of
-these ways, and print the errors of every body.
+render a set with known truth from tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies,
+without masks (`plain`) and with one clicked place for each body (`clicks`: the middle of the body in the photo that
+shows most of it), or in one of these ways, and print the errors of every body.
 
     python -m benchmarks reconstruct hinged -o DIR
     python -m benchmarks reconstruct sliding -o DIR
 
 render a cupboard with its door shut and open by 50 degrees, or a chest with its drawer in and out by 20 cm, reconstruct
-both states with `--joint`, and print how far the joint is from the true one.
+both states with `--joint`, and print the errors of the joint.
 """
 
 import json
@@ -54,15 +54,15 @@ TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the va
 RENDERED = ("touching", "shelf")
 KINDS = ("masks", "plain", "clicks")
 JOINTS = {"hinged": 50.0, "sliding": 0.2}  # degrees, and m, from the first state to the second
-NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
-BALL = 0.02  # m, the radius of the ball that is dropped into the vase, whose neck has one of 4.6 cm
+NEAR_FLOOR = 0.03  # m: below this a surface belongs to the floor
+BALL = 0.02  # m, the radius of the ball that is dropped into the vase; the neck's is 4.6 cm
 
 
 def moved_onto(views: list[View], about: dict[str, Any]) -> tuple[Similarity, np.ndarray]:
     """The similarity that moves cameras onto the true ones of a transforms.json, and the poses [V, 4, 4] of these."""
     import pycolmap
 
-    # Record3D numbers its photos without zeros in front.
+    # Record3D numbers its photos without leading zeros.
     truth = {Path(f["file_path"]).stem.lstrip("0"): np.array(f["transform_matrix"]) for f in about["frames"]}
     true = np.array([truth[Path(v.source).stem.lstrip("0")] for v in views])
     move: Any = pycolmap.estimate_sim3d(np.array([v.center for v in views]), true[:, :3, 3])
@@ -70,7 +70,8 @@ def moved_onto(views: list[View], about: dict[str, Any]) -> tuple[Similarity, np
 
 
 def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Similarity]:
-    """Errors of the camera centres (% of the distance to the table), of rotations and focal lengths; and the move."""
+    """Errors of the camera centres (% of the distance to the table), of rotations and focal lengths; and the
+    similarity."""
     about = json.loads((photos / "transforms.json").read_text())
     move, true = moved_onto(views, about)
     centers = np.array([v.center for v in views])
@@ -96,11 +97,11 @@ def to_truth(folder: Path, points: np.ndarray, move: Similarity) -> np.ndarray:
 
 
 def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str, Any]]:
-    """Measured errors, mm, and the uncertainty that the run gives for the same places.
+    """Measured errors, mm, and the run's uncertainty at the same places.
 
-    Each vertex of what is displayed counts by its area: the scenery as shown, and the closed bodies. First those of
-    which the photos show something, in quarters from the surest on, and the least sure twentieth; then what is guessed
-    there, and what is guessed of all that the scene is made of, also where nothing is displayed.
+    Each displayed vertex counts by its area: the displayed scenery, and the closed bodies. First the vertices that
+    photos show, in quarters from the most certain on, and the least certain twentieth; then the guessed ones among
+    them, and the guessed ones on all surfaces of the scene, displayed or not.
     """
     truth = _scene(_read(photos / "truth.ply"))
     bodies = [f"objects/{entry['name']}.ply" for entry in read_parts(folder / "mesh")["objects"]]
@@ -134,11 +135,11 @@ def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str,
 def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, Any]:
     """Distances between the reconstructed visible surface and the true one, in percent of the table's width.
 
-    `surface`: all of the reconstructed surface, table, vase and floor, to the truth. `object`: its part within 10 cm
-    of the table and vase and above the floor. `missing`: from the truth as the cameras see it (table and vase) to the
-    reconstruction; `complete_percent` is the share of it within 1 %. `vase`: see `vase_size`, of the bodies at its
-    place and of the truth; `vase_seen_cm`: see `seen_depth`. `body`: of these bodies, 1.5 cm above what they stand on,
-    to the truth.
+    `surface`: from the whole reconstructed surface, table, vase and floor, to the truth. `object`: its part within 10
+    cm of the table and vase and above the floor. `missing`: from the true surface that the cameras see (table and vase)
+    to the reconstruction; `complete_percent` is the share of it within 1 %. `vase`: see `vase_size`, for the bodies at
+    its place and for the truth; `vase_seen_cm`: see `seen_depth`. `body`: from these bodies, 1.5 cm above their
+    support, to the truth.
     """
     import open3d as o3d
 
@@ -147,7 +148,7 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     to_unit, rotation = load_field(folder / "distill").to_unit, move.rotation
 
     def read(name: str) -> Any:
-        """A mesh of the mesh stage on the true cameras."""
+        """A mesh of the mesh stage, moved onto the true cameras."""
         mesh = _read(folder / "mesh" / name)
         mesh.vertices = o3d.utility.Vector3dVector(to_truth(folder, np.asarray(mesh.vertices), move))
         return mesh
@@ -204,8 +205,8 @@ def near_axis() -> np.ndarray:
 
 
 def seen_depth(truth: Any, about: dict[str, Any], rim: float) -> float:
-    """How far below the rim of the vase, cm, three photos of a transforms.json see places near its axis, by rays: the
-    median of these places. `rim` is its height, m."""
+    """Depth below the rim of the vase, cm, to which three photos of a transforms.json see points near its axis, by
+    rays: the median over these points. `rim` is its height, m."""
     scene, at, step = _scene(truth), near_axis(), 0.005
     poses = [np.array(frame["transform_matrix"]) for frame in about["frames"]]
     for number in range(round(rim / step)):
@@ -224,7 +225,7 @@ def seen_depth(truth: Any, about: dict[str, Any], rim: float) -> float:
 
 
 def vase_size(mesh: Any) -> dict[str, float]:
-    """Height, and how deep it is hollow, cm: what rays straight down within 2 cm of the axis meet below the rim."""
+    """Height and depth of the hollow, cm: vertical rays within 2 cm of the axis measure the depth below the rim."""
     at = near_axis()
     down = np.concatenate([at, np.full((len(at), 1), 2.0), np.tile([0.0, 0, -1], (len(at), 1))], 1)
     top = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(-1, 3)[:, 2].max()
@@ -233,8 +234,8 @@ def vase_size(mesh: Any) -> dict[str, float]:
 
 
 def dropped_ball(folder: Path, name: str) -> dict[str, float]:
-    """Drops a ball of `BALL` m radius into the vase of a run, a body, and tells where its centre is at last: below the
-    rim and beside the middle, cm, in the axes of the vase, however that stands by then."""
+    """Drops a ball of `BALL` m radius into the vase of a run, a body, and returns its final centre: depth below the rim
+    and distance from the axis, cm, in the axes of the vase at that time."""
     scene = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
     assets = {key: shape for key, shape in scene["shapes"].items() if "asset" in shape}
     bodies = [body for body in scene["bodies"] if "plane" in body or body["shape"] in assets]
@@ -267,7 +268,7 @@ def _scene(mesh: Any) -> Any:
 
 
 def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
-    """All errors of a finished run against the truth beside its photos."""
+    """All errors of a finished run against the truth next to its photos."""
     poses, move = pose_errors(load_views(folder / "poses"), photos)
     surface = surface_errors(folder, photos, move)
     return {
@@ -277,7 +278,7 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
 
 
 def captured(layout: str, out: Path, photos: Path) -> Path:
-    """A rendered set as a phone's capture beside `out`, made where it is not there."""
+    """A rendered set as a phone's capture next to `out`, made if it does not exist."""
     import phone
 
     if layout not in phone.LAYOUTS:
@@ -290,8 +291,8 @@ def captured(layout: str, out: Path, photos: Path) -> Path:
 
 
 def drawn(photos: Path, out: Path) -> Path:
-    """The folder of a set that make.py names: the bundled one, or one beside `out`, made where it is not there. Any
-    other folder as it is."""
+    """The folder of one of make.py's sets: the bundled one, or one next to `out`, made if it does not exist. Any other
+    folder is returned unchanged."""
     import make
 
     name = str(photos)
@@ -304,8 +305,8 @@ def drawn(photos: Path, out: Path) -> Path:
 
 
 def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
-    """Errors of every body of a run: of its sides x, y, z and its volume against the true body in the same place, %;
-    and the mean distance of its vertices from that, mm, 1.5 cm above what it stands on."""
+    """Errors of every body of a run: of its sides x, y, z and its volume against the true body at the same place, %;
+    and the mean distance of its vertices from that body, mm, 1.5 cm above its support."""
     about = json.loads((photos / "images" / "transforms.json").read_text())
     move, found = moved_onto(load_views(folder / "poses"), about)[0], {}
     true = {path.stem: load_mesh(path) for path in sorted((photos / "truth").glob("*.ply"))}
@@ -327,7 +328,7 @@ def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
 
 
 def clicked(photos: Path) -> dict[str, list[str]]:
-    """A place on each body of a rendered set: the middle of where a photo shows most of it."""
+    """A place on each body of a rendered set: its middle in the photo that shows most of it."""
     from PIL import Image
 
     found = {}
@@ -362,8 +363,8 @@ def rendered(name: str, out: Path, kind: str | None, **options: Any) -> dict[str
 
 
 def joint_of(name: str, out: Path, **options: Any) -> dict[str, Any]:
-    """Renders both states of a thing, reconstructs them together, and tells the errors of the joint: of the axis in
-    degrees, of its place in % of the size of the cupboard or chest, and of how far the part has moved."""
+    """Renders both states of an object, reconstructs them together, and returns the errors of the joint: of the axis in
+    degrees, of its position in % of the size of the cupboard or chest, and of the travel of the part."""
     from pipeline.mesh.joint import load_held
     from pipeline.states import reconstruct_states
     from tests.pipeline import photo_sets
@@ -382,7 +383,7 @@ def joint_of(name: str, out: Path, **options: Any) -> dict[str, Any]:
     found = held.moved(move.after(place.after(to_unit).inverse()))
     axis = np.array([0, 0, -1.0] if name == "hinged" else [0, -1.0, 0])
     still = load_mesh(states[0] / "truth" / "still.ply")
-    thing = still.vertices[still.vertices[:, 0] < 0.3]  # without the crate beside it
+    thing = still.vertices[still.vertices[:, 0] < 0.3]  # without the crate next to it
     size = float(np.linalg.norm(np.ptp(thing, axis=0)))
     result: dict[str, Any] = {
         "found": held.line(), "kind": found.kind,

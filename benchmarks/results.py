@@ -1,4 +1,4 @@
-"""What benchmarks share: their command lines, lines of progress, and the pages of results, one section a benchmark."""
+"""Shared by benchmarks: command lines, lines of progress, and the pages of results with one section per benchmark."""
 
 import argparse
 import inspect
@@ -20,7 +20,7 @@ PAGE = Path(__file__).with_name("RESULTS.md")
 
 
 def script(doc: str | None, *functions: Callable[..., None]) -> None:
-    """Run a function with what the command line gives: of several the one that it names first.
+    """Run a function with the arguments of the command line, which names the function first if there are several.
 
     Keyword-only parameters are options, `out` also as -o; lists take several values.
     """
@@ -53,8 +53,8 @@ def progress(fraction: float, message: str) -> None:
 
 
 def in_turn(calls: Sequence[Callable[[], Any]], rounds: int) -> np.ndarray:
-    """What each call gives, [rounds, calls, ...], all of them in turn: a shared machine that slows one down slows all.
-    A first round, which loads and compiles, is left out."""
+    """Results of the calls, [rounds, calls, ...], in alternating order, so that other work on the machine slows all of
+    them alike. A first round, which loads and compiles, is left out."""
     return np.array([[call() for call in calls] for _ in range(rounds + 1)])[1:]
 
 
@@ -64,12 +64,12 @@ def spread(values: np.ndarray) -> str:
 
 
 def pages() -> list[Path]:
-    """Those that hold sections of benchmarks: RESULTS.md, and what tells more."""
+    """The pages that may hold sections of benchmarks: RESULTS.md, docs/notes and docs."""
     return [PAGE, *sorted((ROOT / "docs" / "notes").glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def page_of(name: str) -> Path:
-    """The page that holds a section. Raises ValueError where none does."""
+    """The page that holds a section. Raises ValueError if none does."""
     found = [page for page in pages() if f"<!-- {name} -->" in page.read_text(encoding="utf-8")]
     if not found:
         raise ValueError(f"no section {name} in RESULTS.md, docs/notes or docs")
@@ -77,15 +77,15 @@ def page_of(name: str) -> Path:
 
 
 def section(name: str, page: Path | None = None) -> str:
-    """What stands between the marks of a section, its command first."""
+    """The text between the marks of a section, with its command first."""
     text = (page or page_of(name)).read_text(encoding="utf-8")
     return text.partition(f"<!-- {name} -->")[2].partition(f"<!-- end of {name} -->")[0].strip()
 
 
 def write_section(name: str, command: str, content: str, page: Path | None = None) -> None:
-    """Print `content`, and put it between the marks of a section, under the command that repeats it and the day.
+    """Print `content`, and write it between the marks of a section, below the command that repeats it and the day.
 
-    The page is the one of `pages` that has the section.
+    The default page is the one of `pages` that has the section.
 
     Raises:
         ValueError: the page, or every page, has no such section.

@@ -1,4 +1,4 @@
-"""Our solver and other engines on shapes that are hard for these: RESULTS.md.
+"""Our solver and other engines on shapes that are hard for other engines: RESULTS.md.
 
     python -m benchmarks rivals shapes DATA -o DIR
     python -m benchmarks rivals turns DATA -o DIR
@@ -6,11 +6,11 @@
     python -m benchmarks rivals large -o DIR
         the first 20 steps of large scenes with inner steps of 4 ms: as they fall, and at rest
 
-DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 10, 4, 2 and 1 ms (of bodies of a
-metre; smaller ones in proportion to the root of their size), one thread, processor time. No engine is another's truth:
-an error is the distance from the same engine's motion at 1 ms. Depth is measured on the exact surfaces. Convex pieces
-are CoACD's, with one setting for all, where a shape has none of its own. Making them, tetrahedra and kernels is not
-timed. Restitution is 0, friction the same for all. DIR keeps results.
+DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 10, 4, 2 and 1 ms (for bodies of a
+metre; for smaller ones in proportion to the square root of their size), in processor time of one thread. No engine is
+the reference for another: an error is the distance from the same engine's motion at 1 ms. Depth is measured on the
+exact surfaces. Shapes without convex pieces get pieces by CoACD, with one setting for all. The making of pieces,
+tetrahedra and kernels is not timed. Restitution is 0, friction the same for all. DIR keeps results.
 """
 
 import time
@@ -58,15 +58,15 @@ ENGINES: dict[str, Engine | None] = {
     "Newton, XPBD": newton,
 }
 FAST = list(ENGINES)[:3]
-INNER = (2, 5, 10, 20)  # inner steps in one of 20 ms; the last is an engine's own truth
+INNER = (2, 5, 10, 20)  # inner steps in a step of 20 ms; the last is an engine's own reference
 USUAL = 5
 STEPS = 100
-COMPARED = 25  # steps over which an engine is compared with itself: later, chaos says more than the step
+COMPARED = 25  # steps over which an engine is compared with itself: later, chaos dominates
 HEAP_STEPS = 20  # of the large scenes: enough to time a step
 SETTLED = 400  # steps in which our solver lets bodies come to rest
 MOVI_B = 5  # trajectories
 DEEP = 0.01  # of the smallest body's size: "equal penetration"
-FRICTION = 0.7  # of everything: 0.49 where two meet
+FRICTION = 0.7  # of all bodies: 0.49 for a contact
 
 
 # --- the cases ---
@@ -87,7 +87,7 @@ def implicit(
 
 
 def mug() -> Mesh:
-    """A mug of 1 m without what it stands on: open at the top, its handle a ring at +x."""
+    """A mug of 1 m without a base: open at the top, with a ring at +x as its handle."""
 
     def field(p: np.ndarray) -> np.ndarray:
         radius = np.hypot(p[:, 0], p[:, 1])
@@ -100,7 +100,7 @@ def mug() -> Mesh:
 
 
 def rugged() -> Mesh:
-    """Ground 6 m wide of 200,000 triangles, in place of a scan: hills, an arch to fall through and noise of 2 mm."""
+    """Ground 6 m wide of 200,000 triangles, instead of a scan: hills, an arch to fall through and noise of 2 mm."""
     rng = np.random.default_rng(0)
     waves = [(rng.uniform(1, 5, 2), rng.uniform(0, 6.3), rng.uniform(0.03, 0.12)) for _ in range(12)]
 
@@ -152,7 +152,7 @@ def written(folder: Path, name: str, count: int | None = None) -> Scene:
 
 
 def settled(folder: Path, name: str, count: int | None = None) -> Scene:
-    """The same after our solver has let it come to rest; poses are kept in the folder."""
+    """The same scene after our solver has let it come to rest; poses are kept in the folder."""
     scene, file = written(folder, name, count), folder / f"{name}{count or ''}-settled.npz"
     if not file.exists():
         simulator = Simulator(scene, "solver")
@@ -187,7 +187,7 @@ SHAPES = ["MOVi-B", *(case for case in CASES if case not in LARGE)]
 
 
 def in_pieces(scene: Scene, folder: Path) -> Scene:
-    """The scene with convex pieces for every shape but closed forms, kept in a folder."""
+    """The scene with convex pieces for every shape except closed forms, kept in a folder."""
     shapes = []
     for shape in scene.shapes:
         if not isinstance(shape.sdf, ClosedForm) and not own_pieces(shape):
@@ -236,7 +236,7 @@ def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
 
 @one_thread()
 def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str, Any]:
-    """What every inner step costs an engine in a case.
+    """The cost of every inner step for an engine in a case.
 
     Returns:
         by inner steps: ms per simulated second; deep, the 95th percentile of the depth, and away, the distance from
@@ -283,7 +283,7 @@ def lost(case: str, run: Ran, size: float) -> int:
 
 def compared(cases: list[str], data: Path | None, out: Path) -> Results:
     for case in set(cases) & set(LARGE):
-        CASES[case](out / "scenes")  # settles it here: a process that is measured has no memory of that
+        CASES[case](out / "scenes")  # settles it here, so that the measured process does not contain that memory
     content = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION]
     jobs = [
         Job(case, name, content, measured, (name, case, data and data.resolve(), out / "scenes"))
@@ -298,7 +298,7 @@ def why_not(result: dict[str, Any]) -> str:
 
 
 def shapes(data: Path, *, out: Path) -> None:
-    """Hard shapes: a row for each case and engine at the usual inner step, with the time that equal depth takes."""
+    """Hard shapes: a row for each case and engine at the usual inner step, with the time for equal depth."""
     rows: list[tuple[str, ...]] = [(
         "case", "engine", "ms per s at 4 ms", "depth, %", "away from itself at 1 ms, %", "lost",
         f"ms per s where depth is at most {100 * DEEP:g} %", "prepared in, s", "MiB",
@@ -319,7 +319,7 @@ def shapes(data: Path, *, out: Path) -> None:
 
 @one_thread()
 def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
-    """The fast engines in turn: a shared machine slows all of them alike."""
+    """The fast engines in alternating runs, so that other work on the machine slows all of them alike."""
     rows: list[tuple[str, ...]] = [("case, ms per s at 4 ms", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
     for k, case in enumerate(SHAPES):
         scenes = scenes_of(case, data, out / "scenes")

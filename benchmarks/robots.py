@@ -1,8 +1,8 @@
-"""How many robots of PyBullet's data import, and whether MuJoCo puts their links where the scenes do.
+"""Imports the robots in PyBullet's data, and compares the poses of their links with MuJoCo's.
 
     python -m benchmarks robots [--files FILE ...]     # else all of pybullet_data but its random solids
 
-Of each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
+For each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
 scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
 """
 
@@ -28,8 +28,8 @@ FREE = 1.0  # rad or m to each side, of joints without limits
 
 
 def poses(scene: Scene, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies of a scene of trees, in the world: roots as they are
-    at the start, joints at `q` (rad, m; of a ball a rotation vector), by name."""
+    """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies of a scene of trees, in the world: roots at their start
+    poses, joints at `q` (rad, m; a rotation vector for a ball), by name."""
     held: dict[int, Joint] = {joint.bodies[0]: joint for joint in scene.joints if not joint.collides}
     found: dict[int, tuple[np.ndarray, Rotation]] = {-1: (np.zeros(3), Rotation.identity())}
 
@@ -60,9 +60,9 @@ def poses(scene: Scene, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, n
 
 @dataclass(frozen=True)
 class Judged:
-    """How far a scene is from what MuJoCo makes of the same file."""
+    """Differences between a scene and MuJoCo's model of the same file."""
 
-    links: int  # that both have
+    links: int  # in both
     apart: float  # m, the largest
     turned: float  # rad, the largest
     mass: float  # relative, the largest
@@ -82,7 +82,7 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     data = mujoco.MjData(model)
     number = {body.name: k for k, body in enumerate(scene.bodies)}
     ids = {k: model.body(k).name or f"body_{k}" for k in range(1, model.nbody)}
-    # Statics of MJCF are bodies a geom each; links of no mass are parts of others.
+    # Each static geom of MJCF is a body; links without mass are parts of others.
     both = [(k, number[name]) for k, name in ids.items() if name in number and model.body_mass[k] > 0]
     both = [(k, i) for k, i in both if scene.bodies[i].motion == "dynamic"]
     by_name = {joint.name: joint for joint in scene.joints}
@@ -93,7 +93,7 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     first = [(data.xmat[k].reshape(3, 3).copy(), turns[i]) for k, i in both]
     axes = {k: ours.T @ theirs for (k, _), (theirs, ours) in zip(both, first, strict=True)}
     apart = turned = 0.0
-    # MuJoCo holds the roots of a URDF in the origin, and a scene has free roots where they are.
+    # MuJoCo fixes the root of a URDF at the origin; in a scene it is free at its own pose.
     for trial in range(tries + 1):
         values = start if trial == 0 else _set(mujoco, model, data, joints, by_name, rng, axes)
         places, turns = poses(scene, values)
@@ -106,7 +106,7 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
 
 
 def _mass(scene: Scene, k: int) -> float:
-    """kg, of a body with the small balls that hold a part of its mass."""
+    """kg, of a body including the small balls that have a part of its mass."""
     name = scene.bodies[k].name
     balls = [b for b in scene.bodies if b.collides_with == () and b.name.startswith(f"{name}_")]
     chain = [b for b in balls if b.name.removeprefix(f"{name}_") in {joint.name for joint in scene.joints}]
@@ -123,8 +123,8 @@ def _set(
     mujoco, model, data, joints, known: dict[str, Joint], rng: np.random.Generator | None,
     shape_axes: dict[int, np.ndarray] | None = None,
 ) -> dict:  # fmt: skip
-    """Set joints to where the scene starts, or at random within limits, and return their positions; `shape_axes` by
-    body carry from the axes of its link to those of its shape."""
+    """Set joints to the scene's start, or at random within limits, and return their positions; `shape_axes` by body map
+    the axes of its link to those of its shape."""
     mujoco.mj_resetData(model, data)
     if "start" in (keys := [model.key(k).name for k in range(model.nkey)]):
         mujoco.mj_resetDataKeyframe(model, data, keys.index("start"))
@@ -136,7 +136,7 @@ def _set(
         if kind == mujoco.mjtJoint.mjJNT_BALL:
             turn = np.zeros(3) if rng is None else rng.normal(size=3)
             data.qpos[at : at + 4] = np.roll(Rotation.from_rotvec(turn).as_quat(), 1)
-            # MuJoCo turns about the link's axes, which need not be those of the shape that stands for it.
+            # MuJoCo's rotation is in the link's axes, which may differ from those of the body's shape.
             own = Rotation.from_quat(known[name].quat_xyzw[0]).inv()
             values[name] = own.apply(shape_axes[int(model.jnt_bodyid[j])] @ turn) if shape_axes else turn
             continue
@@ -150,8 +150,8 @@ def _set(
 
 
 def _bare(source: Path) -> str:
-    """A URDF without geometry: MuJoCo finds no meshes by ROS paths, and masses and joints do not need them. Without
-    what no XML has around it, and with ROS' defaults in place of variables of the environment."""
+    """A URDF without geometry, because MuJoCo finds no meshes by ROS paths, and masses and joints do not need them.
+    Text outside of the XML is removed, and ROS' defaults replace environment variables."""
     text = source.read_bytes().decode(errors="replace").strip(" \t\r\n\0")
     root = ElementTree.fromstring(re.sub(r"\$\(optenv +\w+([^()]*)\)", r"\1", text).encode())
     for link in root.findall("link"):
@@ -162,7 +162,7 @@ def _bare(source: Path) -> str:
 
 
 def main(*, files: list[Path] | None = None) -> None:
-    """Print a row a URDF or MJCF file; without any, of those of pybullet_data."""
+    """Print a row for each URDF or MJCF file; by default for those of pybullet_data."""
     counts = {"imported": 0, "judged": 0, "refused": 0}
     rows = [("file", "bodies", "joints", "links judged", "apart, mm", "turned, degrees", "mass", "")]
     files = files or _all()

@@ -1,16 +1,16 @@
 """Time and memory of large scenes, and of many scenes at once: RESULTS.md.
 
     python -m benchmarks scale growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
-        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, beside networks and two engines
+        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, with networks and two engines
     python -m benchmarks scale large -o DIR
         heaps, shoes and knots to the end on all cores, each with a movie
     python -m benchmarks scale many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
     python -m benchmarks scale roofline
-        what a distance, a contact and a row of impulses cost, beside what the machine could do: docs/scale.md
+        cost of a distance, a contact and a row of impulses, compared with the limits of the machine: docs/scale.md
 
-Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
-holds is not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
+Every case of the first command runs in a separate process on one thread; times are processor times. Results in DIR are
+not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
 """
 
 import os
@@ -69,20 +69,20 @@ def apart(count: int) -> Scene:
 
 
 def with_nodes_cut(scene: Scene, keep: float) -> Scene:
-    """The scene with a part of every shape's nodes only, the first of them: they are stored farthest first."""
+    """The scene with only the first part of every shape's nodes, which are stored farthest first."""
     shapes = tuple(replace(s, nodes=s.nodes[: max(1, round(keep * len(s.nodes)))]) for s in scene.shapes)
     return replace(scene, shapes=shapes)
 
 
 @one_thread()
 def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
-    """Time and memory of a scene (its file, or a number of boxes `apart`) with a model, and how deep bodies overlap."""
+    """Time and memory of a scene (its file, or a number of boxes `apart`) with a model, and the depth of overlaps."""
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:
         published = stepper_of(load_model(model, weights=False)).on_surfaces
         simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
-        frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
+        frames.extend(simulator.frames(1))  # not timed: it loads compiled code
         began = time.process_time()
         try:
             frames.extend(simulator.frames(steps - 1))
@@ -101,7 +101,7 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
 
 
 def engine(run: Engine, file: Path, steps: int) -> dict:
-    """The same of an engine; spheres are spheres there, everything else its convex pieces."""
+    """The same for an engine; spheres stay spheres, all other shapes become convex pieces."""
     scene = load_scene(file)
     units = scene_units(scene)
     start = start_of_scene(scene, file.parent / "engine", units)
@@ -112,7 +112,7 @@ def engine(run: Engine, file: Path, steps: int) -> dict:
 
 
 def _where(run: Ran) -> dict[str, float]:
-    """How deep bodies are in each other, mm, and how many are below the floor at the end."""
+    """Depth of overlaps, mm, and the number of bodies below the floor at the end."""
     depth = depths(run)
     return {
         "depth_95": 1e3 * float(np.percentile(depth, 95)) if len(depth) else 0.0,
@@ -121,7 +121,7 @@ def _where(run: Ran) -> dict[str, float]:
 
 
 def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
-    """Everything that is measured; scene files are written on first use."""
+    """All jobs; scene files are written on first use."""
 
     def scene(name: str, count: int, nodes: int = 0) -> Path:
         home = folder / "scenes" / f"{name}_{count}_{nodes}"
@@ -151,7 +151,7 @@ def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None
 
 
 def to_the_end(name: str, home: Path) -> dict[str, Any]:
-    """A large scene as a user runs it: the command, its recording, and a movie of it."""
+    """A large scene run like by a user: the command, its recording, and a movie."""
     scene, run = home / name / "scene.yaml", home / name / "run"
     if not scene.exists():
         write_scene(name, home / name)
@@ -203,7 +203,7 @@ def many(data: Path, *, scenes: int = 1000) -> None:
         local: Any = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="")
         with local:
             with cluster(local.scheduler_address):
-                deque(parallel(simulated, jobs[:workers]), maxlen=0)  # not timed: the workers load what is compiled
+                deque(parallel(simulated, jobs[:workers]), maxlen=0)  # not timed: the workers load compiled code
                 began = time.perf_counter()
                 deque(parallel(simulated, jobs), maxlen=0)
                 rate = scenes / (time.perf_counter() - began)
@@ -226,16 +226,16 @@ def roofline() -> None:
     """Write the section of docs/scale.md: the machine's bandwidth and arithmetic on one thread, and ours."""
     flops, bandwidth, latency = arithmetic(), memory(), chain()
     rows: list[tuple[str, ...]] = [
-        ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "of the arithmetic", "of the bandwidth")
+        ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "share of arithmetic", "share of bandwidth")
     ]
     for name, (operations, moved), seconds in (
-        ("the machine: products of matrices", (1, 0), 1 / flops),
-        ("the machine: sums that wait for each other", (1, 0), latency),
-        ("the machine: copies of 256 MiB", (0, 1), 1 / bandwidth),
-        ("a distance of a grid, places in turn", DISTANCE, distance_time(scattered=False)),
-        ("a distance of a grid, places anywhere", DISTANCE, distance_time(scattered=True)),
-        ("a contact: its three rows", CONTACT, contact_time()),
-        ("a row of impulses, and its change", ROW, row_time()),
+        ("machine: matrix products", (1, 0), 1 / flops),
+        ("machine: dependent sums", (1, 0), latency),
+        ("machine: copies of 256 MiB", (0, 1), 1 / bandwidth),
+        ("grid distance, neighbouring points in order", DISTANCE, distance_time(scattered=False)),
+        ("grid distance, points in random order", DISTANCE, distance_time(scattered=True)),
+        ("contact: its three rows", CONTACT, contact_time()),
+        ("row of impulses, one update", ROW, row_time()),
     ):
         rate, speed = operations / seconds, moved / seconds
         told = ((operations, rate / 1e9, rate / flops), (moved, speed / 1e9, speed / bandwidth))
@@ -245,7 +245,7 @@ def roofline() -> None:
 
 
 def best(call: Callable[[], object], rounds: int = 7) -> float:
-    """s of the processor that a call takes at least, of several: other programs beside it count for less."""
+    """Least processor seconds of several calls, which reduces the effect of other programs."""
     call()
     took = []
     for _ in range(rounds):
@@ -256,7 +256,7 @@ def best(call: Callable[[], object], rounds: int = 7) -> float:
 
 
 def arithmetic() -> float:
-    """Operations a second in double precision, of what keeps all units of a core busy."""
+    """Operations per second in double precision, with all units of a core busy."""
     size = 768
     a, b = torch.rand((2, size, size), dtype=torch.float64)
     with one_thread():
@@ -264,8 +264,8 @@ def arithmetic() -> float:
 
 
 def memory() -> float:
-    """Bytes a second, read and written, of copies that no cache holds."""
-    a = np.full(2**25, 2.0)  # written: pages of zeros that nobody wrote are all one page
+    """Bytes per second, read and written, of copies that do not fit into a cache."""
+    a = np.full(2**25, 2.0)  # written, because unwritten pages of zeros are all one page
     b = np.ones_like(a)
     return 2 * a.nbytes / best(lambda: np.copyto(b, a))
 
@@ -274,12 +274,12 @@ def memory() -> float:
 def _summed(count: int, value: float) -> float:
     total = value
     for _ in range(count):
-        total = total * value + value  # the next one waits for it
+        total = total * value + value  # the next one depends on it
     return total
 
 
 def chain() -> float:
-    """s of an operation whose result the next one waits for: two in each turn."""
+    """s per operation in a chain of dependent operations: two per turn."""
     count = 10_000_000
     return best(lambda: _summed(count, 0.999)) / (2 * count)
 
@@ -305,7 +305,7 @@ def _written(world, work, motion, rules, manifolds, times: int) -> int:
 
 
 def contact_time() -> float:
-    """s in which the rows of a contact are written, of boxes that rest on a floor."""
+    """s to write the rows of a contact, for boxes that rest on a floor."""
     simulator = Simulator(apart(BOXES), "solver")
     simulator.step(30)
     scene: Any = simulator.carry.scene
@@ -321,7 +321,7 @@ def _swept(mass: np.ndarray, rules: Rules, system: System, change: np.ndarray, i
 
 
 def row_time() -> float:
-    """s of a row of impulses in a sweep, in islands of `ISLAND` contacts of bodies in a chain that never agree."""
+    """s per row of impulses in a sweep, in islands of `ISLAND` contacts of bodies in a chain that does not converge."""
     generator, bodies = np.random.default_rng(0), ROWS + 1
     row = generator.uniform(-1.0, 1.0, (ROWS, 3, WIDTH))
     row[:, :, MASS], row[:, :, WANTED], row[:, :, IMPULSE] = 0.01, 1.0, 0.0

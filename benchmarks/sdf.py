@@ -1,10 +1,10 @@
-"""How good, how fast and how large our SDF networks are, beside the paper's recipe and other representations.
+"""Accuracy, speed and size of our SDF networks, compared with the paper's recipe and other representations.
 
     python -m benchmarks sdf MESH_FOLDER -o DIR [--seconds 60]
 
 MESH_FOLDER holds NAME/visual_geometry.obj for each shape; `kubasic` downloads Kubric's. Each is fitted with our recipe
 and the paper's at equal time, with other widths of the network, and with smaller budgets; then queries of one shape are
-timed. Fits that DIR holds are not made again. Writes DIR/table.md and DIR/sdf.png.
+timed. Fits in DIR are not made again. Writes DIR/table.md and DIR/sdf.png.
 """
 
 import time
@@ -39,7 +39,7 @@ ERRORS = tuple(EXACT)
 
 
 def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | None = None) -> dict:
-    """Fit a mesh and keep the shape; the errors of its certificate, and the seconds that it took."""
+    """Fit a mesh and keep the shape; returns the errors of its certificate, and the seconds of the fit."""
     plan = replace(RECIPES[recipe], width=width or RECIPES[recipe].width)
     began = time.monotonic()
     with patch.dict(RECIPES, {recipe: plan}):
@@ -51,7 +51,7 @@ def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | No
 
 
 def queries(file: Path, default: Path, paper: Path) -> dict:
-    """Seconds that value and gradient of a million points take, by representation; and the bytes of each."""
+    """Seconds for value and gradient at a million points, by representation; and the bytes of each."""
     sdf, published, mesh = load_shape(default).sdf, load_shape(paper).sdf, solidify(load_mesh(file)).surface
     grid, exact = sample_grid(sdf, sdf.bounds, GRID), MeshSdf(mesh)
     assert isinstance(sdf, MlpSdf) and isinstance(published, MlpSdf)
@@ -115,7 +115,7 @@ def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
         lines = [line(name, [fits[name, method] for method in ours], "seconds", key) for name in files]
         panels.append(Panel(key.replace("_", " "), "seconds", "of the largest extent", lines, "xy", EXACT[key]))
     draw(panels, out / "sdf.png")
-    # Errors are relative to the largest extent; the last column says what of its certificate a fit missed.
+    # Errors are relative to the largest extent; the last column has the limits of the certificate that a fit missed.
     table = [("shape", "fit", *ERRORS, "updates", "s", "missed")]
     table += [(*key, *cells(found, (*ERRORS, "steps", "seconds"))) for key, found in fits.items()]
     rows = [("", f"s per million points of {first}", "bytes")]

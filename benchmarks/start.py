@@ -1,9 +1,9 @@
-"""How long a command takes from nothing to its end, and how much memory, and a box that falls: RESULTS.md.
+"""Time and memory of a command from a cold start to its end, and of a falling box: RESULTS.md.
 
     python -m benchmarks start [--rounds 7]
 
-Every case is a process of its own, all of them in turn; medians. Compiled code and what else is kept on disk is there
-from a first round, which is left out. Processor time says what a free machine would take where this one was not free.
+Every case is a separate process, and all alternate; figures are medians. Compiled code and other files on disk exist
+from a first round, which is left out. Processor time estimates the time on an idle machine.
 """
 
 import os
@@ -34,7 +34,7 @@ while data.time < 0.4:
 """
 
 
-# A process has from its parent how much memory that had: a small one starts each.
+# A process inherits its parent's peak memory, so a small process starts each case.
 LAUNCH = """
 import resource, subprocess, sys, time
 began = time.perf_counter()
@@ -45,7 +45,7 @@ print(time.perf_counter() - began, used.ru_utime + used.ru_stime, used.ru_maxrss
 
 
 def ended(command: list[str]) -> tuple[float, ...]:
-    """s by the clock and of the processor that a command takes, and MiB at most. Raises SdfsimError where it fails."""
+    """Wall-clock and processor seconds of a command, and its peak MiB. Raises SdfsimError if it fails."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     started = [sys.executable, "-c", LAUNCH, *command]
     done = subprocess.run(started, cwd=ROOT, env=kept, capture_output=True, text=True, check=False)
@@ -66,6 +66,6 @@ def main(*, rounds: int = 7) -> None:
             "the same in MuJoCo": [sys.executable, "-c", MUJOCO],
         }
         found = np.median(in_turn([lambda some=some: ended(some) for some in cases.values()], rounds), axis=0)
-    rows = [("from nothing", "s", "s of the processor", "MiB")]
+    rows = [("cold start", "s", "processor s", "MiB")]
     rows += [(name, *map(number, values)) for name, values in zip(cases, found, strict=True)]
     write_section("start", "python -m benchmarks start", markdown(rows))

@@ -1,15 +1,15 @@
-"""What becomes of photos, meshes and recordings that nobody tuned anything on: a line each.
+"""Results for photos, meshes and recordings that were not used for tuning: one line each.
 
     python -m benchmarks strangers FOLDER -o DIR [--preset quick] [--longest 1800] [--page]
 
-Takes what it finds below FOLDER for what it is: folders of three photos or more (with none of a mesh beside them, whose
-textures they would be), COLMAP models' folders of photos, videos and captures of phones; mesh files; run folders, and
-CSV or npz files of poses with their scene beside them, `NAME.yaml` of one file or `scene.yaml` of all others. Every
-input is handed to the commands as a user would: photos to `reconstruct` and the scene to `simulate`; a mesh to `fit`
-(with --cap, where it is refused as open) and, 20 cm wide, dropped from half its size onto a floor, with `sdf: grid`
-where the fit misses its certificate; recordings to `identify`. Commands run in processes of their own, none for longer
-than `--longest` seconds, so that nothing that one input does stops the others. Writes DIR/table.md and DIR/table.json,
-what failed first, and with `--page` the table of docs/notes/strangers.md. Times are those of a DIR that was empty.
+Finds the inputs below FOLDER by their kind: folders of at least three photos (without a mesh next to them, whose
+textures they would be), photo folders of COLMAP models, videos and captures of phones; mesh files; run folders, and CSV
+or npz files of poses with their scene next to them, `NAME.yaml` for one file or `scene.yaml` for all others. It runs
+the commands that a user would run: `reconstruct` for photos and `simulate` for the scene; `fit` for a mesh (with --cap,
+if it is refused as open), which is then scaled to 20 cm and dropped from half its size onto a floor, with `sdf: grid`
+if the fit misses its certificate; `identify` for recordings. Commands run in separate processes, none for longer than
+`--longest` seconds, so that one input cannot stop the others. Writes DIR/table.md and DIR/table.json, failures first,
+and with `--page` the table of docs/notes/strangers.md. Times are for an empty DIR.
 """
 
 import json
@@ -34,14 +34,14 @@ from sdfsim.evaluation.harness import markdown, number
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 
 PAGE = ROOT / "docs" / "notes" / "strangers.md"
-SIZE, SECONDS = 0.2, 5.0  # m, how wide a mesh is made that is dropped; s, that it may take to come to rest
+SIZE, SECONDS = 0.2, 5.0  # m, width of a dropped mesh; s, time limit for coming to rest
 PROGRAM = "from cli import app; app()"
-HEAD = ("input", "is", "became", "s", "exact to", "rests", "what is wrong")
+HEAD = ("input", "kind", "result", "s", "error", "at rest", "faults")
 
 
 @dataclass(frozen=True)
 class Found:
-    """An input: what it is, and its files. Recordings of one scene are one input."""
+    """An input: its kind and its files. Recordings of one scene are one input."""
 
     kind: str  # photos, mesh or recordings
     files: tuple[Path, ...]
@@ -50,13 +50,13 @@ class Found:
 
 @dataclass
 class Row:
-    """What is told of an input."""
+    """The result for an input."""
 
     name: str
     kind: str
     became: str = "nothing"
-    seconds: float = 0.0  # of all commands, by the clock
-    exact: str = ""  # the certificate, the scale, or how far motions are off
+    seconds: float = 0.0  # wall-clock time of all commands
+    exact: str = ""  # the certificate, the scale, or the errors of motions
     rests: str = ""
     wrong: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # only in table.json
@@ -67,7 +67,7 @@ class Row:
 
 
 class Failed(Exception):
-    """A command that did not end well; says why in a line."""
+    """A command that failed, with the reason in one line."""
 
 
 # --- finding ---
@@ -101,7 +101,7 @@ def found_in(folder: Path) -> Iterator[Found]:
 
 
 def command(*arguments: object, longest: float) -> dict[str, Any]:
-    """The report of a command of sdfsim. Raises Failed where it ends otherwise, with what it says of that."""
+    """The report of a command of sdfsim. Raises Failed with its error message if it fails."""
     line = [sys.executable, "-c", PROGRAM, *map(str, arguments), "--json"]
     try:
         done = subprocess.run(
@@ -142,7 +142,7 @@ def of_mesh(found: Found, row: Row, place: Path, run: Callable[..., dict[str, An
         row.became = "grid"
         made = {"mesh": str(mesh.resolve()), "sdf": "grid", "cap": "on"}
     up = 0.5 * SIZE - scale * corners[:, 2].min()
-    # A floor whose coefficients, with those of what falls, make a friction of 0.4 and a restitution of 0.2.
+    # A floor whose coefficients, with those of the falling body, give a friction of 0.4 and a restitution of 0.2.
     scene = Scene(duration=SECONDS).add("floor", plane={}, friction=0.8, restitution=0.4)
     scene.add("it", **made, scale=float(scale), position=(0.0, 0.0, float(up)))
     scene.save(place / "scene.yaml")
@@ -150,7 +150,7 @@ def of_mesh(found: Found, row: Row, place: Path, run: Callable[..., dict[str, An
 
 
 def of_photos(found: Found, row: Row, place: Path, run: Callable[..., dict[str, Any]], preset: str) -> None:
-    """Reconstruct a scene, and let what is in it come to rest."""
+    """Reconstruct a scene, and let its bodies come to rest."""
     room = place / "room"
     try:
         report = run("reconstruct", found.files[0], "-o", room, "--preset", preset)
@@ -173,7 +173,7 @@ def of_photos(found: Found, row: Row, place: Path, run: Callable[..., dict[str, 
 
 
 def dropped(place: Path, row: Row, run: Callable[..., dict[str, Any]], scene: Path | None = None) -> None:
-    """Simulate a scene until all in it rests."""
+    """Simulate a scene until all bodies rest."""
     report = run(
         "simulate", scene or place / "scene.yaml", "-o", place / "run", "--viewer", "none",
         "--until-settled", "--seconds", SECONDS, "--allow-outside",
@@ -195,11 +195,11 @@ def of_recordings(found: Found, row: Row, place: Path, run: Callable[..., dict[s
     row.exact = f"{after} off; {before} as the scene was"
     row.notes += report["notes"]
     if any(now > was for now, was in zip(held["after"], held["before"], strict=True)):
-        row.wrong.append("what was found is farther off than what the scene said")
+        row.wrong.append("the identified numbers are farther off than those of the scene")
 
 
 def judged(found: Found, folder: Path, out: Path, preset: str, longest: float) -> Row:
-    """The row of an input; whatever goes wrong is told in it."""
+    """The row of an input, including any failure."""
     name = found.files[0].relative_to(folder).as_posix()
     row = Row(name if len(found.files) == 1 else f"{name} and {len(found.files) - 1} more", found.kind)
     place = out / name
@@ -228,7 +228,7 @@ def judged(found: Found, folder: Path, out: Path, preset: str, longest: float) -
 
 
 def table(rows: list[Row]) -> str:
-    """In Markdown: first what became nothing, then what something is wrong with, then the others."""
+    """The table in Markdown: first inputs without a result, then those with faults, then the others."""
     ordered = sorted(rows, key=lambda row: (row.became != "nothing", not row.wrong, row.kind, row.name))
     good = sum(not row.wrong and row.became != "nothing" for row in rows)
     count = {kind: sum(row.kind == kind for row in rows) for kind in ("photos", "mesh", "recordings")}
@@ -237,7 +237,7 @@ def table(rows: list[Row]) -> str:
 
 
 def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 1800.0, page: bool = False) -> None:
-    """A line each, the table in DIR, and with `page` in docs/notes."""
+    """Print a line for each input, and write the table to DIR, with `page` also to docs/notes."""
     if not folder.is_dir():
         raise SdfsimError(f"{folder}: no such folder", "give the folder that holds photos, meshes or recordings")
     folder, out = folder.resolve(), out.resolve()  # commands run in another folder
@@ -248,7 +248,7 @@ def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 180
     for found in inputs:
         rows.append(judged(found, folder, out, preset, longest))
         print(" | ".join(filter(None, rows[-1].cells())), flush=True)
-        write_json(out / "table.json", [asdict(row) for row in rows])  # as far as it got
+        write_json(out / "table.json", [asdict(row) for row in rows])  # the rows so far
     write_text(out / "table.md", table(rows))
     if page:
         write_section("strangers", "python -m benchmarks strangers FOLDER -o DIR --page", table(rows), PAGE)

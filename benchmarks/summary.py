@@ -1,8 +1,8 @@
-"""The first lists of RESULTS.md, from the tables of its pages: what is lost, then what is won.
+"""The first lists of RESULTS.md, from the tables of all pages: where sdfsim is worse, then where it is better.
 
     python -m benchmarks summary
 
-No number of theirs is written by hand: after any table was measured again, this command makes them agree.
+No number in them is written by hand. Run this command after any table was measured again.
 """
 
 import re
@@ -15,7 +15,7 @@ OURS, PULLED = "sdfsim", ("PyBullet, pieces", "MuJoCo, pieces")  # engines on co
 
 
 def cells_of(text: str) -> list[list[str]]:
-    """The rows of the first table in a text, its head first."""
+    """The rows of the first table in a text, with its head first."""
     lines = [line for line in text.splitlines() if line.startswith("|")]
     rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
     return [row for row in rows if not set("".join(row)) <= set("-: ")]
@@ -31,7 +31,7 @@ def joined(parts: list[str]) -> str:
 
 
 def in_turn() -> tuple[list[str], list[str]]:
-    """Cases in which ours takes longer than an engine, and those in which it takes less, as median ratios."""
+    """Cases in which ours is slower than an engine, and those in which it is faster than both, as median ratios."""
     head, *rows = cells_of(section("rivals in turn"))
     names = [title.removeprefix(f"{OURS} / ") for title in head[4:]]
     longer, less = [], []
@@ -44,7 +44,7 @@ def in_turn() -> tuple[list[str], list[str]]:
 
 
 def of_tosses() -> tuple[list[str], list[str]]:
-    """Engines that are nearer to the real cube in place or turn, and by how much ours is nearer in place."""
+    """Engines with a smaller position or rotation error on the real cube, and the lead of ours in position."""
     nearer, lead = [], []
     for row in cells_of(section("reality"))[1:]:
         if "/" not in row[3] or "tosses" in row[0]:
@@ -55,15 +55,15 @@ def of_tosses() -> tuple[list[str], list[str]]:
             if less > 0.0:
                 nearer.append(told)
         lead.append(-figures(row[3])[0])
-    return nearer, [f"{number(min(lead), 2)} to {number(max(lead), 2)} % of its side" if min(lead) > 0 else ""]
+    return nearer, [f"{number(min(lead), 2)} to {number(max(lead), 2)} % of the side" if min(lead) > 0 else ""]
 
 
 def of_elbows() -> list[str]:
-    """Engines that are nearer to the real elbow in any of its errors."""
+    """Engines with a smaller error on the real elbow, for any of its errors."""
     text = (ROOT / "docs" / "joints.md").read_text(encoding="utf-8").partition("## Real tosses of an elbow")[2]
     nearer = []
     for row in cells_of(text.partition("\n## ")[0])[1:]:
-        whats = ("% of a link", "degrees of turn", "degrees of the hinge")
+        whats = ("% of a link", "degrees of rotation", "degrees of the hinge")
         for part, what in zip(row[4].split("/") if row[4] else (), whats, strict=False):
             less, low, high = figures(part)
             if less > 0.0:
@@ -72,7 +72,7 @@ def of_elbows() -> list[str]:
 
 
 def deeper() -> Iterator[str]:
-    """Cases in which our bodies are deeper in each other than those of both engines on convex pieces."""
+    """Cases in which our bodies overlap more than those of both engines on convex pieces."""
     rows = cells_of(section("rivals"))[1:]
     for case in dict.fromkeys(row[0] for row in rows):
         depth = {row[1]: figures(row[3]) for row in rows if row[0] == case}
@@ -82,7 +82,7 @@ def deeper() -> Iterator[str]:
 
 
 def without_pieces() -> tuple[float, float, list[str]]:
-    """How many times as long engines take at least and at most that collide meshes as they are, and what they lose."""
+    """Time of engines that collide meshes without pieces, divided by ours: least and most; and what they lose."""
     ratios, lost = [], []
     rows = cells_of(section("rivals"))[1:]
     ours = {row[0]: figures(row[2])[0] for row in rows if row[1] == OURS}
@@ -90,16 +90,16 @@ def without_pieces() -> tuple[float, float, list[str]]:
         if row[1] in (OURS, *PULLED):
             continue
         if len(row) < 6 or not row[5]:
-            lost.append(f"{row[1].partition(',')[0]} does not end {row[0]}")
+            lost.append(f"{row[1].partition(',')[0]} does not finish {row[0]}")
             continue
         ratios.append(figures(row[2])[0] / ours[row[0]])
         if int(row[5]):
-            lost.append(f"{row[1]} loses {row[5]} of {row[0]}")
+            lost.append(f"{row[1]} loses {row[5]} of the bodies of {row[0]}")
     return min(ratios), max(ratios), lost
 
 
 def grown() -> dict[str, list[str]]:
-    """By engine, its time over ours (64 nodes) with 1 to 512 spheres."""
+    """For each engine, its time divided by ours (64 nodes) with 1 to 512 spheres."""
     rows = cells_of(section("growth"))[1:]
     time = {(row[0], row[1]): figures(row[2]) for row in rows if row[0].endswith("spheres in a bowl")}
     found: dict[str, list[str]] = {}
@@ -112,7 +112,7 @@ def grown() -> dict[str, list[str]]:
 
 
 def of_joints() -> tuple[list[str], list[str]]:
-    """Scenes with joints in which ours takes longer than MuJoCo, and less."""
+    """Scenes with joints in which ours is slower than MuJoCo, and those in which it is faster."""
     longer, less = [], []
     for row in cells_of(section("joints"))[1:]:
         ours, theirs = figures(row[4])[0], figures(row[5])[0]
@@ -121,7 +121,7 @@ def of_joints() -> tuple[list[str], list[str]]:
 
 
 def counts(cell: str) -> tuple[int, int]:
-    """How many checks hold, of how many."""
+    """Checks that hold, and all checks."""
     held, run = figures(cell)[:2]
     return int(held), int(run)
 
@@ -141,35 +141,38 @@ def summary() -> str:
     solver, engine = errors["`solver`"], errors["the engine again, starts 1e-3 m/s off"]
     growth = grown()
     losses = [
-        f"[In turn](#hard-shapes-beside-other-engines) at the same step, longer than an engine: {joined(longer)} time.",
-        f"Deeper in each other than bodies of both engines: {joined(list(deeper()))} of the smallest body.",
-        f"[Real tosses](#real-tosses-of-a-cube), nearer than ours: {joined(nearer)}. "
+        "[Hard shapes](#hard-shapes-beside-other-engines), slower than an engine at the same step: "
+        f"{joined(longer)} time.",
+        f"Bodies overlap more than in both engines: {joined(list(deeper()))} of the smallest body.",
+        f"[Real tosses](#real-tosses-of-a-cube), engines with smaller errors: {joined(nearer)}. "
         f"[Elbows](../docs/joints.md#real-tosses-of-an-elbow): {joined(of_elbows())}.",
-        f"[MOVi-B](#movi-b), 50 steps: {solver[0]:g} m off, where the engine is {engine[0]:g} m off from itself. The "
-        f"graph network on top of the solve has {errors['`small`'][0]:g} m and takes longer.",
+        f"[MOVi-B](#movi-b), 50 steps: an error of {solver[0]:g} m, and {engine[0]:g} m for PyBullet itself from "
+        f"starts 1 mm/s off. The graph network on top of the solve has {errors['`small`'][0]:g} m and takes longer.",
         f"[Everyday checks](#everyday-scenes-beside-other-engines): {total[OURS][1] - total[OURS][0]} missed of "
-        f"{total[OURS][1]}. [Hard cases](#hard-cases): {hard[0][2]} missed, {hard[0][3]} behind PyBullet.",
-        f"[Joints](../docs/joints.md#time), longer than MuJoCo: {joined(slow_joints)} times its time.",
-        f"[From nothing](#from-nothing) a box that falls takes {start['a box that falls for 0.4 s'][1]} s, "
-        f"in MuJoCo {start['the same in MuJoCo'][1]} s.",
-        f"[Growth](../docs/notes/growth.md), time of PyBullet over ours by spheres: {joined(growth['PyBullet'])}; "
-        f"of MuJoCo {joined(growth['MuJoCo'])}.",
+        f"{total[OURS][1]}. [Hard cases](#hard-cases): {hard[0][2]} missed, {hard[0][3]} worse than PyBullet.",
+        f"[Joints](../docs/joints.md#time), slower than MuJoCo: {joined(slow_joints)} times its time.",
+        f"[Cold start](#cold-start): a falling box takes {start['a box that falls for 0.4 s'][1]} s, in MuJoCo "
+        f"{start['the same in MuJoCo'][1]} s.",
+        f"[Growth](../docs/notes/growth.md), time divided by ours for each number of spheres: PyBullet "
+        f"{joined(growth['PyBullet'])}; MuJoCo {joined(growth['MuJoCo'])}.",
     ]
     wins = [
-        f"In turn, of the time of PyBullet and MuJoCo: {joined(less)}. 512 spheres in a bowl take "
+        f"Hard shapes, relative to the time of PyBullet and MuJoCo: {joined(less)}. 512 spheres in a bowl take "
         f"{steps['512 spheres in a bowl'][5]} of PyBullet's.",
-        f"Engines that collide meshes without pieces, as ours does, take {number(at_least, 2)} to {number(at_most, 2)} "
+        f"Engines that collide meshes without pieces, like ours, take {number(at_least, 2)} to {number(at_most, 2)} "
         f"times as long ([all of them](../docs/notes/hard-shapes.md)). {joined(lost)}.",
-        *([f"Real tosses: nearer in position than every other engine, by {lead[0]}."] if lead[0] else []),
-        "Everyday checks that others miss: "
-        + joined([f"{run - held} of {run} {name}" for name, (held, run) in total.items() if name != OURS])
-        + f". Hard cases: {joined([f'{missed} {who}' for who, _, missed, _ in hard[2:]])}.",
-        f"Joints: {joined(fast_joints)} of MuJoCo's time.",
+        *([f"Real tosses: a smaller position error than every other engine, by {lead[0]}."] if lead[0] else []),
+        "Everyday checks that other engines miss: "
+        + joined([f"{name} {run - held} of {run}" for name, (held, run) in total.items() if name != OURS])
+        + ". Hard cases that they miss: "
+        + joined([f"{who.replace('teacher', 'PyBullet')} {missed}" for who, _, missed, _ in hard[2:]])
+        + ".",
+        f"Joints, relative to MuJoCo's time: {joined(fast_joints)}.",
     ]
     return (
-        "**What is lost**\n\n"
+        "**Where sdfsim is worse**\n\n"
         + "".join(f"- {line}\n" for line in losses)
-        + "\n**What is won**\n\n"
+        + "\n**Where sdfsim is better**\n\n"
         + "".join(f"- {line}\n" for line in wins)
     )
 

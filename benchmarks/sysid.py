@@ -1,11 +1,12 @@
-"""MuJoCo's own system identification on the recorded tosses of a cube, beside `sdfsim identify`: docs/identify.md.
+"""MuJoCo's own system identification on the recorded tosses of a cube, compared with `sdfsim identify`:
+docs/identify.md.
 
     pip install 'mujoco[sysid]'
     python -m benchmarks sysid TOSSES [--frames N ...]
 
-MuJoCo's least squares (`mujoco.sysid.optimize`) move the parameters that benchmarks/reality.py searches for, from the
-middle of their bounds, until 60 tosses go as recorded; over so many frames of them as are given. All is judged on the
-100 other tosses of that benchmark, over its 75 frames, from the same starts.
+MuJoCo's least squares (`mujoco.sysid.optimize`) fit the parameters of benchmarks/reality.py, from the middle of their
+bounds, to the given number of frames of 60 tosses. Errors are measured on the 100 other tosses of that benchmark, over
+its 75 frames, from the same starts.
 """
 
 import contextlib
@@ -29,9 +30,9 @@ SHORT = [25, 40, FRAMES]
 
 @one_thread()
 def main(tosses: Path, *, frames: list[int] = SHORT) -> None:
-    """Fit over so many `frames`, and print the errors over all that are compared."""
+    """Fit over each number of `frames`, and print the errors over all compared frames."""
     toolbox: Any = optional("mujoco.sysid", "MuJoCo's sysid", "bench")
-    if not hasattr(toolbox, "optimize"):  # it swallows what is missing
+    if not hasattr(toolbox, "optimize"):  # it hides import errors
         raise SdfsimError("MuJoCo's sysid is not installed", "pip install 'mujoco[sysid]'")
     known = load_tosses(tosses)
     groups = split(known)[:2]
@@ -44,7 +45,7 @@ def main(tosses: Path, *, frames: list[int] = SHORT) -> None:
         runs = [0]
 
         def off(x: np.ndarray, _: Any, horizon: int = horizon, runs: list[int] = runs) -> tuple[list, None, None]:
-            """Places in sides and turns in rad; a column for each of `x` [parameters, columns]."""
+            """Residuals of positions in sides and rotations in rad; a column for each of `x` [parameters, columns]."""
             columns = []
             for point in np.atleast_2d(x.T):
                 runs[0] += 1
@@ -60,7 +61,7 @@ def main(tosses: Path, *, frames: list[int] = SHORT) -> None:
             {name: toolbox.Parameter(name, 0.5 * (a + b), a, b) for name, (a, b) in SOFT.items()}
         )
         began = time.process_time()
-        with contextlib.redirect_stdout(io.StringIO()):  # a line an iteration
+        with contextlib.redirect_stdout(io.StringIO()):  # one line per iteration
             made, _ = toolbox.optimize(wanted, off, verbose=False, max_iters=50)
         spent = time.process_time() - began
         values = dict(zip(SOFT, made.as_vector().tolist(), strict=True))

@@ -1,5 +1,5 @@
-"""What tosses of a cube and of an elbow share: how they are split and compared, and how ours, MuJoCo and PyBullet throw
-a box, or two on a hinge."""
+"""Shared by tosses of a cube and of an elbow: how they are split and compared, and simulations of a box, or two on a
+hinge, by ours, MuJoCo and PyBullet."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from sdfsim.data.public_tosses import ARM, PIVOT, links_of
 from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.scene.scene import Scene
 
-FRAMES = 75  # that are compared: half a second
+FRAMES = 75  # compared: half a second
 FIT, TEST, SEED = 60, 100, 0
-CLEAR = 0.005  # m: what is higher than this over z = 0 flies; the table is 1 to 6 mm lower
+CLEAR = 0.005  # m: a body higher than this over z = 0 flies; the table is 1 to 6 mm lower
 FLIGHT = 6  # frames at least, to fit a start to
 INNER = 5  # inner steps of every engine in a frame
-IMPRATIO = 14.0  # MuJoCo: how much stiffer friction is than the normal
-FAR = 30.0  # % and degrees: errors of a toss that are larger count as this in the search for parameters
-CROWD, ROUNDS = 25, 15  # of that search: points (rounded up to a power of two), and how often each is tried anew
-# Where engines look for their parameters: lower and upper bound. Sizes are in sides, heights in m, times in s, inertias
-# in told ones.
+IMPRATIO = 14.0  # MuJoCo: stiffness of friction relative to the normal
+FAR = 30.0  # % and degrees: cap on the errors of a toss in the search for parameters
+CROWD, ROUNDS = 25, 15  # of that search: points (rounded up to a power of two), and rounds
+# Bounds of the engines' parameters, lower and upper. Sizes are in sides, heights in m, times in s, inertias relative to
+# the published one.
 BODY = {"friction": (0.05, 0.4), "height": (-0.006, 0.003), "side": (0.9, 1.02), "inertia": (0.8, 1.4)}
 SOLID = BODY | {"restitution": (0.0, 0.5)}
 SOFT = BODY | {"softness": (0.003, 0.04), "damping": (0.05, 1.2)}
@@ -38,17 +38,17 @@ One = TypeVar("One")
 
 @dataclass(frozen=True)
 class Thing:
-    """What is thrown: a box, or two on a hinge, as `links_of` has them."""
+    """The thrown object: a box, or two on a hinge, from `links_of`."""
 
     sides: np.ndarray  # [3] m, of a box
     mass: float  # kg, of a box
-    inertia: np.ndarray  # [3] kg m2, likewise
+    inertia: np.ndarray  # [3] kg m2, of a box
     hinged: bool = False
 
 
 @dataclass(frozen=True)
 class Start:
-    """Pose and velocities at a first frame; those of two links have an axis of two in front."""
+    """Pose and velocities at a first frame; for two links the arrays have a leading axis of two."""
 
     position: np.ndarray  # [3] m
     quat_xyzw: np.ndarray  # [4]
@@ -62,7 +62,8 @@ class Start:
 
 
 class Motion(NamedTuple):
-    """Poses of B tosses in the frames after their first; those of two links have an axis of two before the last."""
+    """Poses of B tosses in the frames after their first; for two links the arrays have an axis of two before the
+    last."""
 
     position: np.ndarray  # [B, T, 3] m
     quat_xyzw: np.ndarray  # [B, T, 4]
@@ -72,7 +73,7 @@ Engine = Callable[[Sequence[Start], float, np.ndarray, dict[str, float]], Motion
 
 
 def read_tosses(file: Path, *names: str) -> tuple[float, list[dict[str, np.ndarray]]]:
-    """Frame spacing s, and of each toss in a file the arrays `names`. Raises SdfsimError where one is absent."""
+    """Frame spacing s, and of each toss in a file the arrays `names`. Raises SdfsimError if one is absent."""
     found = read_arrays(file, "recorded tosses", f"give the folder that holds {file.name}")
     if missing := {"start", "dt", *names} - set(found):
         raise SdfsimError(f"{file}: there is no array {min(missing)!r}", f"it has {', '.join(sorted(found))}")
@@ -81,7 +82,7 @@ def read_tosses(file: Path, *names: str) -> tuple[float, list[dict[str, np.ndarr
 
 
 def drawn(usable: Sequence[One]) -> tuple[list[One], list[One], list[One]]:
-    """Tosses to find parameters on, others to judge by, and the rest. Raises SdfsimError for too few."""
+    """Tosses for fitting parameters, others for testing, and the rest. Raises SdfsimError for too few."""
     if len(usable) < FIT + TEST:
         raise SdfsimError(f"{len(usable)} tosses are long enough (at least {FIT + TEST})")
     order = np.random.default_rng(SEED).permutation(len(usable))
@@ -90,7 +91,7 @@ def drawn(usable: Sequence[One]) -> tuple[list[One], list[One], list[One]]:
 
 
 def recorded(tosses: Sequence[Any]) -> Motion:
-    """What is compared of recordings."""
+    """The compared frames of recordings."""
     frames = slice(1, FRAMES + 1)
     return Motion(*(np.array([getattr(toss, name)[frames] for toss in tosses]) for name in Motion._fields))
 
@@ -103,13 +104,14 @@ def apart(found: Motion, truth: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cost(errors: Iterable[np.ndarray]) -> float:
-    """Mean errors [B] of tosses, % and degrees added up. What comes to lie on another face counts as far off, no more:
-    else the few that do so by chance decide about the fit."""
+    """Sum of the mean errors [B] of tosses, % and degrees. Errors are capped, because otherwise the few cubes that come
+    to rest on another face by chance would dominate the fit."""
     return float(sum(np.minimum(error, FAR).mean() for error in errors))
 
 
 def searched(loss: Callable[[dict[str, float]], float], bounds: Bounds, rounds: int = ROUNDS) -> dict[str, float]:
-    """The values within bounds of the least loss. On sixty tosses it has many dips, so that a simplex gets stuck."""
+    """The values within bounds with the least loss. On sixty tosses the loss has many local minima, in which a simplex
+    gets stuck."""
     found = differential_evolution(
         lambda point: loss(dict(zip(bounds, point, strict=True))), list(bounds.values()), maxiter=rounds - 1,
         popsize=CROWD // len(bounds), init="sobol", tol=0.0, polish=False, rng=SEED,
@@ -121,7 +123,7 @@ def searched(loss: Callable[[dict[str, float]], float], bounds: Bounds, rounds: 
 
 
 def ours(starts: Sequence[Start], dt: float, scene: Scene) -> Motion:
-    """The scene that `sdfsim identify` wrote, from these starts."""
+    """The motion of the scene that `sdfsim identify` wrote, from these starts."""
     begun = []
     for start in starts:
         place, turn, speed, spin = (np.broadcast_to(v, (FRAMES + 1, *v.shape)) for v in start.links)
@@ -131,8 +133,7 @@ def ours(starts: Sequence[Start], dt: float, scene: Scene) -> Motion:
 
 
 def half_a_step_ago(start: Start, step: float, gravity: np.ndarray) -> np.ndarray:
-    """The velocity [3] of the first link with which engines that add gravity first, and move by the sum, fly along the
-    exact parabola."""
+    """The velocity [3] of the first link with which engines with symplectic Euler follow the exact parabola."""
     return start.links[2][0] - 0.5 * step * gravity
 
 
@@ -145,7 +146,7 @@ def _hinge(start: Start) -> tuple[float, float]:
 
 
 def _moved(place: np.ndarray, quat: np.ndarray, angle: np.ndarray | None) -> Motion:
-    """By the poses [B, T, *] of the first link, and the angles [B, T] of the hinge where there is one."""
+    """The motion from the poses [B, T, *] of the first link, and the angles [B, T] of the hinge, if there is one."""
     if angle is None:
         return Motion(place, quat)
     count = place.shape[:2]
@@ -157,8 +158,8 @@ def mujoco(
     thing: Thing, starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[str, float], *,
     elliptic: bool = True,
 ) -> Motion:  # fmt: skip
-    """MuJoCo's contacts are damped springs, of a time constant s and a damping ratio; its cone is elliptic or a
-    pyramid."""
+    """MuJoCo: contacts are damped springs with a time constant, s, and a damping ratio; its friction cone is elliptic
+    or a pyramid."""
     engine, rollout = (optional(name, "MuJoCo", "bench") for name in ("mujoco", "mujoco.rollout"))
     spec, step = engine.MjSpec(), dt / INNER
     spec.option.timestep, spec.option.gravity = step, gravity
@@ -194,7 +195,7 @@ def mujoco(
 
 
 def bullet(thing: Thing, starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[str, float]) -> Motion:
-    """PyBullet as it is without settings."""
+    """PyBullet with default settings."""
     engine = import_pybullet()
     client, step = engine.connect(engine.DIRECT), dt / INNER
     here: dict[str, Any] = {"physicsClientId": client}

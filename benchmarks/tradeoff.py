@@ -1,4 +1,4 @@
-"""What `sdfsim tradeoff` finds on MOVi-B, with its picture: RESULTS.md.
+"""The results of `sdfsim tradeoff` on MOVi-B, with its picture: docs/notes/error-against-time.md.
 
     python -m benchmarks tradeoff DATA -o DIR
 

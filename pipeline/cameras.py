@@ -11,7 +11,7 @@ from sdfsim.base.console import plain
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, read_json, write_json
 
-# People hold cameras level to about this; where photos are turned, or all from one place, next to nothing is known.
+# People hold cameras level to about this; if photos are turned, or all from one place, almost nothing is known.
 CAREFUL, UNKNOWN = 2.0, 30.0  # degrees
 
 
@@ -59,7 +59,7 @@ class View:
         return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels [P, 2] and depths [P] of world points [P, 3]; pixels mean nothing where the depth is <= 0."""
+        """Pixels [P, 2] and depths [P] of world points [P, 3]; pixels are meaningless where the depth is <= 0."""
         local = points @ self.rotation.T + self.translation
         depth = local[:, 2]
         xy = local[:, :2] / np.where(np.abs(depth) < 1e-12, 1e-12, depth)[:, None]
@@ -80,12 +80,12 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.translation
 
     def after(self, first: "Similarity") -> "Similarity":
-        """What `first` and then this one do together."""
+        """The product: `first`, then this one."""
         rotation = self.rotation @ first.rotation
         return Similarity(self.scale * first.scale, rotation, self.points(first.translation))
 
     def inverse(self) -> "Similarity":
-        """The way back."""
+        """The inverse transform."""
         return Similarity(1 / self.scale, self.rotation.T, -(np.asarray(self.translation) @ self.rotation) / self.scale)
 
     def view(self, view: View) -> View:
@@ -120,8 +120,8 @@ STILL = Similarity(1.0, np.eye(3), np.zeros(3))
 
 @dataclass(frozen=True)
 class PosedPhotos:
-    """Posed photos and the points that they see, in one world; and how that world came out of structure-from-motion's.
-    Whoever moves it makes another one, so cameras and points are always in the same world."""
+    """Posed photos and the points that they see, in one world, with the transform from the world of
+    structure-from-motion. Moving it makes a new object, so cameras and points are always in the same world."""
 
     views: tuple[View, ...]
     sparse: Sparse
@@ -140,7 +140,7 @@ def save_views(views: Sequence[View], path: Path) -> None:
 
 
 def load_views(path: Path) -> list[View]:
-    """The views of a poses folder, or of a file that `save_views` wrote. Raises SdfsimError where it is absent or
+    """The views of a poses folder, or of a file that `save_views` wrote. Raises SdfsimError if it is absent or
     damaged."""
     path = path / "cameras.json" if path.is_dir() else path
     data = read_json(path, "run the poses stage first")
@@ -157,8 +157,8 @@ def view_of(entry: dict) -> View:
 
 
 def load_poses(folder: Path) -> PosedPhotos:
-    """Reads the cameras and points of a poses folder. Raises SdfsimError: no readable `cameras.json` or
-    `sparse.npz`."""
+    """Reads the cameras and points of a poses folder. Raises SdfsimError if `cameras.json` or `sparse.npz` is not
+    readable."""
     views, path = load_views(folder), folder / "sparse.npz"
     try:
         return PosedPhotos(tuple(views), Sparse(**read_arrays(path, "sparse points", "run the poses stage again")))
@@ -174,8 +174,8 @@ def frame_of(normal: np.ndarray) -> np.ndarray:
 
 
 def nearest_to_axes(centers: np.ndarray, axes: np.ndarray, anchor: np.ndarray | None = None) -> np.ndarray:
-    """The point [3] nearest to all lines through `centers` [N, 3] along unit `axes` [N, 3], by least squares; an
-    `anchor` [3] draws it weakly, which settles the depth where the lines are nearly parallel."""
+    """The point [3] nearest to all lines through `centers` [N, 3] along unit `axes` [N, 3], by least squares; a weak
+    pull to an `anchor` [3] fixes the depth if the lines are nearly parallel."""
     projector = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     matrix, right = projector.sum(0), (projector @ centers[:, :, None]).sum(0)[:, 0]
     weight = 1e-6 if anchor is None else 0.02
@@ -185,7 +185,7 @@ def nearest_to_axes(centers: np.ndarray, axes: np.ndarray, anchor: np.ndarray | 
 
 
 class Up(NamedTuple):
-    """Up: a unit vector [3], where it is from, and degrees within which it can be trusted."""
+    """Up: a unit vector [3], its source, and its uncertainty in degrees."""
 
     direction: np.ndarray
     source: str
@@ -194,7 +194,7 @@ class Up(NamedTuple):
 
 def camera_up(views: Sequence[View]) -> Up:
     """Up from the cameras alone: people hold cameras level, so it is the direction with the least spread of their right
-    axes; where these span no plane, the mean image up."""
+    axes; if these do not span a plane, the mean image up."""
     right = np.array([v.rotation[0] for v in views])
     mean = -np.mean([v.rotation[1] for v in views], axis=0)
     mean /= np.linalg.norm(mean) + 1e-12
@@ -202,7 +202,7 @@ def camera_up(views: Sequence[View]) -> Up:
     up = vectors[:, 0] * np.sign(vectors[:, 0] @ mean or 1.0)
     if values[1] < 0.05 or values[0] > 0.3 * values[1] or up @ mean < 0.5:
         return Up(mean, "cameras", UNKNOWN)
-    # Where the right axes fan out little, a roll of each camera tilts the whole the more.
+    # The less the right axes fan out, the more a roll of each camera tilts the result.
     return Up(up, "cameras", float(np.hypot(CAREFUL, np.degrees(np.sqrt(max(values[0], 0) / values[1])))))
 
 
@@ -221,7 +221,7 @@ def spread_angle(views: list[View]) -> float:
 
 
 def view_span(views: list[View]) -> float:
-    """Degrees around the scene's upright axis from which it was photographed: 360 less the largest gap."""
+    """Degrees around the scene's upright axis that the cameras cover: 360 minus the largest gap."""
     rays, up = focus(views)[1], camera_up(views).direction
     flat = rays - np.outer(rays @ up, up)
     level = np.linalg.norm(flat, axis=1) > 0.1  # a photo from straight above has no side

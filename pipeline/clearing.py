@@ -1,7 +1,7 @@
-"""Bodies that photos put into what they stand on, or into each other, are moved out.
+"""Moves reconstructed bodies out of their support, or out of each other.
 
-A field does not separate what touches: each surface is off by some share of a cell, so a jar may start some millimetres
-deep in its table. A simulation would throw it out at once, with energy from nothing.
+A field does not separate bodies that touch: each surface is off by a part of a cell, so a jar may start some
+millimetres deep in its table. A simulation would throw it out at once, with energy from nothing.
 """
 
 from dataclasses import dataclass
@@ -18,29 +18,28 @@ from sdfsim.scene.scene import Body, Scene
 from sdfsim.sdf.closed_forms import ClosedForm, PlaneSdf
 from sdfsim.shape.shape import Shape
 
-UPRIGHT = 2.0  # straight up is preferred to a move that is shorter by no more than this factor
-TOUCHES = 2e-5  # of a body's thickness: what is no deeper in another one touches it
+UPRIGHT = 2.0  # straight up is preferred to any move that is not shorter by this factor
+TOUCHES = 2e-5  # of a body's thickness: up to this depth a body only touches another
 ROUNDS = 40  # of steps on the way out
 
 
 @dataclass(frozen=True)
 class Cleared:
-    """What became of a body that was in others."""
+    """The result for a body that overlapped others."""
 
     shift: np.ndarray  # [3] m, by which it is moved
-    into: tuple[str, ...]  # names of what it was in
-    left: float  # m, how deep it still is in one of these; 0 where it is out
+    into: tuple[str, ...]  # names of the bodies that it overlapped
+    left: float  # m, how deep it still is in one of these; 0 if it is out
     held: bool = False  # by a joint
 
 
 def cleared(scene: Scene, solids: dict[str, Mesh]) -> dict[str, Cleared]:
-    """Bodies that are in others at the start, by name, with the shortest moves that take them out: against gravity,
-    unless another way is much shorter. Lower ones are moved first, and those on them follow.
+    """Bodies that overlap others at the start, by name, with the shortest moves that separate them: upwards, unless
+    another direction is much shorter. Lower bodies are moved first, and the bodies on them follow.
 
-    Bodies that joints hold stay where these hold them, and others go out of their way. So do bodies that would have to
-    move by more than their own thickness: out of a hollow that is too tight. `solids` are closed meshes of bodies, in
-    their own frames, where the mesh of the shape is an open one. What is deep is measured on these and on the
-    distances that are simulated.
+    Bodies in joints stay at their place, and others move away from them. A body also stays if it would have to move by
+    more than its own thickness, as out of a hollow that is too tight. `solids` are closed meshes of bodies, in their
+    own frames, for shapes with an open mesh. Depth is measured on these and on the simulated distances.
     """
     holders = {frozenset(joint.bodies) for joint in scene.joints if not joint.collides}
     held = {index for joint in scene.joints for index in joint.bodies}
@@ -73,7 +72,7 @@ def cleared(scene: Scene, solids: dict[str, Mesh]) -> dict[str, Cleared]:
 
 
 class _Solid:
-    """A body as it is placed in the scene, and then moved."""
+    """A body at its place in the scene, and at its moved place."""
 
     def __init__(self, body: Body, shape: Shape, solid: Mesh | None) -> None:
         self.name, self.scale, self._shape, self._mesh = body.name, body.scale, shape, solid or shape.mesh
@@ -93,7 +92,7 @@ class _Solid:
         self._place, self.points = self._place + shift, self.points + shift
 
     def placed(self, number: int, shift: np.ndarray) -> Placed:
-        """As `gaps` takes it, farther by a shift."""
+        """The form that `gaps` takes, moved by a shift."""
         return Placed(np.array([number]), np.array([self.scale]), (self._place + shift)[None], self._turn[None])
 
     def ask(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +107,7 @@ class _Solid:
 
 
 class _Way:
-    """One body's way out of others."""
+    """Search for one body's way out of others."""
 
     def __init__(self, body: _Solid, others: list[_Solid]) -> None:
         self.body, self.most = body, body.scale * body.surface.thickness
@@ -117,10 +116,10 @@ class _Way:
         self.pairs = [pair for pair in self.pairs if pair.near]
 
     def hits(self, shift: np.ndarray) -> dict[str, tuple[float, np.ndarray]]:
-        """What the body is in once it is moved by a shift: by name how deep, m, and which way is out [3]."""
+        """The overlaps of the body after a shift: by name the depth, m, and the direction out [3]."""
         found = {}
         for pair in self.pairs:
-            # Where no point tells that a body is in another, two edges may cross: that takes longer to find.
+            # Even without a point inside, two edges may cross: that search takes longer.
             for measure in (pair.deepest_point, pair.deepest):
                 depth, normal = measure(shift)
                 if depth > self.touches:
@@ -129,15 +128,15 @@ class _Way:
         return found
 
     def out(self, up: np.ndarray) -> np.ndarray | None:
-        """The shift [3] m that takes the body out; None where none does that is short."""
+        """The shift [3] m that takes the body out; None if there is no short one."""
         straight, shortest = self._along(up), self._shortest()
         if straight is None or (shortest is not None and straight > UPRIGHT * np.linalg.norm(shortest)):
             return shortest
         return straight * up + 0.0
 
     def _along(self, direction: np.ndarray) -> float | None:
-        """The shortest way along a direction, m. Distances grow no faster than the way does, so a step by the depth
-        never goes too far."""
+        """The shortest way along a direction, m. Distances grow no faster than the way, so a step by the depth never
+        goes too far."""
         way = 0.0
         for _ in range(ROUNDS):
             hits = self.hits(way * direction)
@@ -149,7 +148,7 @@ class _Way:
         return None
 
     def _shortest(self) -> np.ndarray | None:
-        """The shortest shift by which the body leaves all, as the planes say in which it has met them so far."""
+        """The shortest shift that takes the body out of all others, according to the contact planes found so far."""
         shift, normals, least = np.zeros(3), [], []
         for _ in range(ROUNDS):
             hits = self.hits(shift)
@@ -163,14 +162,14 @@ class _Way:
             residual = table @ nnls(table, np.array([0.0, 0.0, 0.0, 1.0]))[0] - [0.0, 0.0, 0.0, 1.0]
             if residual[3] > -1e-9:
                 return None
-            shift = -residual[:3] / residual[3] + 0.0  # without a minus in front of a zero
+            shift = -residual[:3] / residual[3] + 0.0  # avoids negative zeros
             if np.linalg.norm(shift) > self.most:
                 return None
         return None
 
 
 class _Pair:
-    """A body and another one, in which it may be: how deep once the body is shifted by no more than `most` m."""
+    """A body and another one that it may overlap: the depth after a shift of at most `most` m."""
 
     def __init__(self, body: _Solid, other: _Solid, most: float) -> None:
         self.body, self.other = body, other
@@ -179,13 +178,13 @@ class _Pair:
         self.near = bool(len(self.mine) or len(self.theirs)) or _meet(body.points, other.points, most)
 
     def deepest(self, shift: np.ndarray) -> tuple[float, np.ndarray]:
-        """How deep, m, and which way is out [3]."""
+        """The depth, m, and the direction out [3]."""
         solids = [self.body.surface, self.other.surface]
         gap = gaps(solids, self.body.placed(0, shift), self.other.placed(1, np.zeros(3)), np.zeros(1))
         return -float(gap.apart[0]), gap.sign[0] * gap.normal[0]
 
     def deepest_point(self, shift: np.ndarray) -> tuple[float, np.ndarray]:
-        """The same of the points of both surfaces alone."""
+        """The same from the points of both surfaces only."""
         found = (0.0, np.zeros(3))
         length = float(np.linalg.norm(shift))
         for points, away, solid, sense in (

@@ -1,4 +1,4 @@
-"""From photos and meshes to shapes: reconstruct, its stages, measure, joint, and fit."""
+"""The commands that start from photos or meshes: reconstruct, its stages, measure, joint, and fit."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ Stage = Literal["photos", "poses", "distill", "mesh", "fit", "scene"]
 
 
 def options(*names: str, kept: bool = False) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command these options of `Options`, as keywords, None where they are not given; it has to take
-    `**options`. Where they are `kept`, those that are not given stay as they are in the folder."""
+    """Gives a command these options of `Options` as keywords, None if they are not given; the command must accept
+    `**options`. If they are `kept`, options that are not given keep the values in the folder."""
 
     def added(work: Callable[..., None]) -> Callable[..., None]:
         parameters = [*inspect.signature(work, eval_str=True).parameters.values()][:-1]
@@ -55,20 +55,20 @@ def reconstruct(
     photos: Photos,
     out: Out,
     other: Annotated[
-        Path | None, typer.Argument(help="With --joint: photos of the thing in its other state.", show_default=False)
+        Path | None, typer.Argument(help="With --joint: photos of the object in its other state.", show_default=False)
     ] = None,
     joint: Annotated[
-        bool, typer.Option("--joint", help="Find the hinge or slider by which what moves between both states is held.")
+        bool, typer.Option("--joint", help="Find the hinge or slider of the part that moves between both states.")
     ] = False,
-    first: Annotated[Stage | None, typer.Option("--from", help="Do this stage and those after it again.")] = None,
+    first: Annotated[Stage | None, typer.Option("--from", help="Run this stage and the later ones again.")] = None,
     last: Annotated[Stage | None, typer.Option("--until", help="Stop after this stage.")] = None,
     budget: Budget = None,
     device: str = "auto",
     **options: Any,
 ) -> None:
-    """Photos -> a scene that can be simulated, by all stages.
+    """Photos -> a scene that can be simulated. Runs all stages.
 
-    With --joint, photos of one thing in two states (door shut and open) -> a scene in which the door turns.
+    With --joint, photos of one object in two states (door shut and open) -> a scene in which the door turns.
     """
     if joint != (other is not None):
         message = (
@@ -106,10 +106,12 @@ def measure(
 @command
 def joint(
     session: Session,
-    one: Annotated[Path, typer.Argument(help="Mesh of the thing in one state.", show_default=False)],
-    other: Annotated[Path, typer.Argument(help="In another, in the same frame and scale.", show_default=False)],
+    one: Annotated[Path, typer.Argument(help="Mesh of the object in one state.", show_default=False)],
+    other: Annotated[
+        Path, typer.Argument(help="Mesh of the other state, in the same frame and scale.", show_default=False)
+    ],
 ) -> None:
-    """Two states of one thing, as meshes -> its hinge or slider."""
+    """Meshes of one object in two states -> its hinge or slider."""
     import numpy as np
 
     from pipeline.mesh.joint import find_joint, scene_keys
@@ -172,7 +174,7 @@ def fit(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Shape folder of one mesh file; of several, a folder of them.")
+        Path | None, typer.Option("-o", "--out", help="Shape folder for one mesh file; for several, a folder for them.")
     ] = None,
     budget: Budget = None,
     cap: Annotated[bool, typer.Option("--cap", help="Close openings of any size (with -o).")] = False,
@@ -187,20 +189,20 @@ def fit(
     device: str = "auto",
     **options: Any,
 ) -> None:
-    """Mesh -> compact SDF network, its errors certified.
+    """Mesh -> compact SDF network with certified errors.
 
-    Several meshes, or a folder, with -o DIR: a shape folder DIR/NAME each; what is there already is kept. A folder
-    that `mesh` has written, without -o: its shape and scene.yaml.
+    Several meshes, or a folder, with -o DIR: a shape folder DIR/NAME for each; existing ones are kept. A folder that
+    `mesh` has written, without -o: its shapes and scene.yaml.
     """
     if out is None:
         if len(sources) > 1 or not sources[0].is_dir():
             raise SdfsimError("a mesh file needs -o SHAPE_DIR", exit_code=EXIT_USAGE)
         if cap or thicken is not None or units is not None or cluster is not None:
-            raise SdfsimError("--cap, --thicken, --units and --cluster go with -o", exit_code=EXIT_USAGE)
+            raise SdfsimError("--cap, --thicken, --units and --cluster need -o", exit_code=EXIT_USAGE)
         _run_stage(session, "fit", sources[0], then="scene", budget=budget, device=device, **options)
         return
     if options["sdf"] == "grid":
-        message = "--sdf grid goes without -o: a scene samples a mesh file itself (mesh: FILE, sdf: grid)"
+        message = "--sdf grid cannot be combined with -o: a scene samples a mesh file itself (mesh: FILE, sdf: grid)"
         raise SdfsimError(message, exit_code=EXIT_USAGE)
     from sdfsim.apps import fit as fitting
     from sdfsim.base.parallel import cluster as working_on
@@ -217,7 +219,7 @@ def fit(
 
 
 def _run_stage(session: Session, name: str, folder: Path, *, then: Stage | None = None, **options: Any) -> None:
-    """Runs one stage, and `then` another that costs next to nothing."""
+    """Runs one stage, and `then` another one that takes almost no time."""
     from pipeline import stages
 
     report = stages.run_stage(name, folder, progress=session.stage_progress, **options)

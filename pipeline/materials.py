@@ -10,7 +10,7 @@ TOOLBOX = "Engineering ToolBox"
 FACTBOOK = "The Physics Factbook"
 EUROCODE = "EN 1991-1-1"
 ROUGH = "rough"
-SCENERY = "scenery"  # the body of all that stays where it is
+SCENERY = "scenery"  # the name of the static body
 UNMOVED = ("floor", SCENERY)  # bodies whose mass never counts
 _WALL = re.compile(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", re.ASCII)
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -18,17 +18,17 @@ _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of. The numbers are typical ones.
+    """A material, with typical numbers.
 
-    A contact takes the product of its two bodies' friction, and likewise of their restitution. So `friction` is the
-    root of what the material has on itself, moved within the published range towards its other common pairs.
-    `restitution` is such that the product with concrete's 0.8 is what a ball of the material has on a hard floor.
+    A contact has the product of its two bodies' friction, and the product of their restitution. So `friction` is the
+    square root of the material's friction on itself, adjusted within the published range for its other common pairs.
+    `restitution` times concrete's 0.8 is the value for a ball of the material on a hard floor.
     """
 
     density: float  # kg/m^3
     friction: float  # Coulomb coefficient of the body itself
     restitution: float  # of the body itself
-    # density_from, friction_from, restitution_from: the source; `rough` where the number is only plausible
+    # density_from, friction_from, restitution_from: the source; `rough` if the number is only plausible
     density_from: str = ROUGH
     friction_from: str = ROUGH
     restitution_from: str = ROUGH
@@ -39,7 +39,7 @@ class Material:
         return f"density: {self.density_from}; friction: {self.friction_from}; restitution: {self.restitution_from}"
 
 
-ASSUMED = Material(400.0, 0.8, 0.4)  # of a light wood; photos do not show what a thing is made of
+ASSUMED = Material(400.0, 0.8, 0.4)  # of a light wood; photos do not show the material
 MATERIALS = {
     "wood": Material(650, 0.65, 0.75, CRC, TOOLBOX, FACTBOOK),
     "plywood": Material(600, 0.65, 0.7),
@@ -62,16 +62,16 @@ MATERIALS = {
 
 @dataclass(frozen=True)
 class Choice:
-    """What one body is made of."""
+    """The material of one body."""
 
     name: str = "assumed"  # in `MATERIALS`, or `assumed`
     material: Material = ASSUMED  # its numbers
-    wall: float | None = None  # m, how thick the wall of a hollow body is; None of a solid one
+    wall: float | None = None  # m, thickness of the wall of a hollow body; None for a solid one
 
 
 def materials_of(given: dict[str, str]) -> dict[str, Choice]:
-    """Looks up what bodies are made of: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a
-    hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError where this makes no sense."""
+    """Looks up the materials of bodies: for each body's name, a name in `MATERIALS`, optionally with the thickness of a
+    hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError for an invalid entry."""
     found = {}
     for body, text in given.items():
         name, colon, thickness = text.partition(":")

@@ -1,4 +1,4 @@
-"""A page on which clicks into photos become the options that name places: a known distance, and bodies."""
+"""Writes a page in which clicks on photos become options: a known distance, and bodies."""
 
 import base64
 import io
@@ -20,11 +20,11 @@ MARK = "__PHOTOS__"  # where the page has its photos
 
 
 def measure(given: Path | str, out: Path | str, *, on_progress: Progress = silent) -> dict:
-    """Write one HTML file that holds the photos (what `reconstruct` takes) and needs nothing else, nor a network.
+    """Write one HTML file that contains the photos (any input of `reconstruct`) and works offline.
 
-    Two clicks in it give `--distance PLACE PLACE METRES`, one gives `--body NAME=PHOTO:X,Y`; pixels count in the
-    user's upright photo, whatever size it has on the page. Returns `page`, `photos` and `mib`. Raises SdfsimError where
-    `reconstruct` would refuse the photos, and where the page cannot be written.
+    Two clicks in it give `--distance PLACE PLACE METRES`, one gives `--body NAME=PHOTO:X,Y`; pixels are those of the
+    user's upright photo, not of the page. Returns `page`, `photos` and `mib`. Raises SdfsimError if `reconstruct` would
+    refuse the photos, or if the page cannot be written.
     """
     given, out = Path(given), Path(out)
     if out.suffix.lower() not in (".html", ".htm"):
@@ -43,7 +43,7 @@ def measure(given: Path | str, out: Path | str, *, on_progress: Progress = silen
             data = "data:image/jpeg;base64," + base64.b64encode(packed.getvalue()).decode()
             photos.append({"name": name, "width": width, "height": height, "data": data})
             on_progress(fraction, f"{len(photos)} photos")
-    # Nothing that a file is called can end the element in which this stands.
+    # No file name can end the element that contains this.
     content = json.dumps({"given": str(given), "photos": photos}).replace("<", "\\u003c")
     out.parent.mkdir(parents=True, exist_ok=True)
     page = PAGE.read_text(encoding="utf-8").replace(MARK, content)

@@ -1,10 +1,10 @@
-"""What a body may be called."""
+"""Allowed names of bodies."""
 
 import re
 
 import yaml
 
-# Names that a scene file holds already, or that of the folder of the scenery's shape.
+# Names that a scene file uses already, and the folder of the scenery's shape.
 TAKEN = ("scenery", "scene", "floor", "box", "ball")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 NAMING = f"use letters, digits, - and _, a letter first; not {', '.join(TAKEN)}"

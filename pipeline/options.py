@@ -21,8 +21,8 @@ Preset = Literal["quick", "standard", "fine", "volsdf"]  # what each is: PRESETS
 
 def option(default: Any, stages: Sequence[str], about: str = "", kind: Any = None, metavar: str | None = None,
            **limits: Any) -> Any:  # fmt: skip
-    """A field of `Options`: the stages whose results depend on it (those after them follow), and for the command line
-    what is said about it, the type of its value, if another than here, and how that is written."""
+    """A field of `Options`: the stages whose results depend on it (later stages follow), and for the command line its
+    help text, the type of its value if different, and its notation."""
     extra = {"stages": [*stages], "kind": kind, "metavar": metavar}
     given = {"default_factory": default} if callable(default) else {"default": default}
     return Field(**given, description=about, json_schema_extra=extra, **limits)
@@ -36,12 +36,12 @@ class Options(BaseModel):
     photos: str = ""  # what the user gave, an absolute path
     preset: Preset = option(
         "standard", ["distill", "mesh"],
-        "How much time to spend; volsdf is the network of the paper of that name, for a GPU.",
+        "How much time to spend; volsdf is the network of the VolSDF paper, for a GPU.",
     )  # fmt: skip
     size: float | None = option(None, ["mesh"], "Widest side of the scene, metres.")  # None: assumed to be 1 m
-    # s for everything; None: what the preset takes
+    # s for all stages; None: no limit beyond the preset
     budget: float | None = option(None, ["distill", "fit"], gt=0, allow_inf_nan=False)
-    seed: int = option(0, ["poses", "distill", "fit", "scene"])  # of everything random
+    seed: int = option(0, ["poses", "distill", "fit", "scene"])  # of all random numbers
     device: Literal["auto", "cpu", "cuda"] = "auto"
     recipe: Literal["quick", "default", "paper"] | None = option(
         None, ["fit"],
@@ -55,10 +55,10 @@ class Options(BaseModel):
     )  # fmt: skip
     distance: tuple[str, str, float] | None = option(
         None, ["mesh"],
-        "A distance that you know. A place is PHOTO:X,Y, what that pixel shows, or PHOTO, the camera itself.",
+        "A distance that you know. A place is PHOTO:X,Y, the point at that pixel, or PHOTO, the camera itself.",
         metavar="PLACE PLACE METRES",
     )  # fmt: skip
-    # m, x, y, z of the lower and of the upper corner; None: everything is kept
+    # m, x, y, z of the lower and of the upper corner; None: no crop
     crop: tuple[float, float, float, float, float, float] | None = option(
         None, ["mesh"], "Corners of the box to keep, metres, the lower one first.",
         kind=tuple[str, str] | None, metavar="X,Y,Z X,Y,Z",
@@ -66,21 +66,21 @@ class Options(BaseModel):
     # by body, places PHOTO:X,Y that show it
     body: dict[str, list[str]] = option(
         dict, ["mesh"],
-        "A body that you point at: cup=041.jpg:300,200 is what that pixel shows. Can be repeated, also for one body.",
+        "A body that you point at: cup=041.jpg:300,200 is the body at that pixel. Can be repeated, also for one body.",
         kind=list[str] | None, metavar="NAME=PHOTO:X,Y",
     )  # fmt: skip
     drop: Literal["box", "ball", "none"] = option("box", ["scene"], "What falls onto the scene.")
     # by body, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall
     material: dict[str, str] = option(
         dict, ["scene"],
-        "What a body is made of: object1=wood, or object1=ceramic:4mm where it is hollow. Can be repeated.",
+        "Material of a body: object1=wood, or object1=ceramic:4mm for a hollow one. Can be repeated.",
         kind=list[str] | None, metavar="BODY=MATERIAL",
     )  # fmt: skip
 
     @field_validator("crop", mode="before")
     @classmethod
     def _read_corners(cls, given: Any) -> Any:
-        """Six numbers from two corners `X,Y,Z`, as they are on the command line."""
+        """Six numbers from two corners `X,Y,Z` as on the command line."""
         if not isinstance(given, Sequence) or not all(isinstance(corner, str) for corner in given):
             return given
         try:
@@ -95,7 +95,7 @@ class Options(BaseModel):
     @field_validator("material", "body", mode="before")
     @classmethod
     def _read_by_body(cls, given: Any, info: ValidationInfo) -> Any:
-        """Values by body from a list of `BODY=VALUE`, as they are on the command line; several places of one body."""
+        """Values by body from a list of `BODY=VALUE` as on the command line; a body may have several places."""
         if not isinstance(given, list):
             return given
         once = info.field_name == "material"
@@ -136,36 +136,36 @@ class Options(BaseModel):
         return self
 
     def changed(self, changes: dict[str, Any]) -> "Options":
-        """The options with other values; a new size replaces a known distance, and the other way round. Raises as
-        `options_of` does."""
+        """The options with other values; a new size replaces a known distance, and vice versa. Raises the errors of
+        `options_of`."""
         other = {"size": "distance", "distance": "size"}
         replaced = {other[key]: None for key in changes if key in other}
         return options_of(**self.model_dump() | replaced | changes)
 
     def of_stage(self, stage: str) -> dict[str, Any]:
-        """The values, ready for JSON, on which the result of a stage depends."""
+        """The values, as JSON types, on which the result of a stage depends."""
         values = self.model_dump(mode="json") | {"recipe": self.fit_recipe(), "sdf": self.shape_sdf()}
         return {name: value for name, value in values.items() if stage in form_of(name)["stages"]}
 
     def longer(self) -> str:
-        """What trains for longer than these options."""
+        """Advice on options that train for longer than these."""
         if self.budget is not None:
             return "train for longer (a larger --budget)"
         better = {"quick": "standard", "standard": "fine"}.get(self.preset)
         return f"train for longer (--preset {better})" if better else "take more and sharper photos"
 
     def fit_recipe(self) -> str:
-        """The recipe of the fit, see `fit_mesh`: quick for the preset quick, else the default, where none is given."""
+        """The recipe of the fit, see `fit_mesh`. If none is given: quick for the preset quick, else the default."""
         return self.recipe or ("quick" if self.preset == "quick" else "default")
 
     def shape_sdf(self) -> Literal["grid", "mlp"]:
-        """What the distances of shapes become: a grid for the preset quick, else a network, as whoever gives a recipe
-        wants one."""
+        """The representation of shapes' distances: a grid for the preset quick, else a network; a network too if a
+        recipe is given."""
         return self.sdf or ("grid" if self.preset == "quick" and self.recipe is None else "mlp")
 
 
 class OptionKeys(TypedDict, total=False):
-    """The same options as arguments, for type checkers; a test holds both to the same names."""
+    """The same options as arguments, for type checkers; a test checks that both have the same names."""
 
     preset: Preset
     size: float | None
@@ -188,8 +188,8 @@ def form_of(name: str) -> dict[str, Any]:
 
 
 def options_of(**values: Any) -> Options:
-    """Options with these values, the others as by default. Raises SdfsimError, which names the option and what is
-    allowed, for a value that makes no sense or an option that does not exist."""
+    """Options with these values and defaults for the others. Raises SdfsimError, which names the option and the allowed
+    values, for an invalid value or an unknown option."""
     try:
         return Options(**values)
     except ValidationError as error:
@@ -202,7 +202,7 @@ def options_of(**values: Any) -> Options:
 
 
 def write_config(options: Options, folder: Path) -> None:
-    """Writes config.yaml: every option as resolved."""
+    """Writes config.yaml: every option with its final value."""
     from sdfsim.base.files import CONFIG, write_text
 
     content = {"command": COMMAND, "version": 1, **options.model_dump(mode="json")}
@@ -210,8 +210,7 @@ def write_config(options: Options, folder: Path) -> None:
 
 
 def read_config(folder: Path) -> Options:
-    """Reads config.yaml. Raises SdfsimError: it is missing, not of a reconstruction, or has a value that makes no
-    sense."""
+    """Reads config.yaml. Raises SdfsimError if it is missing, not from a reconstruction, or has an invalid value."""
     from sdfsim.base.files import CONFIG
 
     path = folder / CONFIG

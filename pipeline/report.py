@@ -1,4 +1,4 @@
-"""What a run reports: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
+"""The reports of a run: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
 
 from collections.abc import Collection
 from contextlib import suppress
@@ -15,7 +15,7 @@ from pipeline.options import Options
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json, write_text
 
-# What a person looks for, and the stage that writes it.
+# What users look for, and the stage that writes it.
 RESULTS = {
     "scene": ("scene.yaml", "scene"), "shape": ("assets/scene", "fit"), "mesh": ("mesh/mesh.ply", "mesh"),
     "textured": ("mesh/textured.glb", "mesh"),
@@ -26,13 +26,13 @@ RECORDING = "reconstruction.rrd"
 NAMED = 10  # photos left out that the notes name; the page has them all
 PROPOSED = (255, 40, 200)  # RGB of the cameras that are proposed
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
-GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
+GUESSED_SHARE = 0.01  # of a body's surface: from here on a note reports it
 
 
 def write_report(
     folder: Path, options: Options, records: dict[str, dict], failed: tuple[str, SdfsimError] | None = None
 ) -> dict:
-    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, and the
+    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, with the
     error."""
     stages = {stage: known["report"] for stage, known in records.items()}
     seconds = {stage: round(known["seconds"], 1) for stage, known in records.items()}
@@ -64,7 +64,7 @@ def write_report(
 
 
 def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]:
-    """Each photo with what became of it: posed, held out, left out (and why), or not posed yet."""
+    """Each photo with its outcome: posed, held out, left out (and why), or not posed yet."""
     photos = []
     if "photos" in stages:
         with suppress(SdfsimError):
@@ -80,7 +80,7 @@ def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]
 
 
 def improvements(report: dict, options: Options) -> list[str]:
-    """What to do for a better result, most useful first; one line each."""
+    """Advice for a better result, most useful first; one line each."""
     poses, stages = report["poses"], report["stages"]
     lines = [*poses.get("causes", [])]
     if 0 < len(report["photos"]) < FEW_PHOTOS:
@@ -89,19 +89,19 @@ def improvements(report: dict, options: Options) -> list[str]:
         lines.append("keep zoom and focus fixed, and nothing moving in view: the photos agree only within "
                      f"{poses['mean_error']:.1f} px")  # fmt: skip
     if report["psnr"] is not None and report["psnr"] < LOW_PSNR:
-        lines.append(f"photos that were not trained on come out at {report['psnr']:.1f} dB only: {options.longer()}, "
+        lines.append(f"held-out photos have a PSNR of only {report['psnr']:.1f} dB: {options.longer()}, "
                      "and keep light and exposure the same in all photos")  # fmt: skip
     for number, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1):
         place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
         lines.append(f"{number}. of the photos that would help most: {photo['words']} (camera at {place} m, aimed at "
-                     f"{target} m); it makes up for {photo['gain']:.0%} of what is weak")  # fmt: skip
+                     f"{target} m); it improves {photo['gain']:.0%} of the weak surface")  # fmt: skip
     if report["failed_checks"]:
-        lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
+        lines.append("fit for longer (a larger --budget), or repair the mesh: a shape is not usable")
     return lines
 
 
 def notes(stages: dict[str, dict]) -> list[str]:
-    """What a person should know about a run: what was passed over, assumed or is uncertain; one line each."""
+    """Notes for users about a run: what was skipped, assumed or is uncertain; one line each."""
     poses, scene = stages.get("poses", {}), stages.get("scene", {})
     lines = [*stages.get("photos", {}).get("notes", []), *poses.get("warnings", [])]
     lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in poses.get("left_out", [])[:NAMED]]
@@ -115,31 +115,31 @@ def notes(stages: dict[str, dict]) -> list[str]:
 
 
 def mesh_notes(mesh: dict) -> list[str]:
-    """Those of the mesh stage, from its report."""
+    """The notes of the mesh stage, from its report."""
     lines = []
     if mesh.get("up_from") == "cameras":
-        lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
+        lines.append("no level plane found: up comes from the cameras and may be off by some degrees")
     if mesh.get("up_confidence") == "low":
         lines.append(f"up is uncertain, within {mesh['up_within_degrees']:.0f} degrees: check it before simulating")
     if mesh.get("size_assumed"):
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
-        lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
+        lines.append(f"separate bodies: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
     how = {
         "masks": "split where their masks end",
-        "clicks": "split where photos show a border between the places that you gave",
+        "clicks": "split where photos show a border between your places",
         "shape": "split along a seam by shape; give masks to be sure",
     }
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
     lines += [f"no body was found for {name}, which {by} name" for by in ("masks", "places")
               for name in mesh.get(f"{by}_without_surface", [])]  # fmt: skip
-    lines += [f"{name}: its surface was not moved all the way to where the photos agree: {why}"
+    lines += [f"{name}: its surface was not fully refined by photos: {why}"
               for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
     lines += [hollow_line(name, found) for name, found in mesh.get("hollows", {}).items()]
     if "smallest_object_m" in mesh:
-        lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
-    lines += [f"{area:.2g} m^2 of a level surface without texture were completed as a plane, from what is seen around: "
-              "nothing measured its height there" for area in mesh.get("completed_m2", [])]  # fmt: skip
+        lines.append(f"pieces lower than {mesh['smallest_object_m']:.2g} m stay part of their support")
+    lines += [f"{area:.2g} m^2 of a level surface without texture were completed as a plane from the visible surface "
+              "around: nothing measured its height there" for area in mesh.get("completed_m2", [])]  # fmt: skip
     if mesh.get("left_out_m"):
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
@@ -147,14 +147,14 @@ def mesh_notes(mesh: dict) -> list[str]:
         if part["guessed"] > GUESSED_SHARE and name != SCENERY:
             lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
     if "weak" in mesh:
-        more = "" if mesh["next_photos"] else "; no one photo would help much"
-        lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
-                     f"all from nearly one direction{more}")  # fmt: skip
+        more = "" if mesh["next_photos"] else "; no single photo would help much"
+        lines.append(f"{mesh['weak']:.1%} of the surface that photos could show is weak: fewer than three photos see "
+                     f"it, or all from nearly one direction{more}")  # fmt: skip
     return lines
 
 
 def material_line(body: dict) -> str:
-    """What a body is made of and what it weighs, from an entry of `bodies_of`."""
+    """A line with a body's material and mass, from an entry of `bodies_of`."""
     line = f"{body['material']}, friction {body['friction']:g}, restitution {body['restitution']:g}"
     if "mass" not in body:
         return line
@@ -186,7 +186,7 @@ def page(report: dict, folder: Path) -> str:
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
     if report["psnr"] is not None:
-        side = stages["distill"].get("psnr_px", "a third of the trained")  # older runs did not record it
+        side = stages["distill"].get("psnr_px", "a third of the trained")  # absent in older runs
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB at {side} px"))
     if mesh:
         rows += [
@@ -218,7 +218,7 @@ def page(report: dict, folder: Path) -> str:
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
-    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras show; then in metres.
+    Before the mesh stage it is in the units of the camera poses, with z up according to the cameras; later in metres.
     Returns its path, or None before the poses stage.
     """
     from pipeline.field.training import load_field

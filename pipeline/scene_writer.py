@@ -32,17 +32,17 @@ from sdfsim.scene.scene import Scene
 from sdfsim.sdf.far_field import BOX
 from sdfsim.sdf.sdf import Sdf
 
-SAMPLES, BLOCK = (65, 161), 4  # fewest and most along a side of a grid; cells a side of what is sampled as a whole
-SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
+SAMPLES, BLOCK = (65, 161), 4  # fewest and most along a side of a grid; cells per side of a block sampled at once
+SCENERY_SHARE = 2  # The scenery gets the budget of this many bodies, because it has more detail.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily
 LEVEL = 10.0  # degrees; far below what friction holds, as learned contacts creep on slopes
 BUMP = 0.06  # how far a level place may stick out of its plane, as a share of the side
-BELOW = 0.001  # of the scenery's widest side: so far the added floor lies below the lowest of the scenery's own
-OWN_FLOOR, DENTS = 0.01, 0.02  # of that side: how far a floor is from 0 at most; share of it that may lie lower
+BELOW = 0.001  # of the scenery's widest side: distance of the added floor below the scenery's own floor
+OWN_FLOOR, DENTS = 0.01, 0.02  # of that side: largest distance of a floor from 0; share of it that may lie lower
 UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
-ONTO, STEPS = 1.0, 4  # of a cell of the field, that a vertex of what is shown is from the fit's surface; steps to it
-TOUCHES = 0.05  # of a part's surface, that is near to what holds it
+ONTO, STEPS = 1.0, 4  # of a cell of the field: largest distance of a displayed vertex from the fit; steps to it
+TOUCHES = 0.05  # of a part's surface that is near its holder
 GAP = 0.3  # of the fall, as a share of the side
 
 
@@ -50,8 +50,8 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
               sdf: Literal["grid", "mlp"] = "mlp", seed: int = 0, device: str = "cpu",
               on_progress: Progress = silent) -> dict:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body within the budget, s, or samples their distances on a grid;
-    each is a Shape folder in `out` that `folder_of` names, and those that are there already are kept. Returns a
-    certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them."""
+    each is a Shape folder in `out`, named by `folder_of`, and existing ones are kept. Returns a certificate for each of
+    `shapes`, and `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.sdf.baked_grid import grid_certificate
     from sdfsim.shape.make import fit_mesh, mesh_shape
     from sdfsim.shape.shape import load_shape
@@ -80,7 +80,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
                 budget=None if budget is None else budget * share, on_progress=report, device=device,
             )  # fmt: skip
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
-        # The folder appears complete or not at all: a run that goes on keeps those that are there.
+        # The folder appears complete or not at all: a resumed run keeps existing folders.
         shutil.rmtree(partial, ignore_errors=True)
         if name == SCENERY:
             shown = onto(shape.sdf, shown, ONTO * parts["cell"])
@@ -93,22 +93,22 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
 
 
 def onto(sdf: Sdf, mesh: Mesh, reach: float) -> Mesh:
-    """A mesh with its vertices on the surface of a fit, where that is within `reach` m. Photos leave bumps that are
-    finer than the fit of a scenery: bodies would be shown, and judged, to lie in these."""
+    """A mesh with its vertices moved to the surface of a fit, where that is within `reach` m. The mesh from photos has
+    bumps finer than the fit of a scenery: without this, bodies would seem to overlap them."""
     vertices = mesh.vertices.copy()
     near = np.flatnonzero(np.abs(np.asarray(sdf(vertices)[0])) < reach)
     for _ in range(STEPS):
         distance, slope = (np.asarray(part) for part in sdf(vertices[near]))
-        steep = np.maximum((slope**2).sum(1), 0.25)  # where surfaces are near to each other a grid is flat
+        steep = np.maximum((slope**2).sum(1), 0.25)  # a grid is flat between surfaces that are close
         vertices[near] -= (distance / steep)[:, None] * slope
-    # Where the fit has no such surface, as of a thin wall, it is shown all the same, where photos show it.
+    # If the fit has no such surface, as for a thin wall, the mesh keeps the surface of the photos.
     lost = np.linalg.norm(vertices - mesh.vertices, axis=1) > reach
     return replace(mesh, vertices=np.where(lost[:, None], mesh.vertices, vertices))
 
 
 def samples_of(mesh: Mesh, cell: float) -> int:
-    """Samples along a side of the grid of a mesh from a field with cells of so many m: two a cell, as far as `SAMPLES`
-    allow."""
+    """Samples along a side of the grid of a mesh from a field with cells of `cell` m: two per cell, within
+    `SAMPLES`."""
     wide = 2 * BOX * float(np.ptp(mesh.vertices, axis=0).max())
     blocks = np.clip(np.ceil(2 * wide / cell / BLOCK), *((np.array(SAMPLES) - 1) // BLOCK))
     return int(blocks) * BLOCK + 1
@@ -120,7 +120,7 @@ def folder_of(name: str) -> str:
 
 
 def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
-    """The closed mesh of a part in its own frame, and what is displayed of it."""
+    """The closed mesh of a part in its own frame, and its displayed mesh."""
     if name == SCENERY:
         return load_mesh(mesh_folder / "solid.ply"), load_mesh(mesh_folder / "shown.ply")
     mesh = load_mesh(mesh_folder / "objects" / f"{name}.ply")
@@ -129,7 +129,7 @@ def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
 
 
 def skins_of(mesh_folder: Path) -> dict[str, Mesh]:
-    """The textured mesh of each part in its own frame; none where there are no textures."""
+    """The textured mesh of each part in its own frame; empty if there are no textures."""
     skins = read_glb(mesh_folder / TEXTURED) if (mesh_folder / TEXTURED).exists() else {}
     origins = {name: origin_of(load_mesh(mesh_folder / "objects" / f"{name}.ply")) for name in skins if name != SCENERY}
     return {name: replace(skin, vertices=skin.vertices - origins.get(name, 0)) for name, skin in skins.items()}
@@ -145,10 +145,10 @@ def write_scene(
     mesh_folder: Path, scene_file: Path, *, drop: str = "box", materials: dict[str, Choice] | None = None,
     written: str | None = None, seed: int = 0,
 ) -> dict:  # fmt: skip
-    """Writes scene.yaml for the meshes of a mesh folder and the shapes beside it; returns the stage's report.
+    """Writes scene.yaml for the meshes of a mesh folder and the shapes next to it; returns the stage's report.
 
-    A file that the user has changed (it has another hash than `written`, that of what this function last wrote) is kept
-    as `scene.yaml.bak`. Raises SdfsimError where a material is for a body that there is not.
+    A file that the user has changed (its hash differs from `written`, the hash of this function's last output) is kept
+    as `scene.yaml.bak`. Raises SdfsimError if a material names an unknown body.
     """
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
     names = [entry["name"] for entry in parts["objects"]]
@@ -204,21 +204,22 @@ def write_scene(
 
 
 def moved_line(name: str, one: Cleared, unsure: float) -> str:
-    """What the report says of a body that was in others; photos do not tell what touches closer than `unsure` m."""
+    """The report's line on a body that overlapped others; photos do not resolve overlaps below `unsure` m."""
     there = " and ".join(one.into)
     if one.left:
         if one.held:
-            return f"{name}: is {one.left:.2g} m in {there}, where its joint holds it: these do not touch"
-        return f"{name}: starts {one.left:.2g} m in {there}, as no short way leads out: expect that it is thrown out"
+            return f"{name}: is {one.left:.2g} m deep in {there}, where its joint holds it: these do not touch"
+        why = "because there is no short way out: it will probably be thrown out"
+        return f"{name}: starts {one.left:.2g} m deep in {there}, {why}"
     away = float(np.linalg.norm(one.shift))
     line = f"{name}: moved {'up ' if one.shift[2] > 0.99 * away else ''}by {away:.2g} m, out of {there}"
     if away > unsure:
-        line += f": more than the {unsure:.2g} m that photos leave open where bodies touch, so look at mesh/objects.png"
+        line += f": more than the {unsure:.2g} m that photos cannot resolve, so look at mesh/objects.png"
     return line
 
 
 def holder_of(part: Mesh, others: dict[str, Mesh]) -> str | None:
-    """Name of what a part that moves is beside, of which it was cut off; None where there is nothing else."""
+    """Name of the body from which a moving part was cut off; None if there is no other body."""
 
     def beside(mesh: Mesh) -> float:
         away = np.linalg.norm(ClosestPoint(mesh)(part.vertices)[0] - part.vertices, axis=1)
@@ -228,8 +229,8 @@ def holder_of(part: Mesh, others: dict[str, Mesh]) -> str | None:
 
 
 def floor_height(shown: Mesh) -> float:
-    """Height, m, of the floor that is added to a scenery: 0, or just below the scenery's own level surface there. In
-    one plane with it, it would cover it."""
+    """Height, m, of the floor that is added to a scenery: 0, or just below the scenery's own level surface there,
+    because in the same plane it would cover that surface."""
     normals, areas = face_normals(shown)
     height = shown.vertices[shown.faces][:, :, 2].mean(1)
     width = float(np.ptp(shown.vertices, axis=0).max())
@@ -241,8 +242,8 @@ def floor_height(shown: Mesh) -> float:
 
 
 def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
-    """What the report says of each body that can move or has a material: `material`, `friction`, `restitution`; of
-    those that can move also `density` kg/m^3, `wall` m (None: solid), `volume` m^3 of what has mass, `mass` kg."""
+    """The report's entry for each body that can move or has a material: `material`, `friction`, `restitution`; for
+    those that can move also `density` kg/m^3, `wall` m (None: solid), `volume` m^3 with mass, `mass` kg."""
     found = {}
     for body in scene.bodies:
         choice = materials.get(body.name, Choice())
@@ -259,10 +260,9 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0,
                held: HeldPart | None = None, holder: str | None = None,
                moved: dict[str, Cleared] | None = None) -> str:  # fmt: skip
-    """The text of scene.yaml: a floor at a height, m, the scenery, the bodies that were found at their origins [3] m,
-    and one dropped from above where there is a slab. What is `held` by a joint starts in its first state, and the body
-    that is its `holder` stands still. Bodies that would be in others are `moved`; what the part is in does not touch
-    it."""
+    """The text of scene.yaml: a floor at a height, m, the scenery, the bodies at their origins [3] m, and a body
+    dropped from above if there is a slab. A part `held` by a joint starts in its first state, and its `holder` is
+    static. Overlapping bodies are `moved`; bodies that the part overlaps do not touch it."""
     moved = moved or {}
     assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
@@ -335,13 +335,13 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
 
 
 def _flow(content: dict | list) -> str:
-    """One line of YAML. Its numbers are not Python's: 1e-05 would be read as a text."""
+    """One line of YAML. YAML reads Python's 1e-05 as text, so numbers get a different form."""
     return yaml.safe_dump(content, default_flow_style=True, sort_keys=False, width=1000).strip()
 
 
 @dataclass(frozen=True)
 class Slab:
-    """A level slab above a place where it can lie."""
+    """A level slab above a place where it can rest."""
 
     side: float  # m
     thickness: float  # m
@@ -351,12 +351,12 @@ class Slab:
 
 def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     """Chooses a place for a slab from geometry alone: level, flat, seen in the photos, high and central. Both meshes
-    are in metres, z up; `solid` is closed. Raises SdfsimError (exit code 3) where there is no place at all."""
+    are in metres, z up; `solid` is closed. Raises SdfsimError (exit code 3) if there is no place at all."""
     low, high = shown.vertices.min(0), shown.vertices.max(0)
     side = SIDE * float((high - low).max())
     axes = [np.arange(low[k], high[k] + side / 4, side / 2) for k in range(2)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    # Wider than the slab: what stands beside it must not be in its way on the way down.
+    # Wider than the slab: neighbours must not be in its way as it falls.
     line = np.linspace(-0.75, 0.75, 13) * side
     around = np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
     under = (np.abs(around) <= 0.5 * side + 1e-9).all(1)
@@ -376,7 +376,7 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     central = np.linalg.norm((places - (low + high)[:2] / 2) / np.maximum(high - low, 1e-9)[:2], axis=1)
     good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central
     good = good - slope / LEVEL - bump / BUMP - obstacle
-    # Places that are not level, not flat, or not in the photos are taken only where there are no others.
+    # Places that are not level, not flat, or not in the photos are used only if there are no others.
     bad = np.maximum(slope / LEVEL - 1, 0) + 10 * np.maximum(bump - BUMP, 0) + 10 * np.maximum(unseen - UNSEEN, 0)
     best = int((good - 100 * bad).argmax())
     thickness = THICKNESS * side

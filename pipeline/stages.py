@@ -19,16 +19,17 @@ from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import CONFIG, check_own, locked, write_json
 from sdfsim.base.parallel import Progress, StageProgress
 
-# In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of one at work: its fingerprint alone.
+# In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of a running stage: only its
+# fingerprint.
 RECORD = "stage.json"
 
-# Share of an overall time budget that fitting may take, and what the other stages need after training, s.
+# Share of an overall time budget that fitting may take, and the time of the other stages after training, s.
 FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 
 
 @dataclass(frozen=True)
 class Instead:
-    """What is done in place of a stage's own work, and on what its result depends besides options and inputs."""
+    """Replaces a stage's own work, with the further inputs on which its result depends."""
 
     run: Callable[[Project, Path], dict]
     depends: Any
@@ -36,18 +37,18 @@ class Instead:
 
 @dataclass
 class Project:
-    """A reconstruction: its folder, its options, and where it reports its progress."""
+    """A reconstruction: its folder, its options, and its progress callback."""
 
     folder: Path  # of all stages
     options: Options  # as in its config.yaml
     progress: StageProgress | None = None  # called with (stage, fraction, message)
-    # s for the one stage that is run; None: it has its share of the budget for everything
+    # s for a single stage; None: its share of the overall budget
     own_budget: float | None = None
     started: float = field(default_factory=time.monotonic)
     instead: dict[str, Instead] = field(default_factory=dict)  # of stages
 
     def progress_of(self, stage: str) -> Progress:
-        """Where one stage reports its progress."""
+        """The progress callback of one stage."""
         return lambda fraction, message: self.progress(stage, fraction, message) if self.progress else None
 
     def place(self, stage: str) -> Path:
@@ -55,13 +56,13 @@ class Project:
         return self.folder / STAGES[stage].folder
 
     def device(self) -> str:
-        """Where to compute, as torch names it. Raises SdfsimError: cuda was asked for and is not there."""
+        """The device for computing, as torch names it. Raises SdfsimError if CUDA was requested and is missing."""
         from sdfsim.base.devices import pick_device
 
         return str(pick_device(self.options.device))
 
 
-# What each stage does: it makes its result in a folder that is there already and returns its report.
+# The work of each stage: it makes its result in an existing folder and returns its report.
 
 
 def do_photos(project: Project, work: Path) -> dict:
@@ -78,7 +79,7 @@ def do_poses(project: Project, work: Path) -> dict:
 
     folder = project.place("photos")
     photos = load_photos(folder)
-    if project.options.distance is not None:  # rather than after minutes of poses and training
+    if project.options.distance is not None:  # before minutes of poses and training
         check_distance(project.options.distance, photos)
     check_bodies(project.options.body, photos)
     return solve(photos, folder, work, seed=project.options.seed, on_progress=project.progress_of("poses"))
@@ -140,11 +141,11 @@ def do_scene(project: Project, work: Path) -> dict:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the way."""
+    """One stage."""
 
     run: Callable[[Project, Path], dict]
     folder: str  # where the result lies in that of the run
-    # Raise it with every change after which the stage makes something else of the same; those after it follow.
+    # Raise it with every change that gives other results for the same inputs; later stages follow.
     version: int = 1
 
 
@@ -162,7 +163,7 @@ def reconstruct(
     photos: str | Path, out: str | Path, *, from_stage: str | None = None, until_stage: str | None = None,
     progress: StageProgress | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
-    """Photos -> a scene, by all stages: `pipeline.states.reconstruct` says more."""
+    """Photos -> a scene, by all stages; see `pipeline.states.reconstruct`."""
     resolved = options_of(photos=str(Path(photos).absolute()), **options)
     wanted = wanted_stages(from_stage, until_stage)
     project = Project(Path(out), resolved, progress)
@@ -171,8 +172,8 @@ def reconstruct(
 
 
 def wanted_stages(from_stage: str | None, until_stage: str | None) -> dict[str, bool]:
-    """The stages up to one, and whether each is to be done even where nothing changed, as those from another one on
-    are. Raises SdfsimError where there is no such stage, or they are in the wrong order."""
+    """The stages up to `until_stage`, and whether each must run even if nothing changed, which holds from `from_stage`
+    on. Raises SdfsimError if there is no such stage, or they are in the wrong order."""
     first, last = number_of(from_stage or "scene"), number_of(until_stage or "scene")
     if from_stage and first > last:
         raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
@@ -182,8 +183,8 @@ def wanted_stages(from_stage: str | None, until_stage: str | None) -> dict[str, 
 
 def find_poses(photos: str | Path, out: str | Path, *, progress: StageProgress | None = None,
                **changes: Any) -> dict:  # fmt: skip
-    """Photos -> camera poses: the first two stages, as `reconstruct` does them; options that are not given (None) are
-    those of the folder's config.yaml, where there is one."""
+    """Photos -> camera poses: the first two stages of `reconstruct`; options that are not given (None) come from the
+    folder's config.yaml, if it exists."""
     kept = read_config(Path(out)).model_dump() if (Path(out) / CONFIG).exists() else {}
     given: dict[str, Any] = kept | {key: value for key, value in changes.items() if value is not None}
     given["photos"] = photos
@@ -193,11 +194,11 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: StageProgress |
 def run_stage(
     name: str, folder: str | Path, *, progress: StageProgress | None = None, **changes: Any
 ) -> dict:  # fmt: skip
-    """Runs one stage in a folder that the stages before it have written; returns and raises as `reconstruct` does.
-    Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone."""
+    """Runs one stage in a folder that the earlier stages have written; returns and raises like `reconstruct`. Options
+    that are given (not None) are stored in the folder's config.yaml; a budget holds only for this call."""
     number, kept = number_of(name), read_config(Path(folder))
     known = {key: value for key, value in changes.items() if value is not None}
-    options = kept.changed(known)  # also checks the budget, which is not kept
+    options = kept.changed(known)  # also checks the budget, which is not stored
     project = Project(
         Path(folder), options.changed({"budget": kept.budget}), progress, options.budget if "budget" in known else None
     )
@@ -211,15 +212,15 @@ def run_stage(
 
 
 def number_of(stage: str) -> int:
-    """Its place in the order of the stages. Raises SdfsimError: there is no such stage."""
+    """Its place in the order of the stages. Raises SdfsimError for an unknown stage."""
     if stage not in STAGES:
         raise SdfsimError(f"no such stage: {stage!r}", "stages: " + ", ".join(STAGES))
     return list(STAGES).index(stage)
 
 
 def run_all(project: Project, stages: dict[str, bool]) -> dict:
-    """Runs stages, those whose value is True also when nothing changed, and returns the report. Raises SdfsimError
-    before anything is written where the device is missing, or where files that sdfsim did not write would be lost."""
+    """Runs stages, those with the value True even if nothing changed, and returns the report. Raises SdfsimError,
+    before it writes anything, if the device is missing or if files that sdfsim did not write would be lost."""
     if project.options.device == "cuda":
         project.device()
     check_own(project.folder, COMMAND, "report.json", "report.md")
@@ -231,13 +232,13 @@ def run_all(project: Project, stages: dict[str, bool]) -> dict:
             for stage, again in stages.items():
                 run_reported(project, stage, again=again)
             return write_report(project.folder, project.options, current(project.folder))
-    except OSError as error:  # a full disk, or what cannot be read or written
+    except OSError as error:  # a full disk, or an unreadable or unwritable file
         message = f"{error.filename or project.folder}: {error.strerror or error}"
         raise SdfsimError(message, "solve this and run again: finished stages are kept") from error
 
 
 def check_apart(project: Project) -> None:
-    """Raises SdfsimError where there are no photos, or a file of the user's lies where a result will replace it."""
+    """Raises SdfsimError if there are no photos, or a file of the user's lies where a result will replace it."""
     from pipeline.inputs.sources import find_source
 
     given = Path(project.options.photos)
@@ -250,7 +251,7 @@ def check_apart(project: Project) -> None:
 
 
 def run_reported(project: Project, stage: str, *, again: bool) -> None:
-    """Runs one stage; the report records its result, also an error."""
+    """Runs one stage; the report records its result or its error."""
     try:
         run_one(project, stage, again=again)
     except SdfsimError as error:
@@ -261,7 +262,7 @@ def run_reported(project: Project, stage: str, *, again: bool) -> None:
 
 
 def run_one(project: Project, stage: str, *, again: bool) -> None:
-    """Runs one stage, or skips it where its fingerprint is that of its last run."""
+    """Runs one stage, or skips it if its fingerprint is that of its last run."""
     place, work = project.place(stage), project.folder / f".{stage}.part"
     before = read_record(project.place(list(STAGES)[number_of(stage) - 1])) if stage != "photos" else None
     instead = project.instead.get(stage)
@@ -288,14 +289,14 @@ def run_one(project: Project, stage: str, *, again: bool) -> None:
     begin(work, wanted, fresh=again)
     started = time.monotonic()
     report = (STAGES[stage] if instead is None else instead).run(project, work)
-    # Training that a killed run had already done counts as well.
+    # Includes the training of a killed run.
     seconds = time.monotonic() - started + report.get("seconds_before", 0.0)
     finish(work, place, wanted, inputs, report, seconds)
     project.progress_of(stage)(1.0, f"done in {seconds:.0f} s")
 
 
 def hash_of_photos(given: Path) -> str:
-    """Hash of the places and contents of the photos (or the video), their masks and cameras; a place is relative to the
+    """Hash of the paths and contents of the photos (or the video), their masks and cameras; paths are relative to the
     photos: all may move together, but the folder of a mask is the name of its body."""
     from pipeline.inputs.sources import find_source
 
@@ -309,7 +310,8 @@ def hash_of_photos(given: Path) -> str:
 
 
 def current(folder: Path) -> dict[str, dict]:
-    """Records by stage, up to the first stage that is missing or was made from another result of the one before."""
+    """Records by stage, up to the first stage that is missing or was made from a different result of the stage
+    before."""
     found: dict[str, dict] = {}
     before = None
     for name, stage in STAGES.items():
@@ -321,7 +323,7 @@ def current(folder: Path) -> dict[str, dict]:
 
 
 def read_record(place: Path) -> dict | None:
-    """The record of a finished stage; None where it has not finished."""
+    """The record of a finished stage; None if it has not finished."""
     try:
         known = json.loads((place / RECORD).read_text(encoding="utf-8"))
         return known if {"fingerprint", "inputs", "made", "report", "seconds"} <= set(known) else None
@@ -330,14 +332,14 @@ def read_record(place: Path) -> dict | None:
 
 
 def check_replaceable(place: Path) -> None:
-    """Raises SdfsimError where anything but an earlier result lies at a stage's place: that is never replaced."""
+    """Raises SdfsimError if the place of a stage holds anything but an earlier result, which would be lost."""
     if os.path.lexists(place) and read_record(place) is None:
         message = f"{place}: exists and is not replaced, as sdfsim did not write it (no {RECORD} in it)"
         raise SdfsimError(message, "choose another folder to write to, or move it away")
 
 
 def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
-    """A folder to work in: the one that a killed run left for the same fingerprint, else an empty one."""
+    """A folder to work in: that of a killed run with the same fingerprint, else an empty one."""
     try:
         left = json.loads((work / RECORD).read_text(encoding="utf-8"))["fingerprint"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -354,13 +356,13 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
 
 
 def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seconds: float) -> None:
-    """Writes the record and moves the finished folder to its place, in place of an earlier result of the stage.
+    """Writes the record and moves the finished folder to its place, where it replaces an earlier result of the stage.
 
-    Each result gets a name of its own, `made`: two of the same fingerprint may differ (time budgets, GPUs). Raises
-    SdfsimError where a stage did not write what lies at the place.
+    Each result gets its own name, `made`, because two results with the same fingerprint may differ (time budgets,
+    GPUs). Raises SdfsimError if the place holds files that no stage wrote.
     """
     check_replaceable(place)
-    # Where the record cannot be written, the one with the fingerprint alone stays, and the next run goes on from here.
+    # If the record cannot be written, the one with only the fingerprint stays, and the next run continues from here.
     write_json(
         work / RECORD,
         {"version": 1, "fingerprint": wanted, "inputs": inputs, "made": uuid.uuid4().hex, "seconds": seconds,

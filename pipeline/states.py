@@ -1,12 +1,12 @@
-"""Photos of one thing in two states, such as a door shut and open -> a scene with the joint of what moves.
+"""Photos of one object in two states, such as a door shut and open -> a scene with the joint of the moving part.
 
-Each state is reconstructed by itself, as in it nothing moves. Most of what looks alike in both stands still and brings
-them into one world. What then differs gives the joint, and the scene is made of the state that shows most of the part,
-whose pixels are its labels.
+Each state is reconstructed separately, because nothing moves within a state. Most surfaces that look alike in both are
+static and align the two. The remaining difference gives the joint. The scene is made from the state that shows most of
+the part; the part's pixels are its labels.
 
-Posing the photos of both together would be wrong where the part fills the photos: cameras then follow it.
+Posing the photos of both states together would fail if the part fills the photos, because the cameras would follow it.
 
-Folders: `first` and `second` hold a reconstruction of each state as far as its meshes, and the folder itself a whole
+Folders: `first` and `second` hold a reconstruction of each state up to its meshes, and the folder itself a whole
 reconstruction of one of them, with the joint.
 """
 
@@ -39,7 +39,7 @@ from sdfsim.base.files import write_json
 from sdfsim.base.parallel import StageProgress
 
 FIRST, SECOND = "first", "second"
-WITHOUT = ("crop", "body")  # options that say something of one state's meshes
+WITHOUT = ("crop", "body")  # options that refer to one state's meshes
 
 
 def reconstruct(
@@ -51,15 +51,15 @@ def reconstruct(
         sdfsim.reconstruct("PHOTOS", "room", preset="quick", size=1.8, progress=print)
         sdfsim.reconstruct("SHUT", "cupboard", joint="OPEN", preset="quick")
 
-    `joint` are photos of the same thing in another state, such as with its door open: what moves between both is then
-    a body of its own, called `part`, on a hinge or a slider. `options` are those of `sdfsim reconstruct --help` by the
-    same names, `seed` and `recipe` (see `OptionKeys`); `from_stage` and `until_stage` are its --from and --until.
-    `progress` is called with the stage, its share that is done, and a line.
+    `joint` are photos of the same object in another state, for example with its door open: the moving part becomes a
+    separate body, called `part`, on a hinge or a slider. `options` are those of `sdfsim reconstruct --help` with the
+    same names, and `seed` and `recipe` (see `OptionKeys`); `from_stage` and `until_stage` are its --from and --until.
+    `progress` is called with the stage, its finished share, and a line.
 
-    Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
-    `out` (of two states also a folder each), and returns the report. Skips a stage whose inputs, options and version
-    are those of its last run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises
-    SdfsimError for bad photos or options (exit code 1), or where poses, surface or joint are not good enough (3).
+    Writes one folder per stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md`
+    to `out` (for two states also a folder for each), and returns the report. Skips a stage if its inputs, options and
+    version are those of its last run, and resumes a killed one. Photos (see `find_source`) are never written to. Raises
+    SdfsimError for bad photos or options (exit code 1), or if poses, surface or joint are not good enough (3).
     """
     given: Any = {"from_stage": from_stage, "until_stage": until_stage, "progress": progress, **options}
     return (
@@ -73,11 +73,11 @@ def reconstruct_states(
     first: str | Path, second: str | Path, out: str | Path, *, from_stage: str | None = None,
     until_stage: str | None = None, progress: StageProgress | None = None, **options: Any,
 ) -> tuple[dict, Path]:  # fmt: skip
-    """Photos of a thing in two states -> a scene in which what moves is a body of its own, on a hinge or a slider.
+    """Photos of an object in two states -> a scene in which the moving part is a separate body, on a hinge or a slider.
 
-    Takes stages and options as `reconstruct` does, for both states; the size is that of the first state's scene.
-    Returns the report of the scene, or of the last stage that was wanted, and its folder. Raises SdfsimError as
-    `reconstruct`, `tie` and `find_joint` do, and where the photos come with masks.
+    Takes the stages and options of `reconstruct` for both states; the size is that of the first state's scene. Returns
+    the report of the scene, or of the last wanted stage, and its folder. Raises the SdfsimErrors of `reconstruct`,
+    `tie` and `find_joint`, and one if the photos come with masks.
     """
     out, given = Path(out), (Path(first), Path(second))
     if given[0].resolve() == given[1].resolve():
@@ -85,12 +85,12 @@ def reconstruct_states(
     resolved = options_of(photos=str(given[0].absolute()), **options)
     for name in WITHOUT:
         if getattr(resolved, name):
-            message = f"--{name} goes without --joint"
+            message = f"--{name} cannot be combined with --joint"
             raise SdfsimError(message, "give it to `sdfsim mesh` afterwards", exit_code=EXIT_USAGE)
     again = wanted_stages(from_stage, until_stage)
 
     def wanted(*names: str) -> dict[str, bool]:
-        """Those of some stages that are to be done, and whether also where nothing changed."""
+        """Those of some stages that have to run, and whether also if nothing changed."""
         return {name: again[name] for name in names if name in again}
 
     def project(name: str, **changes: Any) -> Project:
@@ -100,7 +100,7 @@ def reconstruct_states(
 
         return Project(out / name, resolved.changed(changes), said)
 
-    share = {} if resolved.budget is None else {"budget": 0.5 * resolved.budget}  # each state has half of the time
+    share = {} if resolved.budget is None else {"budget": 0.5 * resolved.budget}  # each state gets half of the time
     states = [project(name, photos=str(path.absolute()), distance=None, **share)
               for name, path in zip((FIRST, SECOND), given, strict=True)]  # fmt: skip
     final = project("", size=None, distance=None)
@@ -137,15 +137,15 @@ def _record(project: Project, stage: str) -> dict:
 
 
 def check_unmasked(state: Project) -> None:
-    """Raises SdfsimError where the photos of a state come with masks: what stands still is mostly outside of them."""
+    """Raises SdfsimError if the photos of a state come with masks, because most static surfaces are outside of them."""
     folder = state.place("photos")
     if all(photo.mask for photo in load_photos(folder)) or load_names(folder):
-        message = "--joint takes no masks: what stands still around the thing ties both states"
+        message = "--joint takes no masks: the static surfaces around the object align both states"
         raise SdfsimError(f"{state.options.photos}: {message}", "give the photos without them")
 
 
 def measured_in(states: Sequence[Project], distance: Any) -> int:
-    """Which state's photos hold both places of a known distance. Raises SdfsimError: neither's."""
+    """The state whose photos show both places of a known distance. Raises SdfsimError if neither's do."""
     errors = []
     for number, state in enumerate(states):
         try:
@@ -157,15 +157,15 @@ def measured_in(states: Sequence[Project], distance: Any) -> int:
 
 
 def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path) -> dict:
-    """Finds the joint, and takes the photos of the state that shows most of the part, with labels of it and the joint
-    in the world of the poses. A unit of that is as long as in the meshes of the `scaled` state."""
+    """Finds the joint, and takes the photos of the state that shows most of the part, with labels of the part and the
+    joint in the world of the poses. A unit of this world is as long as in the meshes of the `scaled` state."""
     on_progress = own.progress_of("photos")
     one, other = (load_state(state.folder) for state in states)
-    on_progress(0.1, "looking for what stands still")
+    on_progress(0.1, "looking for static surfaces")
     onto, tied = tie(other, one)
     other = other.moved(onto)
     near = CELLS * max(one.cell, other.cell)
-    on_progress(0.3, "looking for what has moved")
+    on_progress(0.3, "looking for the part that has moved")
     try:
         found = find_joint(one.visible, other.visible, seed=own.options.seed, near=near,
                            empty=(one.empty, other.empty), paired=alike(one, other))  # fmt: skip
@@ -175,7 +175,7 @@ def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path)
     number = int(shown[1] >= shown[0])
     best, rest = (one, other)[number], (one, other)[1 - number]
     motion = found.motion.inverse() if number else found.motion
-    on_progress(0.6, "marking what moves in the photos")
+    on_progress(0.6, "marking the moving part in the photos")
     labels = label_images(best, which_move(best.closed, rest, motion, found.seen[number]))
     source = states[number].place("photos")
     shutil.copytree(source, work, copy_function=_link, ignore=shutil.ignore_patterns(RECORD), dirs_exist_ok=True)
@@ -185,7 +185,7 @@ def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path)
     write_json(work / FOLDER / NAMES, {"version": 1, "names": [PART]})
     home = motion if number else STILL
     sizes = [load_placement(state.folder / "mesh") for state in states]
-    # From metres of the first state's meshes to those that count, and to the world of the chosen state's poses.
+    # From metres of the first state's meshes to final metres, and to the world of the chosen state's poses.
     unit = 1.0 if scaled == 0 else 1.0 / onto.scale
     held = HeldPart(
         found.kind, found.anchor, found.axis, found.travel, home.rotation, home.translation, unit,
@@ -202,14 +202,14 @@ def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path)
 
 
 def take(state: Project, stage: str, work: Path) -> dict:
-    """A stage's result as a state has it."""
+    """A stage's result in the folder of a state."""
     place = state.place(stage)
     shutil.copytree(place, work, copy_function=_link, ignore=shutil.ignore_patterns(RECORD), dirs_exist_ok=True)
     return _record(state, stage)["report"]
 
 
 def _link(source: str | Path, target: str | Path) -> None:
-    """A second name of a file, which no stage changes, or a copy where there cannot be one."""
+    """A hard link to a file that no stage changes, or a copy if links do not work."""
     try:
         os.link(source, target)
     except OSError:

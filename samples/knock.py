@@ -1,10 +1,10 @@
-"""Throws a ball at a body of a reconstruction, towards the nearest edge of what it stands on.
+"""Throws a ball at a body of a reconstruction, towards the nearest edge of its support.
 
     sdfsim reconstruct samples/photos/table_vase -o table --preset quick --distance 041.jpg:68,364 041.jpg:574,341 1.2
     python samples/knock.py table object1           # writes table/knock.yaml
     sdfsim simulate table/knock.yaml -o run
 
-What was dropped onto the scene is left out; everything else stays as it is in scene.yaml.
+The body that was dropped onto the scene is left out; everything else is as in scene.yaml.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import Shape, load_shape
 
 GRAVITY = 9.81  # m/s^2
-HEAVIER = 2.0  # the ball's mass over the body's
-SPARE = 1.4  # speed over what sliding to the edge takes
+HEAVIER = 2.0  # the ball's mass relative to the body's
+SPARE = 1.4  # speed relative to that needed for sliding to the edge
 SLOWEST = 1.5  # m/s
-SECONDS = 2.0  # until all that is knocked off lies on the floor
+SECONDS = 2.0  # until everything knocked off lies on the floor
 
 
 def edge(support: Mesh, at: np.ndarray, base: float, size: float) -> tuple[np.ndarray, float]:
-    """The direction [2] in which the support ends first, and how far away that is, m."""
+    """The direction [2] in which the support ends first, and the distance, m."""
     angles = np.arange(32) * 2 * np.pi / 32
     directions = np.stack([np.cos(angles), np.sin(angles)], 1)
     away = np.arange(0.5, 20, 0.1) * size
@@ -51,9 +51,9 @@ def throw(body: dict, mass: float, friction: float, shape: Shape, support: Mesh)
     Args:
         body: its entry in scene.yaml.
         mass: of it, kg.
-        friction: between it and what it stands on.
+        friction: between it and its support.
         shape: of it.
-        support: what it stands on.
+        support: mesh of the support.
     """
     low, high = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)])
     height, wide = float(high[2] - low[2]), float(max(high[:2] - low[:2]))
@@ -65,7 +65,7 @@ def throw(body: dict, mass: float, friction: float, shape: Shape, support: Mesh)
     speed = max(SLOWEST, sliding * (1 + HEAVIER) / (HEAVIER * (1 + bounce)))
     flight = wide / 2 + 3 * radius
     start = np.array([*(base[:2] - (flight + radius) * direction), base[2] + 0.55 * height])
-    # As fast upwards as gravity takes away on half the way: it hits at the height that it starts from.
+    # The upward speed that gravity takes away on half of the way: it hits at its starting height.
     velocity = [*(speed * direction), 0.5 * GRAVITY * flight / speed]
     return radius, {
         "name": "thrown", "shape": "thrown", "position": rounded(start).tolist(),
@@ -76,7 +76,7 @@ def throw(body: dict, mass: float, friction: float, shape: Shape, support: Mesh)
 
 
 def main() -> None:
-    """Writes knock.yaml beside scene.yaml."""
+    """Writes knock.yaml next to scene.yaml."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="of a reconstruction")
     parser.add_argument("body", help="its name in scene.yaml (mesh/objects.png shows the names)")

@@ -5,7 +5,7 @@
     python samples/large.py knots -o DIR                           # 270 torus knots, 384k nodes, 200 steps
     python samples/large.py heaps -o DIR                           # 380 bodies of eight shapes, 1.1 M nodes, 400 steps
 
-`--resampled` takes the nodes of a 7^3 grid instead. Then: sdfsim simulate DIR/scene.yaml -o RUN
+`--resampled` uses the nodes of a 7^3 grid instead. Then: sdfsim simulate DIR/scene.yaml -o RUN
 
 Four of the shapes come with the samples, two are exact; clog and knot are fitted on first use (half a minute each).
 """
@@ -31,9 +31,9 @@ from sdfsim.simulate.simulator import Simulator
 
 BALL = 0.52  # m, diameter
 MOST_BALLS = 512
-LATTICE = 1.1  # diameters from ball to ball at the start
-GAP = 1.02  # bounding spheres from body to body at the start
-GRID = 48  # of the points that become nodes, along each side; far more than are kept
+LATTICE = 1.1  # diameters between ball centres at the start
+GAP = 1.02  # bounding spheres between body centres at the start
+GRID = 48  # points along each side before nodes are chosen; far more than are kept
 VOXEL = 0.01
 SAMPLED = ("bowl", "can", "cone", "ring")  # of samples/shapes
 MIXED = ("box", "sphere", *SAMPLED, "torus_knot", "shoe")
@@ -70,13 +70,13 @@ FLOOR = {"name": "floor", "plane": {"normal": [0, 0, 1], "offset": 0.0}, "fricti
 
 
 def sample_shape(name: str) -> Shape:
-    """One of samples/shapes, brought to a largest extent of 1 m."""
+    """One of samples/shapes, scaled to a largest extent of 1 m."""
     shape = load_shape(Path(__file__).resolve().parent / "shapes" / name)
     return scaled(shape, 1.0 / float(np.ptp(shape.sdf.bounds, axis=0).max()))
 
 
 def shape_with_nodes(kind: str, nodes: int | None) -> Shape:
-    """A shape of size 1 m with exactly so many nodes (None: those of a 7^3 grid)."""
+    """A shape of size 1 m with exactly this many nodes (None: those of a 7^3 grid)."""
     if kind == "sphere":
         shape = analytic_shape("sphere", radius=0.5, name=kind)
     elif kind == "box":
@@ -101,7 +101,7 @@ def ball_places(count: int, inner: float) -> np.ndarray:
 
 
 def bowl_scene(folder: Path, count: int, nodes: int | None) -> tuple[dict, int]:
-    """Spheres a little above where they fit into the bowl that holds 512 of them twice."""
+    """Spheres a little above their places in a bowl with room for twice 512 of them."""
     inner, outer = bowl_radii(MOST_BALLS, BALL)
     shape_with_nodes("sphere", nodes).save(folder / "shapes/ball")
     sample_shape("bowl").save(folder / "shapes/bowl")
@@ -118,7 +118,7 @@ def bowl_scene(folder: Path, count: int, nodes: int | None) -> tuple[dict, int]:
 
 
 def heap_scene(folder: Path, heap: Heap, count: int, nodes: int | None) -> tuple[dict, int]:
-    """Bodies turned at random in a block with room for each one's bounding sphere."""
+    """Bodies with random rotations in a block with room for each one's bounding sphere."""
     shapes = {kind: shape_with_nodes(kind, nodes) for kind in heap.kinds}
     for kind, shape in shapes.items():
         shape.save(folder / "shapes" / kind)
@@ -158,7 +158,7 @@ def write_scene(name: str, folder: Path, count: int | None = None, nodes: int | 
         content, steps = heap_scene(folder, heap, count or heap.count, heap.nodes if nodes == 0 else nodes)
     path = folder / "scene.yaml"
     write_text(path, _text({"version": 1, **content}))
-    # The model owns its step, so only now is it known how long so many steps take.
+    # The model sets its time step, so the duration of the steps is only known now.
     length = steps * Simulator(load_scene(path)).dt
     write_text(path, _text({"version": 1, "duration": round(length, 6), **content}))
     return path

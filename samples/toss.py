@@ -1,9 +1,9 @@
-"""Make toss.csv, a recording as a tracker would give it: a box thrown onto a table, with noise, a gap and a jump.
+"""Make toss.csv, a recording like that of a tracker: a box thrown onto a table, with noise, a gap and a jump.
 
     python samples/toss.py
 
-The table lies 3 mm higher than toss.yaml says, and friction and restitution are other ones: `sdfsim identify
-samples/toss.csv --scene samples/toss.yaml` finds them.
+The table lies 3 mm higher than in toss.yaml, and friction and restitution differ: `sdfsim identify samples/toss.csv
+--scene samples/toss.yaml` finds them.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""A tour in cells, to run as a whole or, in an editor that knows `# %%`, cell by cell: python samples/tour.py
+"""A tour in cells, to run as a whole or, in an editor that supports `# %%`, cell by cell: python samples/tour.py
 
-It leaves pictures and files in the folder `tour`.
+It writes pictures and files to the folder `tour`.
 """
 
-# %% A scene: what falls, onto what
+# %% A scene: bodies that fall into each other
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +30,14 @@ camera = {"camera": (0.0, -1.3, 0.7), "look_at": (0, 0, 0.12)}
 for at in (0.0, 0.25, 1.5):
     sdfsim.render(scene, rollout, out / f"tour-{at:g}.png", at=min(at, rollout.time[-1]), **camera)
 
-# %% By hand: pull the bowl, and see who touches it
+# %% By hand: pull the bowl, and list the bodies that touch it
 bowl = simulator["bowl"]
 bowl.pull((6.0, 0.0, 0.0))  # N
 simulator.step(60)
 touching = {contact.first for contact in simulator.contact_points() if contact.second == "bowl"}
 print(f"the bowl moves at {bowl.velocity[0]:.2f} m/s; it is touched by {sorted(touching)}")
 
-# %% What if: the same with other frictions, on all cores
+# %% Variants: the same with different frictions, on all cores
 frictions = np.linspace(0.1, 0.9, 5)
 found = simulator.rollouts([{"bowl": {"friction": mu, "velocity": (1.0, 0.0, 0.0)}} for mu in frictions], seconds=0.5)
 for mu, run in zip(frictions, found, strict=True):

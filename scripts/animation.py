@@ -21,14 +21,14 @@ from sdfsim.base.files import replacing
 
 HEIGHT = 360  # px; a photo and a picture side by side
 RATE = 20  # frames a second
-BEFORE, AFTER = 0.6, 1.0  # s, for which the scene stands at first, and in the end
-EACH = 0.15  # s, for which a photo is shown
+BEFORE, AFTER = 0.6, 1.0  # s, pauses at the start and at the end
+EACH = 0.15  # s, display time of a photo
 GAP = 8  # px between the two
 MOST = 3 * 2**20  # bytes
 
 
 def photos(room: Path) -> list[Image.Image]:
-    """The photos that the room was reconstructed from."""
+    """The photos of the reconstruction."""
     found = []
     for file in sorted((room / "photos" / "images").glob("*.jpg")):
         image = Image.open(file).convert("RGB")
@@ -69,7 +69,7 @@ def main() -> None:
         frame.paste(photo, (0, 0))
         frame.paste(picture, (photo.width + GAP, 0))
         frames.append(frame)
-    for quality in (80, 70, 60, 50, 40, 30, 20):  # the best that is small enough
+    for quality in (80, 70, 60, 50, 40, 30, 20):  # the best quality that is small enough
         with replacing(given.out) as partial:
             how = {"save_all": True, "append_images": frames[1:], "duration": round(1000 / RATE), "loop": 0}
             frames[0].save(partial, "WEBP", quality=quality, method=4, **how)

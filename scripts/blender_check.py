@@ -1,5 +1,5 @@
-"""Opens an exported run in Blender and compares it, frame by frame, with the same run as a CSV; ends with code 1 where
-they differ. Needs a Python of its own, with Blender as a module and nothing of ours:
+"""Opens an exported run in Blender and compares it, frame by frame, with the same run as a CSV; ends with code 1 if
+they differ. Needs a separate Python, with Blender as a module and without sdfsim:
 
     sdfsim export run -o run.glb --fps 24 && sdfsim export run -o run.csv --fps 24
     python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1
@@ -40,7 +40,7 @@ def main(glb: str, poses: str, fps: int) -> int:
             sign = 1.0 if sum(a * b for a, b in zip(turn, wanted, strict=True)) > 0 else -1.0
             off = [abs(a - float(row[c])) for a, c in zip(place, "xyz", strict=True)]
             off += [abs(sign * a - b) for a, b in zip(turn, wanted, strict=True)]
-            # A floor that scenery lies in is drawn a little lower.
+            # A floor in the same plane as scenery is drawn a little lower.
             worst = max(worst, *off) if found.animation_data else worst
     if worst > NEAR:
         wrong.append(f"poses differ by {worst:.2g}")

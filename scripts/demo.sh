@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The whole way on a bundled photo set: set-up, photos -> scene, scene -> motion: a ball knocks a vase off a table.
+# All steps on a bundled photo set: set-up, photos -> scene, scene -> motion. A ball knocks a vase off a table.
 # Usage: bash scripts/demo.sh [FOLDER]   (default: runs/demo)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -8,7 +8,7 @@ out="${1:-runs/demo}"
 sdfsim=.venv/bin/sdfsim
 
 echo "1/3  reconstructing samples/photos/table_vase (the table is 1.2 m wide)"
-# Two corners of the table, as one of the photos shows them.
+# Two corners of the table in one of the photos.
 "$sdfsim" reconstruct samples/photos/table_vase -o "$out/scene" --preset quick --drop none \
     --distance 041.jpg:68,364 041.jpg:574,341 1.2
 

@@ -22,8 +22,8 @@ from sdfsim.simulate.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
-SMALL = (480, 270)  # px, of a sample's picture
-# When, from where and at what, in s and m.
+SMALL = (480, 270)  # px, size of a sample's picture
+# Time, camera and target, in s and m.
 PICTURES = {
     "bounce": (0.62, (0.0, -1.1, 0.45), (0.0, 0.0, 0.25)),
     "slope": (0.45, (0.3, -0.95, 0.2), (0.25, 0.05, -0.05)),
@@ -42,7 +42,7 @@ PICTURES = {
     "ragdoll": (1.1, (3.2, -3.4, 2.4), (1.2, 0.0, 0.8)),
     "spheres_in_bowl": (4.0, (0.5, -0.9, 1.0), (0.0, 0.0, 0.3)),
 }
-# From where and at what, m, at the end.
+# Camera and target, m, at the end.
 LARGE = {
     "heaps": ((-4.2, -6.6, 3.6), (0.2, 0.2, 0.3)),
     "knots": ((-3.0, -4.6, 2.5), (0.05, 0.0, 0.2)),
@@ -66,7 +66,7 @@ def picture(
 
 
 def sample(name: str) -> None:
-    """Its picture, and in the console what became of its bodies."""
+    """The picture of a sample; the console shows the final state of its bodies."""
     at, camera, look_at = PICTURES[name]
     scene = load_scene(ROOT / "samples" / f"{name}.yaml")
     rollout = Simulator(scene).run()
@@ -75,7 +75,7 @@ def sample(name: str) -> None:
 
 
 def large(name: str) -> None:
-    """Its picture."""
+    """The picture of a large scene."""
     with tempfile.TemporaryDirectory() as folder:
         scene = load_scene(write_scene(name, Path(folder)))
     rollout = Simulator(scene).run(steps=HEAPS[name].steps)

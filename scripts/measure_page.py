@@ -1,4 +1,4 @@
-"""Clicks in the page that `sdfsim measure` writes, and takes its picture for docs/vfx.md. It needs Chromium.
+"""Clicks in the page from `sdfsim measure`, and takes its picture for docs/vfx.md. It needs Chromium.
 
 python scripts/measure_page.py
 """
@@ -17,7 +17,7 @@ from sdfsim.base.files import write_bytes
 from tests.helpers.browser import Browser
 
 ROOT = Path(__file__).resolve().parents[1]
-PHOTOS = Path("samples/photos/table_vase/images")  # as the page's command is to name them
+PHOTOS = Path("samples/photos/table_vase/images")  # as in the page's command
 PHOTO, WIDE = "041.jpg", 640  # px
 # Two corners of the table, and the vase; px of the photo.
 ENDS, BODY = ((68, 364), (574, 341)), (262, 160)
@@ -50,7 +50,7 @@ def main() -> None:
             browser.click(*at(*BODY))
             browser.value("document.getElementById('distance').click()")
             browser.click(*at(*ENDS[1]))
-            browser.move(*at(*ENDS[1]))  # the lens is gone after a click
+            browser.move(*at(*ENDS[1]))  # the lens disappears after a click
             browser.value("document.querySelector('#list .now').scrollIntoView()")
             told = browser.value("document.getElementById('option').textContent")
             picture = Image.open(browser.picture(Path(folder) / "page.png")).convert("RGB")

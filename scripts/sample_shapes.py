@@ -15,7 +15,7 @@ SHAPES = {"bowl": ("bowl", 0.6), "ring": ("torus", 0.22), "can": ("cylinder", 0.
 
 
 def stone() -> Mesh:
-    """A pebble of 12 cm, in centimetres and with colours, as a scanner might have written it."""
+    """A pebble of 12 cm, in centimetres and with colours, like the file of a scanner."""
     draw, ball = np.random.default_rng(4), sphere(1.0, 4)
     unit = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
     ways = draw.normal(size=(24, 3)) * np.linspace(1.0, 7.0, 24)[:, None]

@@ -1,18 +1,18 @@
 #!/usr/bin/env bash
 # Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: data, bench, test, cluster, export, record3d, rivals)
-# Run again it does nothing, unless pyproject.toml has changed or an extra is wanted that is not there yet.
+# A second run does nothing, unless pyproject.toml has changed or it names a new extra.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 
-# Debian names of the shared libraries that open3d and torch load, beside the file that proves each is there.
+# Debian packages with the shared libraries that open3d and torch load, each with a file that shows whether it is installed.
 libraries=(
     libGL.so.1:libgl1 libEGL.so.1:libegl1 libX11.so.6:libx11-6
     libudev.so.1:libudev1 libusb-1.0.so.0:libusb-1.0-0 libgomp.so.1:libgomp1
 )
 
-# Pictures without a screen need a Vulkan driver; all else works without one.
+# Only pictures without a screen need a Vulkan driver.
 drivers=(libvulkan.so.1:libvulkan1 libvulkan_lvp.so:mesa-vulkan-drivers)
 
 missing() {
@@ -34,7 +34,7 @@ find_python() {
     done
 }
 
-# Whether it can; with a reason where it cannot.
+# Whether it can, with a reason if it cannot.
 install_packages() {
     local as_root=()
     if [ "$(id -u)" -ne 0 ]; then
@@ -76,7 +76,7 @@ if [ "${#absent[@]}" -gt 0 ]; then
     install_packages "${absent[@]}" || say "without it, only pictures that are taken without a screen are missing"
 fi
 
-# The mark of a finished set-up: what it was made from, then the extras that are in. Those stay in.
+# The mark of a finished set-up: its inputs, then the installed extras. These stay installed.
 made_from="$({ cat pyproject.toml; pwd; } | sha256sum | cut -d' ' -f1)"
 known=() marked=''
 if [ -x .venv/bin/sdfsim ] && [ -f .venv/.set-up ]; then
@@ -93,7 +93,7 @@ if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
     "$python" -m venv --clear .venv
 fi
 
-# Without an NVIDIA card, torch's CPU build spares several GB of CUDA packages; where it cannot be reached, any will do.
+# Without an NVIDIA card, torch's CPU build saves several GB of CUDA packages; if it cannot be downloaded, any build works.
 index=()
 cpu_torch=https://download.pytorch.org/whl/cpu
 if ! { command -v nvidia-smi >/dev/null && nvidia-smi -L >/dev/null 2>&1; } &&
@@ -107,7 +107,7 @@ fi
 say "installing Python packages (a few minutes the first time)"
 rm -f .venv/.set-up
 .venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" \
-    --config-settings editable_mode=compat --editable ".${extras:+[$extras]}"  # a path, which type checkers find too
+    --config-settings editable_mode=compat --editable ".${extras:+[$extras]}"  # a path, so that type checkers find it too
 .venv/bin/python -c 'import sdfsim; sdfsim.Simulator(sdfsim.load_scene("samples/tower.yaml"), "small").step(2)'
 printf '%s\n%s\n' "$made_from" "${extras//,/ }" >.venv/.set-up
 say "done: $(.venv/bin/python --version), $PWD/.venv"

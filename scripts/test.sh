@@ -5,10 +5,10 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh test
 .venv/bin/ruff check .
 .venv/bin/pyright
-# What hollow shapes and joints need is compiled once and kept, before both processes of tests would compile it.
+# Compiles and keeps the code for hollow shapes and joints once, so that the two test processes do not both compile it.
 warm() { .venv/bin/python -c 'import sys, sdfsim; sdfsim.Simulator(f"samples/{sys.argv[1]}.yaml").step(2)' "$1"; }
 warm door &
 warm knocked_vase
 wait $!
-# Two processes of one thread each are faster than one of two: most tests are too small for threads to help.
+# Two processes with one thread each are faster than one with two, because most tests are too small for threads.
 OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist worksteal "$@"

@@ -226,7 +226,7 @@ def test_errors_on_real_tosses_are_the_same_everywhere():
 # What the numbers are, and where on each page they stand; the groups of all pages are alike.
 SAME = {
     "how deep the demo's vase is hollow": {
-        "README.md": r"a hollow 32 cm deep comes out (\d+) cm deep",
+        "README.md": r"a hollow 32 cm deep is reconstructed (\d+) cm deep",
         RESULTS: r"a body of its own, hollow by \| (\d+) cm",
         "docs/photos.md": r"\| vase, hollow below its rim \(the true one: 32 cm\) \| [\d.]+ cm \| (\d+) cm",
     },

@@ -1,1 +1,1 @@
-"""Engines that only comparisons need: Drake and Newton."""
+"""Engines for comparisons only: Drake and Newton."""

@@ -1,4 +1,4 @@
-"""Drake, with hydroelastic contact of tetrahedra that fTetWild makes."""
+"""Drake, with hydroelastic contact of tetrahedra from fTetWild."""
 
 import tempfile
 from contextlib import chdir
@@ -22,9 +22,9 @@ TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
 def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
     """Drake's motion with hydroelastic contact: bodies that move are compliant tetrahedra, others rigid triangles.
 
-    It combines two coefficients of friction by their harmonic mean, where the teacher multiplies. So every body carries
-    its own square (one that moves alone, its product with the roughest thing that it may meet), and floor and static
-    bodies what suits the median body: exact where all that move have one friction, of at least half of the others'.
+    It combines two coefficients of friction by their harmonic mean; PyBullet multiplies them. So every body gets its
+    own square (a single moving body the product with the roughest body that it may meet), and floor and static bodies
+    get the value for the median body: exact if all moving bodies have one friction, of at least half of the others'.
     Restitution is 0.
 
     Raises:
@@ -57,7 +57,7 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
         world, friction = (plant.world_body(), lib.RigidTransform()), beside(start.floor[0])
         plant.RegisterCollisionGeometry(*world, lib.HalfSpace(), "floor", surface(friction, False, 1.0))
     bodies = []
-    with tempfile.TemporaryDirectory() as scratch:  # files are read when the simulator is made
+    with tempfile.TemporaryDirectory() as scratch:  # files are read while the simulator is made
         for i, name in enumerate(map(str, t.shape)):
             kind, sizes = form_of(start.urdfs[name])
             place = lib.RigidTransform(lib.Quaternion(np.roll(t.orientation[0, i], 1)), t.position[0, i])
@@ -99,11 +99,11 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
 
 
 def _tetrahedra(mesh: Mesh, beside: Path) -> str:
-    """A VTK file of tetrahedra that fill a closed mesh, kept beside the shape's URDF."""
+    """A VTK file of tetrahedra that fill a closed mesh, kept next to the shape's URDF."""
     kept = beside.with_suffix(".vtk").resolve()
     if not kept.exists():
         filler = optional("pytetwild", "fTetWild", "rivals")
-        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file where it runs
+        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file in its working folder
             points, cells = filler.tetrahedralize(
                 mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA
             )

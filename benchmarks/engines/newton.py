@@ -15,8 +15,8 @@ ITERATIONS = 10  # of XPBD in an inner step
 def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
     """Newton's motion on the CPU, by XPBD on triangle meshes, contacts searched in every inner step.
 
-    It takes the mean of two coefficients of friction. So every body carries its square, and the floor what suits the
-    median body: exact where all have one friction. Its kernels compile for a minute on a machine's first run.
+    It takes the mean of two coefficients of friction. So every body gets its square, and the floor the value for the
+    median body: exact if all have one friction. Its kernels compile for a minute on a machine's first run.
 
     Raises:
         SdfsimError: Newton is not installed, or the motion fails.

@@ -1,7 +1,7 @@
 """The volumetric field: an SDF and a colour on dense multi-resolution grids, rendered through a Laplace density.
 
-Density and rendering follow VolSDF (Yariv et al., 2021, sections 3.1 and 3.2). Space is the unit sphere; what lies
-outside it is a background of its own on contracted coordinates (Barron et al., 2022, eq. 10).
+Density and rendering follow VolSDF (Yariv et al., 2021, sections 3.1 and 3.2). Space is the unit sphere; a separate
+background outside of it uses contracted coordinates (Barron et al., 2022, eq. 10).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 class FieldSize:
     """Resolution of a field."""
 
-    levels: tuple[int, ...] = (16, 32, 64, 128)  # grid points a side of each level, coarse to fine
-    channels: tuple[int, ...] = (4, 4, 4, 2)  # features a level
+    levels: tuple[int, ...] = (16, 32, 64, 128)  # grid points per side of each level, coarse to fine
+    channels: tuple[int, ...] = (4, 4, 4, 2)  # features per level
     width: int = 64  # hidden width of both small networks
-    background: int = 64  # grid points a side of the background
-    finer: tuple[int, ...] = (2,)  # how many cells there are for one of the last level, in bricks near the surface
+    background: int = 64  # grid points per side of the background
+    finer: tuple[int, ...] = (2,)  # cells per cell of the last level along a side, in bricks near the surface
     finer_channels: tuple[int, ...] = (4,)  # features there
 
     @property
@@ -49,12 +49,12 @@ class FieldSize:
 
     @property
     def sampling(self) -> float:
-        """Distance of samples along rays, normalised units: a cell of the last level that is everywhere."""
+        """Distance of samples along rays, normalised units: a cell of the last dense level."""
         return self.steps[len(self.levels) - 1]
 
 
 BACKGROUND_SAMPLES = 12
-GEOMETRY = 13  # features that the SDF network hands to the colour network
+GEOMETRY = 13  # features from the SDF network to the colour network
 
 
 def laplace_density(sdf: Tensor, beta: float | Tensor) -> Tensor:
@@ -65,7 +65,7 @@ def laplace_density(sdf: Tensor, beta: float | Tensor) -> Tensor:
 
 def render_weights(density: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
     """Quadrature of the volume rendering integral, from densities [R, S] near to far and lengths [R, S] of their
-    intervals: the weight [R, S] of each sample, and the transmittance [R] that is left behind the last one."""
+    intervals: the weight [R, S] of each sample, and the transmittance [R] behind the last one."""
     depth = torch.cumsum(density * delta, 1)
     before = torch.cat([torch.zeros_like(depth[:, :1]), depth[:, :-1]], 1)
     weights = torch.exp(-before) * -torch.expm1(-(density * delta))
@@ -85,13 +85,13 @@ def contract(points: Tensor) -> Tensor:
 
 
 class Field(nn.Module, ABC):
-    """SDF and colour in the unit sphere, and a background outside; what both encodings have in common."""
+    """SDF and colour in the unit sphere, and a background outside; the base of both encodings."""
 
     background: nn.Parameter  # [n, n, n, 4], channel 0 density before softplus, channels 1 to 3 colour before sigmoid
     size: Any  # of the encoding, a dataclass
     start_radius: float  # radius of the sphere that the SDF starts from
     active: int = 0  # how many levels of detail are in use
-    view_dependence: float = 1.0  # how much colour changes with direction, 0 to 1
+    view_dependence: float = 1.0  # dependence of colour on direction, 0 to 1
 
     @property
     def finest(self) -> float:
@@ -111,8 +111,8 @@ class Field(nn.Module, ABC):
         return self.geometry_at(points)[0]
 
     def background_along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
-        """RGB [R, 3] of what lies behind the unit sphere along rays [R, 3], by rendering its grid; `jitter` [R, S] in
-        0..1 is the place of each sample within its step of inverse radius."""
+        """RGB [R, 3] of the background behind the unit sphere along rays [R, 3], by rendering its grid; `jitter` [R, S]
+        in 0..1 is the position of each sample within its step of inverse radius."""
         count = jitter.shape[1]
         inverse = 1 - (torch.arange(count, device=jitter.device) + jitter) / count * 0.995
         radius = 1 / inverse
@@ -121,7 +121,7 @@ class Field(nn.Module, ABC):
         distance = along + torch.sqrt((radius**2 - closest).clamp_min(1e-6))
         points = origins[:, None] + distance[..., None] * directions[:, None]
         values = interpolate(self.background, contract(points).view(-1, 3)).view(*jitter.shape, 4)
-        # Optical depth per step of inverse radius, so that far steps are not heavier than near ones.
+        # Optical depth per step of inverse radius, so that far steps do not weigh more than near ones.
         depth = functional.softplus(values[..., 0] * 10 - 1.0)
         depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
         weights, _ = render_weights(depth, torch.ones_like(depth))
@@ -129,11 +129,11 @@ class Field(nn.Module, ABC):
 
 
 class Bricks(nn.Module):
-    """A level of a field that is there near the surface only."""
+    """A level of a field that exists only near the surface."""
 
     places: Tensor  # [B, 3] int16 (z, y, x) of its bricks
-    numbers: Tensor  # [m, m, m] int32, which brick is where; -1 for none
-    # [B * 64, 4] what the distance has more at the start than without the level, and RGB there, less a middle grey
+    numbers: Tensor  # [m, m, m] int32, number of the brick at each place; -1 for none
+    # [B * 64, 4] correction of the start distance by this level, and RGB there minus a middle grey
     start: Tensor
 
     def __init__(self, side: int, channels: int) -> None:
@@ -146,8 +146,7 @@ class Bricks(nn.Module):
         self.values = nn.Parameter(torch.zeros(0, channels))
 
     def add(self, places: Tensor, start: Tensor | None = None) -> None:
-        """Puts bricks [B, 3] (z, y, x) where there are none yet; features are 0 there, and so is `start` unless it is
-        given."""
+        """Adds bricks [B, 3] (z, y, x) where none exist; their features are 0, and so is `start` unless it is given."""
         where = places.to(self.numbers.device).long()
         new = self.numbers[tuple(where.t())] < 0
         where, before = where[new], len(self.places)
@@ -165,19 +164,19 @@ class Bricks(nn.Module):
         self.values = nn.Parameter(torch.cat([self.values.detach(), self.values.new_zeros(rows, self.channels)]))
 
     def at(self, points: Tensor) -> Tensor:
-        """Features [P, C] at points [P, 3]; 0 where there are no bricks."""
+        """Features [P, C] at points [P, 3]; 0 outside of bricks."""
         return interpolate_bricks(self.values, self.numbers, self.side, points)
 
     def start_at(self, points: Tensor) -> Tensor:
-        """What the distance has more at the start, and RGB less a middle grey, [P, 4] at points [P, 3]."""
+        """The correction of the start distance, and RGB minus a middle grey, [P, 4] at points [P, 3]."""
         return interpolate_bricks(self.start, self.numbers, self.side, points)
 
 
 class GridField(Field):
-    """SDF and colour in the unit sphere, and a background outside. The SDF starts as a sphere of `start_radius`, or as
-    what depth maps show."""
+    """SDF and colour in the unit sphere, and a background outside. The SDF starts as a sphere of `start_radius`, or
+    from depth maps."""
 
-    start: Tensor  # [n, n, n, 1] SDF at the start, of no places where it is a sphere
+    start: Tensor  # [n, n, n, 1] SDF at the start, empty if it is a sphere
 
     def __init__(self, size: FieldSize, seed: int = 0, start_radius: float = 0.5, fused: Fused | None = None) -> None:
         super().__init__()
@@ -216,7 +215,7 @@ class GridField(Field):
         self.background = uniform(n, n, n, 4, bound=1e-2)
         if fused is not None:
             self.start = torch.from_numpy(fused.coarse)[..., None].contiguous()
-            with torch.no_grad():  # A network that knows nothing yet must not bend what is known.
+            with torch.no_grad():  # An untrained network must not change the known distance.
                 self.head.weight[0] *= 0.05
                 last.weight *= 0.1
                 if fused.behind is not None:
@@ -229,8 +228,8 @@ class GridField(Field):
                     level.add(torch.from_numpy(near_bricks(fused.coarse, side)))  # type: ignore[operator]
 
     def refine(self, cache: Tensor) -> list[Tensor]:
-        """Puts bricks wherever a cached SDF [n, n, n, 1] has its surface and there are none yet. Returns the features
-        that they replace, level by level."""
+        """Adds bricks where a cached SDF [n, n, n, 1] has its surface and none exist. Returns the features that they
+        replace, level by level."""
         before: list[Tensor] = []
         for level in self.bricks:
             assert isinstance(level, Bricks)
@@ -261,7 +260,7 @@ class GridField(Field):
         return start + hidden[:, 0], hidden[:, 1:], torch.cat([features, color], 1)
 
     def start_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The SDF [P] that training started from, and RGB [P, 3] less a middle grey, at points [P, 3]."""
+        """The SDF [P] at the start of training, and RGB [P, 3] minus a middle grey, at points [P, 3]."""
         if not self.start.numel():
             return points.norm(dim=1) - self.start_radius, torch.zeros_like(points)
         found, color = interpolate(self.start, points)[:, 0], torch.zeros_like(points)
@@ -275,13 +274,13 @@ class GridField(Field):
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
         features, start = features[:, :-3], features[:, -3:]
         seen_along = self.view_dependence * direction_features(directions)
-        # What the photos show there on average, and what the network knows better.
+        # The photos' mean colour there, plus the network's correction.
         usual = torch.logit((start + 0.5).clamp(0.02, 0.98))
         return torch.sigmoid(usual + self.color(torch.cat([geometry, features, seen_along], 1)))
 
 
 def stencil(points: Tensor, step: float) -> Tensor:
-    """The seven points [P, 7, 3] from which `differences` takes gradient and Laplacian at `points` [P, 3]."""
+    """The seven points [P, 7, 3] for gradient and Laplacian by `differences` at `points` [P, 3]."""
     offsets = torch.eye(3, device=points.device, dtype=points.dtype) * step
     return torch.cat([points[:, None] + offsets, points[:, None] - offsets, points[:, None]], 1)
 

@@ -10,7 +10,7 @@ from torch.nn import functional
 from pipeline.field.grid_field import Field
 
 SHARPNESS = 100.0  # of the Softplus
-SPAN = 3.0  # the networks see the unit sphere as the paper's, with radius 3: Softplus and waves are for that size
+SPAN = 3.0  # the networks see the unit sphere with the paper's radius of 3, for which Softplus and waves are made
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class MlpSize:
     """Size of the paper's two networks."""
 
     depth: int = 8  # hidden layers of the SDF network; the position enters again at the middle one
-    width: int = 256  # of its layers, and of the features that it hands on
+    width: int = 256  # of its layers, and of its output features
     frequencies: int = 6  # octaves of the positional encoding of positions
     color_depth: int = 4  # hidden layers of the colour network
     view_frequencies: int = 4  # octaves of the encoding of directions
@@ -26,7 +26,7 @@ class MlpSize:
 
     @property
     def finest(self) -> float:
-        """Half a wave of the highest octave, normalised units: what is smaller is not resolved."""
+        """Half a wave of the highest octave, normalised units, the limit of resolution."""
         return math.pi / (SPAN * 2.0 ** (self.frequencies - 1))
 
     @property
@@ -43,7 +43,8 @@ def encoded(values: Tensor, frequencies: int) -> Tensor:
 
 
 class MlpField(Field):
-    """SDF and colour by the paper's networks, and a background outside; its SDF starts as a sphere of that radius."""
+    """SDF and colour by the paper's networks, and a background outside; the SDF starts as a sphere of the given
+    radius."""
 
     size: MlpSize
 
@@ -71,7 +72,7 @@ class MlpField(Field):
                 layer.weight.copy_((torch.rand(layer.weight.shape, generator=rng) * 2 - 1) * bound)
                 layer.bias.zero_()
             self.color.append(layer)
-        # One weight vector's length and direction learn apart, as in the paper's code.
+        # Length and direction of each weight vector are learned separately, as in the paper's code.
         for layers_ in (self.geometry, self.color):
             for k, layer in enumerate(layers_):
                 layers_[k] = nn.utils.parametrizations.weight_norm(layer)
@@ -87,20 +88,20 @@ class MlpField(Field):
                 mean = math.sqrt(math.pi / layer.in_features)
                 layer.weight.copy_(mean + 1e-4 * torch.randn(layer.weight.shape, generator=rng))
                 continue
-            # The waves start without influence. Orthogonal where the paper draws every weight by itself: lengths are
-            # then kept as the theorem wants them, not only on average.
+            # The waves start without influence. Weights are orthogonal, while the paper draws every weight
+            # independently: this keeps lengths exactly as in the theorem, not only on average.
             layer.weight.zero_()
             seeing = layer.in_features - (inputs - 3 if k in (0, self.skip) else 0)
             tall = torch.randn(max(seeing, layer.out_features), min(seeing, layer.out_features), generator=rng)
             square = torch.linalg.qr(tall).Q
             gain = math.sqrt(2 * max(1.0, seeing / layer.out_features))
             layer.weight[:, :seeing] = gain * (square if seeing <= layer.out_features else square.T)
-        # The theorem holds for endless width; here slope and offset come out wrong by some percent. The last layer
-        # is linear, so both can be put right in it.
+        # The theorem holds for infinite width; here slope and offset are wrong by some percent. The last layer is
+        # linear, so it can correct both.
         points = torch.randn(2000, 3, generator=rng)
         radius = torch.rand(2000, generator=rng)
         points = points / points.norm(dim=1, keepdim=True) * radius[:, None]
-        # In closed form: LAPACK's answer depends, in the last bit, on where in memory its input happens to lie.
+        # In closed form, because the last bit of LAPACK's result depends on the memory address of its input.
         found, away = self.sdf(points).double(), radius.double()
         slope = ((away - away.mean()) * found).sum() / (away - away.mean()).square().sum()
         offset = found.mean() - slope * away.mean()

@@ -1,4 +1,4 @@
-"""Volume rendering: where along rays the field is asked, and the colour that comes out.
+"""Volume rendering: samples of the field along rays, and the resulting colour.
 
 The grids choose samples from a cached SDF; the MLP bounds the error of the opacity as VolSDF does (sections 3.3, 3.4).
 """
@@ -15,15 +15,15 @@ from pipeline.field.grid_field import BACKGROUND_SAMPLES, Field, laplace_density
 from pipeline.grids.interpolation import interpolate
 
 EPSILON = 0.1  # of opacity
-START = 128  # samples of every ray at first, and added to those that need more
-COARSE = 4  # cells of the cached SDF between places where the field is always asked
-BINS = 0.75  # reads of the cached SDF along a ray, for each cell of a side
+START = 128  # first samples of every ray, and samples added to rays that need more
+COARSE = 4  # cells of the cached SDF between points where the field is always evaluated
+BINS = 0.75  # reads of the cached SDF along a ray, per cell of a side
 ROUNDS, BISECTIONS = 5, 10
 
 
 @torch.no_grad()
 def sdf_cache(field: Field, cell: float) -> Tensor:
-    """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen.
+    """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), used to choose samples along rays.
 
     Its cells are no wider than `cell`. Every `COARSE`-th value is the field's, the others only in blocks that the
     surface may cross; elsewhere they are interpolated.
@@ -61,7 +61,7 @@ def sphere_interval(origins: Tensor, directions: Tensor, near: float = 0.02) -> 
 
 @dataclass(frozen=True)
 class Samples:
-    """Where the field is asked along some rays."""
+    """Sample points of the field along some rays."""
 
     distance: Tensor  # [R, S] from the camera, in order, normalised units
     delta: Tensor  # [R, S] length of each sample's interval
@@ -75,14 +75,14 @@ def choose_samples(
     cache: Tensor, origins: Tensor, directions: Tensor, beta: float, uniforms: Tensor, *, plain: int = 8
 ) -> Samples:
     """Samples along rays [R, 3], one for each of `uniforms` [R, S] in 0..1: `plain` of them evenly spread, the others
-    where the cached SDF has its surface, read at even steps."""
+    near the surface of the cached SDF, which is read at even steps."""
     bins = round(BINS * (cache.shape[0] - 1))
     enter, leave = sphere_interval(origins, directions)
     length = (leave - enter)[:, None]
     steps = (torch.arange(bins, device=cache.device) + 0.5) / bins
     points = origins[:, None] + (enter[:, None] + length * steps)[..., None] * directions[:, None]
     sdf = interpolate(cache, points.view(-1, 3)).view(len(origins), bins)
-    # The cache knows the surface only to a fraction of its cell: no narrower than that.
+    # The cache has the surface only to a fraction of its cell, so the width is not smaller.
     broad = max(beta, 0.6 / cache.shape[0])
     weights, _ = render_weights(laplace_density(sdf, broad), (length / bins).expand(-1, bins))
     count = uniforms.shape[1] - plain
@@ -104,12 +104,12 @@ def samples_at(distance: Tensor, enter: Tensor, leave: Tensor, origins: Tensor, 
 def composite(
     field: Field, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float | Tensor, behind: Tensor
 ) -> dict[str, Tensor]:
-    """Renders rays from what `field.geometry_at` gave at their samples, before a colour `behind` [R, 3] or [3]: `rgb`
-    [R, 3] and `opacity` [R] inside the sphere."""
+    """Renders rays from the output of `field.geometry_at` at their samples, in front of a colour `behind` [R, 3] or
+    [3]: `rgb` [R, 3] and `opacity` [R] inside the sphere."""
     sdf, features, grid = geometry
     shape = samples.distance.shape
     weights, left = render_weights(laplace_density(sdf, beta).view(shape), samples.delta)
-    # Colour costs as much as the SDF, and most samples carry no weight.
+    # Colour costs as much as the SDF, and most samples have no weight.
     chosen = torch.nonzero(weights.detach().view(-1) > 5e-4)[:, 0]
     seen_along = samples.directions[:, None].expand(*shape, 3).reshape(-1, 3)[chosen]
     color = torch.zeros(sdf.shape[0], 3, device=sdf.device).index_put(
@@ -124,8 +124,8 @@ def render(
     field: Field, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
     samples: int = 32, backdrop: Tensor | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Renders rays [R, 3] as `composite` does, without gradients and the same every time; a `backdrop` [3] is a
-    constant colour in place of the background model."""
+    """Renders rays [R, 3] like `composite`, without gradients and deterministically; a `backdrop` [3] is a constant
+    colour instead of the background model."""
     middle = torch.full((len(origins), samples), 0.5, device=origins.device)
     chosen = choose_samples(cache, origins, directions, beta, middle)
     behind = backdrop
@@ -138,8 +138,8 @@ def distance_bound(sdf: Tensor, delta: Tensor) -> Tensor:
     """A lower bound [R, S - 1] of the distance to the surface within each interval of a ray (eq. 13, figure 5), from
     the SDF [R, S] at the samples and the intervals' lengths [R, S - 1].
 
-    The balls around both ends hold no surface; what is left of the interval may come as near as the corner where the
-    balls meet, and where they do not meet, anything may lie between.
+    The balls around both ends contain no surface. The surface may come as near to the rest of the interval as the
+    corner where the balls meet; if they do not meet, the bound is zero.
     """
     a, b = sdf[:, :-1].abs(), sdf[:, 1:].abs()
     half = (a + b + delta) / 2
@@ -208,7 +208,7 @@ def bounded_samples(
     active = torch.arange(count, device=enter.device)
     sdf = sdf_at(active, distance)
     beta = beta.detach().reshape(1, 1).to(enter.dtype)
-    # Lemma 2: with this beta+ the first samples suffice.
+    # Lemma 2: with this beta+ the first samples are enough.
     length = (leave - enter)[:, None]
     safe = (length**2 / (4 * (START - 1) * torch.log(torch.tensor(1 + EPSILON)))).sqrt().clamp_min(float(beta))
     for number in range(ROUNDS + 1):

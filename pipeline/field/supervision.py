@@ -1,4 +1,5 @@
-"""What structure-from-motion and depth give to the training: where the object is, its surface, and free space."""
+"""Supervision of the training from structure-from-motion and depth: the object's position, its surface, and free
+space."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,35 +16,35 @@ from pipeline.inputs.photos import Photo
 from pipeline.stereo.depth import DepthMap
 from sdfsim.base.errors import SdfsimError
 
-# In cells of the field's finest grid, as the field cannot follow a surface more closely:
-GAP = 0.9525  # that lines of sight end before their points; those are uncertain, and so is the surface there
-CLEARANCE = 1.27  # that free space asks for at most, and the shortest line of sight that counts
-# Free space counts as filled where the field is below the first; it is asked to become the second, and no more.
+# In cells of the field's finest grid, the limit of its accuracy:
+GAP = 0.9525  # gap between the end of a line of sight and its point, because points and surface are uncertain
+CLEARANCE = 1.27  # largest clearance that free space demands, and the shortest line of sight that counts
+# Free space counts as filled if the field is below the first value; the loss demands the second, and no more.
 FILLED, JUST_EMPTY = -0.254, 0.127
-# Clearance as a share of the way to the point, which may be on a grazed plane.
+# Clearance as a share of the distance to the point, which may be on a plane at a grazing angle.
 SLOPE = 0.1
-DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor or of stereo, that are used
-STEREO_POINTS = 20_000  # of a photo
-CERTAIN = 0.3  # Less certain pixels of stereo draw no surface towards them, and prove no free space.
-NOISES = 5.0  # median errors of the depth before which its lines of sight end: a line through the surface erodes it
-APART = 0.2  # A scale that differs by more than this share means other units, or another photo's depth.
-USUAL = 0.01  # share by which a phone's depth is off, where nothing is known better
-FEWEST = 50  # sparse points on pixels with depth that the scale needs
-TRIES = 16  # places along each line at which filled free space is looked for
+DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # used, from a depth sensor or from stereo
+STEREO_POINTS = 20_000  # per photo
+CERTAIN = 0.3  # Less certain pixels of stereo are used neither for the surface nor for free space.
+NOISES = 5.0  # gap before the point in median errors of the depth, because a line through the surface erodes it
+APART = 0.2  # A scale that differs by more than this share means wrong units, or another photo's depth.
+USUAL = 0.01  # relative error of a phone's depth, if nothing better is known
+FEWEST = 50  # sparse points on pixels with depth needed for the scale
+TRIES = 16  # points along each line checked for filled free space
 
 
 @dataclass(frozen=True)
 class DepthPoints:
     """Pixels with depth."""
 
-    xyz: np.ndarray  # [P, 3] in the world of the poses, as far away as the sensor says
-    pixel: np.ndarray  # [P, 2] where the straight photo shows them
+    xyz: np.ndarray  # [P, 3] in the world of the poses, at the sensor's depth
+    pixel: np.ndarray  # [P, 2] in the undistorted photo
     view: np.ndarray  # [P] index of the view
 
 
 def depth_points(views: Sequence[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:
-    """All pixels with depth, times `scale`, in the world of the poses, whose unit is the metre as far as the cameras
-    know. Raises SdfsimError where a file of the photos stage is missing."""
+    """All pixels with depth, times `scale`, in the world of the poses, which is nominally in metres. Raises SdfsimError
+    if a file of the photos stage is missing."""
     by_name = {photo.name: photo for photo in photos}
     xyz, pixel, index = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, np.int32)]
     for number, view in enumerate(views):
@@ -69,9 +70,9 @@ def depth_points(views: Sequence[View], photos: list[Photo], folder: Path, *, sc
 def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
     """Compares depth with the triangulated points that lie on the same pixels.
 
-    Returns `scale`, the factor of the depth that makes both agree; `spread`, the median share by which a pixel differs
-    after that; `points`, how many were compared: with fewer than `FEWEST` the depth is taken as it is. Raises
-    SdfsimError where they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
+    Returns `scale`, the factor of the depth that makes both agree; `spread`, the median relative difference of a pixel
+    after that; `points`, the number compared: with fewer than `FEWEST` the depth is not scaled. Raises SdfsimError if
+    they differ by more than `APART`, because the depth is then not in metres or not of these photos.
     """
     ratios, sparse = [], poses.sparse
     for number, view in enumerate(poses.views):
@@ -95,8 +96,8 @@ def depth_scale(poses: PosedPhotos, points: DepthPoints) -> dict[str, float]:
 
 
 def stereo_points(maps: Sequence[DepthMap], poses: PosedPhotos) -> DepthPoints:
-    """At most `STEREO_POINTS` places of which each depth map is `CERTAIN`, rather the surest. Maps are in the space of
-    the poses, the result is in the world that these were moved from."""
+    """At most `STEREO_POINTS` points per depth map that are `CERTAIN`, preferably the most certain. Maps are in the
+    space of the poses, the result is in the world before their move."""
     names, back = [view.name for view in poses.views], poses.moved_by.inverse()
     rng, xyz, index = np.random.default_rng(0), [np.zeros((0, 3))], [np.zeros(0, np.int32)]
     for one in maps:
@@ -116,7 +117,7 @@ class Supervision:
     """Sparse points and free space in the unit sphere."""
 
     points: np.ndarray  # [P, 3] surface points in the unit sphere
-    weights: np.ndarray  # [P] how far each is trusted, mean 1
+    weights: np.ndarray  # [P] trust in each, mean 1
     sight: np.ndarray  # [L, 6] starts and ends of stretches of free space
     # [D, 3] points of a depth sensor in the unit sphere
     depth: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
@@ -127,9 +128,9 @@ def supervision_of(
 ) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
-    Poses are moved to the unit sphere; a sensor's depth is where it was before. `cell` is the width of a cell of the
-    field's finest grid. Pixels with depth are lines of sight as well, which end earlier by `noise`, the median share by
-    which the depth is off.
+    Poses are in the unit sphere; a sensor's depth is in the world before that move. `cell` is the width of a cell of
+    the field's finest grid. Pixels with depth give lines of sight as well, which end earlier by `noise`, the median
+    relative error of the depth.
     """
     sparse = poses.sparse
     points = sparse.xyz
@@ -154,7 +155,7 @@ def supervision_of(
     direction = (end - start) / np.maximum(length, 1e-9)[:, None]
     along = -(start * direction).sum(1)
     half = np.sqrt(np.maximum(1 - ((start**2).sum(1) - along**2), 0))
-    # Not all the way: a point is uncertain by a little, and so is the surface there.
+    # Not all the way, because a point and the surface there are a little uncertain.
     low, high = np.maximum(along - half, 0), np.minimum(along + half, length - gap)
     crosses = (half > 0) & (high > low + CLEARANCE * cell)
     sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
@@ -163,9 +164,9 @@ def supervision_of(
 
 
 class FreeSpace:
-    """Points on lines [L, 6] from cameras to what they see, which must be empty. Half of the
-    points picked are where the field is solid nevertheless: a vase's mouth is crossed by one line of sight in hundreds,
-    and would stay filled if lines were drawn evenly. `cell` is the width of a cell of the field's finest grid."""
+    """Points on lines [L, 6] from cameras to seen points, which must be empty. Half of the picked points are where the
+    field is still solid: only one line of sight in hundreds crosses a vase's mouth, which would stay filled if lines
+    were drawn evenly. `cell` is the width of a cell of the field's finest grid."""
 
     def __init__(self, sight: np.ndarray, cell: float, device: str) -> None:
         self.cell = cell
@@ -178,7 +179,7 @@ class FreeSpace:
         return len(self.start)
 
     def look(self, cache: Tensor, rng: torch.Generator) -> None:
-        """Finds filled places by the SDF on a grid [n, n, n, 1] over [-1, 1]^3, at random places of every line."""
+        """Finds filled points with the SDF on a grid [n, n, n, 1] over [-1, 1]^3, at random points of every line."""
         device = self.start.device
         found = []
         for _ in range(TRIES):
@@ -189,7 +190,7 @@ class FreeSpace:
         self.filled = torch.cat(found)
 
     def at(self, line: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
-        """Points [P, 3] at fractions [P] of lines [P], and the clearance [P] that each asks for."""
+        """Points [P, 3] at fractions [P] of lines [P], and the clearance [P] that each demands."""
         start, end = self.start[line], self.end[line]
         rest = (1 - along) * (end - start).norm(dim=1) + GAP * self.cell
         return start + along[:, None] * (end - start), (SLOPE * rest).clamp_max(CLEARANCE * self.cell)
@@ -205,22 +206,23 @@ class FreeSpace:
         line[: count // 2] = self.filled[again, 0].long()
         along[: count // 2] = self.filled[again, 1]
         points, clearance = self.at(line, along)
-        # Emptied, but no more: right beside may be a surface, and this loss comes back to the same places.
+        # Emptied, but no more: a surface may be right next to it, and this loss returns to the same places.
         clearance[: count // 2].clamp_(max=JUST_EMPTY * self.cell)
         return points, clearance
 
 
 def point_weights(sparse: Sparse, count: int) -> np.ndarray:
-    """Weight [P] of each sparse point: how many of the views see it, less where its error is large."""
+    """Weight [P] of each sparse point: the number of views that see it, reduced if its error is large."""
     seen = np.bincount(sparse.point_of, minlength=count).astype(float)
     return seen / (1 + np.maximum(sparse.error, 0) ** 2)
 
 
 def unit_sphere_of(poses: PosedPhotos, *, masked: bool = False) -> Similarity:
-    """The similarity that puts what the cameras look at into the unit sphere; `masked`: all points lie on the object.
+    """The similarity that moves the scene in front of the cameras into the unit sphere; `masked`: all points lie on the
+    object.
 
-    The centre is where the optical axes meet, drawn weakly to the points' median. The radius is what fits the longer
-    side of most photos, less where nearly all points are nearer, and never past the nearest cameras.
+    The centre is where the optical axes meet, with a weak pull to the points' median. The radius fits the longer side
+    of most photos, is smaller if nearly all points are nearer, and never reaches the nearest cameras.
     """
     views, sparse = poses.views, poses.sparse
     centers = np.array([v.center for v in views])
@@ -237,7 +239,7 @@ def unit_sphere_of(poses: PosedPhotos, *, masked: bool = False) -> Similarity:
     else:
         center = nearest_to_axes(centers, axes, anchor=quantile(sparse.xyz, 0.5))
         in_front = ((center - centers) * axes).sum(1) > 0
-        if in_front.mean() < 0.8:  # Axes that meet behind the cameras (a capture looking outwards) say nothing.
+        if in_front.mean() < 0.8:  # Axes that meet behind the cameras (a capture looking outwards) are useless.
             center = quantile(sparse.xyz, 0.5)
         away = np.linalg.norm(centers - center, axis=1)
         half = np.array([np.arctan(0.5 * max(v.width, v.height) / v.focal) for v in views])

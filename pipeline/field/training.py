@@ -49,36 +49,36 @@ from sdfsim.base.parallel import Progress, choose_threads, share_of, silent
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
-REFINED = 0.4  # of the training is done when bricks are put wherever the surface is
-# From a sphere: share of the training by which all levels are in use, and that is done before filled free space is
-# looked for. From fused depth neither waits: coarse levels alone would fill the hollows that are there.
+REFINED = 0.4  # of the training after which bricks are added where the surface is
+# From a sphere: share of the training until all levels are active, and until the search for filled free space begins.
+# From fused depth both start at once, because coarse levels alone would fill existing hollows.
 ALL_LEVELS, HOLLOWS = 0.45, 0.25
-# Scale of the density that training from fused depth starts with, in cells of the last level that is everywhere: the
-# surface is there.
+# First scale of the density for training from fused depth, in cells of the last dense level: small, because the surface
+# is known.
 FUSED_BETA = 1.5
-EXPOSURE_RATE = 0.004  # Adam's, of the photos' gains and offsets, at the start
-# Standard deviation of the gains from which on photos that were not trained on are compared at an exposure of their
-# own; in rendered sets of one exposure it was below 0.01.
+EXPOSURE_RATE = 0.004  # Adam's rate for the photos' gains and offsets, at the start
+# Standard deviation of the gains above which held-out photos are compared at their own exposure; in rendered sets with
+# one exposure it was below 0.01.
 VARIED = 0.03
-BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
-FEWEST_STEPS = 100  # with however small a budget
-PACE = 25  # steps between looks at the clock
-# Pixels along each side of a held-out photo of which one is rendered, where that leaves so many on the long side.
+BACKGROUND_RATE = 0.02  # for the background's grid with the MLP
+FEWEST_STEPS = 100  # for any budget
+PACE = 25  # steps between checks of the clock
+# One in this many pixels along each side of a held-out photo is rendered, if that leaves this many on the long side.
 SCORED, LEAST_SCORED = 3, 100
-STEREO = 0.2  # of the progress that is shown
-HELD_OUT = "held_out"  # folder of the renders of photos that were not trained on
-EMPTY = 0.9  # grey of their pixels whose ray misses the trained sphere
+STEREO = 0.2  # share of the displayed progress
+HELD_OUT = "held_out"  # folder of the renders of held-out photos
+EMPTY = 0.9  # grey of pixels whose ray misses the trained sphere
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a field is trained. Lengths are in normalised units (the scene is the unit sphere)."""
+    """Settings of the training of a field. Lengths are in normalised units (the scene is the unit sphere)."""
 
     # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
-    start_radius: float = 0.25  # of the ball that training starts from; small, as shadowed parts are hardly carved away
+    start_radius: float = 0.25  # of the ball at the start; small, because shadowed parts are hardly removed
     iterations: int = 900  # steps of Adam
-    rays: int = 512  # a step
+    rays: int = 512  # per step
     samples: int = 32  # along a ray inside the sphere
     long_side: int = 480  # of the photos used, px
     stereo: int = 640  # px of the longer side for depth from stereo; 0: none, training starts from a ball
@@ -88,9 +88,9 @@ class Settings:
     curvature: float = 0.01  # weight of |Laplacian| at the start, in units of the finest active cell
     sparse: float = 0.3  # weight of |sdf| at the points of structure-from-motion
     depth: float = 0.3  # weight of |sdf| at the points of a depth sensor, at the start
-    free: float = 1.0  # weight of what is solid between a camera and a point that it sees
-    mask: float = 0.3  # weight of the opacity loss where photos have masks
-    exposure: float = 0.02  # weight of what draws the photos' exposures together; 0: they are alike
+    free: float = 1.0  # weight of solid matter between a camera and a point that it sees
+    mask: float = 0.3  # weight of the opacity loss if photos have masks
+    exposure: float = 0.02  # weight of the penalty on differences of exposure; 0: one exposure for all
     surface_points: int = 512  # points of the eikonal loss
 
 
@@ -101,8 +101,8 @@ PRESETS = {
         size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96), stereo=1280,
         iterations=20000, rays=1024, samples=48, long_side=1280, beta=(0.1, 0.0015),
     ),
-    # The paper's (section 4, appendix B): L1 colour, eikonal 0.1, Adam 5e-4, 1024 rays of 64 samples. Its beta is
-    # learned; sparse points, which the paper did without, get little weight.
+    # The paper's settings (section 4, appendix B): L1 colour, eikonal 0.1, Adam 5e-4, 1024 rays of 64 samples. Beta is
+    # learned; sparse points, which the paper does not use, have a small weight.
     "volsdf": Settings(
         size=MlpSize(), iterations=100_000, rays=1024, samples=64, long_side=1600, rate=5e-4, eikonal=0.1,
         curvature=0.0, sparse=0.1, free=0.0, exposure=0.0, surface_points=2048, stereo=0,
@@ -139,13 +139,13 @@ class Rays:
         )
 
     def batch(self, count: int, seed: int, iteration: int) -> Tensor:
-        """Indices [count] of a random batch; depends on nothing but its arguments, so a resumed run draws the same."""
+        """Indices [count] of a random batch; it depends only on its arguments, so a resumed run draws the same."""
         rng = torch.Generator().manual_seed(seed * 1_000_003 + iteration)
         return torch.randint(len(self), (count,), generator=rng).to(self.rgb.device)
 
 
 def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Rays through pixels (see `View.rays`, the slow twin): intrinsics [R, 4], rotation [R, 3, 3], uv [R, 2]."""
+    """Rays through pixels (a fast version of `View.rays`): intrinsics [R, 4], rotation [R, 3, 3], uv [R, 2]."""
     distorted = (uv - intrinsics[:, 1:3]) / intrinsics[:, :1]
     xy = distorted
     for _ in range(8):
@@ -156,8 +156,8 @@ def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor
 
 
 def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
-    """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. With masks, a view without one
-    counts as all object. Raises SdfsimError where a photo is missing."""
+    """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. If some views have masks, a view
+    without a mask counts as all object. Raises SdfsimError if a photo is missing."""
     rgb, mask, view_of, pixel, intrinsics, sizes = [], [], [], [], [], []
     for index, view in enumerate(views):
         try:
@@ -179,7 +179,7 @@ def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, mas
         column, row = column.ravel(), row.ravel()
         direction = view.rays((column + 0.5) / sx, (row + 0.5) / sy)
         along = -(direction @ view.center)
-        # Rays that miss the sphere say nothing about what is in it.
+        # Rays that miss the sphere carry no information about its inside.
         meets = ((view.center**2).sum() - along**2 < 0.998) & (along > 0)
         rgb.append(pixels.reshape(-1, 3)[meets])
         mask.append(shade.reshape(-1)[meets] if shade is not None else np.full(meets.sum(), 255, np.uint8))
@@ -198,13 +198,13 @@ def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, mas
 
 
 def held_out(count: int) -> list[int]:
-    """Indices of the views kept for measuring: every 8th, none where there are too few to spare."""
+    """Indices of the held-out views: every 8th, or none if there are too few photos."""
     return list(range(4, count, 8)) if count >= 16 else []
 
 
 class Trainer:
-    """One training run of the grids; rays, sparse points, lines of sight and fused depth, from which it starts where
-    there is some, are in the space of the unit sphere."""
+    """One training run of the grids. Rays, sparse points, lines of sight, and fused depth, from which it starts if
+    available, are in the space of the unit sphere."""
 
     def __init__(self, settings: Settings, rays: Rays, supervision: Supervision, seed: int, device: str = "cpu",
                  fused: Fused | None = None):  # fmt: skip
@@ -221,7 +221,7 @@ class Trainer:
         self.cache: Tensor | None = None
 
     def begin(self) -> None:
-        """Makes everything as it is before the first step."""
+        """Sets everything to the state before the first step."""
         self.field = self.fresh()
         self.exposure = Exposure(len(self.rays.center)).to(self.device) if self.settings.exposure else None
         self.optimizer = self.optimizer_of(self.field)
@@ -234,7 +234,7 @@ class Trainer:
         return GridField(settings.size, self.seed, settings.start_radius, self.fused).to(self.device)
 
     def optimizer_of(self, field: Field) -> torch.optim.Adam:
-        """What trains a field, from its first step on."""
+        """The optimiser of a field, in its initial state."""
         assert isinstance(field, GridField)
         networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "bricks", "background"))]
         features = [*field.grids, *(level.values for level in field.bricks), field.background]
@@ -242,18 +242,18 @@ class Trainer:
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
     def exposures(self) -> tuple[list, float]:
-        """The photos' gains and offsets, where they are learned, and their rate."""
+        """The photos' gains and offsets, if they are learned, and their rate."""
         return [] if self.exposure is None else [*self.exposure.parameters()], EXPOSURE_RATE
 
     @property
     def fraction(self) -> float:
-        """Share of the training that is done."""
+        """Finished share of the training."""
         return self.iteration / self.iterations
 
     @property
     def beta(self) -> float | Tensor:
-        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays. With
-        a gradient where it is learned."""
+        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays. It
+        has a gradient if it is learned."""
         start, end = self.settings.beta
         if self.fused is not None:
             start = max(end, min(start, FUSED_BETA * self.settings.size.sampling))
@@ -266,17 +266,17 @@ class Trainer:
 
     @property
     def period(self) -> int:
-        """Steps between updates of the cache; of the iteration alone, so that a resumed run does the same."""
+        """Steps between updates of the cache; depends only on the iteration, so that a resumed run does the same."""
         return EARLY_PERIOD if self.iteration < EARLY else PERIOD
 
     def refresh(self) -> None:
-        """Brings the cached SDF and the active levels up to date."""
+        """Updates the cached SDF and the active levels."""
         assert isinstance(self.settings.size, FieldSize)
-        # Two levels at first, the others one after the other.
+        # Two levels at first, then the others one by one.
         levels = len(self.settings.size.steps)
         used = 1.0 if self.fused is not None else self.fraction / ALL_LEVELS
         self.field.active = min(levels, 2 + int((levels - 2) * used + 0.4))
-        # Colour does not change with direction at first, or a wrong surface is painted right.
+        # At first colour does not depend on direction, because otherwise it could hide a wrong surface.
         self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
         self.cache = sdf_cache(self.field, self.settings.size.sampling)
         if self.fraction >= REFINED and not self.refined:
@@ -284,7 +284,7 @@ class Trainer:
         self.find_filled()
 
     def refine(self) -> None:
-        """Puts bricks wherever the surface is now; the optimiser goes on with the features that were there before."""
+        """Adds bricks where the surface is now; the optimiser keeps its state for existing features."""
         assert isinstance(self.field, GridField) and self.cache is not None
         self.refined = True
         for before, level in zip(self.field.refine(self.cache), self.field.bricks, strict=True):
@@ -300,26 +300,26 @@ class Trainer:
                 self.optimizer.state[now] = state
 
     def find_filled(self) -> None:
-        """Finds free space that the cached SDF fills, once the field is fine enough to have room for a hollow."""
-        # A function of the step at which the cache was made, so that a resumed run finds the same.
+        """Finds free space that the cached SDF fills, as soon as the field is fine enough for a hollow."""
+        # Depends only on the step at which the cache was made, so that a resumed run finds the same.
         made = self.iteration - self.iteration % self.period
         early = self.fused is None and made <= HOLLOWS * self.iterations
         if self.cache is not None and not early and len(self.free):
             self.free.look(self.cache, torch.Generator().manual_seed((self.seed + 11) * 1_000_003 + made))
 
     def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
-        """Samples [R, S] along rays [R, 3], for as many uniforms [R, S]."""
+        """Samples [R, S] along rays [R, 3], one for each of the uniforms [R, S]."""
         if self.cache is None or self.iteration % self.period == 0:
             self.refresh()
         assert self.cache is not None
         return choose_samples(self.cache, origins, directions, float(self.beta), uniforms)
 
     def slope_queries(self, points: Tensor) -> Tensor:
-        """Where the field has to be asked [Q, 3] for its slopes at points [P, 3]."""
+        """Points [Q, 3] at which the field is needed for its slopes at points [P, 3]."""
         return stencil(points, self._cell()).view(-1, 3)
 
     def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
-        """Losses of gradient and curvature from what the field gave at `slope_queries`."""
+        """Losses of gradient and curvature from the field's values at `slope_queries`."""
         width = self._cell()
         gradient, laplacian = differences(sdf.view(-1, 7), width)
         fade = self.settings.curvature * max(0.03, 1 - self.fraction / 0.7)
@@ -348,7 +348,7 @@ class Trainer:
         pick = torch.randint(max(1, len(self.points)), (min(256, len(self.points)),), generator=rng).to(self.device)
         empty, clearance = self.free.pick(512, rng)
         measured = torch.randint(max(1, len(self.depth)), (min(512, len(self.depth)),), generator=rng).to(self.device)
-        # One query for all: each would otherwise fill a gradient buffer as large as the grids.
+        # One query for all, because each query fills a gradient buffer as large as the grids.
         parts = [samples.points.view(-1, 3), slopes, self.points[pick], empty, self.depth[measured]]
         sdf, geometry, more = (
             values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
@@ -367,13 +367,14 @@ class Trainer:
             losses["mask"] = torch.nn.functional.binary_cross_entropy(opacity, wanted) * settings.mask
         losses |= self.slope_losses(sdf[1], more[1])
         if len(pick):
-            # Robust: a wrong point must not pull a surface out of nothing.
+            # Robust, so that a wrong point does not create a surface.
             pull = self.point_weights[pick] * sdf[2].abs().clamp_max(0.1)
             losses["sparse"] = pull.mean() * settings.sparse
         if len(empty):
             losses["free"] = torch.relu(clearance - sdf[3]).mean() * settings.free
         if len(measured):
-            # It gives the shape early on. Later, colours see finer than the sensor's noise, though not than stereo.
+            # It gives the shape early on. Later, colours resolve finer detail than the sensor's noise, though not finer
+            # than stereo.
             fade = max(0.03, 1 - self.fraction / 0.5) if self.fused is None else 1.0
             losses["depth"] = sdf[4].abs().clamp_max(0.1).mean() * settings.depth * fade
         self.optimizer.zero_grad(set_to_none=True)
@@ -394,7 +395,7 @@ class Trainer:
         return torch.cat([free, near[torch.randint(len(near), (count,), generator=rng).to(self.device)]])
 
     def save(self, path: Path) -> None:
-        """Writes everything needed to go on, atomically."""
+        """Writes everything needed to resume, atomically."""
         tensors = {f"field.{k}": v.detach().contiguous() for k, v in self.field.state_dict().items()}
         for number, parameter in enumerate(self._parameters()):
             for key, value in self.optimizer.state.get(parameter, {}).items():
@@ -408,12 +409,12 @@ class Trainer:
             "active": self.field.active, "view_dependence": self.field.view_dependence, "refined": self.refined,
             "size": str(self.settings.size),
         }  # fmt: skip
-        # As bytes: safetensors' own writer does not raise OSError where the disk is full.
+        # As bytes, because safetensors' own writer does not raise OSError if the disk is full.
         write_bytes(path, safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
 
     def load(self, path: Path) -> bool:
-        """Goes on from a checkpoint; False where there is none. Raises SdfsimError where there is one that cannot be
-        read or is of another field; then the training is as before its first step."""
+        """Resumes from a checkpoint; False if there is none. Raises SdfsimError if a checkpoint cannot be read or
+        belongs to another field; the training is then in the state before its first step."""
         if not path.exists():
             return False
         try:
@@ -446,7 +447,8 @@ class Trainer:
 
 
 class MlpTrainer(Trainer):
-    """One training run of the VolSDF paper's field: error-bounded samples, learned beta; arguments as of `Trainer`."""
+    """One training run of the VolSDF paper's field: error-bounded samples, learned beta; the arguments are those of
+    `Trainer`."""
 
     field: MlpField
     converged = 0.0  # share of the last step's rays whose opacity is bounded
@@ -471,7 +473,7 @@ class MlpTrainer(Trainer):
         self.cache = sdf_cache(self.field, self.settings.size.sampling)  # only for pictures
 
     def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
-        """Samples [R, S] that bound the error of the opacity, for as many uniforms [R, S]."""
+        """Samples [R, S] that bound the error of the opacity, one for each of the uniforms [R, S]."""
         enter, leave = sphere_interval(origins, directions)
 
         def sdf_at(rays: Tensor, distance: Tensor) -> Tensor:
@@ -484,7 +486,7 @@ class MlpTrainer(Trainer):
         return samples_at(distance, enter, leave, origins, directions, near)
 
     def slope_queries(self, points: Tensor) -> Tensor:
-        return points  # The network hands on its own gradient.
+        return points  # The network returns its own gradient.
 
     def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
         return {"eikonal": ((more[:, 3:].norm(dim=1) - 1) ** 2).mean() * self.settings.eikonal}
@@ -497,7 +499,8 @@ def _groups(*groups: tuple[list, float]) -> list[dict]:
 
 @dataclass
 class Trained:
-    """A trained field, its density scale, the way from the world of the poses to its unit sphere, and its report."""
+    """A trained field, its density scale, the transform from the world of the poses to its unit sphere, and its
+    report."""
 
     field: Field
     beta: float
@@ -512,10 +515,10 @@ def train(
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
-    The poses are as structure-from-motion left them. The budget, s, includes training before a kill: the number of
-    steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Where the checkpoint of a killed run
-    cannot be read, training begins again, and a note of the report says so. Raises SdfsimError where the loss is no
-    longer finite.
+    The poses are those of structure-from-motion. The budget, s, includes training before a kill: the number of steps is
+    reduced to fit. Without `threads` the CPU uses the number that is fastest now. If the checkpoint of a killed run
+    cannot be read, training begins again, and a note in the report says so. Raises SdfsimError if the loss is no longer
+    finite.
     """
     photos = load_photos(photos_folder)
     masked = all(photo.mask for photo in photos)
@@ -550,7 +553,7 @@ def train(
     resumed, notes = False, []
     try:
         resumed = trainer.load(checkpoint)
-    except SdfsimError as error:  # Nothing else can come of what is left of the killed run.
+    except SdfsimError as error:  # The rest of the killed run is of no use.
         notes = [f"what a killed run had trained is lost: {error.message}; training began again"]
         on_progress(0.0, notes[0])
     per_step = calibrate(make(settings, trainer.rays, supervision, seed, device, fused), threads)
@@ -599,7 +602,7 @@ def train(
 def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
           on_progress: Progress = silent) -> dict:  # fmt: skip
     """PSNR of held-out views, in normalised space, for the report, at the training resolution (`psnr_px` on the long
-    side); empty where none shows anything of the unit sphere. Of large photos one pixel of `SCORED` along each side is
+    side); empty if none shows any part of the unit sphere. For large photos one in `SCORED` pixels along each side is
     rendered; writes these pictures to `out`/held_out."""
     rays = load_rays(views, photos_folder, trainer.settings.long_side, masks=False).to(trainer.device)
     shown: list[int] = rays.view.unique().tolist()
@@ -622,8 +625,8 @@ def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *
 
 @torch.no_grad()
 def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) -> tuple[float, np.ndarray]:
-    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere; of large photos
-    one of `SCORED` along each side."""
+    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere; for large photos
+    one in `SCORED` pixels along each side."""
     assert trainer.cache is not None
     every = SCORED if rays.sizes.max() >= SCORED * LEAST_SCORED else 1
     index = torch.nonzero((rays.view == number) & (rays.pixel % every == every // 2).all(1))[:, 0]
@@ -646,17 +649,18 @@ def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) 
 
 
 def calibrate(probe: Trainer, threads: int | None) -> float:
-    """Seconds a step, late in training; sets the number of threads to `threads`, or to the fastest."""
+    """Seconds per step, late in training; sets the number of threads to `threads`, or to the fastest."""
     probe.iteration, probe.iterations = 9701, 10_000  # Late in training all levels are active.
     probe.refresh()
     return choose_threads(probe.step, threads if probe.device == "cpu" else torch.get_num_threads())
 
 
 def paced(trainer: Trainer, settings: Settings, budget: float, elapsed: float, done: int) -> int:
-    """Steps that fit into the budget (s) after `done` steps in `elapsed` s, as the pace changes with other work."""
+    """Steps that fit into the budget (s) after `done` steps in `elapsed` s, because the pace changes with other
+    work."""
     left = int((budget - elapsed) / (elapsed / done))
     wanted = trainer.iteration + left
-    if left > 0:  # Schedules follow the share that is done: they must not jump.
+    if left > 0:  # Schedules follow the finished share, which must not jump.
         wanted = min(max(wanted, int(0.9 * trainer.iterations)), int(1.1 * trainer.iterations))
     return max(trainer.iteration, min(FEWEST_STEPS, settings.iterations), min(wanted, settings.iterations))
 
@@ -674,7 +678,7 @@ def save_field(trained: Trained, folder: Path) -> None:
 
 
 def load_field(folder: Path) -> Trained:
-    """Reads what `train` wrote. Raises SdfsimError: no readable field in `folder`."""
+    """Reads the output of `train`. Raises SdfsimError if `folder` has no readable field."""
     try:
         about = json.loads((folder / "field.json").read_text(encoding="utf-8"))
         size, radius = about["size"], float(about["start_radius"])

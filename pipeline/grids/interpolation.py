@@ -1,7 +1,7 @@
 """Trilinear interpolation of grids that are learned.
 
-On a CPU it is compiled. torch's `grid_sample` does the same for volumes, with one thread a volume and channel by
-channel; elsewhere the eight corners of a point are rows of a table, summed by `embedding_bag`.
+On a CPU it is compiled, because torch's `grid_sample` uses one thread per volume, channel by channel. On other devices
+the eight corners of a point are rows of a table, summed by `embedding_bag`.
 """
 
 from typing import Any
@@ -15,30 +15,30 @@ from torch.nn import functional
 
 from sdfsim.physics import solver as kernels
 
-NEAR = 2.0  # cells from a surface within which all bricks are there
+NEAR = 2.0  # cells from a surface within which all bricks exist
 
 with kernels.kept():
     from pipeline.grids.trilinear import BRICK, gather, gather_with_threads, scatter, scatter_with_threads
 
-WHOLE = torch.zeros((0, 0, 0), dtype=torch.int32)  # the bricks of a grid whose rows are all there
+WHOLE = torch.zeros((0, 0, 0), dtype=torch.int32)  # the bricks of a complete grid
 
 
 def interpolate(grid: Tensor, points: Tensor) -> Tensor:
-    """Trilinear values [P, C] of a grid [n, n, n, C] (z, y, x order) over [-1, 1]^3 at points [P, 3] (x, y, z), outside
-    those of its border. Differentiable in the grid, not in the points."""
+    """Trilinear values [P, C] of a grid [n, n, n, C] (z, y, x order) over [-1, 1]^3 at points [P, 3] (x, y, z);
+    outside, those of its border. Differentiable in the grid, not in the points."""
     return interpolate_bricks(grid.reshape(-1, grid.shape[3]), WHOLE, grid.shape[0], points)
 
 
 def interpolate_bricks(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
-    """The same as `interpolate` for a grid [side, side, side, C] that is there in bricks only: rows of a table [R, C]
-    by `bricks` [m, m, m] int32 (z, y, x order), the numbers of those that are there, else -1; elsewhere it is 0."""
+    """The same as `interpolate` for a grid [side, side, side, C] that exists only in bricks: rows of a table [R, C] by
+    `bricks` [m, m, m] int32 (z, y, x order), the numbers of existing bricks, else -1; outside of bricks it is 0."""
     if table.is_cuda:
         return by_rows(table, bricks, side, points)
     return _OnCpu.apply(table, bricks, side, points.detach().contiguous())  # type: ignore[no-any-return]
 
 
 def by_rows(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
-    """What `interpolate_bricks` gives, in torch alone, for any device."""
+    """The same as `interpolate_bricks` in pure torch, for any device."""
     rows, weights = _corners(side, points)
     if len(bricks):
         x, y, z = rows % side, rows // side % side, rows // side**2
@@ -49,8 +49,8 @@ def by_rows(table: Tensor, bricks: Tensor, side: int, points: Tensor) -> Tensor:
 
 
 def near_bricks(distance: np.ndarray, side: int) -> np.ndarray:
-    """Bricks [B, 3] int16 (z, y, x) of a grid with `side` places a side that hold places within `NEAR` cells of the
-    zero level of a signed distance [n, n, n] over [-1, 1]^3."""
+    """Bricks [B, 3] int16 (z, y, x) of a grid with `side` points per side that contain points within `NEAR` cells of
+    the zero level of a signed distance [n, n, n] over [-1, 1]^3."""
     cell, step = 2 / (side - 1), BRICK * 2 / (side - 1)
     middles = (np.arange(-(-side // BRICK)) + 0.5) * step - 0.5 * cell - 1
     at = (middles + 1) * (len(distance) - 1) / 2
@@ -94,8 +94,8 @@ class _OnCpu(torch.autograd.Function):
 
 
 def _with_threads(work: Any, *given: Any) -> None:
-    """Compiled work on as many threads as torch uses, if there are so many. Not for one: threads do not survive a
-    fork."""
+    """Compiled work on as many threads as torch uses, if available. Not for one thread, because threads do not survive
+    a fork."""
     before = numba.get_num_threads()
     count = min(torch.get_num_threads(), before)
     numba.set_num_threads(count)
@@ -104,8 +104,8 @@ def _with_threads(work: Any, *given: Any) -> None:
 
 
 def _corners(side: int, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Of the cells that points [P, 3] are in, of a grid with so many places a side: the eight corners as numbers in z,
-    y, x order, and their weights, both [P, 8]."""
+    """For the cells of points [P, 3] in a grid with this many points per side: the eight corners as numbers in z, y, x
+    order, and their weights, both [P, 8]."""
     place = ((points.detach().t() + 1) * (0.5 * (side - 1))).clamp(0, side - 1)
     cell = place.long().clamp_max(side - 2)
     x1, y1, z1 = place - cell
@@ -117,7 +117,7 @@ def _corners(side: int, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _WeightedRows(torch.autograd.Function):
-    """Sums of rows of a table; unlike `embedding_bag`'s own, its gradient does not sort."""
+    """Sums of rows of a table; unlike the gradient of `embedding_bag`, its gradient does not sort."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:

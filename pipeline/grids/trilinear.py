@@ -1,7 +1,7 @@
 """Trilinear interpolation and its gradient, compiled for the CPU: `interpolation.py` has the same in torch.
 
-A grid of `side` places a side is a table [R, C] of its rows: all of them in z, y, x order, or those of the bricks that
-are there. `bricks` [m, m, m] int32 has the brick's number at each place, -1 for none; it is empty where all rows are.
+A grid of `side` points per side is a table [R, C] of its rows: all of them in z, y, x order, or those of existing
+bricks. `bricks` [m, m, m] int32 has the brick's number at each place, -1 for none; it is empty if all rows exist.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ def _cell(points: Any, p: int, side: int) -> Any:
 
 @njit(cache=True, inline="always")
 def _row(bricks: Any, side: int, i: int, j: int, k: int) -> Any:
-    """The row of a place in the table; below 0 where there is none."""
+    """The row of a place in the table; below 0 if there is none."""
     if bricks.shape[0] == 0:
         return (k * side + j) * side + i
     brick = bricks[k // BRICK, j // BRICK, i // BRICK]
@@ -54,9 +54,9 @@ def gather(table: Any, bricks: Any, side: int, points: Any, found: Any, first: i
 
 @njit(cache=True)
 def scatter(gradient: Any, bricks: Any, side: int, points: Any, given: Any, shares: int, share: int) -> None:
-    """Adds what gradients [P, C] at points [P, 3] are of each row of a grid to `gradient` [R, C].
+    """Adds gradients [P, C] at points [P, 3] to `gradient` [R, C] of each row of a grid.
 
-    A share has every so many layers and adds in the order of points, so that sums do not depend on how many there are.
+    Each share has every n-th layer and adds in the order of points, so that sums do not depend on the number of shares.
     """
     for p in range(len(points)):
         i, j, k, x, y, z = _cell(points, p, side)
@@ -86,6 +86,6 @@ def gather_with_threads(table: Any, bricks: Any, side: int, points: Any, found: 
 
 @njit(cache=True, parallel=True)
 def scatter_with_threads(gradient: Any, bricks: Any, side: int, points: Any, given: Any, threads: int) -> None:
-    """The same as `scatter`, a share a thread."""
+    """The same as `scatter`, with one share per thread."""
     for t in prange(threads):
         scatter(gradient, bricks, side, points, given, threads, t)

@@ -1,4 +1,4 @@
-"""Image files with more than 8 bits a channel, or with floats: read as they are, and brought to 8 bits."""
+"""Reads image files with more than 8 bits per channel, or with floats, and converts them to 8 bits."""
 
 import struct
 from collections.abc import Callable, Sequence
@@ -14,12 +14,12 @@ from sdfsim.base.errors import SdfsimError
 
 PNG, TIFFS = b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 OTHERWISE = "save it as PNG, or as TIFF of 8 or 16 bits, channels interleaved, uncompressed or with LZW or ZIP"
-BITS = (8, 10, 12, 14, 16, 32)  # that integers may have, however wide the file stores them
-BEYOND = 16.0  # floats up to this many times white are highlights, larger ones count like integers
-# A photo whose range is a smaller share of that of its set is of another kind, not a dark one.
+BITS = (8, 10, 12, 14, 16, 32)  # of integers, whatever the width in the file
+BEYOND = 16.0  # floats up to this many times white are highlights; larger ones are treated like integers
+# A photo whose range is a smaller share of its set's range is of a different kind, not a dark photo.
 OTHER = 1 / 16
 GREYS, RGB, ALPHA = (0, 1), 2, (1, 2)  # of the tags PhotometricInterpretation (0: zero is white) and ExtraSamples
-# OpenCV turns TIFF files upright; by their orientation, what gives the pixels as stored again.
+# OpenCV turns TIFF files upright; for each orientation, the turn back to the stored pixels.
 STORED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: np.fliplr, 3: partial(np.rot90, k=2), 4: np.flipud, 5: partial(np.swapaxes, axis1=0, axis2=1), 6: np.rot90,
     7: lambda pixels: np.rot90(pixels, 2).swapaxes(0, 1), 8: partial(np.rot90, k=-1),
@@ -28,18 +28,18 @@ STORED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass(frozen=True)
 class Deep:
-    """What the header of a file with more than 8 bits a channel says."""
+    """The header of a file with more than 8 bits per channel."""
 
     size: tuple[int, int]  # width and height, px
-    known: bool = True  # whether PIL knows this kind of file, though not all its bits
-    planes: bool = False  # whether its channels follow one another
-    alpha: bool = True  # whether a fourth channel says what is transparent
+    known: bool = True  # whether PIL supports this kind of file, though not all its bits
+    planes: bool = False  # whether its channels are stored one after the other
+    alpha: bool = True  # whether a fourth channel is transparency
     inverted: bool = False  # whether zero is white
-    orientation: int | None = None  # as EXIF has it; None of a PNG, where EXIF says so itself
+    orientation: int | None = None  # as in EXIF; None for a PNG, whose EXIF is read later
 
 
 def deep_header(path: Path) -> Deep | None:
-    """What the header says; None of a file of 8 bits, of colours other than grey and RGB, and of what is no PNG or
+    """The header of a file; None for 8 bits, for colours other than grey and RGB, and for files other than PNG and
     TIFF."""
     try:
         with open(path, "rb") as file:
@@ -64,12 +64,12 @@ def deep_header(path: Path) -> Deep | None:
             orientation=int(tags.get(ExifTags.Base.Orientation, 1)),
         )  # fmt: skip
     except (OSError, SyntaxError, ValueError, KeyError, TypeError, IndexError, struct.error):
-        return None  # PIL says what is wrong with it.
+        return None  # PIL reports the fault later.
 
 
 def deep_values(path: Path, header: Deep) -> np.ndarray:
-    """The numbers of a file, as stored: grey [H, W], RGB [H, W, 3] or RGBA [H, W, 4]. Raises SdfsimError where it is
-    damaged, or stores them in a way that is not read."""
+    """The numbers of a file, as stored: grey [H, W], RGB [H, W, 3] or RGBA [H, W, 4]. Raises SdfsimError if it is
+    damaged or its layout is not supported."""
     import cv2
 
     if header.planes:
@@ -94,19 +94,19 @@ def deep_values(path: Path, header: Deep) -> np.ndarray:
 
 
 def white_of(values: np.ndarray) -> float:
-    """What stands for white where these are the largest values: floats count from 0 to 1, integers as many bits as they
+    """The value of white, given the largest values: 1 for floats; for integers the maximum of the bits that they
     need."""
     most = float(np.nanmax(values, initial=0.0, where=np.isfinite(values)))
     if values.dtype.kind == "f" and most <= BEYOND:
         return max(1.0, most)
-    signed = values.dtype.kind == "i"  # and half as many numbers above 0
+    signed = values.dtype.kind == "i"  # with half as many numbers above 0
     whites = [2.0 ** (bits - (signed and bits >= 16)) - 1 for bits in BITS]
     return next((white for white in whites if most <= white), most)
 
 
 def common_white(paths: Sequence[Path]) -> dict[Path, float]:
-    """White of each photo of a set that has more than 8 bits: the same for all, so that a dark photo stays dark beside
-    the others. Raises as `deep_values` does."""
+    """White of each photo in a set with more than 8 bits: the same for all, so that a dark photo stays darker than the
+    others. Raises the errors of `deep_values`."""
     own: dict[Path, float] = {}
     for path in paths:
         if (header := deep_header(path)) is not None:
@@ -116,7 +116,7 @@ def common_white(paths: Sequence[Path]) -> dict[Path, float]:
 
 
 def eight_bits(values: np.ndarray, header: Deep, white: float | None = None) -> np.ndarray:
-    """Numbers from `deep_values` as uint8 of the same shape; `white` is what their own range says where not given."""
+    """Numbers from `deep_values` as uint8 of the same shape; `white` comes from their own range if not given."""
 
     def scaled(part: np.ndarray, most: float) -> np.ndarray:
         return (255 * np.nan_to_num(part / np.float32(most), posinf=1.0).clip(0, 1) + 0.5).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Captures of phones that know their depth, gravity and metres: Record3D, Polycam, and transforms.json with depth."""
+"""Captures of phones with depth, gravity and metric scale: Record3D, Polycam, and transforms.json with depth."""
 
 import json
 import os
@@ -21,17 +21,17 @@ from pipeline.inputs.known_cameras import DepthFile, KnownCamera, lens_of, posed
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, visible
 
-CAPTURE = "capture.json"  # what `Capture` says, in the folder of the photos stage
+CAPTURE = "capture.json"  # file of `Capture`, in the folder of the photos stage
 LARGEST = 32 << 30  # bytes of a capture
 ARCHIVES = {".r3d", ".zip"}
-MOST = 100  # frames that are used of a recording
-DEEPEST = 4  # folders below the one that was given, in which a capture or photos are looked for
-FOLDERS = 2000  # at one depth; where there are more, nobody meant to give all of them
-TRIED = 5  # frames of a stretch that are looked at for the sharpest
-TURN = 1.0  # m of way that a turn by one radian counts as, when frames are spread along it
+MOST = 100  # frames of a recording that are used
+DEEPEST = 4  # levels of folders below the given one in which a capture or photos may lie
+FOLDERS = 2000  # at one level; more are surely given by mistake
+TRIED = 5  # frames of a stretch among which the sharpest is chosen
+TURN = 1.0  # m of path that a turn by one radian counts as, when frames are spread along the path
 POLYCAM = ("corrected_cameras", "cameras")  # folders of its cameras, the better ones first
 UP = (0.0, 1.0, 0.0)  # ARKit measures gravity, and its worlds have y up
-FARTHEST = 8.0  # m; a phone's sensor guesses beyond
+FARTHEST = 8.0  # m; beyond this a phone's sensor is unreliable
 # Neighbours whose depths differ by more than this share lie on both sides of an edge, which sensors smear.
 EDGE = 0.04
 BELIEVED = 0.5  # of the highest confidence
@@ -40,15 +40,15 @@ EXTRA = "install what reads it: bash scripts/setup.sh record3d (or pip install '
 
 @dataclass(frozen=True)
 class Capture:
-    """What a capture with depth says about its world, whose unit is the metre."""
+    """The world of a capture with depth, in metres."""
 
     app: str  # what wrote it
-    up: tuple[float, float, float] | None  # [3] against gravity, in the world of its cameras; None: not said
+    up: tuple[float, float, float] | None  # [3] against gravity, in the world of its cameras; None: unknown
 
 
 def find_capture(folder: Path, *, deep: bool = False) -> Path | None:
-    """The folder of a Record3D or Polycam export in `folder`, where `deep` also farther below; None where there is
-    none. Raises SdfsimError where there are several."""
+    """The folder of a Record3D or Polycam export in `folder`, if `deep` also in folders below it; None if there is
+    none. Raises SdfsimError if there are several."""
     near = [folder, folder / "EXR_RGBD", folder / "keyframes"]
     for places in [*([place] for place in near), *(levels(folder) if deep else [])]:
         found = [place for place in places if _is_capture(place)]
@@ -69,7 +69,7 @@ def _jsons(folder: Path) -> list[Path]:
 
 
 def levels(folder: Path) -> Iterator[list[Path]]:
-    """A folder, those in it, those in these and so on, none that are hidden or cannot be read."""
+    """A folder, and its subfolders level by level, without hidden and unreadable ones."""
     level = [folder]
     for _ in range(DEEPEST + 1):
         yield level
@@ -83,8 +83,8 @@ def levels(folder: Path) -> Iterator[list[Path]]:
 
 
 def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
-    """What a Record3D or Polycam export says of its world, and its cameras, whose names are paths in `folder`. Raises
-    SdfsimError where it is damaged."""
+    """The world of a Record3D or Polycam export, and its cameras, whose names are paths in `folder`. Raises
+    SdfsimError if it is damaged."""
     try:
         if _metadata(folder).is_file():
             return Capture("Record3D", UP), _record3d(folder)
@@ -100,8 +100,8 @@ def _metadata(folder: Path) -> Path:
 def _record3d(folder: Path) -> list[KnownCamera]:
     """Record3D: a `.r3d` unpacked (`rgbd/N.jpg`, `N.depth`, `N.conf`), or its EXR export (`rgb/N.jpg`, `depth/N.exr`).
 
-    `metadata` holds the matrix K by columns, and a pose a frame: the quaternion x, y, z, w of the camera in the world,
-    OpenGL axes, and its position in metres.
+    `metadata` holds the matrix K by columns, and one pose per frame: the quaternion x, y, z, w of the camera in the
+    world, OpenGL axes, and its position in metres.
     """
     about: dict[str, Any] = json.loads(_metadata(folder).read_bytes())
     same = np.reshape(about["K"], (3, 3)).T
@@ -126,15 +126,15 @@ def _record3d(folder: Path) -> list[KnownCamera]:
 
 
 def depth_file(path: Path, confidence: Path, shape: tuple[int, int] | None = None) -> DepthFile | None:
-    """Depth that may be there, with a confidence that may be."""
+    """The depth file of a frame, if it exists, with its confidence file, if it exists."""
     return DepthFile(path, None, confidence if confidence.is_file() else None, shape) if path.is_file() else None
 
 
 def _polycam(folder: Path) -> list[KnownCamera]:
-    """Polycam's raw data: a JSON a camera with its matrix as t_00 to t_23 (OpenGL axes, y up), depth in millimetres.
-    The better cameras do not say how large their photos are."""
+    """Polycam's raw data: one JSON per camera with its matrix as t_00 to t_23 (OpenGL axes, y up), depth in
+    millimetres. The corrected cameras do not give the size of their photos."""
     kinds = [folder / name for name in POLYCAM if _jsons(folder / name)]
-    # The better cameras are of photos of their own, which may not have been exported.
+    # The corrected cameras have separate photos, which may not have been exported.
     cameras = next((kind for kind in kinds if _images_of(kind).is_dir()), kinds[0])
     there = visible(_images_of(cameras)) if _images_of(cameras).is_dir() else []
     images = {path.stem: path for path in there if path.suffix.lower() in (".jpg", ".jpeg", ".png")}
@@ -157,7 +157,7 @@ def _images_of(cameras: Path) -> Path:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks the files of a zipped capture. Raises SdfsimError where it is damaged or no zip, too large once unpacked,
+    """Unpacks the files of a zipped capture. Raises SdfsimError if it is damaged or not a zip, too large once unpacked,
     or has names that lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
@@ -180,7 +180,7 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def spread(photos: Sequence[Path], cameras: dict[Path, KnownCamera], most: int = MOST) -> list[Path]:
-    """At most `most` photos of a recording, evenly along the way of its camera, of each stretch the sharpest."""
+    """At most `most` photos of a recording, evenly along the path of its camera: the sharpest of each stretch."""
     if len(photos) <= most:
         return list(photos)
     centers = np.array([cameras[p].center for p in photos])
@@ -197,7 +197,7 @@ def spread(photos: Sequence[Path], cameras: dict[Path, KnownCamera], most: int =
 
 
 def load_capture(folder: Path) -> Capture | None:
-    """What the capture behind a folder of prepared photos says; None: these were just photos."""
+    """The capture from which a folder of prepared photos comes; None for plain photos."""
     path = Path(folder) / CAPTURE
     if not path.exists():
         return None
@@ -205,8 +205,8 @@ def load_capture(folder: Path) -> Capture | None:
 
 
 def read_depth(file: DepthFile) -> np.ndarray:
-    """Depth [H, W] m along the optical axis; 0 where the sensor had none, was not sure, or saw an edge. Raises
-    SdfsimError where the file is absent, damaged, or needs a package that is not installed."""
+    """Depth [H, W] m along the optical axis; 0 where the sensor had no value, low confidence, or an edge. Raises
+    SdfsimError if the file is absent, damaged, or needs a package that is not installed."""
     counts = _read(file.path, file.shape, np.float32)
     unit = file.unit or (1e-3 if counts.dtype.kind in "ui" else 1.0)
     depth = counts.astype(np.float32) * np.float32(unit)
@@ -226,7 +226,7 @@ def read_depth(file: DepthFile) -> np.ndarray:
 
 
 def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:
-    """The numbers [H, W] of a file, `raw` ones where it does not say what they are."""
+    """The numbers [H, W] of a file, in the form of `raw` if the file does not name its type."""
     try:
         if path.suffix in (".depth", ".conf"):  # of Record3D
             import imagecodecs

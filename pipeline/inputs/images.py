@@ -1,4 +1,4 @@
-"""One image file -> upright pixels, its mask, what EXIF says about the lens, and whether it is sharp and well lit."""
+"""One image file -> upright pixels, its mask, the lens data of EXIF, and whether it is sharp and well lit."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,32 +14,32 @@ register_heif_opener(thumbnails=False)
 
 MIN_SIDE = 64
 MAX_PIXELS = 200_000_000
-# As PIL calls them. It knows others as well, and starts a program for some of them, whatever the file's name says.
+# PIL's names. PIL reads more formats, and starts a program for some of them, whatever the file's name is.
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "AVIF", "HEIF")
-# Photos with a mask are shown on this grey; it has no texture, so it adds no features.
+# Photos with a mask get this grey background; it has no texture, so it adds no features.
 BACKDROP = 0.5
 # Measured on three real and four rendered sets: photos in focus have 0.19 to 0.6, blurred by 1.5 px less than 0.08.
 BLURRED = 0.1
-BLOCKS = 12  # a side, fewer of small photos
-DARK = 0.1  # of white, that a hundredth of a photo has to reach
+BLOCKS = 12  # per side, fewer for small photos
+DARK = 0.1  # of white: a hundredth of a photo has to reach this
 
 
 @dataclass(frozen=True)
 class ReadPhoto:
-    """A photo as it was read."""
+    """A photo after reading."""
 
     pixels: np.ndarray  # RGB [H, W, 3] uint8
-    # width and height of the whole photo before it was made smaller, px; turned as `pixels` are
+    # width and height of the whole photo before it was reduced, px; turned like `pixels`
     original: tuple[int, int]
     mask: np.ndarray | None = None  # [H, W] uint8 (255 = object), or None
     focal: float | None = None  # prior from EXIF, px of `pixels`, or None
-    camera: str = ""  # make and model, empty where unknown
+    camera: str = ""  # make and model, empty if unknown
     labels: np.ndarray | None = None  # [H, W] uint8, see `Labels.of`, or None
 
 
 def exif_focal(image: Image.Image) -> tuple[float | None, str]:
-    """Focal length in units of the image's longer side, and the camera's name, from EXIF. A photo whose shape is not
-    the one that the camera wrote down was cropped, and its focal length is not known."""
+    """Focal length in units of the image's longer side, and the camera's name, from EXIF. If the aspect ratio differs
+    from that in EXIF, the photo was cropped and its focal length is unknown."""
     try:
         exif, tags = image.getexif(), ExifTags.Base
         detail = exif.get_ifd(ExifTags.IFD.Exif)
@@ -55,21 +55,21 @@ def exif_focal(image: Image.Image) -> tuple[float | None, str]:
         if number(tags.FocalLengthIn35mmFilm) > 0:  # of a frame that is 36 mm wide
             return number(tags.FocalLengthIn35mmFilm) / 36.0, camera
         unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(number(tags.FocalPlaneResolutionUnit)), 25.4)
-        # The density is that of the photo as written: a copy at half the size has half of it.
+        # The density is that of the original photo: a copy at half the size has half of it.
         ratio = number(tags.FocalLength) / unit * number(tags.FocalPlaneXResolution) / (longer or max(image.size))
         return (ratio if 0.3 < ratio < 20 else None), camera
     except (ValueError, TypeError, ZeroDivisionError, OSError, SyntaxError):
-        return None, ""  # Broken EXIF is common and never worth failing for.
+        return None, ""  # Broken EXIF is common and no reason to fail.
 
 
 def read_photo(
     path: Path, long_side: int, mask: Path | None = None, shape: float | None = None, white: float | None = None
 ) -> ReadPhoto:
-    """Reads one photo upright and no larger than `long_side` px; a mask file goes before an alpha channel.
+    """Reads one photo upright and no larger than `long_side` px; a mask file has priority over an alpha channel.
 
-    Where a known camera has another `shape`, width over height, than the upright photo, the photo stays as stored.
-    `white` is what a file of more than 8 bits has for white (see `common_white`), else what its own range says. Raises
-    SdfsimError, with the file's name, where it is no image, truncated, too small or too large.
+    If a known camera has a different `shape`, width over height, from the upright photo, the photo stays as stored.
+    `white` is the value of white in a file of more than 8 bits (see `common_white`), by default from its own range.
+    Raises SdfsimError, with the file's name, if it is no image, truncated, too small or too large.
     """
     image, original, focal, camera = shown(path, long_side, white)
     turned = ImageOps.exif_transpose(image)
@@ -95,8 +95,9 @@ def read_photo(
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """A mask [H, W] uint8, grey or with alpha, white is the object, at the size (width, height) of its upright photo;
-    of 0 and 1 alone, 1 is the object. Raises SdfsimError where it cannot be read or is not shaped like the photo."""
+    """A mask [H, W] uint8, grey or with alpha, at the size (width, height) of its upright photo. White is the object;
+    if a mask has only 0 and 1, 1 is the object. Raises SdfsimError if it cannot be read or is not shaped like the
+    photo."""
     image = turned_like(shown(path, max(size))[0], size, path)
     grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
     if grey.getextrema() == (0, 1):
@@ -105,7 +106,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image.Image:
-    """A mask as its photo of this size (width, height) is turned: upright, or as stored. Raises SdfsimError where
+    """A mask turned like its photo of this size (width, height): upright, or as stored. Raises SdfsimError if
     neither is shaped like the photo."""
     for image in (ImageOps.exif_transpose(stored), stored):
         if misfit(image, size[0] / size[1]) < 0.02:
@@ -117,7 +118,7 @@ def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image
 def shown(
     path: Path, long_side: int, white: float | None = None
 ) -> tuple[Image.Image, tuple[int, int], float | None, str]:
-    """What `decoded` gives, brought to 8 bits a channel where the file has more."""
+    """The result of `decoded`, reduced to 8 bits per channel if the file has more."""
     header = deep_header(path)
     if header is None:
         return decoded(path, long_side)
@@ -133,7 +134,7 @@ def shown(
 
 
 def stored_size(path: Path) -> tuple[int, int]:
-    """Width and height, px, of a photo as stored. Raises OSError where it is no image."""
+    """Width and height, px, of a photo as stored. Raises OSError if it is not an image."""
     with Image.open(path, formats=FORMATS) as image:
         return image.size
 
@@ -150,14 +151,14 @@ def check_size(path: Path, size: tuple[int, int]) -> None:
 def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
     """A decoded image, its size in the file, its focal length in longer sides, and its camera."""
     limit = Image.MAX_IMAGE_PIXELS
-    Image.MAX_IMAGE_PIXELS = None  # Our own limit below, before anything is decoded.
+    Image.MAX_IMAGE_PIXELS = None  # Our own limit below applies before decoding.
     try:
         with Image.open(path, formats=FORMATS) as image:
             size = image.size
             check_size(path, size)
             focal, camera = exif_focal(image)
             if image.format == "JPEG":
-                # The decoder may skip to a smaller size, but no smaller than twice what is wanted.
+                # The decoder may reduce the size, but not below twice the wanted size.
                 image.draft("RGB", (2 * long_side, 2 * long_side))
             image.load()
             return image, size, focal, camera
@@ -178,18 +179,18 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
 
 
 def reduced(size: tuple[int, int], long_side: int) -> tuple[int, int]:
-    """Width and height, px, of a picture that is made no larger than `long_side`."""
+    """Width and height, px, of a picture reduced to `long_side`."""
     scale = min(1.0, long_side / max(size))
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def misfit(image: Image.Image, shape: float) -> float:
-    """By what share an image is wider or narrower than a shape, width over height."""
+    """Share by which an image is wider or narrower than a shape, width over height."""
     return abs(image.width / image.height / shape - 1)
 
 
 def brightness(picture: ReadPhoto) -> float:
-    """How light the lightest hundredth of a photo is, or of its object where it has a mask; from 0 to 1."""
+    """Brightness of the lightest hundredth of a photo, or of its object if it has a mask; from 0 to 1."""
     grey = picture.pixels.astype(np.float32).mean(-1) / 255
     inside = grey if picture.mask is None else grey[picture.mask >= 128]
     return float(np.quantile(inside, 0.99)) if inside.size else 1.0
@@ -203,10 +204,10 @@ def block_means(values: np.ndarray, blocks: int) -> np.ndarray:
 
 
 def sharpness(pixels: np.ndarray) -> float:
-    """How strong edges are at the finest scale against a scale eight times as coarse, in RGB [H, W, 3] uint8.
+    """Strength of edges at the finest scale relative to a scale eight times as coarse, in RGB [H, W, 3] uint8.
 
-    Looks only at the tenth of the picture's blocks with the most edges, so that an object in focus before a soft
-    background counts as sharp. 0 where there is nothing to see.
+    Uses only the tenth of the picture's blocks with the most edges, so that an object in focus in front of a soft
+    background counts as sharp. 0 if there are no edges.
     """
     import cv2
 

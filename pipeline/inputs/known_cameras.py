@@ -1,4 +1,4 @@
-"""Cameras that others have found: transforms.json (NeRF, instant-ngp, nerfstudio) and COLMAP models, text or binary."""
+"""Cameras from other programs: transforms.json (NeRF, instant-ngp, nerfstudio) and COLMAP models, text or binary."""
 
 import codecs
 import json
@@ -16,8 +16,8 @@ from pipeline.cameras import View
 from pipeline.inputs.images import ReadPhoto
 from sdfsim.base.errors import SdfsimError
 
-# COLMAP's camera models, by number: name, and the names of their parameters; none of those that OpenCV does not know.
-# A transforms.json has the same names, with fl_x and fl_y in place of f, fx and fy.
+# COLMAP's camera models, by number: name, and names of the parameters; only models that OpenCV supports.
+# A transforms.json has the same names, with fl_x and fl_y instead of f, fx and fy.
 MODELS = {
     0: ("SIMPLE_PINHOLE", "f cx cy"), 1: ("PINHOLE", "fx fy cx cy"), 2: ("SIMPLE_RADIAL", "f cx cy k1"),
     3: ("RADIAL", "f cx cy k1 k2"), 4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
@@ -29,21 +29,21 @@ MODELS = {
 }  # fmt: skip
 PARAMETERS = {name: parameters.split() for name, parameters in MODELS.values() if parameters}
 STRAIGHTEN = f"allowed: {', '.join(PARAMETERS)}; `colmap image_undistorter` makes photos of any other straight"
-SQUARE = 1e-3  # pixels that differ from squares by less are squares
+SQUARE = 1e-3  # pixels within this share of a square count as square
 # OpenCV counts pixel centres from 0.
 CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What bends a photo of some size."""
+    """Intrinsics and distortion for a photo of some size."""
 
     matrix: tuple[tuple[float, ...], ...]  # rows of the intrinsics [3, 3], pixel centres at +0.5
     distortion: tuple[float, ...]  # OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model
     fisheye: bool  # which of the two
 
     def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
-        """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
+        """Pixels in the undistorted photo of `view` for pixels [P, 2] of the distorted one; may lie outside it."""
         import cv2
 
         until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
@@ -64,24 +64,24 @@ def lens_of(
 
 @dataclass(frozen=True)
 class DepthFile:
-    """Where the depth of a photo is kept."""
+    """The file with the depth of a photo."""
 
     path: Path  # PNG or TIFF of integers, EXR, NPY, or Record3D's compressed floats (`.depth`)
-    unit: float | None = None  # m that a count stands for; None: integers are millimetres, floats metres
-    confidence: Path | None = None  # file of the same shape, higher is better; None: there is none
-    shape: tuple[int, int] | None = None  # rows and columns, of a `.depth` file, which does not say so itself
+    unit: float | None = None  # m per count; None: integers are millimetres, floats metres
+    confidence: Path | None = None  # file of the same shape, higher is better; None: no file
+    shape: tuple[int, int] | None = None  # rows and columns of a `.depth` file, which does not contain them
 
     def files(self) -> list[Path]:
-        """The files that this depth is read from."""
+        """The files of this depth."""
         return [self.path] + ([self.confidence] if self.confidence else [])
 
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """A camera that was found elsewhere."""
+    """A camera from another program."""
 
-    name: str  # of its photo, as the file says it
-    width: int  # px of the photo that the lens is for
+    name: str  # of its photo, as in the file
+    width: int  # px of the photo of the lens
     height: int  # px
     lens: Lens  # of a photo of this size
     rotation: np.ndarray  # [3, 3] world to camera; x right, y down, z forward
@@ -91,14 +91,14 @@ class KnownCamera:
 
     @property
     def center(self) -> np.ndarray:
-        """[3] where it stands in the world."""
+        """[3] its position in the world."""
         return -self.rotation.T @ self.translation
 
 
 def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: str | None = None,
           depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
-    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards). Raises SdfsimError: no
-    pose."""
+    """A camera from its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards). Raises SdfsimError if
+    the matrix is not a pose."""
     turn, place = pose[:, :3], pose[:, 3]
     if not np.isfinite(pose).all() or abs(np.linalg.det(turn)) < 1e-6:
         raise SdfsimError(f"{name}: its matrix is not a pose")
@@ -107,14 +107,14 @@ def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: 
 
 
 def below(folder: Path, name: str) -> Path:
-    """The file of this name in a folder, though the name may have been written on Windows."""
+    """The file of this name in a folder; the name may have been written on Windows."""
     place = folder / name
     return place if place.exists() or "\\" not in name else folder / name.replace("\\", "/")
 
 
 def read_cameras(path: Path) -> list[KnownCamera]:
     """The cameras of a transforms.json or of a COLMAP model's folder, in the order of their names. Raises SdfsimError
-    where it is damaged or no such file, or where a lens is not known."""
+    if the file is damaged or of another kind, or if a lens is not supported."""
     read = read_model if path.is_dir() else read_transforms
     try:
         return sorted(read(path), key=lambda camera: camera.name)
@@ -124,7 +124,7 @@ def read_cameras(path: Path) -> list[KnownCamera]:
 
 def read_transforms(path: Path) -> list[KnownCamera]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
-    about = json.loads(path.read_bytes())  # Bytes: it knows a byte order mark.
+    about = json.loads(path.read_bytes())  # Bytes: json handles a byte order mark.
     found = []
     for frame in about["frames"]:
         values = {**about, **frame}
@@ -138,16 +138,16 @@ def read_transforms(path: Path) -> list[KnownCamera]:
         known = "fl_x" in values
         if (known or fisheye) and not (known and sized):
             raise SdfsimError(f"{where}: a fisheye, or a lens with fl_x, needs fl_x, w and h in px")
-        if not sized:  # For a photo of any width: `scaled` knows it.
+        if not sized:  # For a photo of any width: `scaled` adapts it.
             width, height = 1, 0
         fx = float(values["fl_x"]) if known else 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-        # What others call k4 is OpenCV's only of a fisheye and of this model.
+        # k4 has OpenCV's meaning only for a fisheye and for this model.
         bends = values if fisheye or model == "FULL_OPENCV" else {**values, "k4": 0, "k5": 0, "k6": 0}
         lens = lens_of(fx, fy, cx, cy, bends, fisheye)
         pose = _pose(frame["transform_matrix"], where)
-        # As nerfstudio, or as instant-ngp says it.
+        # In nerfstudio's form, or in instant-ngp's.
         name = values.get("depth_file_path") or values.get("depth_path")
         unit = values.get("depth_unit_scale_factor", values.get("integer_depth_scale"))
         depth = DepthFile(below(path.parent, name), unit and float(unit)) if name else None
@@ -195,7 +195,7 @@ def _parameters(folder: Path, model: str) -> list[str]:
     return PARAMETERS[model]
 
 
-# Of each camera by its number: model, width, height, parameters. Of each image: name, camera, quaternion, translation.
+# For each camera number: model, width, height, parameters. For each image: name, camera, quaternion, translation.
 Model = tuple[dict[int, tuple[str, int, int, list[float]]], list[tuple[str, int, Sequence[float], Sequence[float]]]]
 
 
@@ -209,7 +209,7 @@ def _model_text(folder: Path) -> Model:
             raise SdfsimError(f"{where}: not a camera's number, model, width, height, parameters") from error
     before = False  # whether the last line was an image
     for where, line in _lines(folder / "images.txt"):
-        # Two lines an image. The second, its points, may be empty, and so may lines between images.
+        # Two lines per image. The second, its points, may be empty, and so may lines between images.
         if before and _are_points(line):
             before = False
             continue
@@ -226,7 +226,7 @@ def _model_text(folder: Path) -> Model:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Lines that are neither empty nor a comment, and where each is."""
+    """Lines that are neither empty nor a comment, each with its place in the file."""
     data = path.read_bytes()
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     for number, line in enumerate(data.decode("utf-16" if wide else "utf-8-sig").splitlines(), start=1):
@@ -235,7 +235,7 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _are_points(line: str) -> bool:
-    """Whether a line of images.txt has only numbers, by three: x, y and the number of a point."""
+    """Whether a line of images.txt has only triples of numbers: x, y and the number of a point."""
     words = line.split()
     try:
         return len(words) % 3 == 0 and bool([float(word) for word in words])
@@ -273,15 +273,15 @@ def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
 
 
 def rectified(picture: ReadPhoto, known: KnownCamera, name: str, source: str) -> tuple[ReadPhoto, View, Lens | None]:
-    """A photo as a pinhole camera in the same place would have taken it, that camera, and the lens it was freed from.
+    """A photo as a pinhole camera in the same place would have taken it, that camera, and the removed lens.
 
-    Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the
-    lens shows of the pinhole's picture all over.
+    A lens without distortion needs no resampling, and no lens is returned. Otherwise the photo is cropped to the region
+    of the pinhole's picture that the lens covers completely.
     """
     height, width = picture.pixels.shape[:2]
     matrix, bent, lens = scaled(known, width, height), known.lens, None
     pixels, mask, labels = picture.pixels, picture.mask, picture.labels
-    # A fisheye bends also where all its coefficients are 0.
+    # A fisheye distorts even if all its coefficients are 0.
     if bent.fisheye or any(bent.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
         import cv2
 

@@ -1,4 +1,4 @@
-"""Which object each pixel shows: masks by object, or label images, that came with the photos."""
+"""The object at each pixel: masks by object, or label images, that came with the photos."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,21 +12,21 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, visible
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes
-UNKNOWN = 255  # a pixel of which nothing is said
+FOLDER, NAMES = "labels", "names.json"  # written by the photos stage
+UNKNOWN = 255  # a pixel without information
 
 
 @dataclass(frozen=True)
 class Labels:
     """Object masks, or label images, of a set of photos."""
 
-    # mask file of each object on each photo that has one: white is the object
+    # mask file of each object for each photo that has one: white is the object
     masks: dict[Path, dict[str, Path]] = field(default_factory=dict)
     images: dict[Path, Path] = field(default_factory=dict)  # label image of each photo that has one
-    # of the objects; pixels of a prepared label image count from 1 in this order, 0 is none of them
+    # of the objects; pixels of a prepared label image count from 1 in this order, 0 is no object
     names: tuple[str, ...] = ()
-    values: tuple[int, ...] = ()  # label of each object in `images`; none where masks are given
-    notes: tuple[str, ...] = ()  # what was passed over, for the report
+    values: tuple[int, ...] = ()  # label of each object in `images`; empty if masks are given
+    notes: tuple[str, ...] = ()  # skipped files, for the report
 
     def files(self) -> list[Path]:
         """Every file whose content the result depends on."""
@@ -35,8 +35,8 @@ class Labels:
     def of(self, photo: Path, size: tuple[int, int]) -> np.ndarray | None:
         """Number of the object at each pixel [H, W] uint8 of a photo that is width x height upright; None: not given.
 
-        Where some objects have no mask of this photo, a pixel outside the others is `UNKNOWN`; so is one in two masks.
-        Raises SdfsimError where a file cannot be read or is not shaped like the photo.
+        If some objects have no mask for this photo, a pixel outside the other masks is `UNKNOWN`; so is a pixel in two
+        masks. Raises SdfsimError if a file cannot be read or is not shaped like the photo.
         """
         if photo in self.images:
             found = read_label_image(self.images[photo], size)
@@ -56,7 +56,7 @@ class Labels:
 
 
 def find_masks(photos: list[Path]) -> dict[Path, Path]:
-    """The mask file of each photo that has one in a folder `masks` in or beside the photo's folder; white is the
+    """The mask file of each photo that has one in a folder `masks` in or next to the photo's folder; white is the
     object."""
     masks: dict[Path, Path] = {}
     for root in _roots(photos):
@@ -65,8 +65,9 @@ def find_masks(photos: list[Path]) -> dict[Path, Path]:
 
 
 def find_labels(photos: list[Path]) -> Labels:
-    """Looks for `masks/NAME/` (white is the object of that name) and `labels/` (label images) in and beside the photos'
-    folders. Raises SdfsimError where both are given, for a name that no body can have, or where no file is of use."""
+    """Looks for `masks/NAME/` (white is the object of that name) and `labels/` (label images) in and next to the
+    photos' folders. Raises SdfsimError if both are given, if a name is not allowed for bodies, or if no file is
+    usable."""
     masks: dict[Path, dict[str, Path]] = {}
     images: dict[Path, Path] = {}
     notes: list[str] = []
@@ -108,8 +109,8 @@ def _roots(photos: list[Path]) -> list[Path]:
 
 
 def _of_photos(root: Path, folder: Path, photos: list[Path]) -> tuple[dict[Path, Path], list[str]]:
-    """The file of each photo in or beside `root` in a folder below it, and a note on what belongs to none. A file is
-    named like its photo, with `.png` behind it or with another suffix."""
+    """The file of each photo in or next to `root`, in a folder below it, and a note on files without a photo. A file is
+    named like its photo, with `.png` added or with another suffix."""
     if not folder.is_dir():
         return {}, []
     there = {path.name for path in visible(folder) if path.is_file() and path.suffix.lower() in MASK_SUFFIXES}
@@ -125,7 +126,7 @@ def _of_photos(root: Path, folder: Path, photos: list[Path]) -> tuple[dict[Path,
 
 def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """A label image [H, W] int, palette or grey of 8 or 16 bits, at the size (width, height) of its upright photo, else
-    as stored. Raises SdfsimError where it cannot be read, is in colour, or is not shaped like the photo."""
+    as stored. Raises SdfsimError if it cannot be read, is in colour, or is not shaped like the photo."""
     stored = decoded(path, 1 << 20)[0]
     if stored.mode not in ("1", "L", "P") and not stored.mode.startswith("I"):
         raise SdfsimError(f"{path}: a label image has one number per pixel, this one is {stored.mode}",
@@ -138,13 +139,14 @@ def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndar
 
 
 def load_names(folder: Path) -> list[str]:
-    """Names of the objects whose labels the photos stage wrote; none where there are none."""
+    """Names of the objects whose labels the photos stage wrote; empty if there are none."""
     path = Path(folder) / FOLDER / NAMES
     return read_json(path)["names"] if path.exists() else []
 
 
 def load_labels(folder: Path, name: str) -> np.ndarray | None:
-    """Labels [H, W] uint8 of a prepared photo: numbers of the names from 1 on, 0 none, `UNKNOWN`; None: not given."""
+    """Labels [H, W] uint8 of a prepared photo: numbers of the names from 1 on, 0 for no object, `UNKNOWN`; None: not
+    given."""
     path = Path(folder) / FOLDER / (name + ".png")
     if not path.exists():
         return None

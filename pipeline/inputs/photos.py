@@ -1,4 +1,4 @@
-"""Whatever the user gave -> upright, sized photos with masks and focal priors."""
+"""The user's input -> upright photos of limited size with masks and focal priors."""
 
 import shutil
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json
 from sdfsim.base.parallel import Progress, silent
 
-LONG_SIDE = 1600  # px; what reads the photos takes them as small as it needs
+LONG_SIDE = 1600  # px; later steps reduce the photos to the size that they need
 KNOWN_CAMERAS = "known_cameras.json"  # cameras that came with the photos
 NAMED = 8  # photos named one by one in a note
 
@@ -30,14 +30,14 @@ NAMED = 8  # photos named one by one in a note
 class Photo:
     """One prepared photo."""
 
-    name: str  # file name under `images/` (and, with `.png` added, under `masks/`)
-    source: str  # the user's name of it, see `Source.name_of`, or the video's with a time; no two photos have the same
+    name: str  # file name in `images/` (and, with `.png` added, in `masks/`)
+    source: str  # the user's name for it, see `Source.name_of`, or the video's with a time; unique
     width: int  # prepared width, px
     height: int  # prepared height, px
-    # width and height of the user's photo, px, turned as the prepared one is; of a frame of a video those prepared
+    # width and height of the user's photo, px, turned like the prepared one; for a video frame those prepared
     original: tuple[int, int]
-    lens: Lens | None  # what the photo was freed from; None where nothing was straightened
-    focal: float | None  # from EXIF, px of the prepared photo; None where EXIF has none
+    lens: Lens | None  # the removed lens; None if the photo had no distortion
+    focal: float | None  # from EXIF, px of the prepared photo; None if EXIF has none
     camera: str  # make and model from EXIF, empty where unknown
     mask: bool  # whether a mask came with it, as alpha or as a file
     sharpness: float  # see `sharpness`; 0.2 to 0.6 for photos in focus
@@ -45,7 +45,7 @@ class Photo:
     depth: bool = False  # whether depth came with it
 
     def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
-        """Pixels [P, 2] of the prepared photo, of camera `view`, from those of the user's photo."""
+        """Pixels [P, 2] of the prepared photo, with camera `view`, from those of the user's photo."""
         found = pixels * np.array([self.width, self.height]) / self.original
         return found if self.lens is None else self.lens.straight(found, view)
 
@@ -55,7 +55,7 @@ def prepare_photos(
 ) -> tuple[list[Photo], list[str]]:
     """Reads every photo (see `find_source`) and writes upright copies of at most `long_side` px to `out`.
 
-    Writes `images/NNNN.jpg` and `photos.json`; where they were given, `masks/NNNN.jpg.png`, `depth/NNNN.jpg.npy`,
+    Writes `images/NNNN.jpg` and `photos.json`; if they were given, also `masks/NNNN.jpg.png`, `depth/NNNN.jpg.npy`,
     `labels/NNNN.jpg.png` with their names, `known_cameras.json` and `capture.json`. Returns the photos in order, and
     notes for the report.
     """
@@ -81,14 +81,14 @@ def prepare_photos(
                 np.save(out / "depth" / f"{name}.npy", depth)
             height, width = picture.pixels.shape[:2]
             sharp = round(sharpness(picture.pixels), 4)
-            focal = None if known else picture.focal  # A known camera is no prior.
+            focal = None if known else picture.focal  # A known camera needs no prior.
             photos.append(
                 Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
                       picture.mask is not None, sharp, "too dark" if brightness(picture) < DARK else "",
                       bool(known and known.depth))
             )  # fmt: skip
             on_progress(fraction, f"{len(photos)} photos")
-        # Relative to what is typical of the set: a blur that all have in common may be the scene's.
+        # Relative to the set's typical value: if all photos are blurred alike, the scene may be the cause.
         least = max(BLURRED, 0.35 * float(np.quantile([p.sharpness for p in photos], 0.75)))
         photos = [replace(p, fault=p.fault or ("blurred" if p.sharpness < least else "")) for p in photos]
         if views:
@@ -103,8 +103,8 @@ def prepare_photos(
 
 @contextmanager
 def opened(given: Path, unpacked: Path) -> Iterator[Source]:
-    """What the user gave (see `find_source`); an archive is in the folder `unpacked` until the block ends, and of a
-    recording there are only the photos that are used. Raises SdfsimError as `find_source` and `unpack` do."""
+    """The user's input (see `find_source`); an archive is in the folder `unpacked` until the block ends, and a
+    recording has only the photos that are used. Raises the errors of `find_source` and `unpack`."""
     source = find_source(given)
     try:
         if source.archive is not None:
@@ -113,14 +113,14 @@ def opened(given: Path, unpacked: Path) -> Iterator[Source]:
         if source.capture:
             source = replace(source, photos=tuple(spread(source.photos, source.frames)))
         yield source
-    except SdfsimError as error:  # which may name files that nobody knows
+    except SdfsimError as error:  # which may name temporary files
         message, hint = (text.replace(str(unpacked), str(given)) for text in (error.message, error.hint))
         raise SdfsimError(message, hint, exit_code=error.exit_code) from error
     shutil.rmtree(unpacked, ignore_errors=True)
 
 
 def pictures(source: Source, long_side: int = LONG_SIDE) -> Iterator[tuple[str, ReadPhoto, KnownCamera | None, float]]:
-    """Name, picture, camera where it is known, and share done, of every photo of what is no archive."""
+    """Name, picture, camera if it is known, and share done, for every photo of an input that is not an archive."""
     if source.video:
         from pipeline.inputs.video import chosen_frames
 
@@ -130,7 +130,7 @@ def pictures(source: Source, long_side: int = LONG_SIDE) -> Iterator[tuple[str, 
             yield name, ReadPhoto(np.asarray(image), image.size), None, fraction
         return
     masks = source.masks
-    # They count where every photo has one, or is cut out by transparency.
+    # Masks are used if every photo has one, or has transparency.
     lacking = [path for path in source.photos if path not in masks] if masks else []
     if any(read_photo(path, long_side).mask is None for path in lacking):
         masks = {}
@@ -146,18 +146,18 @@ def pictures(source: Source, long_side: int = LONG_SIDE) -> Iterator[tuple[str, 
 
 
 def _check_shape(path: Path, size: tuple[int, int], camera: KnownCamera | None) -> None:
-    """Checks that a photo, or its depth, of this width and height is shaped like the photo of its camera."""
+    """Checks that a photo or depth of this width and height has the aspect ratio of its camera's photo."""
     if camera and camera.height and abs(size[0] / size[1] / (camera.width / camera.height) - 1) > 0.02:
         message = f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}"
         raise SdfsimError(message, "give the photos and depth that the cameras were found for, uncropped and as turned")
 
 
 def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
-    """What a person should know about a set of photos, of which some came with mask files; one line each."""
+    """Notes for users about a set of photos, some of which came with mask files; one line each."""
     notes = []
     masked = sum(p.mask for p in photos)
     if masked < len(photos) and (masked or mask_files):
-        notes.append(f"masks count only where every photo has one: {mask_files} mask files are ignored, and what is "
+        notes.append(f"masks are used only if every photo has one: {mask_files} mask files are ignored, and what is "
                      f"transparent in {masked} photos is grey")  # fmt: skip
     for fault, again in (("too dark", "take them again with more light"), ("blurred", "take them again")):
         names = [p.source for p in photos if p.fault == fault]
@@ -168,7 +168,7 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
 
 
 def open_photo(folder: Path, view: View, mode: str = "RGB") -> Image.Image:
-    """The prepared photo of a view, in a mode of PIL's."""
+    """The prepared photo of a view, in one of PIL's modes."""
     with Image.open(Path(folder) / "images" / view.name) as image:
         return image.convert(mode)
 
@@ -179,7 +179,7 @@ def save_photos(photos: list[Photo], folder: Path) -> None:
 
 
 def load_photos(folder: Path) -> list[Photo]:
-    """The photos that `prepare_photos` wrote to `folder`. Raises SdfsimError where the photos stage has not run."""
+    """The photos that `prepare_photos` wrote to `folder`. Raises SdfsimError if the photos stage has not run."""
     path = Path(folder) / "photos.json"
     data = read_json(path, "run the photos stage first")
     try:

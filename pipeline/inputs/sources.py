@@ -1,4 +1,4 @@
-"""What the user gave: a folder of photos, a video, or photos whose cameras are known already."""
+"""The user's input: a folder of photos, a video, or photos with known cameras."""
 
 import os
 from dataclasses import dataclass, field
@@ -14,34 +14,34 @@ from sdfsim.base.files import visible
 MIN_PHOTOS = 3
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".hif", ".avif"}
 READABLE = "photos are JPEG, PNG, TIFF, HEIC, AVIF, WebP or BMP; give a video itself to use it"
-ABOVE = 3  # folders above a COLMAP model in which its photos are looked for: it may be colmap/sparse/0
+ABOVE = 3  # levels above a COLMAP model in which its photos may lie: the model may be colmap/sparse/0
 NAMED = 3  # folders with photos that an error names
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is to be reconstructed."""
+    """The input of a reconstruction."""
 
-    photos: tuple[Path, ...] = ()  # photo files in name order; none where a video is given
+    photos: tuple[Path, ...] = ()  # photo files in name order; empty for a video
     masks: dict[Path, Path] = field(default_factory=dict)  # mask file of each photo that has one
-    labels: Labels = field(default_factory=Labels)  # which object each pixel shows, where that is given
+    labels: Labels = field(default_factory=Labels)  # the object at each pixel, if given
     video: Path | None = None
-    # transforms.json, or folder of a COLMAP model or of a phone's capture, whose poses are to be used; None: find them
+    # transforms.json, or folder of a COLMAP model or of a phone's capture, whose poses are used; None: find them
     cameras: Path | None = None
     frames: dict[Path, KnownCamera] = field(default_factory=dict)  # camera of each photo in `cameras`
-    capture: Capture | None = None  # what a capture with depth says of its world
-    archive: Path | None = None  # a zipped capture that has to be unpacked first; then there is nothing else
-    notes: tuple[str, ...] = ()  # what was passed over, for the report
+    capture: Capture | None = None  # the world of a capture with depth
+    archive: Path | None = None  # a zipped capture that has to be unpacked first; the other fields are then empty
+    notes: tuple[str, ...] = ()  # skipped files, for the report
 
     @property
     def folder(self) -> Path:
-        """The folder in and below which all photos lie; absolute."""
+        """The folder that contains all photos, directly or in subfolders; absolute."""
         files = self.photos or (self.video or self.archive or Path(),)
         return Path(os.path.commonpath([path.absolute().parent for path in files]))
 
     def name_of(self, photo: Path) -> str:
-        """What a photo is called: its file's name, where subfolders hold photos with theirs before it; no two alike."""
+        """The name of a photo: its file name, with that of its subfolder if photos lie in subfolders; unique."""
         return photo.absolute().relative_to(self.folder).as_posix()
 
     def files(self) -> list[Path]:
@@ -55,12 +55,12 @@ class Source:
 
 
 def find_source(given: Path, *, unpacked: bool = False) -> Source:
-    """Looks at what the user gave; reads no photo yet.
+    """Identifies the user's input; reads no photo yet.
 
     A folder holds photos (in it, or in its subfolder `images`), or is a COLMAP model, or a phone's capture (see
-    `find_capture`); a file is a video, a transforms.json, or a zipped capture. Of an `unpacked` archive the photos may
-    lie in any one folder. Masks and labels: see `find_masks` and `find_labels`. Raises SdfsimError where nothing is
-    there, of fewer than three photos, or of two cameras of a photo.
+    `find_capture`); a file is a video, a transforms.json, or a zipped capture. In an `unpacked` archive the photos may
+    lie in any one folder. Masks and labels: see `find_masks` and `find_labels`. Raises SdfsimError if the input does
+    not exist, for fewer than three photos, or for two cameras of one photo.
     """
     given = Path(given)
     if not given.exists():
@@ -86,8 +86,8 @@ def find_source(given: Path, *, unpacked: bool = False) -> Source:
 
 
 def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
-    """The photo files of `photos_in` a folder, and a note on what was passed over. Raises SdfsimError for fewer than
-    three; it names the folders below that hold some."""
+    """The photo files of `photos_in` a folder, and a note on skipped files. Raises SdfsimError for fewer than three;
+    the error names the subfolders with photos."""
     found = photos_in(folder)
     place = found[0].parent if found else folder
     notes = []
@@ -113,8 +113,8 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def photos_in(folder: Path) -> list[Path]:
-    """The photo files of a folder in name order, or those of its subfolder `images`, beside which there may be a few
-    previews. Raises SdfsimError where the folder cannot be read."""
+    """The photo files of a folder in name order, or those of its subfolder `images`, next to which a few previews may
+    lie. Raises SdfsimError if the folder cannot be read."""
     own = _images(folder)
     inner = _images(folder / "images") if (folder / "images").is_dir() else []
 
@@ -138,7 +138,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _with_photos(folder: Path) -> list[Path]:
-    """Those folders below that hold enough photos and lie least deep."""
+    """The subfolders with enough photos, at the highest level that has any."""
     for level in levels(folder):
         found = [place for place in level if place != folder and len(photos_in(place)) >= MIN_PHOTOS]
         if found:
@@ -152,7 +152,7 @@ def is_model(folder: Path) -> bool:
 
 
 def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | None = None) -> Source:
-    """The photos that known cameras belong to, in the order of the cameras."""
+    """The photos of the known cameras, in the order of the cameras."""
     masks, missing = {}, []
     known: dict[Path, KnownCamera] = {}
     for frame in frames:
@@ -170,7 +170,7 @@ def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | N
     photos = list(known)
     if len(photos) < MIN_PHOTOS:
         message = f"{cameras}: cameras with a photo: {len(photos)}, at least {MIN_PHOTOS} are needed {' '.join(notes)}"
-        raise SdfsimError(message, "put the photos beside the cameras, or in a folder `images` there or just above")
+        raise SdfsimError(message, "put the photos next to the cameras, or in a folder `images` there or just above")
     if capture is None and any(frame.depth for frame in known.values()):
         capture = Capture("transforms.json with depth", None)
     labels = find_labels(photos)
@@ -179,15 +179,15 @@ def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | N
 
 
 def _photo_of(name: str, cameras: Path) -> Path | None:
-    """The file of a photo that a camera file names, by its path, else by its name in a folder `images`. A name that was
-    written on Windows, or with the path of another computer, counts as well."""
+    """The file of a photo that a camera file names, by its path, else by its name in a folder `images`. A name from
+    Windows, or with the path of another computer, works as well."""
     alone = cameras.is_file()
     roots = [cameras.parent] if alone else [cameras, *list(cameras.absolute().parents)[:ABOVE]]
     suffixes = [""] if Path(name).suffix.lower() in SUFFIXES else [".png", ".jpg", ".jpeg"]
     for written in dict.fromkeys([name, name.replace("\\", "/")]):
         for root in roots:
             inner = root / "images"
-            # A model's names count from its folder of photos; beside that there may be previews.
+            # A model's names are relative to its folder of photos; previews may lie next to it.
             first = (root / written, inner / written) if alone else (inner / written, root / written)
             for place in (*first, inner / Path(written).name, root / Path(written).name):
                 for suffix in suffixes:

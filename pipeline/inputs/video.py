@@ -9,16 +9,17 @@ import numpy as np
 from pipeline.inputs.images import reduced, sharpness
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 
-SMALL, MIDDLE = 256, 960  # px, longer side of the frames that motion and sharpness are measured on
+SMALL, MIDDLE = 256, 960  # px, longer side of the frames for measuring motion and sharpness
 STEP = 0.07  # of the picture's width: motion from one chosen frame to the next
 FEWEST, MOST = 24, 100
-LEAST_MOTION = 0.5  # picture widths in all: less is no walk around anything
-# Else the decoder prints what it thinks of damaged files, past Python.
+LEAST_MOTION = 0.5  # picture widths in total: less is not a walk around an object
+# Without this the decoder prints messages about damaged files, past Python.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
-    """The frames of a video, upright RGB [H, W, 3] uint8, and their number a second. Raises SdfsimError: unreadable."""
+    """The frames of a video, upright RGB [H, W, 3] uint8, and their number per second. Raises SdfsimError if it is
+    unreadable."""
     import cv2
 
     video = cv2.VideoCapture(str(path))
@@ -36,7 +37,8 @@ def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
 def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """First pass: how far the picture has moved up to each frame [F], in picture widths, and how sharp each is [F].
 
-    Motion is the median displacement of corners that Lucas-Kanade tracking finds again; a step where most are lost.
+    Motion is the median displacement of corners that Lucas-Kanade tracking finds again; if most are lost, it is one
+    step.
     """
     import cv2
 
@@ -63,8 +65,8 @@ def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def choose_frames(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
-    """Frames to use, in order: the motion is cut into equal stretches, and the sharpest frame of each is taken; at
-    least `FEWEST` where there are as many, at most `MOST`."""
+    """Frames to use, in order: the sharpest frame of each of equal stretches of the motion; at least `FEWEST` if the
+    video has as many, at most `MOST`."""
     total = float(moved[-1])
     count = int(np.clip(round(total / STEP) + 1, FEWEST, MOST))
     stretch = np.minimum((moved / max(total, 1e-9) * count).astype(int), count - 1)
@@ -72,14 +74,14 @@ def choose_frames(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
 
 
 def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
-    """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError where the video
+    """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError if the video
     cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
     import cv2
 
     moved, sharp = follow(path)
     if len(sharp) < FEWEST:
         told = int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT))
-        if len(sharp) >= 0.9 * told:  # the file is whole, and short
+        if len(sharp) >= 0.9 * told:  # the file is complete, but short
             message = f"{path}: a clip of only {len(sharp)} frames (at least {FEWEST} are needed)"
             raise SdfsimError(message, "film for longer: half a minute, all the way around the object")
         message = f"{path}: only {len(sharp)} of {told} frames can be decoded (at least {FEWEST} are needed)"

@@ -1,4 +1,4 @@
-"""What stands on a level plane, or is named by masks, becomes a body; the scenery is closed where the body stood.
+"""Finds bodies, which stand on a level plane or have masks, and closes the scenery where they stood.
 
 Everything here is in normalised space; heights are measured along a plane's normal.
 """
@@ -48,27 +48,27 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals
 
-# Shares, without unit, chosen by hand on the rendered sets (table_vase, `shelf`, touching bodies). Nothing derives
-# them, and other sets may want others.
-LEVEL_SHARE = 0.1  # of the largest level plane: what is smaller carries nothing, as the lid of a box is no table
-LARGEST_FOOT = 0.5  # share of its plane that a body covers at most; what covers more is relief
-CARRIED = 0.3  # share of a level plane below which a component's samples lie, and it carries that plane
+# Shares, without unit, chosen by hand on the rendered sets (table_vase, `shelf`, touching bodies); other sets may need
+# other values.
+LEVEL_SHARE = 0.1  # of the largest level plane: smaller planes carry nothing; the lid of a box is not a table
+LARGEST_FOOT = 0.5  # largest share of its plane that a body covers; more is relief
+CARRIED = 0.3  # share of a level plane with a component's samples below it: from here on it carries the plane
 SEEN_SHARE = 0.2  # of a body's surface, that photos have to show
 STANDS = 0.3  # least share of a body's lowest layer that has the solid of the plane right below it
-CRUMB = 0.05  # of a body's samples: what is smaller and hangs beside it was torn off it by noise, and goes with it
+CRUMB = 0.05  # of a body's samples: a smaller piece next to it was separated by noise, and belongs to it
 FLAKE = 0.02  # of the area of a body's largest piece: smaller pieces are left out
-SCRAP = 0.4  # of the length of the first piece of what masks name: a second one that is shorter is left out
-# Noise has less than the first of the largest body's surface, and less than the second of the most sparse points that a
-# body has on so much surface. Bodies of `shelf` had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
+SCRAP = 0.4  # of the length of the first piece of a masked body: a shorter second piece is left out
+# Noise has less than the first share of the largest body's surface, and less than the second share of the highest
+# density of sparse points of any body. Bodies of `shelf` had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
 SMALL_NOISE, BARE = 0.15, 0.05
 # In cells of the field's finest grid, which limits what can be separated:
-ON = 1.5  # samples below a plane, that say where it goes on
-LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from what it stands on
-SMALLEST = 4.0  # what rises less stays part of what it stands on
+ON = 1.5  # depth of the samples below a plane that decide where it continues
+LAYER = 1.5  # thickness of the contact layer, in which a field cannot separate a body from its support
+SMALLEST = 4.0  # a lower piece stays part of its support
 FINER = 1 / 3  # distance of a body's samples
-ENOUGH = 96  # samples along a body's longest side, where the field is finer than that
-FILLET = 3.0  # contact layers sideways: what is so near a body's foot is taken away together with it
-FEWEST_SAMPLES = 8  # of a component: less is no body
+ENOUGH = 96  # samples along a body's longest side, if the field is finer
+FILLET = 3.0  # contact layers sideways: matter so near a body's foot is removed together with it
+FEWEST_SAMPLES = 8  # of a component: fewer are not a body
 NOWHERE = np.zeros((0, 3))  # no points
 
 
@@ -78,7 +78,7 @@ class LevelPlane:
 
     normal: np.ndarray  # [3] unit, upwards
     height: float  # of the plane along it
-    area: float  # that photos show
+    area: float  # seen by photos
 
     def above(self, points: np.ndarray) -> np.ndarray:
         """Height [...] of points [..., 3] above the plane."""
@@ -87,19 +87,19 @@ class LevelPlane:
 
 @dataclass(frozen=True, eq=False)
 class FoundBody:
-    """A body that stands on a level plane, or that masks name."""
+    """A body that stands on a level plane, or that has masks."""
 
-    name: str  # that of its masks, else object1, object2 ... from the largest down
-    level: LevelPlane  # what it stands on, infinitely far below where that is not known
+    name: str  # from its masks, else object1, object2 ... from the largest down
+    level: LevelPlane  # its support, infinitely far below if unknown
     size: float  # the longest side of its bounding box
-    # [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane
+    # [X, Y, Z] bool on a part of the samples: those nearest to this body, among all bodies on the plane
     own: np.ndarray
     low: np.ndarray  # [3] position of the first of these samples
     cell: float  # between them
     layer: float  # thickness of the contact layer, in which the field cannot separate body and plane
-    hollow: np.ndarray  # [A, B] bool on the plane: places that the body goes around at the top of the contact layer
+    hollow: np.ndarray  # [A, B] bool on the plane: places enclosed by the body at the top of the contact layer
     corner: np.ndarray  # [2] of the first of these, in the axes of `frame_of` the plane
-    seam: Volume | None = None  # where it ends against what it touches, negative within; None where it ends by itself
+    seam: Volume | None = None  # border to bodies that it touches, negative within; None without such a border
 
     def part_of(self, volume: Volume) -> tuple[slice, ...]:
         """The samples of `own` among those of the whole volume."""
@@ -115,13 +115,13 @@ class FoundBody:
         return marked(self.own, np.round((points - self.low) / self.cell).astype(int))
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Whether points [P, 3] are in the contact layer and the body goes around them, as a cup around its floor."""
+        """Whether points [P, 3] are in the contact layer and enclosed by the body, like the floor of a cup."""
         index = np.round((points @ frame_of(self.level.normal)[:2].T - self.corner) / (0.5 * self.cell)).astype(int)
         return marked(self.hollow, index) & (self.level.above(points) < self.layer)
 
     def distance(self, field: Distance) -> Distance:
-        """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane. What
-        it goes around there is as the field has it: the floor of a cup, or nothing."""
+        """Its signed distance, from the field's: the cross-section above the contact layer continues down to the plane.
+        The enclosed part, such as the floor of a cup, stays as in the field."""
 
         def value(points: np.ndarray) -> np.ndarray:
             lifted, holds = self.lifted(points), self.holds(points)
@@ -145,7 +145,7 @@ def find_level_planes(shown: Mesh, up: np.ndarray, width: float, share: float = 
         height = centers @ up
         bins = ((height - height.min()) / width).astype(int)
         total = np.bincount(bins, areas)
-        # A plane that lies across the border of two bins must not be missed.
+        # Must not miss a plane on the border of two bins.
         fullest = int(np.argmax(total + np.append(total[1:], 0)))
         member = (bins == fullest) | (bins == fullest + 1)
         if levels and areas[member].sum() < share * levels[0].area:
@@ -162,11 +162,11 @@ def find_level_planes(shown: Mesh, up: np.ndarray, width: float, share: float = 
 
 def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, smallest: float,
                 named: np.ndarray | None = None, clicked: np.ndarray = NOWHERE) -> list[FoundBody]:  # fmt: skip
-    """Bodies without names that stand on level planes, wholly within the trained space; those that touch are one.
+    """Bodies without names that stand on level planes, completely within the trained space; touching ones count as one.
 
-    What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
-    What rises less than `smallest` above its plane stays part of it, unless its vertices are `named` [V] bool by masks,
-    or a point of it was `clicked` [K, 3].
+    A piece that carries a level plane itself, like a table, is scenery, and so is one that reaches the end of the
+    trained space. A piece that rises less than `smallest` above its plane stays part of it, unless its vertices are
+    `named` [V] bool by masks, or a point of it was `clicked` [K, 3].
     """
     volume = surface.volume
     solid = volume.values < 0
@@ -176,7 +176,7 @@ def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
     at_rim = np.sqrt(x**2 + y**2 + z**2) > RIM - 2 * volume.cell
     taken = np.zeros(solid.shape, bool)
     found: list[FoundBody] = []
-    # From the top down: what stands on a table has been taken when the table itself is looked at.
+    # From the top down: bodies on a table are taken before the table itself is examined.
     for level in sorted(levels, key=lambda level: -level.height):
         height = volume.along(level.normal).astype(np.float32) - level.height
         label = np.empty(solid.shape, np.int32)
@@ -210,8 +210,8 @@ def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
 
 def bodies_with(surface: FieldSurface, levels: list[LevelPlane], layer: float, smallest: float, clicked: np.ndarray
                 ) -> list[FoundBody]:  # fmt: skip
-    """`find_bodies` for points [K, 3] that were clicked. A level plane that is one of a body's own sides, as the cover
-    of a book is on which another lies, would make scenery of it: while a point is in no body, the smallest goes."""
+    """`find_bodies` for points [K, 3] that were clicked. A level plane on a body's own side, like the cover of a book
+    below another book, would turn the body into scenery: while a point is in no body, the smallest plane is dropped."""
     most: list[FoundBody] = []
     reached = -1
     for count in range(len(levels), 0, -1):
@@ -225,7 +225,7 @@ def bodies_with(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
 
 
 def _holds(surface: FieldSurface, body: FoundBody, point: np.ndarray) -> bool:
-    """Whether a point [3] on the surface is one of a body."""
+    """Whether a point [3] on the surface belongs to a body."""
     return bool(_near(Volume(_within(surface, body).astype(np.float32), body.low, body.cell), point[None])[0])
 
 
@@ -236,7 +236,7 @@ def _near(place: Volume, points: np.ndarray) -> np.ndarray:
 
 
 def _carries(place: Volume, other: LevelPlane, cell: float) -> bool:
-    """Whether the samples right below a level plane are for a good part those of one component."""
+    """Whether a large part of the samples right below a level plane belong to one component."""
     below = -other.above(place.points())
     return float((place.values * ((below > 0) & (below <= cell))).sum()) * cell**2 > CARRIED * other.area
 
@@ -251,7 +251,7 @@ def _stands(volume: Volume, place: Volume, lowest: np.ndarray, level: LevelPlane
 
 
 def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
-    """Share of the surface vertices at a component that some others, like those that photos show, are."""
+    """Share of the surface vertices at a component that belong to a given set, such as those seen by photos."""
 
     def here(points: np.ndarray) -> int:
         inside = (points > place.low - place.cell) & (points < place.low + place.cell * np.array(place.values.shape))
@@ -264,7 +264,7 @@ def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
 
 def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np.ndarray, level: LevelPlane,
           layer: float, size: float) -> FoundBody:  # fmt: skip
-    """The body of one component: all samples around it that are nearer to it than to what else is on the plane."""
+    """The body of one component: all samples around it that are nearer to it than to the rest on the plane."""
     margin = int(np.ceil((FILLET + 1) * layer / volume.cell)) + 1
     start = [max(part.start - margin, 0) for part in box]
     wide = tuple(slice(low, part.stop + margin) for low, part in zip(start, box, strict=True))
@@ -302,8 +302,8 @@ def body_mesh(body: FoundBody, field: Distance, cell: float) -> Mesh:
 
 
 def without_bodies(volume: Volume, bodies: list[FoundBody], field: Distance) -> Volume:
-    """The scenery alone: what bodies leave behind is empty, and their plane goes on below them. `volume` holds samples
-    of `field`, the signed distance."""
+    """The scenery without bodies: their space is empty, and their plane continues below them. `volume` holds samples of
+    `field`, the signed distance."""
     values = volume.values.copy()
     for body in bodies:
         part = body.part_of(volume)
@@ -312,15 +312,15 @@ def without_bodies(volume: Volume, bodies: list[FoundBody], field: Distance) -> 
         own = body.owns(lifted) | holds
         inside = values[part].reshape(-1).copy()
         over = own & (height > 0)
-        # What stands on nothing known leaves a dent that ends at its seam.
+        # A body without a known support leaves a dent that ends at its seam.
         gone = height if np.isfinite(body.level.height) or body.seam is None else -body.seam.at(points)
         inside[over] = np.maximum(inside[over], gone[over])
-        # Below its foot the field never saw anything: there the plane's solid goes on, and holes in it are closed.
+        # The field has no data below its foot: there the plane's solid continues, and holes in it are closed.
         under = np.flatnonzero(own & (height <= 0) & (height > -2 * body.layer))
         foot = under[holds[under] | (sample(field, lifted[under]) < 0.5 * body.layer)] if len(under) else under
         inside[foot] = np.minimum(inside[foot], height[foot])
-        # Between samples the surface is where the two nearest say: deep in what stood there, the lower one would lift
-        # it by up to a sample.
+        # The two nearest samples define the surface between them: deep inside the removed body, the lower one would
+        # lift it by up to a sample.
         near = foot[height[foot] > -ON * volume.cell]
         inside[near] = height[near]
         values[part] = inside.reshape(body.own.shape)
@@ -329,26 +329,26 @@ def without_bodies(volume: Volume, bodies: list[FoundBody], field: Distance) -> 
 
 @dataclass(frozen=True)
 class Parts:
-    """What a scene is made of, in normalised space."""
+    """The parts of a scene, in normalised space."""
 
-    solid: Mesh | None  # closed mesh of the scenery; None where there are bodies alone
-    shown: Mesh | None  # what is displayed of it: its visible surface, and the places where bodies stood
+    solid: Mesh | None  # closed mesh of the scenery; None if there are bodies alone
+    shown: Mesh | None  # its displayed mesh: the visible surface, and the places where bodies stood
     bodies: dict[str, Mesh]  # closed mesh of each body by name, with colours; the largest first
-    smallest: float  # what rises less than this above its plane stayed part of the scenery
-    # names of two bodies that touch, and "masks", "clicks" or "shape", which separated them
+    smallest: float  # pieces lower than this above their plane stayed part of the scenery
+    # names of two touching bodies, and "masks", "clicks" or "shape", which separated them
     touching: list[tuple[str, str, str]] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)  # names of masks or clicks that no body has
-    noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_are_noise`
-    unrefined: dict[str, str] = field(default_factory=dict)  # by body, why it was not moved to where the photos agree
+    missing: list[str] = field(default_factory=list)  # names of masks or clicks without a body
+    noise: list[float] = field(default_factory=list)  # longest sides of pieces that are noise
+    unrefined: dict[str, str] = field(default_factory=dict)  # by body, why its surface was not refined by photos
 
 
 def split(surface: FieldSurface, distance: Distance, finest: float, poses: PosedPhotos, photos_folder: Path,
           up: np.ndarray, *, alone: bool, clicked: dict[str, np.ndarray] | None = None) -> Parts:  # fmt: skip
     """Finds bodies, takes them out of the scenery and separates those that touch. Points [K, 3] of the surface that
-    were `clicked` give bodies their names. Raises SdfsimError where masks do so as well.
+    were `clicked` give bodies their names. Raises SdfsimError if masks do so as well.
 
-    All is in normalised space: the poses, `up` [3] and the signed distance that the surface is of; `finest` is the
-    width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
+    All is in normalised space: the poses, `up` [3] and the signed distance of the surface; `finest` is the width of a
+    cell of the field's finest grid. `alone`: there is no scenery, only bodies.
     """
     smallest, layer, lift = SMALLEST * finest, LAYER * finest, LIFT * surface.volume.cell
     names, clicked = load_names(photos_folder), clicked or {}
@@ -367,7 +367,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
         whole = [_whole(surface, mesh, up, layer) for mesh in whole_bodies(surface).values()]
     else:
         named = None if votes is None else votes.winner > 0
-        # Masks separate what lies on a body from it; the plane between them does not.
+        # Masks separate a body from one that lies on it; the plane between them does not.
         plain = surface.shown if named is None else surface.shown & ~named[surface.raw.faces].any(1)
         levels = find_level_planes(keep_faces(surface.raw, plain), up, finest)
         if clicked:
@@ -398,7 +398,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     called = _names([body for body in pieces if body not in noise])
     meshes, unrefined, pictures = {}, {}, load_grey_photos(poses.views, photos_folder)
     for body, name in called.items():
-        # Lifted clear of the surface in the way, which is sampled more coarsely.
+        # Lifted off the occluding surface, which is sampled more coarsely.
         mesh, why = refine(sampled[body], pictures, blocking, lift, finest, body.level.above, body.layer)
         if why:
             unrefined[name] = why
@@ -415,8 +415,8 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
 
 def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smallest: float,
             clicked: dict[str, np.ndarray], scene: Scene) -> tuple[list[Part], str, str]:  # fmt: skip
-    """The parts that a body is made of, none for a single one; what separates them, "masks", "clicks" or "shape"; and
-    the name that masks or clicks give to a single one."""
+    """The parts of a body, empty for a single one; what separates them: "masks", "clicks" or "shape"; and the name from
+    masks or clicks for a single one."""
     solid = _solid(surface, body)
     assert surface.raw.colors is not None
     points = {number: points[[_holds(surface, body, point) for point in points]]
@@ -434,7 +434,7 @@ def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smalles
 
 
 def _solid(surface: FieldSurface, body: FoundBody) -> ConnectedSolid:
-    """What is solid of a body above its contact layer."""
+    """The solid of a body above its contact layer."""
     around = Volume(surface.volume.values[body.part_of(surface.volume)], body.low, body.cell)
     return solid_of(around, _within(surface, body), surface.raw)
 
@@ -446,7 +446,7 @@ def _within(surface: FieldSurface, body: FoundBody) -> np.ndarray:
 
 
 def _piece(body: FoundBody, part: Part, name: str) -> FoundBody:
-    """One part of a body, with no more samples than it needs."""
+    """One part of a body, with only the samples that it needs."""
     mine = body.own & (part.seam.values < 0)
     box = ndimage.find_objects(ndimage.binary_dilation(mine, iterations=3).astype(np.int8))[0]
     size = max(np.ptp(places) for places in np.nonzero(mine)) * body.cell
@@ -455,7 +455,7 @@ def _piece(body: FoundBody, part: Part, name: str) -> FoundBody:
 
 
 def _whole(surface: FieldSurface, mesh: Mesh, up: np.ndarray, layer: float) -> FoundBody:
-    """A connected component of the solid, given by its mesh, as a body that stands on nothing."""
+    """A connected component of the solid, given by its mesh, as a body without a support."""
     volume = surface.volume
     label = ndimage.label(volume.values < 0)[0]  # type: ignore[index]
     at = np.round((mesh.vertices - volume.low) / volume.cell).astype(int)
@@ -465,7 +465,7 @@ def _whole(surface: FieldSurface, mesh: Mesh, up: np.ndarray, layer: float) -> F
 
 
 def _at_nothing(volume: Volume, mine: np.ndarray, solid: np.ndarray, up: np.ndarray, layer: float) -> FoundBody:
-    """The body of some samples `mine` [X, Y, Z] of a solid that stands on nothing known."""
+    """The body of some samples `mine` [X, Y, Z] of a solid without a known support."""
     box = ndimage.find_objects(mine.astype(np.int8))[0]
     size = max(part.stop - part.start for part in box) * volume.cell
     return _body(volume, solid, box, mine[box], LevelPlane(up, -np.inf, 0.0), layer, size)
@@ -473,7 +473,7 @@ def _at_nothing(volume: Volume, mine: np.ndarray, solid: np.ndarray, up: np.ndar
 
 def _loose(surface: FieldSurface, votes: Votes, number: int, bodies: list[FoundBody], up: np.ndarray, layer: float,
            smallest: float) -> list[FoundBody]:  # fmt: skip
-    """The body that masks name and that stands on no plane, cut off what it touches; none where there is too little."""
+    """The body with masks that stands on no plane, cut off from its neighbours; None if there is too little of it."""
     volume = surface.volume
     vertices = surface.raw.vertices
     index = np.flatnonzero((votes.winner == number) & ~np.any([body.owns(vertices) for body in bodies] or [False], 0))
@@ -498,8 +498,8 @@ def _loose(surface: FieldSurface, votes: Votes, number: int, bodies: list[FoundB
 def _noise(meshes: dict[FoundBody, Mesh], points: np.ndarray, width: float) -> list[FoundBody]:
     """The bodies that are only noise: dark or blurred places that the training filled.
 
-    They are small, no masks name them, and hardly any of the sparse points [P, 3] lies within `width` of them, where
-    others are covered with points.
+    They are small, have no masks, and almost none of the sparse points [P, 3] lies within `width` of them, while other
+    bodies are covered with points.
     """
     area = np.array([face_normals(mesh)[1].sum() for mesh in meshes.values()])
     trees = [KDTree(mesh.vertices) for mesh in meshes.values()]
@@ -510,7 +510,7 @@ def _noise(meshes: dict[FoundBody, Mesh], points: np.ndarray, width: float) -> l
 
 
 def _names(bodies: list[FoundBody]) -> dict[FoundBody, str]:
-    """A name of its own for each body, the largest first: that of its masks, or else a number."""
+    """A unique name for each body, the largest first: that of its masks, or else a number."""
     names: dict[FoundBody, str] = {}
     taken = {body.name for body in bodies}
     for body in sorted(bodies, key=lambda body: -body.size):
@@ -531,17 +531,17 @@ def whole_bodies(surface: FieldSurface) -> dict[str, Mesh]:
 
 
 def scenery(surface: FieldSurface, bodies: list[FoundBody], distance: Distance) -> tuple[Mesh, Mesh]:
-    """The scenery's solid without bodies, and what is displayed of it."""
+    """The scenery's solid without bodies, and its displayed mesh."""
     raw, mesh = surface.raw, without_bodies(surface.volume, bodies, distance).mesh()
     assert raw.colors is not None
-    # Wherever nothing was cut, the vertices are those of the whole surface: from these they take what is known.
+    # Away from cuts, the vertices are those of the whole surface, and take its attributes.
     away, nearest = KDTree(raw.vertices).query(mesh.vertices)
     same = away < 1e-6
     shown = same & _at_faces(raw, surface.shown)[nearest]
     color = raw.colors[nearest].astype(float)
     color[~same] = spread_colors(mesh.vertices[~same], mesh.vertices[shown], color[shown])
     mesh = replace(mesh, colors=to_bytes(color))
-    # Components of which nothing was there before are pockets that the cut has left.
+    # Components without any of the earlier surface are pockets left by the cut.
     label = components(mesh)
     belongs = (same & _at_faces(raw, surface.kept)[nearest])[mesh.faces].any(1)
     closed = (np.bincount(label, belongs) > 0)[label]

@@ -1,8 +1,8 @@
-"""Bodies that a person points at: from a few clicked places to who owns which part of a connected surface.
+"""Bodies that users point at: from a few clicked places to the body of each part of a connected surface.
 
-What the shape takes off a surface and nobody clicked is a body of its own. The rest is divided between the clicked
-bodies by distance along the surface first, which grooves and changes of colour lengthen; then photos say where the
-borders lie (GrabCut, Rother et al. 2004).
+A part that the shape separates and that has no click is a separate body. The rest is divided between the clicked
+bodies, first by distance along the surface, which grooves and changes of colour lengthen; then the borders are found in
+photos (GrabCut, Rother et al. 2004).
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from pipeline.mesh.visibility import Visibility, framed
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh
 
-# Chosen by hand on the rendered sets; nothing derives them.
-SEED = 1.5  # samples around a clicked point that surely are its body's
-LONGEST = 7.0  # how much grooves and changes of colour count as long ways at most, as a power of e
-SURE = 0.5  # of the way to the next clicked body: what is nearer than this share of it is sure
-PHOTOS, SIDE = 12, 320  # that are asked for borders, and their px
+# Chosen by hand on the rendered sets.
+SEED = 1.5  # samples around a clicked point that certainly belong to its body
+LONGEST = 7.0  # largest factor by which grooves and changes of colour lengthen distances, as a power of e
+SURE = 0.5  # of the distance to the next clicked body: within this share a vertex is certain
+PHOTOS, SIDE = 12, 320  # used to find borders, and their size in px
 VIEWED = 3  # photos that should see each place
-PASSES, AGREED = 2, 0.9  # in which photos are asked for borders; share of votes from which on the second is sure
-SAMPLES, LEAST = 20_000, 60  # pixels at most and at least from which the colours of bodies are known
-OUTSIDE = (255, 0, 255)  # colour of what is not looked at: it takes one of GrabCut's colour models, and no more
+PASSES, AGREED = 2, 0.9  # of finding borders; share of votes above which the second is certain
+SAMPLES, LEAST = 20_000, 60  # most and fewest pixels for the colours of a body
+OUTSIDE = (255, 0, 255)  # colour of ignored pixels: uses only one of GrabCut's colour models
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What bodies are cut out of, in normalised space."""
+    """The surface from which bodies are cut, in normalised space."""
 
     mesh: Mesh  # all of the closed surface
     caster: Caster  # of it
@@ -49,8 +49,8 @@ class Scene:
 
 def parts_by_clicks(solid: ConnectedSolid, colors: np.ndarray, clicked: dict[int, np.ndarray], scene: Scene,
                     least: float) -> list[Part]:  # fmt: skip
-    """The parts of a solid in which points [K, 3] of several bodies were clicked, by number; other parts that the shape
-    shows have the number 0. `colors` [P, 3] of its vertices; parts are at least `least` long in every direction."""
+    """The parts of a solid in which points [K, 3] of several bodies were clicked, by number; further parts found by
+    shape have the number 0. `colors` [P, 3] of its vertices; parts are at least `least` long in every direction."""
     shape = shape_labels(solid, colors, least)
     tree = KDTree(solid.points)
     seeds = {number: np.unique(np.concatenate(tree.query_ball_point(points, SEED * solid.volume.cell)).astype(int))
@@ -71,7 +71,7 @@ def parts_by_clicks(solid: ConnectedSolid, colors: np.ndarray, clicked: dict[int
 
 def divided(solid: ConnectedSolid, mine: np.ndarray, colors: np.ndarray, seeds: list[np.ndarray], scene: Scene
             ) -> np.ndarray:  # fmt: skip
-    """Which of some bodies, by the vertices of their seeds, each vertex [P] of those `mine` [P] bool belongs to."""
+    """The body of each vertex [P] among those `mine` [P] bool, from the bodies' seed vertices."""
     ends, deep, apart = steps(solid, mine, grooves(solid), colors)
     length = np.linalg.norm(np.diff(solid.points[ends], axis=1)[:, 0], axis=1)
     length *= 1 + np.exp(np.minimum(deep + apart, LONGEST))
@@ -85,7 +85,7 @@ def divided(solid: ConnectedSolid, mine: np.ndarray, colors: np.ndarray, seeds: 
     place = np.cumsum(mine) - 1
     faces = place[solid.faces[mine[solid.faces].all(1)]]
     names = [str(number) for number in range(1, len(seeds) + 1)]
-    # Per vertex of the whole surface: the body from 1 on, 0 for what is not looked at.
+    # Per vertex of the whole surface: the body from 1 on, 0 for ignored vertices.
     whole, certain = np.zeros(len(scene.mesh.vertices), int), np.zeros(len(scene.mesh.vertices), bool)
     for _ in range(PASSES):
         whole[solid.index[mine]], certain[solid.index[mine]] = label[mine] + 1, sure[mine]
@@ -93,7 +93,7 @@ def divided(solid: ConnectedSolid, mine: np.ndarray, colors: np.ndarray, seeds: 
         share = count_votes(sight, faces, chosen, labels.get, names).share[:, 1:]
         if not share.any():
             break
-        # What no photo tells of goes with what is beside it.
+        # Vertices without a vote take the body of their neighbours.
         label, sure = label.copy(), sure.copy()
         label[mine] = owners(solid.points[mine], share, solid.volume.cell).argmax(1)
         sure[mine] = share.max(1) > AGREED
@@ -103,14 +103,14 @@ def divided(solid: ConnectedSolid, mine: np.ndarray, colors: np.ndarray, seeds: 
 def _away(graph: coo_matrix, points: np.ndarray, seed: np.ndarray) -> np.ndarray:
     """Distance [P] of vertices, at `points` [P, 3], from those of a seed along the edges of a graph."""
     found = np.asarray(dijkstra(graph.tocsr(), directed=False, indices=seed, min_only=True))
-    # What hangs together with no seed goes to the nearest in space.
+    # Vertices not connected to a seed take the nearest one in space.
     loose = ~np.isfinite(found)
     found[loose] = 1e6 * KDTree(points[seed]).query(points[loose])[0]
     return found
 
 
 def _chosen(sight: Visibility, views: Sequence[View]) -> list[View]:
-    """The photos that together see most, each vertex so often as helps."""
+    """The photos that together see most; further views of a vertex beyond `VIEWED` do not count."""
     seen = np.zeros((len(views), len(sight.vertices)), np.float32)
     for number, view in enumerate(views):
         index, _, cosine = sight.of_view(view)
@@ -134,12 +134,12 @@ class CutOut:
     view: View
     low: np.ndarray  # [2] px of the photo, column and row of its first pixel
     size: np.ndarray  # [2] px of the photo, width and height
-    picture: np.ndarray  # [H, W, 3] uint8, smaller, `OUTSIDE` where it shows something else
-    body: np.ndarray  # [H, W] as far as is known, from 1 on; 0 for something else
+    picture: np.ndarray  # [H, W, 3] uint8, reduced, `OUTSIDE` where it shows something else
+    body: np.ndarray  # [H, W] as far as known, from 1 on; 0 for something else
     sure: np.ndarray  # [H, W] bool, where that is sure
 
     def labels(self, found: np.ndarray) -> np.ndarray:
-        """What is found [H, W] uint8 in the cut-out as labels of the photo; `UNKNOWN` around it."""
+        """Labels [H, W] uint8 of the cut-out as labels of the photo; `UNKNOWN` around it."""
         result = np.full((self.view.height, self.view.width), UNKNOWN, np.uint8)
         wide = np.asarray(Image.fromarray(found).resize(tuple(self.size.tolist()), Image.Resampling.NEAREST))
         start, end = np.maximum(self.low, 0), np.minimum(self.low + self.size, [self.view.width, self.view.height])
@@ -149,7 +149,7 @@ class CutOut:
 
 
 def _cut_out(view: View, label: np.ndarray, certain: np.ndarray, scene: Scene) -> CutOut:
-    """What a photo shows of the vertices with a label [V] above 0, some of which are `certain` [V] bool."""
+    """The part of a photo with the vertices whose label [V] is above 0; some are `certain` [V] bool."""
     pixels, inside = framed(view, scene.mesh.vertices)
     corner = pixels[inside & (label > 0)]
     low = np.floor(corner.min(0)).astype(int)
@@ -170,8 +170,8 @@ def _cut_out(view: View, label: np.ndarray, certain: np.ndarray, scene: Scene) -
 
 
 def borders(shown: list[CutOut], count: int) -> dict[str, np.ndarray]:
-    """Which of `count` bodies, from 1 on, each pixel [H, W] uint8 of each photo shows, by its name; `UNKNOWN` where
-    that is not clear. The colours of each body are those of what is sure in all photos together."""
+    """The body, from 1 to `count`, at each pixel [H, W] uint8 of each photo, by its name; `UNKNOWN` if unclear. The
+    colours of each body are those of its certain pixels in all photos together."""
     import cv2
 
     color = np.concatenate([one.picture[one.sure & (one.body > 0)] for one in shown])

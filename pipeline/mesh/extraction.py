@@ -20,19 +20,19 @@ from sdfsim.sdf.grid import near_samples
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
-BATCH = 1 << 17  # points a query; more take more memory and no less time
+BATCH = 1 << 17  # points per query; more need more memory and save no time
 RIM = 0.99  # normalised units, radius at which the solid ends: beyond it the field was never trained
 EXTENT = 1.02  # normalised units, half the side of the sampled cube: it holds the ball with two samples around it
 LIFT = 0.75  # cells of the samples by which vertices are lifted off a surface before views look for them
-MIN_SEEN = 2  # photos that have to show a vertex: one alone says nothing of where it is
+MIN_SEEN = 2  # photos that have to show a vertex: one alone does not determine its position
 # Normalised units. Farther than this from every point of structure-from-motion a surface is a guess. Chosen on a
 # rendered set, where the median error beyond it is ten times that within.
 MAX_FROM_POINTS = 0.1
-# Shares of area and of neighbours, chosen by hand on the photo sets of the project; nothing derives them.
-FLOATER = 0.01  # of the visible surface: a smaller patch says nothing; of the closed solid a quarter of that
-UNSEEN = 0.05  # a component of whose area photos show less than this share is matter behind the scenery
-CLOSING, CLOSINGS = 0.6, 4  # share of seen neighbours by which an unseen vertex counts as seen, and how many times
-SPECK = 0.02  # normalised units, from which on what is left out is reported: 1 % of the width of the trained space
+# Shares of area and of neighbours, chosen by hand on the photo sets of the project.
+FLOATER = 0.01  # of the visible surface: smaller patches are ignored; for the closed solid a quarter of that
+UNSEEN = 0.05  # a component with less than this share of its area seen is matter behind the scenery
+CLOSING, CLOSINGS = 0.6, 4  # share of seen neighbours for which an unseen vertex counts as seen, and rounds
+SPECK = 0.02  # normalised units, smallest reported length of pieces left out: 1 % of the trained space's width
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Volume:
         return map_coordinates(self.values, ((points - self.low) / self.cell).T, order=1, mode="nearest")
 
     def limited(self, limit: Distance) -> "Volume":
-        """What of the solid lies within another one, whose distance [P] at points [P, 3] is given."""
+        """The part of the solid within another one, given by its distance [P] at points [P, 3]."""
         values = self.values.copy()
         for number, x in enumerate(self.axes()[0]):  # A fine grid has too many points to hold at once.
             slab = Volume(values[number : number + 1], np.array([x, *self.low[1:]]), self.cell)
@@ -70,12 +70,12 @@ class Volume:
 
     def mesh(self) -> Mesh:
         """The zero surface by marching cubes, faces counter-clockwise from outside. Raises SdfsimError (exit code 3)
-        where the values have one sign everywhere."""
+        if the values have one sign everywhere."""
         if not self.values.min() < 0 < self.values.max():
             raise SdfsimError("mesh: the field holds no surface", exit_code=EXIT_QUALITY)
         from skimage.measure import marching_cubes
 
-        # A surface through a sample makes several vertices in one place; merged later, they would pinch a closed mesh.
+        # A surface through a sample gives several vertices at one point; merged later, they would pinch a closed mesh.
         least = 0.02 * self.cell
         values = np.where(np.abs(self.values) < least, np.where(self.values < 0, -least, least), self.values)
         vertices, faces, _, _ = marching_cubes(values, 0.0)
@@ -116,28 +116,28 @@ def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: floa
 
 @dataclass(frozen=True)
 class FieldSurface:
-    """What was extracted, in normalised space."""
+    """The extracted surface, in normalised space."""
 
     volume: Volume  # the signed distance it comes from
     raw: Mesh  # all of the closed surface, with colours
     seen: np.ndarray  # [V] bool, vertices of it that photos show well enough
-    kept: np.ndarray  # [F] bool, faces of it that belong
-    shown: np.ndarray  # [F] bool, faces of it that belong and that photos show
-    left_out: list[float]  # longest sides of what does not belong, the largest first
+    kept: np.ndarray  # [F] bool, faces of it to keep
+    shown: np.ndarray  # [F] bool, faces to keep that photos show
+    left_out: list[float]  # longest sides of pieces left out, the largest first
 
     @property
     def visible(self) -> Mesh:
-        """What photos show, an open mesh with colours."""
+        """The surface that photos show, an open mesh with colours."""
         return keep_faces(self.raw, self.shown)
 
     @property
     def solid(self) -> Mesh:
-        """The closed surface of what belongs."""
+        """The closed surface of the faces to keep."""
         return keep_faces(self.raw, self.kept)
 
 
 def ball(points: np.ndarray) -> np.ndarray:
-    """Distance [P] from the ball that the field was trained in, at points [P, 3]."""
+    """Distance [P] from the ball in which the field was trained, at points [P, 3]."""
     return np.linalg.norm(points, axis=1) - RIM
 
 
@@ -169,8 +169,8 @@ def surface_of(
     known: Callable[[np.ndarray], np.ndarray] | None = None, on_progress: Progress = silent,
 ) -> FieldSurface:  # fmt: skip
     """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
-    poses are in normalised space. Points [P, 3] that are `known` [P] count as seen, whoever sees them. Raises
-    SdfsimError (exit code 3) where the field has no surface, or hardly any of it is in the photos."""
+    poses are in normalised space. Points [P, 3] that are `known` [P] count as seen in any case. Raises
+    SdfsimError (exit code 3) if the field has no surface, or hardly any of it is in the photos."""
     raw, cell = volume.mesh(), volume.cell
     found = look(Visibility(raw, LIFT * cell), poses.views, photos_folder, on_progress)
     far = KDTree(poses.sparse.xyz).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
@@ -203,7 +203,7 @@ def field_colors(field: Field, mesh: Mesh) -> np.ndarray:
 
 
 def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
-    """The mesh of the faces `keep` [F] bool, without the vertices that nothing uses."""
+    """The mesh of the faces `keep` [F] bool, without unused vertices."""
     faces = mesh.faces[keep]
     used, inverse = np.unique(faces, return_inverse=True)
     colors = None if mesh.colors is None else mesh.colors[used]
@@ -218,7 +218,7 @@ def components(mesh: Mesh) -> np.ndarray:
 
 
 def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float]]:
-    """Which faces [F] bool of a closed mesh belong, by connected components: those that photos show (`seen` [F] bool)
+    """The faces [F] bool of a closed mesh to keep, by connected components: those that photos show (`seen` [F] bool)
     and that have at least this share of all the area. Also the longest sides of the other components from the largest
     down, without those shorter than `speck`."""
     label = components(mesh)
@@ -233,13 +233,13 @@ def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple
     np.minimum.at(low, label, corner.min(1))
     np.maximum.at(high, label, corner.max(1))
     size = (high - low).max(1)
-    # A cavity is a flaw of the piece around it and no piece of its own.
+    # A cavity is a flaw of the piece around it, not a separate piece.
     left_out = size[(small | unseen) & ~inward & (size >= speck)]
     return ~(small | unseen)[label], sorted(left_out.tolist(), reverse=True)
 
 
 def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:
-    """Of some faces [F] bool those that lie together: a patch needs this share of the area of all the faces, or of
+    """Those of some faces [F] bool that form patches: a patch needs this share of the area of all the faces, or of
     those of its own component of the mesh."""
     _, area = face_normals(mesh)
     area = np.where(faces, area, 0)

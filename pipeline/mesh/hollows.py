@@ -1,4 +1,4 @@
-"""What is hollow about a body: how deep it is, whether photos see so deep, and how thick its wall is."""
+"""The hollow of a body: its depth, whether photos see its bottom, and the thickness of the wall."""
 
 from dataclasses import asdict, dataclass
 
@@ -10,20 +10,20 @@ from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
 PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; that a hollow has
-# What is below a hollow is its floor if it is thinner than this share of the hollow's depth.
+# The matter below a hollow is its floor if it is thinner than this share of the hollow's depth.
 FLOOR = 0.3
-UPRIGHT = 0.5  # largest part upwards of the normal of a wall
-KNOWN = 0.5  # share of a wall that photos have to see from both sides before its thickness counts as known
+UPRIGHT = 0.5  # largest upward component of the normal of a wall
+KNOWN = 0.5  # share of a wall that photos have to see from both sides for a known thickness
 
 
 @dataclass(frozen=True)
 class Hollow:
-    """The hollow of a body, upright as it stands."""
+    """The hollow of a body in its upright position."""
 
     depth: float  # m below its rim
-    below: float  # m, how thick what is below the hollow is
+    below: float  # m, thickness of the matter below the hollow
     seen: int  # photos that see its bottom: the median over it, by rays
-    wall: float | None  # m, the median thickness of the wall around it; None where there is none
+    wall: float | None  # m, the median thickness of the wall around it; None if there is none
     wall_seen: float  # share of the wall, by vertices, of which photos see both sides
 
     def to_dict(self) -> dict:
@@ -33,8 +33,8 @@ class Hollow:
 
 
 def hollow(mesh: Mesh, least: float, evidence: Evidence | None = None) -> Hollow | None:
-    """The hollow of a body, a closed mesh in metres with z up; None where it holds no water, or none deeper than
-    `least` m. `evidence` is what photos say about the vertices; without it nothing counts as seen."""
+    """The hollow of a body, a closed mesh in metres with z up; None if it is not hollow, or not deeper than `least` m.
+    `evidence` is the photos' evidence for the vertices; without it nothing counts as seen."""
     from skimage.morphology import reconstruction
 
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
@@ -70,7 +70,7 @@ def _wall(mesh: Mesh, rim: float, bottom: np.ndarray, evidence: Evidence | None)
     start = mesh.vertices[inner] - skin * normals[inner]
     away = Caster(mesh).hits(start, -normals[inner])[0]
     through = np.isfinite(away)
-    # A line that meets the hollow again has left no wall there.
+    # A line that meets the hollow again has not passed a wall.
     if not through.any():
         return None, 0.0
     thick = float(np.median(away[through]) + skin)
@@ -82,7 +82,7 @@ def _wall(mesh: Mesh, rim: float, bottom: np.ndarray, evidence: Evidence | None)
 
 
 def hollow_line(name: str, found: dict) -> str:
-    """What the report says about the hollow of a body, from `Hollow.to_dict`."""
+    """The report's line on the hollow of a body, from `Hollow.to_dict`."""
     depth, below, seen = found["depth"], found["below"], found["seen"]
     photos = f"{seen} photos see its bottom" if seen > 1 else f"{('no', 'one')[seen]} photo sees its bottom"
     if below < FLOOR * depth:
@@ -94,5 +94,5 @@ def hollow_line(name: str, found: dict) -> str:
     if found["wall"] is None:
         return line
     if found["wall_seen"] < KNOWN:
-        return f"{line}; how thick its wall is, is unknown: photos see both sides of {found['wall_seen']:.0%} of it"
+        return f"{line}; the thickness of its wall is unknown: photos see both sides of {found['wall_seen']:.0%} of it"
     return f"{line}; its wall is {1000 * found['wall']:.2g} mm thick"

@@ -1,8 +1,8 @@
-"""Two states of one thing, such as a door shut and open -> its joint: the part that moves, and the screw that moves it.
+"""Two states of one object, such as a door shut and open -> its joint: the moving part, and its screw motion.
 
-What the surfaces of both states have in common stands still. The rest of the one is laid on the rest of the other by
-ICP from many starts, and by what photos show of both; the motion with the least turn and slide of those that fit is a
-hinge or a slider. Where it is known what the photos look through, what they do not show says nothing.
+The common surface of both states is static. The rest of one is matched with the rest of the other by ICP from many
+starts, and by features in photos of both; the fitting motion with the least rotation and translation is a hinge or a
+slider. If it is known where photos see through, hidden places do not count.
 """
 
 from __future__ import annotations
@@ -26,60 +26,60 @@ from sdfsim.geometry.bvh import ClosestPoint
 from sdfsim.geometry.mesh import Mesh, sample_surface
 
 JOINT, PART = "joint.json", "part"  # the file, and the name of the body
-POINTS, MOST_POINTS = 8_000, 64_000  # on each surface: at first, and where little of it moves
-ENOUGH = 1_500  # points that move are enough
-STILL = 0.02  # of the size: what is nearer to the other state's surface does not move
-LEAST = 0.01  # of the surface: less of it that moves is noise
-# In units of what counts as still:
-FAR = 2.5  # a point that is farther off counts as so far
-HIDDEN = 0.3  # how far off a point counts that would be where the other state's photos do not look
-COARSE, FINE = 5.0, 0.5  # how far ICP looks for partners, first and last
-WIDE = 0.2  # of the part's size, how far it looks first at least
-FIT = 0.5  # mean distance of points, of a motion that fits
-MOST = 0.9  # of the surface: where more of it moves, nothing tells where the rest is
-ROUNDS = 10  # of ICP at each reach
-FEW, BEST = 400, 10  # points with which all starts are tried, and how many of these go on with all
-ALIKE = 1.5  # times the least such distance: motions that fit as well, as those of a thing with symmetries do
-EXACT = 2e-5  # of the size: what fits better fits as well
-DIP = math.radians(10.0)  # motions that differ by a smaller turn are one, found less or more exactly
-BESIDE = 0.1  # of the part's size: how far a hinge may be from the part
-SLIDES = math.radians(2.0)  # a motion that turns by less is a slide
-PITCH = 0.05  # of the size: a hinge that slides more along its axis is none
-APART = 3.0  # times what counts as still: surfaces so far apart are two patches
-SPECK = 0.1  # of the largest patch that moves: a smaller one is noise
-SURE = 0.9  # of what moves: where less of it goes with the motion, what was found says so
-FOLLOWS = 0.6  # of what moves: where less of it goes with one motion, more than one thing has moved
+POINTS, MOST_POINTS = 8_000, 64_000  # on each surface: at first, and if little of it moves
+ENOUGH = 1_500  # sufficient number of moving points
+STILL = 0.02  # of the size: points nearer to the other state's surface do not move
+LEAST = 0.01  # of the surface: a smaller moving part is noise
+# In units of the limit of static:
+FAR = 2.5  # distances are capped at this
+HIDDEN = 0.3  # distance assumed for a point where the other state's photos do not look
+COARSE, FINE = 5.0, 0.5  # search radius of ICP for partners, first and last
+WIDE = 0.2  # of the part's size, smallest first search radius
+FIT = 0.5  # largest mean distance of points for a motion that fits
+MOST = 0.9  # of the surface: if more of it moves, the static rest is unknown
+ROUNDS = 10  # of ICP at each search radius
+FEW, BEST = 400, 10  # points with which all starts are tried, and how many starts continue with all points
+ALIKE = 1.5  # times the least mean distance: motions that fit equally well, as for an object with symmetries
+EXACT = 2e-5  # of the size: better fits count as equal
+DIP = math.radians(10.0)  # motions that differ by a smaller turn are the same local minimum
+BESIDE = 0.1  # of the part's size: largest distance of a hinge from the part
+SLIDES = math.radians(2.0)  # a motion with a smaller turn is a slide
+PITCH = 0.05  # of the size: largest slide of a hinge along its axis
+APART = 3.0  # times the limit of static: surfaces so far apart are two patches
+SPECK = 0.1  # of the largest moving patch: a smaller one is noise
+SURE = 0.9  # of the moving surface: if less of it follows the motion, the result says so
+FOLLOWS = 0.6  # of the moving surface: if less of it follows one motion, more than one part has moved
 AGREED = 12  # features at least that show the same motion
-BY_CHANCE = 0.05  # of the features that look alike: so many lie right by chance
-ONE = "give two states between which one thing has moved"
-# Of how far both states' surfaces differ: what is the same all over, and so no draw shows. On rendered sets the joint
-# was off by about as much.
+BY_CHANCE = 0.05  # of the features that look alike: this share fits by chance
+ONE = "give two states between which only one part has moved"
+# Share of the difference between both states' surfaces that is the same everywhere, so that no draw shows it. On
+# rendered sets the joint was off by about as much.
 COMMON = 0.1
-DRAWS = 8  # of patches of the surface, and features, by which the doubt is measured
+DRAWS = 8  # of patches of the surface, and features, for estimating the uncertainty
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """How far a joint may be off, one standard deviation, see `_doubt`."""
+    """Uncertainty of a joint, one standard deviation, see `_doubt`."""
 
     axis: float  # rad
-    place: float  # m, of a hinge's axis beside itself
+    place: float  # m, of a hinge's axis, sideways
     travel: float  # rad or m
 
 
 @dataclass(frozen=True)
 class FoundJoint:
-    """A joint between a part that moves and what stands still, in the frame of the first state."""
+    """A joint between a moving part and the static rest, in the frame of the first state."""
 
     kind: Literal["hinge", "slider"]
     anchor: np.ndarray  # [3] m, a point of a hinge's axis, in the middle of the part; of a slider the part's middle
     axis: np.ndarray  # [3] unit vector, along which the second state is at a positive angle or position
     travel: float  # rad or m, from the first state to the second
     motion: Similarity  # of the part, at scale 1
-    moving: np.ndarray  # [F] bool, the faces of the first state that move
+    moving: np.ndarray  # [F] bool, moving faces of the first state
     off: float  # m, mean distance of the part, moved, from the second state
     doubt: Doubt
-    follows: float  # share of what moves that goes with this motion, or that the other state's photos do not show
+    follows: float  # share of the moving surface that follows this motion, or that the other state's photos do not show
     seen: tuple[np.ndarray, np.ndarray]  # [P, 3] m of the part's surface in the first and in the second state
 
     def line(self, size: float) -> str:
@@ -88,21 +88,22 @@ class FoundJoint:
 
 
 Empty = Callable[[np.ndarray], np.ndarray]  # whether points [P, 3] m are where a state's photos see through, [P] bool
-Pairs = tuple[np.ndarray, np.ndarray]  # [K, 3] m: the same places of what moves, in the one and in the other state
+Pairs = tuple[np.ndarray, np.ndarray]  # [K, 3] m: the same points of the moving part, in one and in the other state
 
 
 def find_joint(
     one: Mesh, other: Mesh, *, seed: int = 0, near: float | None = None, empty: tuple[Empty, Empty] | None = None,
     paired: Callable[[np.ndarray, np.ndarray], Pairs] | None = None,
 ) -> FoundJoint:  # fmt: skip
-    """The joint between two states of one thing, whose surfaces lie in one frame where nothing moves.
+    """The joint between two states of one object, whose static surfaces coincide.
 
-    What is within `near` m of the other state's surface stands still. `empty` tells of both states where photos see
-    through: what moves has left such a place, or come to it. Without it all that has no surface is empty. `paired`
-    gives places that are alike, some of them wrongly, from the points [P, 3] m that move in the one and in the other.
+    Points within `near` m of the other state's surface are static. `empty` gives for both states the places through
+    which photos see: the moving part has left such a place, or come to it. Without it all space without a surface is
+    empty. `paired` gives points that look alike, with some wrong pairs, from the points [P, 3] m that move in one and
+    in the other.
 
-    Raises SdfsimError where nothing moves, all does, several things do, no motion carries the one part onto the other,
-    or the motion is that of neither a hinge nor a slider.
+    Raises SdfsimError if nothing moves, if everything or several parts move, if no motion carries the part from one
+    place to the other, or if the motion is neither that of a hinge nor that of a slider.
     """
     rng = np.random.default_rng(seed)
     size = float(np.linalg.norm(np.ptp(one.vertices, axis=0)))
@@ -113,7 +114,7 @@ def find_joint(
     there, their_share = _moved(other, on[0], clear[0], near, rng)
     if empty is None and share > MOST:
         raise SdfsimError("everything moves: the two states have nothing in common", "bring both into one frame first")
-    # What photos see through tells one way alone where the part is hidden in the other state, as a drawer is.
+    # Empty places give only one direction if the part is hidden in the other state, like a drawer.
     for some, which in ((share, "first"), (their_share, "second")):
         if some < LEAST and (empty is None or max(share, their_share) < LEAST):
             raise SdfsimError(f"nothing moves: the {which} state lies on the other within {100 * near / size:.2g} % "
@@ -129,7 +130,7 @@ def find_joint(
     mid = part[0].mean(0) if len(part[0]) else pairs[0].mean(0)
 
     def tried(starts: list[Similarity]) -> list[_Rated]:
-        """The best of the motions to which these lead, each once."""
+        """The best of the motions from these starts, each once."""
         reach = max(COARSE, WIDE * width / near)
         rough = [surfaces.rated(few.laid(start, (reach, 0.5 * reach, 0.25 * reach)), few) for start in starts]
         best: list[Similarity] = []
@@ -141,20 +142,20 @@ def find_joint(
                 best.append(entry.motion)
         return [surfaces.rated(surfaces.laid(motion, FINISH), surfaces) for motion in best]
 
-    # What is alike by its looks is the same place, however many other places are shaped alike.
+    # Matching features mark the same place, however many other places have the same shape.
     found = [] if shown is None else tried([shown])
     if not found or found[0].off > FIT * near:
         if not len(part[0]) or not len(there[0]):
-            message = "what moves is seen in one state only"
+            message = "the moving part is seen in one state only"
             raise SdfsimError(message, "photograph it from the same sides in both")
         found += tried(_starts(part[0], there[0]))
     least = max(min(entry.off for entry in found), EXACT * size)
     if least > FIT * near:
-        told = f"no motion carries the part that moves onto its second place (best: {least:.3g} m off)"
+        told = f"no motion carries the moving part to its second place (best: {least:.3g} m off)"
         raise SdfsimError(told, ONE)
 
-    # Of motions that fit as well, which a thing with symmetries has: a hinge or a slider before a screw, a hinge beside
-    # its part before one in the air, and then the least motion.
+    # Order of motions that fit equally well, as for an object with symmetries: a hinge or a slider before a screw, a
+    # hinge next to its part before one in the air, and then the smallest motion.
     def unlikely(entry: _Rated) -> tuple[bool, bool, float]:
         angle, axis, point, slide = _screw(entry.motion, mid)
         across = (part[0] if len(part[0]) else pairs[0]) - point
@@ -166,18 +167,18 @@ def find_joint(
     lowest = max(min(entry.cost for entry in found), EXACT * size)
     fitting = [entry for entry in found if entry.cost <= ALIKE * lowest and entry.off <= FIT * near]
     chosen = min(fitting or found, key=unlikely)
-    # Several starts lead into one dip: the deepest place of it counts.
+    # Several starts lead into one local minimum: its lowest point counts.
     same = [entry for entry in fitting or found if _screw(entry.motion.after(chosen.motion.inverse()), mid)[0] < DIP]
     rated = min(same, key=lambda entry: entry.cost)
     if empty is not None and rated.follows < FOLLOWS:
-        told = f"more than one thing has moved: {1 - rated.follows:.0%} of what moved does not go with the rest"
+        told = f"more than one part has moved: {1 - rated.follows:.0%} of what moved does not go with the rest"
         raise SdfsimError(told, ONE)
     angle, _, _, slide = _screw(rated.motion, mid)
     if angle > SLIDES and abs(slide) > PITCH * size:
         told = f"turns by {math.degrees(angle):.1f} degrees and slides by {slide:.3g} m along the same axis"
         raise SdfsimError(f"the part is on neither a hinge nor a slider: it {told}")
     motion = rated.motion
-    if angle <= SLIDES:  # the slide that takes the middle where the motion takes it
+    if angle <= SLIDES:  # the slide that moves the middle like the motion
         motion = surfaces.laid(_shift(motion.points(mid) - mid), FINISH, turns=False)
     kind, anchor, axis, travel = _joint_of(motion, mid)
     doubt = _doubt(surfaces, motion, mid, COMMON * rated.off, 0.5 * width, rng)
@@ -200,21 +201,21 @@ def scene_keys(found: FoundJoint | HeldPart) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class HeldPart:
-    """A joint that was found between two states, in the world of the state of which the scene is made."""
+    """A joint between two states, in the world of the state from which the scene is made."""
 
     kind: Literal["hinge", "slider"]
     anchor: np.ndarray  # [3] on the axis
     axis: np.ndarray  # [3] unit
     travel: float  # rad, or a length, from the first state to the second
-    turn: np.ndarray  # [3, 3] and shift [3]: from the part as the scene's meshes have it to the first state
+    turn: np.ndarray  # [3, 3] and shift [3]: from the part in the scene's meshes to the first state
     shift: np.ndarray
     metres: float  # a unit of this world in metres
-    size_from: str  # where that is from, in words
+    size_from: str  # its source, in words
     size_assumed: bool
     off: float  # as of `FoundJoint`, and so are the next two
     doubt: Doubt
     follows: float
-    size: float  # of what both states were compared by
+    size: float  # of the compared surfaces
 
     def line(self) -> str:
         """What was found."""
@@ -223,7 +224,7 @@ class HeldPart:
     def moved(self, move: Similarity) -> HeldPart:
         """The same in another world."""
         home = move.after(Similarity(1.0, self.turn, self.shift)).after(move.inverse())
-        long = 1.0 if self.kind == "hinge" else move.scale  # a unit of what the joint measures
+        long = 1.0 if self.kind == "hinge" else move.scale  # a unit of the joint's coordinate
         doubt = Doubt(self.doubt.axis, self.doubt.place * move.scale, self.doubt.travel * long)
         return replace(self, anchor=move.points(self.anchor), axis=move.rotation @ self.axis, travel=self.travel * long,
                        turn=home.rotation, shift=home.translation, metres=self.metres / move.scale,
@@ -235,7 +236,7 @@ class HeldPart:
 
 
 def load_held(path: Path) -> HeldPart | None:
-    """What `HeldPart.save` wrote; None where nothing is there. Raises SdfsimError: damaged."""
+    """The joint that `HeldPart.save` wrote; None if there is none. Raises SdfsimError if the file is damaged."""
     if not path.exists():
         return None
     known = read_json(path)
@@ -248,17 +249,17 @@ def load_held(path: Path) -> HeldPart | None:
 
 
 def _told(joint: FoundJoint | HeldPart, size: float) -> str:
-    """What was found, in words; the surfaces that were compared are of a size, m."""
+    """The result in words; the compared surfaces have a size, m."""
     axis = ", ".join(f"{value:.3f}" for value in joint.axis)
     where = ", ".join(f"{value:.4g}" for value in joint.anchor)
-    doubt = f"the axis is sure to {math.degrees(joint.doubt.axis):.2g} degrees"
+    doubt = f"the uncertainty of the axis is {math.degrees(joint.doubt.axis):.2g} degrees"
     if joint.kind == "hinge":
         way = f"turns by {math.degrees(joint.travel):.1f} degrees about"
         doubt += f" and {joint.doubt.place:.2g} m"
     else:
         way = f"slides by {joint.travel:.3g} m along"
-    rest = f"; {1 - joint.follows:.0%} of what moved does not go with it" if joint.follows < SURE else ""
-    fit = f"the two states fit with {100.0 * joint.off / size:.2g} % of the size off"
+    rest = f"; {1 - joint.follows:.0%} of the moved surface does not follow the motion" if joint.follows < SURE else ""
+    fit = f"the two states fit to {100.0 * joint.off / size:.2g} % of the size"
     return f"{joint.kind}: a part {way} ({axis}) through ({where}) m; {fit}; {doubt}{rest}"
 
 
@@ -268,7 +269,7 @@ def _shift(way: np.ndarray) -> Similarity:
 
 
 def _starts(moving: np.ndarray, moved: np.ndarray) -> list[Similarity]:
-    """Motions to try: a slide; and turns, about the principal axes of the part, by which it may have gone."""
+    """Motions to try: a slide, and turns about the principal axes of the part."""
     frames = []
     for points in (moving, moved):
         centred = points - points.mean(0)
@@ -279,11 +280,11 @@ def _starts(moving: np.ndarray, moved: np.ndarray) -> list[Similarity]:
             turn = (frames[1][:, order] * signs) @ frames[0].T
             if np.linalg.det(turn) > 0:
                 turns.append(turn)
-    # Principal axes tell little where a part is seen in part: also turns about each by steps of a twelfth.
+    # Principal axes are unreliable if a part is only partly seen: so also turns about each by steps of a twelfth.
     for axis in frames[0].T:
         turns += [Rotation.from_rotvec(axis * angle).as_matrix() for angle in np.arange(1, 12) * (math.pi / 6.0)]
     found = [Similarity(1.0, turn, moved.mean(0) - turn @ moving.mean(0)) for turn in turns]
-    # Of a slide the middles tell little either: the one or the other end along each axis may be what both show.
+    # For a slide the middles are unreliable too: both states may show only one end or the other along each axis.
     ends = [[(points @ frames[1]).min(0), (points @ frames[1]).max(0)] for points in (moving, moved)]
     return found + [
         _shift(frames[1] @ [ends[1][end][k] - ends[0][end][k] for k, end in enumerate(which)])
@@ -306,14 +307,14 @@ def _everywhere(points: np.ndarray) -> np.ndarray:
 
 
 Points = tuple[np.ndarray, np.ndarray]  # [P, 3] m of a surface, with the normals there
-Reaches = tuple[float, ...]  # how far partners may be, in units of what counts as still, one after the other
+Reaches = tuple[float, ...]  # search radii for partners, in units of the limit of static, one after the other
 FINISH: Reaches = (3.0 * FINE, FINE, FINE, FINE)
 
 
 def _moved(
     mesh: Mesh, other: ClosestPoint, empty: Empty, near: float, rng: np.random.Generator
 ) -> tuple[Points, float]:
-    """Points of a surface that the other state does not have, and what share of it they are."""
+    """Points of a surface that the other state does not have, and their share of it."""
     points, normals = sample_surface(mesh, POINTS, rng)
     gone = _gone(points, other, empty, near)
     share = float(gone.mean())
@@ -324,14 +325,14 @@ def _moved(
 
 
 def _gone(points: np.ndarray, other: ClosestPoint, empty: Empty, near: float) -> np.ndarray:
-    """[P] bool, points that the other state's surface has not, where its photos see through."""
+    """[P] bool, points missing in the other state's surface, where its photos see through."""
     gone = _away(other, points) > near
     gone[gone] = empty(points[gone])
     return gone
 
 
 def _patches(points: Points, gap: float) -> Points:
-    """Those points that lie in the larger patches."""
+    """The points in the larger patches."""
     if not len(points[0]):
         return points
     links = KDTree(points[0]).sparse_distance_matrix(KDTree(points[0]), gap, output_type="coo_matrix")
@@ -342,7 +343,7 @@ def _patches(points: Points, gap: float) -> Points:
 
 
 def _agreed(pairs: Pairs, near: float) -> tuple[Similarity | None, Pairs]:
-    """The motion that most pairs of places agree on, None where too few do, and these pairs."""
+    """The motion that most pairs of points agree on, None if too few do, and these pairs."""
     import pycolmap
 
     options = pycolmap.RANSACOptions(max_error=near, max_num_trials=100_000, random_seed=0)
@@ -359,16 +360,16 @@ class _Rated:
     """A motion of the part from the first state to the second, and how well it fits."""
 
     motion: Similarity
-    cost: float  # m, the mean over what moves, the hidden counting a little
-    off: float  # m, the mean distance of what moves where it can be seen
-    follows: float  # share of what moves that it explains
+    cost: float  # m, the mean over moving points, with a small cost for hidden ones
+    off: float  # m, the mean distance of visible moving points
+    follows: float  # share of the moving points that it explains
 
 
 @dataclass(frozen=True)
 class _Surfaces:
-    """What moves, in both states, and what it is to be laid on."""
+    """The moving surface in both states, and the surfaces with which it is matched."""
 
-    on: tuple[ClosestPoint, ClosestPoint]  # all of the surface of the first and of the second state
+    on: tuple[ClosestPoint, ClosestPoint]  # the whole surface of the first and of the second state
     empty: tuple[Empty, Empty]
     part: Points  # of the first state
     there: Points  # of the second
@@ -388,8 +389,8 @@ class _Surfaces:
         return replace(self, part=few(self.part), there=few(self.there), pairs=pairs)
 
     def carried(self, points: np.ndarray, motion: Similarity, state: int) -> tuple[np.ndarray, np.ndarray]:
-        """[P] m, how far points, moved, are from a state's surface, and whether they are where its photos do not look
-        and so may have one."""
+        """[P] m, distance of moved points from a state's surface, and whether its photos do not look there, so that a
+        hidden surface may exist."""
         moved = motion.points(points)
         away = _away(self.on[state], moved)
         hidden = away > self.near
@@ -397,7 +398,7 @@ class _Surfaces:
         return away, hidden
 
     def rated(self, motion: Similarity, by: _Surfaces) -> _Rated:
-        """How well a motion fits, both ways: nothing of either part is to be left over."""
+        """How well a motion fits in both directions, so that no part of either surface is left over."""
         costs, offs, follow, count = [0.0], [0.0], 0.0, 0
         for (points, _), way, state in ((by.part, motion, 1), (by.there, motion.inverse(), 0)):
             if not len(points):
@@ -410,9 +411,9 @@ class _Surfaces:
         return _Rated(motion, max(costs), max(offs), follow / max(count, 1))
 
     def laid(self, motion: Similarity, reaches: Reaches, *, turns: bool = True) -> Similarity:
-        """A motion made better by ICP, points to planes: of the part in the first state on the second's surface, and of
-        the part in the second state on the first's, looking ever nearer; and of pairs of places on each other. Edges of
-        a part that lies flush in the one state are seen in the other. Without `turns` it does not turn."""
+        """A motion refined by point-to-plane ICP: of the part in the first state with the second's surface, and of the
+        part in the second state with the first's, with shrinking search radii; and of pairs of points. If a part is
+        flush in one state, its edges are seen in the other. Without `turns` the motion has no rotation."""
         for reach in reaches:
             shown = self._shown(motion)
             for _ in range(ROUNDS):
@@ -425,8 +426,8 @@ class _Surfaces:
         return motion
 
     def _shown(self, motion: Similarity) -> _Surfaces:
-        """The same without points that a motion carries to where the other state's photos do not look. There is no
-        surface for them, and the nearest one is another's."""
+        """The same without points that a motion carries to where the other state's photos do not look. They have no
+        surface there, and the nearest one belongs to something else."""
         if self.empty == (_everywhere, _everywhere):
             return self
         some = [
@@ -437,12 +438,12 @@ class _Surfaces:
         return replace(self, part=some[0], there=some[1])
 
     def _step(self, motion: Similarity, reach: float, turns: bool) -> tuple[Similarity, float] | None:
-        """A step of ICP and how long it is, m; None where too little has a partner."""
+        """A step of ICP and how long it is, m; None if too little has a partner."""
         turn, shift = motion.rotation, motion.translation
         here, facing = self.part[0] @ turn.T + shift, self.part[1] @ turn.T
         goal, normal = self.on[1](here) if len(here) else (here, facing)
         back, normal_back = self.on[0]((self.there[0] - shift) @ turn) if len(self.there[0]) else self.there
-        # What moves, where it is to go along a normal, and which way it faces and should.
+        # The moving points, their targets along a normal, and their present and wanted directions.
         moving = np.concatenate([here, back @ turn.T + shift])
         goal = np.concatenate([goal, self.there[0]])
         along = np.concatenate([normal, normal_back @ turn.T])
@@ -458,14 +459,14 @@ class _Surfaces:
         if kept.sum() < 12:
             return None
         moving, goal, along = moving[kept], goal[kept], along[kept]
-        # What is seen in one state only has no partner, or a wrong one, which is far.
+        # Surface seen in only one state has no partner, or a wrong one far away.
         weight = np.maximum(1.0 / (1.0 + (distance[kept] / (0.3 * reach)) ** 2), 0.05)
         middle = moving.mean(0)
         lever = moving - middle
         rows = np.concatenate([np.cross(lever, along), along], 1)
         wanted = ((goal - moving) * along).sum(1)
         scale = np.concatenate([np.full(3, np.sqrt((lever**2).sum(1).mean())), np.ones(3)])
-        # A part that symmetry lets slide along itself is held where it is.
+        # Damping holds a part that can slide along itself by symmetry.
         heavy = (rows / scale) * weight[:, None]
         system = heavy.T @ (rows / scale) + 1e-6 * weight.sum() * np.eye(6)
         if not turns:
@@ -499,8 +500,8 @@ class _Surfaces:
 def _doubt(
     surfaces: _Surfaces, motion: Similarity, mid: np.ndarray, common: float, lever: float, rng: np.random.Generator
 ) -> Doubt:  # fmt: skip
-    """How far the joint differs, in the mean, when it is found from other draws of what moves (the bootstrap), and by
-    what all draws have in `common`, m: an end of the part, `lever` m from its middle, may be off by that."""
+    """The mean difference of the joint over other draws of the moving surface (bootstrap), plus the error that all
+    draws have in `common`, m: an end of the part, `lever` m from its middle, may be off by that."""
     kind, anchor, axis, travel = _joint_of(motion, mid)
     found = []
     for _ in range(DRAWS):
@@ -513,7 +514,7 @@ def _doubt(
     tilt = common / lever
     if kind == "slider":
         return Doubt(float(np.hypot(axis_off, common / travel)), 0.0, float(np.hypot(way_off, common)))
-    # A shift of the part moves the axis so far that turning about it makes up for that.
+    # A shift of the part moves the axis until the turn about it compensates.
     shifted = common / (2.0 * math.sin(0.5 * min(travel, math.pi)))
     return Doubt(float(np.hypot(axis_off, tilt)), float(np.hypot(place, shifted)), float(np.hypot(way_off, tilt)))
 
@@ -543,7 +544,7 @@ def _screw(motion: Similarity, near: np.ndarray) -> tuple[float, np.ndarray, np.
 
 
 def _faces(one: Mesh, motion: Similarity, other: ClosestPoint, near: float) -> np.ndarray:
-    """[F] bool: faces that are off the second state's surface, and nearer to it once they are moved."""
+    """[F] bool: faces that are off the second state's surface, and nearer to it after the motion."""
     middles = one.vertices[one.faces].mean(1)
     stays, moves = (_away(other, points) for points in (middles, motion.points(middles)))
     return (stays > 0.25 * near) & (moves < 0.5 * stays)

@@ -32,8 +32,9 @@ from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
 
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
-RESOLUTION = {"quick": 256, "standard": 320, "fine": 512, "volsdf": 448}  # samples a side, by preset
-# The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
+RESOLUTION = {"quick": 256, "standard": 320, "fine": 512, "volsdf": 448}  # samples per side, by preset
+# The picture of names: largest number of photos, their width while they are chosen and in the picture, px, and the
+# tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 AXIS = (255, 255, 0)  # colour of a joint's axis there
 
@@ -43,7 +44,7 @@ def make_meshes(
     on_progress: Progress = silent,
 ) -> dict:  # fmt: skip
     """Writes the files that docs/objects.md lists and returns the stage's report. Vertices in the PLY files have
-    `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) where there is hardly any surface, or
+    `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) if there is hardly any surface, or
     (1) for a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
@@ -92,7 +93,7 @@ def make_meshes(
             )
         surface = surface_of(volume, field, posed, photos, limit, known=known,
                              on_progress=share_of(on_progress, 0.5, 0.2))  # fmt: skip
-        # Where a person has cut the surroundings away, what is left is what they want to move.
+        # If the user has cropped the surroundings away, the rest is meant to move.
         alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
     on_progress(0.7, "looking for bodies")
     parts = split(surface, inside, field.finest, posed, photos, level, alone=alone, clicked=clicked)
@@ -107,7 +108,7 @@ def make_meshes(
     views = posed.moved(placement.to_metres).views
     shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
     ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
-    on_progress(0.82, "asking how far each place can be trusted")
+    on_progress(0.82, "computing how far each place can be trusted")
     evidence, trusted = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
     write_parts(parts, surface.visible, placement, evidence, out, field.finest * metres)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
@@ -129,8 +130,8 @@ def make_meshes(
 def trust(
     closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
 ) -> tuple[Evidence, dict]:
-    """What the photos say about the vertices of the `closed` meshes, one after the other, and the same for the report;
-    writes `next_photos.json`. Vertices are `counted` [V] bool where they were not cut off; all is in metres."""
+    """The photos' evidence for the vertices of the `closed` meshes, one after the other, and the same for the report;
+    writes `next_photos.json`. Vertices are `counted` [V] bool if they were not cut off; all is in metres."""
     whole = joined(list(closed.values()))
     sight = Visibility(whole, shots.lift, shots.blocking)
     evidence = evidence_of(sight, shots.views)
@@ -145,7 +146,7 @@ def trust(
 
 
 def box_of(placement: Placement, corners: np.ndarray) -> Distance:
-    """Distance from what is left after cropping: the trained ball within a box with corners [2, 3] m."""
+    """Distance from the space left after cropping: the trained ball within a box with corners [2, 3] m."""
     middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
 
     def distance(points: np.ndarray) -> np.ndarray:
@@ -165,8 +166,8 @@ def rounded(values: ArrayLike) -> np.ndarray:
 def write_parts(
     parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path, cell: float
 ) -> None:  # fmt: skip
-    """Writes meshes in metres with what the photos say about their vertices, `placement.json` and `parts.json`; the
-    latter also says how wide the field's cells are, m."""
+    """Writes meshes in metres with the photos' evidence for their vertices, `placement.json` and `parts.json`; the
+    latter also holds the width of the field's cells, m."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
@@ -188,12 +189,12 @@ def write_parts(
 
 
 def read_parts(mesh_folder: Path) -> dict:
-    """What `write_parts` wrote to `parts.json`. Raises SdfsimError: the mesh stage has not run."""
+    """The content of `parts.json` from `write_parts`. Raises SdfsimError if the mesh stage has not run."""
     return read_json(mesh_folder / "parts.json", "run the mesh stage first")
 
 
 def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
-    """The meshes that the scene is made of, by name, in the colours of `colors_of` their uncertainty."""
+    """The meshes of the scene, by name, coloured by their uncertainty (`colors_of`)."""
     known = read_parts(mesh_folder)
     files = {SCENERY: "solid.ply"} if known["scenery"] else {}
     files |= {entry["name"]: f"objects/{entry['name']}.ply" for entry in known["objects"]}
@@ -204,8 +205,8 @@ def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
 
 
 def axis_ends(parts: Parts, held: HeldPart | None) -> np.ndarray | None:
-    """[2, 3] ends of a line that shows a joint, all in normalised space: a hinge's axis along its part, or the way of a
-    slider; None where there is none."""
+    """[2, 3] ends of a line that shows a joint, in normalised space: a hinge's axis along its part, or the path of a
+    slider; None without a joint."""
     if held is None or PART not in parts.bodies:
         return None
     points = parts.bodies[PART].vertices @ held.turn.T + held.shift  # in the first state
@@ -218,14 +219,14 @@ def axis_ends(parts: Parts, held: HeldPart | None) -> np.ndarray | None:
 def draw_names(
     parts: Parts, views: Sequence[View], photos_folder: Path, axis: np.ndarray | None = None
 ) -> Image.Image:  # fmt: skip
-    """A picture of the photos that show bodies best, each body tinted and with its name; and the line [2, 3] of a
+    """A picture of the photos that show bodies best, with each body tinted and named, and with the line [2, 3] of a
     joint."""
     meshes = list(parts.bodies.values())
     caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))
     borders = np.cumsum([len(mesh.faces) for mesh in meshes])
 
     def seen(view: View, longest: int) -> np.ndarray:
-        """Which body each pixel [H, W] shows; the number of bodies for none."""
+        """The body at each pixel [H, W]; the number of bodies stands for none."""
         scale = longest / max(view.width, view.height)
         size = max(1, round(view.height * scale)), max(1, round(view.width * scale))
         row, column = (axis.ravel() for axis in np.indices(size))
@@ -234,7 +235,7 @@ def draw_names(
         return np.where(np.isfinite(away), number, len(meshes)).reshape(size)
 
     pixels = np.array([np.bincount(seen(v, THUMB).ravel(), minlength=len(meshes) + 1)[:-1] for v in views])
-    # Of each body, the largest first, the photo that shows most of it.
+    # For each body, the largest first, the photo that shows most of it.
     chosen = list(dict.fromkeys(pixels.argmax(0).tolist()))[:PICTURES] or [0]
     tiles = [_tile(views[k], seen(views[k], WIDE), list(parts.bodies), photos_folder, axis) for k in chosen]
     sheet = Image.new("RGB", (sum(t.width for t in tiles), max(t.height for t in tiles)), (255, 255, 255))

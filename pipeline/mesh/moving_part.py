@@ -1,5 +1,5 @@
-"""What photos of a thing in one of two states tell of the part that moves: where they see through, what on it looks
-like what, and which pixels show it."""
+"""Evidence from photos of an object in two states on the part that moves: where photos see through, which features look
+alike, and which pixels show the part."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from sdfsim.geometry.bvh import Caster, ClosestPoint
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_mesh
 
-THROUGH = 2  # photos that look through a place where nothing is
-CELLS = 3.0  # of the field's finest grid: what differs by less between two states stands still
-ASKED, SPREAD = 24, 15  # photos of a state at most in which alike places are looked for, on the part and on all else
-FEATURES, DISTINCT = 2000, 0.8  # of a photo; how much nearer than the next a match has to be
-LIKELIER = 0.4  # of the way: a surface that is so much nearer to the other state's once it is moved does move
-BESIDE = 2.0  # times what counts as still: so near to the part's points what moves with it is
-TIED, REFINED = 50, 3  # patches that have to look alike in both states; rounds of least squares on all that do
+THROUGH = 2  # photos that have to look through an empty place
+CELLS = 3.0  # of the field's finest grid: surfaces that differ by less between two states are static
+ASKED, SPREAD = 24, 15  # largest numbers of photos of a state for matching, on the part and elsewhere
+FEATURES, DISTINCT = 2000, 0.8  # per photo; how much nearer than the next a match has to be
+LIKELIER = 0.4  # of the distance: a surface moves if the motion brings it so much nearer to the other state's
+BESIDE = 2.0  # times the limit of static: how near to the part's points its vertices lie
+TIED, REFINED = 50, 3  # patches that have to look alike in both states; rounds of least squares on all of them
 INNER = 0.97  # of the ball in which a field was trained
-EVERY = 2  # px between rays that tell what a photo shows
+EVERY = 2  # px between rays that find the content of a photo
 
 
 @dataclass(frozen=True)
 class State:
-    """One state of a thing, in whatever frame both states share."""
+    """One state of an object, in a frame that both states share."""
 
-    visible: Mesh  # what photos show
-    closed: Mesh  # all of the surface, which is in the way of what lies behind
+    visible: Mesh  # the surface that photos show
+    closed: Mesh  # the whole surface, for occlusion
     views: Sequence[View]
     photos: Path  # folder of the photos stage
     cell: float  # width of the field's cells
@@ -60,7 +60,7 @@ class State:
         return Caster(self.closed)
 
     def empty(self, points: np.ndarray) -> np.ndarray:
-        """[P] bool, places [P, 3] through which photos see what lies behind them."""
+        """[P] bool, places [P, 3] through which photos see the surface behind."""
         inside = np.linalg.norm(points - self.middle, axis=1) < self.radius
         count = np.zeros(len(points), int)
         for view in self.views:
@@ -73,7 +73,7 @@ class State:
 
 
 def load_state(folder: Path) -> State:
-    """The state that a folder of the mesh stage holds, in metres of its own."""
+    """The state in a folder of the mesh stage, in its own metres."""
     trained, place = load_field(folder / "distill"), load_placement(folder / "mesh").to_metres
     known = read_parts(folder / "mesh")
     files = [*(["solid.ply"] if known["scenery"] else []), *(f"objects/{one['name']}.ply" for one in known["objects"])]
@@ -93,14 +93,14 @@ class Landmarks:
 
 
 def landmarks(state: State, part: np.ndarray | None = None) -> Landmarks:
-    """Features (SIFT, Lowe 2004) on the surface in photos from all sides, or near points [P, 3] of it in those that
-    show most of these."""
+    """Features (SIFT, Lowe 2004) on the surface in photos from all sides, or near points [P, 3] of it in the photos
+    that show most of these."""
     import cv2
 
     finder, tree = cv2.SIFT.create(FEATURES, contrastThreshold=0.01), None if part is None else KDTree(part)
     points, looks = [], []
     if part is None:
-        chosen = np.unique(np.linspace(0, len(state.views) - 1, SPREAD).astype(int))  # people walk around a thing
+        chosen = np.unique(np.linspace(0, len(state.views) - 1, SPREAD).astype(int))  # people walk around an object
     else:
         chosen = np.argsort([-framed(view, part)[1].sum() for view in state.views])[:ASKED]
     for number in chosen:
@@ -123,7 +123,7 @@ def landmarks(state: State, part: np.ndarray | None = None) -> Landmarks:
 
 
 def matched(first: Landmarks, second: Landmarks) -> tuple[np.ndarray, np.ndarray]:
-    """Places [K, 3] of the first and of the second that look alike in some two photos, some of them wrongly."""
+    """Points [K, 3] of the first and of the second that look alike in two photos; some pairs are wrong."""
     import cv2
 
     matcher, nothing = cv2.BFMatcher(cv2.NORM_L2), np.zeros((0, 3))
@@ -138,8 +138,8 @@ def matched(first: Landmarks, second: Landmarks) -> tuple[np.ndarray, np.ndarray
 
 
 def alike(one: State, other: State) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """What gives places [K, 3] that look alike, of points [P, 3] that move in the first and in the second state; some
-    of them are wrong."""
+    """A function that gives points [K, 3] that look alike, near points [P, 3] that move in the first and in the second
+    state; some pairs are wrong."""
 
     def paired(part: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not len(part) or not len(there):
@@ -150,15 +150,15 @@ def alike(one: State, other: State) -> Callable[[np.ndarray, np.ndarray], tuple[
 
 
 def tie(state: State, onto: State) -> tuple[Similarity, int]:
-    """The similarity that moves a state onto another where they look alike, and how many places agree with it. Each
-    patch of the surface has one vote, however much there is to see on it. Raises SdfsimError (exit code 3) where too
+    """The similarity that moves a state onto another where they look alike, and the number of places that agree with
+    it. Each patch of the surface has one vote, however many features it has. Raises SdfsimError (exit code 3) if too
     few agree."""
     return tied(*matched(landmarks(state), landmarks(onto)), CELLS * state.cell, CELLS * onto.cell)
 
 
 def tied(here: np.ndarray, there: np.ndarray, near: float, near_there: float) -> tuple[Similarity, int]:
-    """The similarity that most pairs of places [K, 3] agree on, some of which are wrong or have moved, and how many
-    patches, `near` in width, these are on; they are off by `near_there` at most."""
+    """The similarity that most pairs of points [K, 3] agree on (some pairs are wrong or have moved), and the number of
+    patches, `near` in width, with such pairs; their error is at most `near_there`."""
     import pycolmap
 
     patch = np.concatenate([np.floor(here / near), np.floor(there / near_there)], 1).astype(int)
@@ -174,7 +174,7 @@ def tied(here: np.ndarray, there: np.ndarray, near: float, near_there: float) ->
         hint = "leave most of what the photos show as it is, and photograph it from the same sides in both states"
         raise SdfsimError(message, hint, exit_code=EXIT_QUALITY)
     move: Any = found["tgt_from_src"]
-    for _ in range(REFINED):  # all pairs now, and those alone that are near
+    for _ in range(REFINED):  # with all pairs, keeping those that are near
         moved = move.scale * here @ move.rotation.matrix().T + move.translation
         good = np.linalg.norm(moved - there, axis=1) < near_there / 2
         move = pycolmap.estimate_sim3d(here[good], there[good])
@@ -182,8 +182,8 @@ def tied(here: np.ndarray, there: np.ndarray, near: float, near_there: float) ->
 
 
 def which_move(mesh: Mesh, other: State, motion: Similarity, seen: np.ndarray) -> np.ndarray:
-    """[V] uint8, of the vertices of one state's surface: 1 for those that a motion takes to the other state, 0
-    for those that stay, `UNKNOWN` where nothing tells. `seen` [P, 3] are points of the part."""
+    """[V] uint8 for the vertices of one state's surface: 1 for those that a motion takes to the other state, 0 for
+    those that stay, `UNKNOWN` without evidence. `seen` [P, 3] are points of the part."""
     near, points = CELLS * other.cell, mesh.vertices
     moved = motion.points(points)
     on = ClosestPoint(other.visible)
@@ -193,7 +193,8 @@ def which_move(mesh: Mesh, other: State, motion: Similarity, seen: np.ndarray) -
     empty, empty_moved = np.zeros(len(points), bool), np.zeros(len(points), bool)
     empty[may], empty_moved[may] = other.empty(points[may]), other.empty(moved[may])
     gone, nowhere = empty & (stays > near), empty_moved & (goes > near)
-    # What goes to where no photo looks may be the part's, even if it crosses a surface of the other state.
+    # Vertices that move to where no photo looks may belong to the part, even if they cross a surface of the other
+    # state.
     unsure = ~empty_moved & (goes > near) & (beside < BESIDE * near)
     result = np.full(len(points), UNKNOWN, np.uint8)
     result[~may | nowhere | ((stays <= near) & (goes > LIKELIER * stays) & ~unsure)] = 0
@@ -203,9 +204,9 @@ def which_move(mesh: Mesh, other: State, motion: Similarity, seen: np.ndarray) -
 
 
 def label_images(state: State, number: np.ndarray) -> dict[str, np.ndarray]:
-    """What each photo shows, [H, W] uint8 by its name, from the numbers [V] of the closed surface's vertices."""
+    """Label images [H, W] uint8 by photo name, from the numbers [V] of the closed surface's vertices."""
     faces, found = number[state.closed.faces], {}
-    # Where the corners of a face differ, nothing is said.
+    # A face with different corners is unknown.
     of_face = np.where((faces == faces[:, :1]).all(1), faces[:, 0], UNKNOWN).astype(np.uint8)
     for view in state.views:
         row, column = np.mgrid[0 : view.height : EVERY, 0 : view.width : EVERY] + 0.5 * EVERY

@@ -1,8 +1,9 @@
-"""Moves the vertices of bodies to where photos agree best; the field's own surface is as exact as its cells are small.
+"""Moves the vertices of bodies to where photos agree best; the accuracy of the field's own surface is limited by its
+cells.
 
-Around a vertex lies a patch in the tangent plane. Wherever the surface is, that patch looks the same in all photos
-that show it; so the patch is moved along the normal until it does (normalised cross-correlation). At edges patches say
-nothing: there the surface is the smallest one between what is known on both sides, which takes bulges away.
+Around a vertex lies a patch in the tangent plane. On the true surface, this patch looks the same in all photos that
+show it; so the patch is moved along the normal until it does (normalised cross-correlation). At edges patches give no
+information: there the surface is the smallest one between known places on both sides, which removes bulges.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,32 +20,33 @@ from pipeline.mesh.visibility import FAIR, Visibility
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
-# Chosen by hand on the rendered sets, mostly `shelf`; nothing derives these numbers, and other sets may want others.
-LONG_SIDE = 640  # px; larger photos are made smaller, or the right place would lie too many pixels away
-# Photos that a patch is compared in, those that look straightest; and how many there must be: any two agree.
+# Chosen by hand on the rendered sets, mostly `shelf`; other sets may need other values.
+LONG_SIDE = 640  # px; larger photos are reduced, because otherwise the right place would lie too many pixels away
+# Photos in which a patch is compared, those with the best viewing angle; and how many there must be, because any two
+# agree.
 PHOTOS, FEWEST = 5, 3
 HALF = 3  # px from a patch's middle to its sides
-PLACES = 25  # that are tried along the normal
+PLACES = 25  # tried along the normal
 NOISE = 4.0  # grey levels squared: variance that is no texture
-# What is not reconstructed may stand before a photo. That one agrees with no others around there: with the best two of
-# ASKED photos by less than CLEAR times as well as any photo does. One vertex of SELDOM is asked.
+# An object that is not reconstructed may block a photo. Such a photo agrees with no other one there: with the best two
+# of ASKED photos less than CLEAR times as well as the best photo does. One vertex in SELDOM is checked.
 ASKED, CLEAR, SELDOM = 8, 0.5, 16
-# Cells of the field's finest grid by which vertices are moved at most in a round, and rounds; half as far in the last.
+# Largest move of vertices per round, in cells of the field's finest grid, and rounds; half as far in the last.
 REACH, ROUNDS = 1.3, 3
-EVERY = 4  # one vertex of so many is looked at, the others follow
-ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises from 0 to 1
-# A place is no longer trusted SPREAD times the usual difference from the surface around it. What is usual depends on
-# the places around, since many of them are far off where the field is; but it is at most FAR times the body's median.
+EVERY = 4  # one vertex of so many is compared, the others follow
+ALIKE, SURE = 0.35, 0.9  # correlations between which the trust in a place rises from 0 to 1
+# A place is not trusted beyond SPREAD times the usual difference from the surface around it. The places around define
+# the usual difference, because many of them are far off if the field is; but it is at most FAR times the body's median.
 SPREAD, FAR = 3.0, 2.0
-# A place counts in full where the mean trust within NEAR edges is EVEN: a lone match at an edge is a mistake.
+# A place has full weight if the mean trust within NEAR edges is EVEN: a single match at an edge is a mistake.
 NEAR, EVEN = 8, 0.3
-# Weights, with trust as unit: of the surface's area, of its bending, of where a vertex was, and of that where no photo
-# shows anything.
+# Weights relative to trust: of the surface's area, of its bending, of a vertex's old position, and of that where no
+# photo shows the surface.
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
-AROUND, KNOWN = 20, 0.1 / EVERY  # edges, and mean trust within them, below which vertices stay where they were
+AROUND, KNOWN = 20, 0.1 / EVERY  # edges, and mean trust within them, below which vertices stay
 SMOOTHED = 4  # times after each round
-STEPS = 300  # of conjugate gradients, after which the equations count as not solved
-WALL = 0.25  # of the way to the surface opposite, inside or outside, that a vertex may move in a round
+STEPS = 300  # of conjugate gradients; after these the equations count as not solved
+WALL = 0.25  # of the distance to the opposite surface, inside or outside, that a vertex may move in a round
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,8 @@ def load_grey_photos(views: Sequence[View], photos_folder: Path) -> list[GreyPho
 
 def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float, finest: float,
            height: Callable[[np.ndarray], np.ndarray], layer: float) -> tuple[Mesh, str]:  # fmt: skip
-    """A body whose vertices lie where the photos agree, and why not all rounds of it were done, if so; all is in the
-    space of the views.
+    """A body with vertices where the photos agree, and the reason if not all rounds were done; all is in the space of
+    the views.
 
     Vertices are lifted by `lift` off the surface before a view looks for them, and move by cells of width `finest`.
     Below `layer` of `height`, above the plane that the body stands on, no photo separates the body from its plane, so
@@ -118,7 +120,7 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
         known = (known[:, 0] / (KNOWN * known[:, 1]).clip(1e-6)).clip(0, 1)
         stay = STAY + PINNED * (1 - known)
         moved, converged = settled(mesh, along, mean, wanted, weight, stay)
-        # What the surface around it contradicts was a mistake.
+        # A place that contradicts the surface around it was a mistake.
         off = np.abs(moved - wanted)
         around = np.stack([weight * off, weight], 1)
         for _ in range(NEAR):
@@ -144,8 +146,8 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
 def patch_correlation(
     sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray
 ) -> np.ndarray:
-    """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3]: the mean
-    correlation between any two of those that are `clear` [K, P], -1 where too few show a vertex."""
+    """Similarity of the patches [P, M] around vertices [P], moved [M] along normals [P, 3], between photos: the mean
+    correlation of all pairs of photos that are `clear` [K, P], -1 if too few show a vertex."""
     result = np.full((len(normal), len(moves)), -1.0)
     for part, number, found in patches(sight, normal, pictures, moves, clear, PHOTOS):
         used = (number >= 0).sum(0)[:, None]
@@ -155,8 +157,8 @@ def patch_correlation(
 
 def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, mean: csr_matrix,
               picked: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Whether nothing stands before photos [K, V] where they seem to show vertices with normals [V, 3]: asked at those
-    `picked`, and the same around them; yes where they were not asked."""
+    """Whether photos [K, V] have a free view of the vertices with normals [V, 3]: checked at the `picked` ones, and
+    assumed the same around them; True where not checked."""
     support = np.zeros((len(pictures), len(normal)), np.float32)
     asked = np.zeros((len(pictures), len(normal)), bool)
     every = np.ones((len(pictures), len(picked)), bool)
@@ -168,7 +170,7 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], 
         vertex, slot = np.nonzero(number.T >= 0)
         at = number[slot, vertex], picked[part[vertex]]
         support[at], asked[at] = best[vertex, slot], True
-    for photo, there in zip(support, asked, strict=True):  # photo by photo: all at once may not fit into memory
+    for photo, there in zip(support, asked, strict=True):  # photo by photo, because all at once may not fit into memory
         total, weight = photo.astype(float), there.astype(float)
         for _ in range(AROUND if there.any() else 0):
             total, weight = mean @ total, mean @ weight
@@ -180,11 +182,11 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], 
 def patches(
     sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray, most: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The patches around vertices [P], moved [M] along normals [P, 3], in the photos that look straightest, at most so
-    many and only those that are `clear` [K, P].
+    """The patches around vertices [P], moved [M] along normals [P, 3], in the photos with the best viewing angle, at
+    most `most`, and only those that are `clear` [K, P].
 
-    Yields some of the vertices [S] after the others, the number of each photo [most, S], -1 for none, and grey levels
-    [S, M, most, G] as in `normalised`; only vertices that `FEWEST` photos show.
+    Yields batches of vertices [S], the number of each photo [most, S], -1 for none, and grey levels [S, M, most, G] as
+    in `normalised`; only vertices that `FEWEST` photos show.
     """
     cosine = np.zeros((len(pictures), len(normal)), np.float32)
     for number, picture in enumerate(pictures):
@@ -224,8 +226,8 @@ def normalised(picture: GreyPhoto, points: np.ndarray) -> np.ndarray:
 
 
 def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from
-    `patch_correlation`, and how far that is to be trusted [P]."""
+    """The moves at which the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from
+    `patch_correlation`, and their trust [P]."""
     best = score.argmax(1)
     middle = best.clip(1, len(moves) - 2)
     before, here, after = (score[np.arange(len(score)), middle + k] for k in (-1, 0, 1))
@@ -236,11 +238,11 @@ def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray, trust: np.ndarray,
             stay: np.ndarray) -> tuple[np.ndarray, bool]:  # fmt: skip
-    """How far each vertex moves [V] along its normal [V, 3]: where it is wanted [V], by trust [V], or smooth between.
-    And whether that is solved.
+    """The move of each vertex [V] along its normal [V, 3]: the wanted one [V], weighted by trust [V], and smooth
+    between. And whether the equations are solved.
 
-    Normals are shorter where vertices shall move less; `mean` [V, V] takes the mean of the neighbours, `stay` [V] is
-    the trust in where the vertices are.
+    Shorter normals make vertices move less; `mean` [V, V] takes the mean of the neighbours, `stay` [V] is the trust in
+    the old positions.
     """
     bend = mean - diags(np.ones(len(trust)))
     inwards = ((bend @ mesh.vertices) * normal).sum(1)

@@ -1,4 +1,4 @@
-"""Normalised space -> metres with z up: which way gravity points, how large the scene is, where its floor lies."""
+"""Normalised space -> metres with z up: the direction of gravity, the size of the scene, and its floor."""
 
 import re
 from collections.abc import Sequence
@@ -16,26 +16,27 @@ from sdfsim.geometry.mesh import Mesh, face_normals
 
 # Degrees up to which gravity is known well, or well enough to look right: would a ball roll off a level table?
 CONFIDENT = {"high": 2.0, "medium": 6.0}
-GRAVITY = 1.0  # degrees within which a phone knows it
-FLOORS = 0.5  # degrees within which floors and tables are level
-# Of the plane that gives up: largest angle (degrees) between its normal and cameras' up, and least share of the area.
+GRAVITY = 1.0  # degrees, error of a phone's gravity
+FLOORS = 0.5  # degrees, tilt of real floors and tables
+# For the plane that gives up: largest angle (degrees) between its normal and the cameras' up, and least share of the
+# area.
 MAX_ANGLE, MIN_SHARE = 25.0, 0.08
 DRAWN, TRIALS = 2000, 200  # of the search for that plane: points, and planes that are tried
 LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a level face: 18 degrees
 MIN_FLOOR = 0.05  # share of the area that a floor has
-# A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
+# A pixel may miss its target by these shares of the width; a point farther away by the factor is behind the target.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
 FORMS = {"distance": "PHOTO:X,Y or PHOTO", "body": "NAME=PHOTO:X,Y"}  # of a place, by the option that takes it
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a reconstruction stands in the world."""
+    """The placement of a reconstruction in the world."""
 
     to_metres: Similarity  # from normalised space to metres, z up
-    up_from: str  # "plane", "cameras", or in words what measured it
-    size_from: str  # where the scale comes from, in words
-    up_within: float = 0.0  # degrees within which up can be trusted
+    up_from: str  # "plane", "cameras", or its source in words
+    size_from: str  # source of the scale, in words
+    up_within: float = 0.0  # uncertainty of up, degrees
     size_assumed: bool = False  # whether the scale is a guess
 
     @property
@@ -53,7 +54,7 @@ class Placement:
 
 
 def load_placement(mesh_folder: Path) -> Placement:
-    """Reads `placement.json`. Raises SdfsimError: the mesh stage has not run."""
+    """Reads `placement.json`. Raises SdfsimError if the mesh stage has not run."""
     path = mesh_folder / "placement.json"
     content = read_json(path, "run the mesh stage first")
     try:
@@ -63,7 +64,7 @@ def load_placement(mesh_folder: Path) -> Placement:
 
 
 def find_up(shown: Mesh, views: Sequence[View]) -> Up:
-    """Up from the largest nearly level plane, else from the cameras; how far they disagree counts as doubt."""
+    """Up from the largest nearly level plane, else from the cameras; their disagreement adds to the uncertainty."""
     cameras = camera_up(views)
     normals, areas = face_normals(shown)
     centers = shown.vertices[shown.faces].mean(1)
@@ -81,14 +82,14 @@ def plane_up(
 ) -> tuple[np.ndarray, float] | None:
     """The largest plane (RANSAC) among surface samples [P, 3] with unit normals [P, 3] and areas [P], whose normal is
     within `MAX_ANGLE` of a unit guess [3] and whose samples lie within `tolerance`: its unit normal [3] and the slope
-    in degrees that its unevenness amounts to; None where none is large enough."""
+    in degrees that its unevenness amounts to; None if none is large enough."""
     near = normals @ guess > np.cos(np.radians(MAX_ANGLE))
     if near.sum() <= 10:
         return None
     p, n, w = points[near], normals[near], weights[near]
     import open3d as o3d
 
-    # It counts points, so that each has to come as often as its share of the area.
+    # It counts points, so points are drawn in proportion to their area.
     drawn = p[np.random.default_rng(0).choice(len(p), DRAWN, p=w / w.sum())]
     o3d.utility.random.seed(0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(drawn))
@@ -130,7 +131,7 @@ def resting_height(mesh: Mesh) -> float:
 def upright_rotation(shown: Mesh, views: Sequence[View], up: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] that turns up [3] to z and the front, which is towards the mean camera, to -y."""
     center = (shown.vertices.min(0) + shown.vertices.max(0)) / 2
-    # Cameras all around have no front: take the first photo's side.
+    # Cameras all around have no front: use the first photo's side.
     for eye in (np.mean([v.center for v in views], axis=0), views[0].center):
         front = eye - center
         front -= up * (front @ up)
@@ -144,8 +145,8 @@ def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = 
           alone: bool = False, up: Up | None = None) -> Placement:  # fmt: skip
     """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
 
-    Surface and views are in normalised space. `scale`, where known, is metres a normalised unit and where that comes
-    from; else `size` m is the widest side, 1 m where it is None. `alone`: the floor is where the lowest point is.
+    Surface and views are in normalised space. `scale`, if known, is metres per normalised unit and its source; else
+    `size` m is the widest side, 1 m if it is None. `alone`: the floor is at the lowest point.
     """
     up = up or find_up(shown, views)
     rotation = upright_rotation(shown, views, up.direction)
@@ -165,9 +166,9 @@ def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = 
 def measured_scale(
     distance: Sequence, views: Sequence[View], photos: list[Photo], surface: Caster
 ) -> tuple[float, str]:
-    """Metres a normalised unit at which a known distance (see `Options`) is what it should be, and where that comes
-    from, in words. Pixels are those of the user's own photos. Raises SdfsimError as `_end` does, for a photo without a
-    pose, or a pixel that shows nothing of the surface."""
+    """Metres per normalised unit from a known distance (see `Options`), and its source in words. Pixels are those of
+    the user's own photos. Raises the SdfsimErrors of `_end`, and one for a photo without a pose, or a pixel off the
+    surface."""
     first, second, metres = distance
     start, end = (_locate(text, views, photos, surface) for text in (first, second))
     found = float(np.linalg.norm(end - start))
@@ -177,14 +178,14 @@ def measured_scale(
 
 
 def check_distance(distance: Sequence, photos: list[Photo]) -> None:
-    """Checks what can be known of a distance's ends before there are poses. Raises SdfsimError as `_end` does."""
+    """Checks a distance's ends as far as possible without poses. Raises the SdfsimErrors of `_end`."""
     for text in distance[:2]:
         _end(text, photos)
 
 
 def check_bodies(bodies: dict[str, list[str]], photos: list[Photo]) -> None:
-    """Checks what can be known of the places of bodies (see `Options`) before there are poses. Raises SdfsimError as
-    `_end` does, or for a place without a pixel."""
+    """Checks the places of bodies (see `Options`) as far as possible without poses. Raises the SdfsimErrors of `_end`,
+    and one for a place without a pixel."""
     for text in (text for spots in bodies.values() for text in spots):
         if _end(text, photos, "body")[1] is None:
             raise SdfsimError(f"body: {text} has no pixel", "write PHOTO:X,Y")
@@ -193,7 +194,7 @@ def check_bodies(bodies: dict[str, list[str]], photos: list[Photo]) -> None:
 def located_bodies(
     bodies: dict[str, list[str]], views: Sequence[View], photos: list[Photo], surface: Caster
 ) -> dict[str, np.ndarray]:
-    """The points [K, 3] of the surface that the places of each body show. Raises SdfsimError as `measured_scale`."""
+    """The points [K, 3] of the surface at the places of each body. Raises the SdfsimErrors of `measured_scale`."""
     check_bodies(bodies, photos)
     return {
         name: np.array([_locate(text, views, photos, surface, "body") for text in spots])
@@ -204,7 +205,7 @@ def located_bodies(
 def _locate(
     text: str, views: Sequence[View], photos: list[Photo], surface: Caster, option: str = "distance"
 ) -> np.ndarray:
-    """Position [3] of one end of a known distance, or of what another option points at."""
+    """Position [3] of one end of a known distance, or of another option's place."""
     photo, pixel = _end(text, photos, option)
     view = next((view for view in views if view.name == photo.name), None)
     if view is None:
@@ -217,22 +218,24 @@ def _locate(
     rays = view.rays(spots[:, 0], spots[:, 1])
     away = surface.hits(view.center, rays)[0]
     if not np.isfinite(away).any():
-        raise SdfsimError(f"{option}: {text} shows nothing of the surface", "choose a pixel on what was reconstructed")
-    if option == "body":  # People point at the middle of it.
+        raise SdfsimError(
+            f"{option}: {text} shows nothing of the surface", "choose a pixel on the reconstructed surface"
+        )
+    if option == "body":  # Users point at the middle of a body.
         hit = int(np.isfinite(away).argmax())
         return view.center + away[hit] * rays[hit]
-    # People point at corners, which come out a little rounded, and just beside one is what lies far behind it: as far
-    # away as the first pixel that shows none of that, but where they pointed.
+    # Users point at corners. A reconstructed corner is a little rounded, and a pixel just next to it shows a surface
+    # far behind: take the depth of the nearest pixel that does not, at the user's pixel.
     best = int((away < BEHIND * away.min()).argmax())
     return view.center + away[best] * rays[0]
 
 
 def _end(text: str, photos: list[Photo], option: str = "distance") -> tuple[Photo, tuple[float, float] | None]:
     """The photo that one end of a distance, or a place of another option, names, with or without its subfolder, and the
-    pixel if one is given. Raises SdfsimError for no such photo or several, or a pixel outside it."""
+    pixel if one is given. Raises SdfsimError if no photo or several match, or if the pixel is outside."""
     match = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
     name, pixel = (match[1], (float(match[2]), float(match[3]))) if match else (text, None)
-    name = Path(name).as_posix()  # with slashes on Windows too
+    name = Path(name).as_posix()  # with slashes, also on Windows
     found = [p for p in photos if p.source == name] or [p for p in photos if Path(p.source).name == name]
     if len(found) != 1:
         which = f"{len(found)} photos are" if found else "no photo is"

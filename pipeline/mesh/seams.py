@@ -1,8 +1,8 @@
-"""Where one connected solid is several bodies that touch: who owns which part of the surface, and the seams between.
+"""Divides a connected solid into several touching bodies: the body of each part of the surface, and the seams between.
 
-Masks say it, or else the shape: bodies that touch meet in a sharp groove. Nobody sees the seam through the inside. It
-is taken to be flat: the plane through the line on the surface where the parts meet. Where that line is not flat, the
-inside belongs to the part whose surface is nearest.
+Masks decide this, or else the shape: touching bodies meet in a sharp groove. No photo shows the seam through the
+inside. It is assumed to be flat: the plane through the line on the surface where the parts meet. If that line is not
+flat, the inside belongs to the part with the nearest surface.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,55 +23,57 @@ from pipeline.mesh.extraction import Volume
 from pipeline.mesh.visibility import Visibility
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
-# A patch of one label that is smaller than this share of the label's largest is a mistake of some mask.
+# A patch of one label that is smaller than this share of the label's largest is a mistake in a mask.
 STRAY = 0.1
-# What masks do not name is a part of its own from this share of the surface on; a name from that.
+# Smallest share of the surface for a separate part without masks, and for a part with masks.
 REST, NAMED = 0.1, 0.02
-# Radius of the ball, in samples, in which grooves are looked for, and the share of it beyond a half that is solid in
-# one, and their mean along a seam. In a sharp right angle it is 0.25; trained fields fill their grooves.
+# Radius of the ball, in samples, for finding grooves; the share of it beyond a half that is solid in a groove, and the
+# mean of this along a seam. In a sharp right angle it is 0.25; trained fields fill their grooves.
 BALL, GROOVE, DEEP = 3, 0.03, 0.055
-# Colours are means within so many samples. A surface is cut e times as easily where it is a groove by the first of
-# these, or where colours differ by the second from vertex to vertex.
+# Colours are means within this many samples. The cost of a cut falls by a factor e for a groove of the first value, or
+# for a difference of colour of the second value between vertices.
 HUE, SOFT = 1.5, (0.03, 0.015)
 # Least share of all the surface that a part has, and of the seam's border that lies in a groove.
 LEAST_PART, ALL_ALONG = 0.08, 0.65
-# Least share of a seam that is within the solid: the floor of a cup is ringed by a groove as well.
+# Least share of a seam that is within the solid, because a groove also surrounds the floor of a cup.
 THROUGH = 0.6
-# Two parts are apart if their seam is smaller than this share of the smaller one's surface, or their colours differ.
+# Two parts are separate if their seam is smaller than this share of the smaller one's surface, or if their colours
+# differ.
 NARROW, COLORS = 0.06, 0.12
-# Where colours differ twice as much as that, this share of a groove will do.
+# If colours differ twice as much, this share of a groove is enough.
 SHALLOW = 0.75
-# How far a line where parts meet may be from a plane, as a share of its width, beyond a sample.
+# Largest distance of the line where parts meet from a plane, as a share of its width, in addition to a sample.
 FLAT = 0.1
-# Parts touch that have so many samples beside one another.
+# Parts with this many neighbouring samples touch.
 MEET = 12
-# The samples fill grooves: their line is so many samples below the surface.
+# The samples fill grooves: the true line is this many samples below the surface.
 FILLED = 0.45
-# A seam is laid into a surface that is parallel to it to this cosine, within so many samples of its plane, from so many
-# to so many samples outside its rim, that has at least this share of vertices for those of the rim, and faces one way.
+# A seam is moved into a surface that is parallel to it to this cosine, within this many samples of its plane, between
+# these distances in samples outside its rim, that has at least this share of the rim's number of vertices, and faces
+# one way.
 PARALLEL, COVER, BESIDE, AROUND, ONE_SIDED = 0.97, 1.2, (0.7, 5.0), 0.3, 0.8
-# A seam is marked out within so many samples of its plane, which no flood through the inside passes.
+# Within this many samples of its plane a seam stops the flood fill through the inside.
 WALL = 0.9
 
 
 @dataclass(frozen=True)
 class Votes:
-    """Which object each vertex of a surface belongs to."""
+    """The photos' votes on the object of each vertex of a surface."""
 
     names: list[str]  # of the objects
-    # [V, 1 + names] share of the photos' votes for none of the objects, and for each; 0 where none votes
+    # [V, 1 + names] share of the photos' votes for no object, and for each object; 0 where no photo votes
     share: np.ndarray
 
     @property
     def winner(self) -> np.ndarray:
-        """[V] number of the object with most votes, counted from 1; 0 for none of them, -1 where none votes."""
+        """[V] number of the object with most votes, counted from 1; 0 for no object, -1 where no photo votes."""
         return np.where(self.share.any(1), self.share.argmax(1), -1)
 
 
 def count_votes(sight: Visibility, faces: np.ndarray, views: Sequence[View],
                 labels_of: Callable[[str], np.ndarray | None], names: list[str]) -> Votes:  # fmt: skip
     """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out.
-    `labels_of` gives them as `load_labels` does, by the name of the prepared photo."""
+    `labels_of` is like `load_labels`, by the name of the prepared photo."""
     votes = np.zeros((len(sight.vertices), len(names) + 1))
     for view in views:
         labels = labels_of(view.name)
@@ -99,20 +101,20 @@ def count_votes(sight: Visibility, faces: np.ndarray, views: Sequence[View],
 
 @dataclass(frozen=True)
 class Part:
-    """One of the bodies that a solid is made of."""
+    """One of the bodies in a solid."""
 
-    number: int  # of the name in `Votes`; 0: it has none
-    seam: Volume  # negative where the part is; zero at the seams. Its slope is that of a distance, roughly.
-    neighbours: list[int]  # index, in the list of the parts, of those that it touches
+    number: int  # of the name in `Votes`; 0: no name
+    seam: Volume  # negative within the part; zero at the seams. Its slope is roughly that of a distance.
+    neighbours: list[int]  # indices, in the list of the parts, of touching parts
 
 
 @dataclass(frozen=True)
 class Seam:
-    """Where two parts meet, as far as it is one piece."""
+    """One connected seam between two parts."""
 
     pair: tuple[int, int]  # numbers of the two parts
     rim: np.ndarray  # [R, 3] points on the surface where they meet
-    point: np.ndarray  # [3] in the middle
+    point: np.ndarray  # [3] its middle
     normal: np.ndarray  # [3] unit, from the first part to the second
     flat: bool  # whether the rim lies in a plane
     sides: np.ndarray  # [S, 3] the lines (a, b, c) around the seam in its plane: a x + b y + c <= 0 within
@@ -122,7 +124,7 @@ class Seam:
         return (points - self.point) @ self.normal
 
     def outside(self, points: np.ndarray) -> np.ndarray:
-        """How far [P] the feet of points [P, 3] in the plane are outside the rim; negative within."""
+        """Distance [P] of the feet of points [P, 3] in the plane outside the rim; negative within."""
         flat = (points - self.point) @ frame_of(self.normal)[:2].T
         return (flat @ self.sides[:, :2].T + self.sides[:, 2]).max(1)
 
@@ -140,7 +142,7 @@ class ConnectedSolid:
 
     @property
     def border(self) -> np.ndarray:
-        """[X, Y, Z] bool, samples within it beside others that are not."""
+        """[X, Y, Z] bool, samples within it next to samples outside."""
         return self.inside & np.logical_not(ndimage.binary_erosion(self.inside))
 
 
@@ -158,8 +160,8 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> ConnectedSolid:
 
 
 def parts_by_votes(solid: ConnectedSolid, votes: Votes) -> tuple[list[Part], int]:
-    """The parts of a solid that masks separate, none where there are no two; and the name's number of the whole solid
-    where it has one, else 0."""
+    """The parts of a solid that masks separate, empty if there are not two; and the name's number for the whole solid,
+    else 0."""
     winner = votes.winner[solid.index]
     count = np.bincount(winner[winner >= 0], minlength=len(votes.names) + 1)
     least = np.full(len(count), NAMED)
@@ -173,7 +175,7 @@ def parts_by_votes(solid: ConnectedSolid, votes: Votes) -> tuple[list[Part], int
 
 def part_of_name(solid: ConnectedSolid, votes: Votes, number: int) -> Part | None:
     """The part with this number in the masks of a larger solid, of which only a box with an empty border is given; None
-    where there is none."""
+    if there is none."""
     mine = votes.share[solid.index, number]
     if not mine.any():
         return None
@@ -184,7 +186,7 @@ def part_of_name(solid: ConnectedSolid, votes: Votes, number: int) -> Part | Non
 
 
 def parts_by_shape(solid: ConnectedSolid, colors: np.ndarray, least: float) -> list[Part]:
-    """The parts of a solid by `shape_labels`; none where it is a single body."""
+    """The parts of a solid by `shape_labels`; empty for a single body."""
     label = shape_labels(solid, colors, least)
     if not label.any():
         return []
@@ -193,7 +195,7 @@ def parts_by_shape(solid: ConnectedSolid, colors: np.ndarray, least: float) -> l
 
 
 def shape_labels(solid: ConnectedSolid, colors: np.ndarray, least: float) -> np.ndarray:
-    """The part [P] of each vertex, from 0 on: parts meet in a groove all along, and their seam is narrow or their
+    """The part [P] of each vertex, from 0 on: parts meet in a continuous groove, and their seam is narrow or their
     colours [P, 3] differ. Parts are at least `least` long in every direction."""
     groove = grooves(solid)
     label = np.zeros(len(groove), int)
@@ -240,8 +242,8 @@ def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
 
 def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """The edges [E, 2] between some vertices [P] bool of a solid, and what stands against crossing each: how deep a
-    `groove` [P] it lies in [E], and how its ends differ in colour [P, 3] [E]."""
+    """The edges [E, 2] between some vertices [P] bool of a solid, and their resistance to a cut: the depth of the
+    `groove` [P] there [E], and the difference in colour [P, 3] of their ends [E]."""
     ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
     ends = ends[mine[ends].all(1)]
     around = KDTree(solid.points).query_ball_point(solid.points, HUE * solid.volume.cell)
@@ -253,8 +255,8 @@ def steps(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
 
 
 def grooves(solid: ConnectedSolid) -> np.ndarray:
-    """How deep a groove each vertex [P] lies in: how much more than half of a ball about it is solid. 0 on a plane,
-    0.25 in a sharp right angle, less on an edge."""
+    """Depth of the groove at each vertex [P]: the solid share of a ball around it minus a half. 0 on a plane, 0.25 in a
+    sharp right angle, less on an edge."""
     volume = solid.volume
     axis = np.arange(-BALL, BALL + 1)
     x, y, z = np.meshgrid(axis, axis, axis)
@@ -265,7 +267,7 @@ def grooves(solid: ConnectedSolid) -> np.ndarray:
 
 
 def owners(points: np.ndarray, share: np.ndarray, cell: float) -> np.ndarray:
-    """How much each vertex belongs to each part, [P, K], from the votes [P, K] around it."""
+    """Membership of each vertex in each part, [P, K], from the votes [P, K] around it."""
     voting = np.flatnonzero(share.sum(1) > 0)
     away, near = KDTree(points[voting]).query(points, k=min(8, len(voting)))
     away, near = away.reshape(len(points), -1), near.reshape(len(points), -1)
@@ -274,7 +276,7 @@ def owners(points: np.ndarray, share: np.ndarray, cell: float) -> np.ndarray:
 
 
 def seams(solid: ConnectedSolid, share: np.ndarray) -> list[Seam]:
-    """Where the parts of a solid meet, from how much each vertex belongs to each part [P, K]."""
+    """The seams between the parts of a solid, from the membership of each vertex in each part [P, K]."""
     label = share.argmax(1)
     ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
     ends = ends[label[ends[:, 0]] < label[ends[:, 1]]]
@@ -298,7 +300,7 @@ def _seam(pair: tuple[int, int], rim: np.ndarray, across: np.ndarray, cell: floa
     """The seam of a rim [R, 3]; `across` [3] points from the first part to the second."""
     point = (rim.min(0) + rim.max(0)) / 2
     spread, axes = np.linalg.eigh(np.cov((rim - rim.mean(0)).T))
-    # A rim as thin as a line lies in many planes: of these, in that which faces the other part.
+    # A rim as thin as a line lies in many planes: use the one that faces the other part.
     free = axes[:, : 2 if spread[1] < (1.5 * cell) ** 2 else 1]
     normal = free @ (free.T @ across) if free.shape[1] > 1 else free[:, 0] * np.sign(free[:, 0] @ across or 1.0)
     normal /= np.linalg.norm(normal)
@@ -314,8 +316,8 @@ def _sides(rim: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray
 
 
 def _laid(solid: ConnectedSolid, seam: Seam) -> Seam:
-    """The seam laid into the flat surface around it, where there is one: what lies on the cover of a book ends at the
-    cover, which is seen more exactly than the groove around what lies there."""
+    """The seam moved into the flat surface around it, if there is one: a body on the cover of a book ends at the cover,
+    which is seen more exactly than the groove around the body."""
     if not seam.flat:
         return seam
     cell = solid.volume.cell
@@ -345,7 +347,8 @@ def _walled(solid: ConnectedSolid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flood(solid: ConnectedSolid, label: np.ndarray, found: list[Seam]) -> np.ndarray:
-    """Part [X, Y, Z] of each sample: that of the nearest vertex through the inside, past no flat seam; -1 outside."""
+    """Part [X, Y, Z] of each sample: that of the nearest vertex through the inside, without crossing a flat seam; -1
+    outside."""
     from skimage.segmentation import watershed
 
     cell = solid.volume.cell
@@ -369,7 +372,7 @@ def flood(solid: ConnectedSolid, label: np.ndarray, found: list[Seam]) -> np.nda
 
 
 def _spread(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Values [X, Y, Z], those that are not known [X, Y, Z] bool replaced by the nearest one that is."""
+    """Values [X, Y, Z], with those not known [X, Y, Z] bool replaced by the nearest known one."""
     nearest: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return values[tuple(nearest)]
 
@@ -389,7 +392,7 @@ def cut(solid: ConnectedSolid, label: np.ndarray, found: list[Seam], numbers: li
                 close = (np.abs(beyond) < 2.5 * cell) & np.isin(spread.ravel(), seam.pair)
                 close[close] = seam.outside(points[close]) < 0.3 * cell
                 value.reshape(-1)[close] = beyond[close]
-        # What meets at an edge only does not touch.
+        # Parts that only meet at an edge do not touch.
         around = np.asarray(ndimage.binary_dilation(part == k), bool) & (part >= 0)
         beside = np.bincount(part[around], minlength=len(numbers)) >= MEET
         beside[k] = False
@@ -400,7 +403,8 @@ def cut(solid: ConnectedSolid, label: np.ndarray, found: list[Seam], numbers: li
 
 def _apart(solid: ConnectedSolid, label: np.ndarray, found: list[Seam], pair: tuple[int, int], colors: np.ndarray,
            groove: np.ndarray, least: float) -> bool:  # fmt: skip
-    """Whether two parts are two bodies: they meet in one flat seam, in a groove all along, narrow or of two colours."""
+    """Whether two parts are two bodies: they meet in one flat seam, in a continuous groove, which is narrow or between
+    two colours."""
     between = [seam for seam in found if seam.pair == pair]
     if len(between) != 1 or not between[0].flat:
         return False

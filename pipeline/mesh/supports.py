@@ -1,5 +1,5 @@
-"""Level surfaces without texture: a table top of one colour has nothing that photos could be matched by, so the field
-sinks or bulges there. Where photos allow it, its plane goes on from what is seen of it.
+"""Level surfaces without texture: photos cannot be matched on a table top of one colour, so the field sinks or bulges
+there. If photos allow it, its plane is extended from its visible parts.
 
 Everything here is in normalised space.
 """
@@ -21,26 +21,26 @@ from pipeline.mesh.extraction import MIN_SEEN, RIM, FieldSurface, Volume, marked
 from pipeline.mesh.visibility import bilinear, framed
 from sdfsim.geometry.bvh import Caster
 
-# Chosen by hand on rendered sets; nothing derives them. In samples of the volume:
-ON = 1.5  # distance of a plane up to which a surface is the plane's
+# Chosen by hand on rendered sets. In samples of the volume:
+ON = 1.5  # largest distance of a surface that belongs to a plane
 STEP = 1.0  # side of the squares into which a plane is divided
-PATCH, NARROW = 2.0, 0.5  # half of the width of what is looked at around a square, and of the square alone
-SLAB = 4.0  # thickness of what is completed
-BULGE = 24.0  # height of what is taken away above it at most
+PATCH, NARROW = 2.0, 0.5  # half of the width of the patch around a square, and of the square alone
+SLAB = 4.0  # thickness of the completed slab
+BULGE = 24.0  # largest height of matter that is removed above it
 # Of colours, 0 to 255: spread within a patch of a photo, and between photos; more is texture, or another surface.
 PLAIN, SAME = 9.0, 16.0
-LIFTED = 0.02  # normalised units above a plane, from where it is asked whether a photo is in sight
-CROSSED = 2  # lines of sight through a square to points below it: the plane is not there
-RIM_SQUARES = 12  # beside what is seen of the plane that a region needs
-SUPPORTS = 0.04  # of the largest level plane's area: what is seen of another one that is completed, as of a mat
-LEAST = 0.05  # of the area that is seen of the plane: less is not worth the change
-POINTS = 30  # sparse points that tell how bright a photo is
-LONG_SIDE = 480  # px of the photos that are looked at
+LIFTED = 0.02  # normalised units above a plane, start of rays for occlusion
+CROSSED = 2  # lines of sight through a square to points below: from here on the plane does not exist there
+RIM_SQUARES = 12  # next to visible parts of the plane that a region needs
+SUPPORTS = 0.04  # of the largest level plane's area: visible part of another plane to be completed, such as a mat
+LEAST = 0.05  # of the visible area of the plane: less is not worth the change
+POINTS = 30  # sparse points for the brightness of a photo
+LONG_SIDE = 480  # px, longer side of the photos used
 
 
 @dataclass(frozen=True)
 class Completed:
-    """Where one level plane was completed."""
+    """The completed region of one level plane."""
 
     level: LevelPlane
     corner: np.ndarray  # [2] of the first square, in the axes of `frame_of` the plane's normal
@@ -58,30 +58,30 @@ class Completed:
         return marked(self.squares, np.floor((flat - self.corner) / self.step).astype(int))
 
     def on(self, points: np.ndarray, width: float) -> np.ndarray:
-        """Whether points [P, 3] are within `width` of what was completed [P]."""
+        """Whether points [P, 3] are within `width` of the completed region [P]."""
         return (np.abs(self.level.above(points)) < width) & self.covers(points)
 
     def filled(self, volume: Volume) -> Volume:
-        """The samples with a slab below the squares, and nothing that the field piled up on them."""
+        """The samples with a slab below the squares, and without matter that the field piled up on them."""
         height = volume.along(self.level.normal) - self.level.height
         band = (height > -SLAB * volume.cell) & (height < BULGE * volume.cell)
         index = np.argwhere(band)
         mine = self.covers(volume.low + volume.cell * index)
         index, values = index[mine], volume.values.copy()
         at, away = tuple(index.T), height[tuple(index.T)]
-        # A field piles up what it cannot see only so far; what lies higher is left as it is.
+        # A field piles up false matter only to a limited height; higher samples do not change.
         over = np.minimum(away, (BULGE * volume.cell - away) / 2)
         values[at] = np.where(away > 0, np.maximum(values[at], over), np.minimum(values[at], away))
-        near = np.abs(away) < ON * volume.cell  # between samples the surface is where the two nearest say
+        near = np.abs(away) < ON * volume.cell  # between samples, the two nearest define the surface
         values[tuple(index[near].T)] = away[near]
         return replace(volume, values=values.astype(np.float32))
 
 
 def complete(surface: FieldSurface, up: np.ndarray, finest: float, poses: PosedPhotos, photos_folder: Path
              ) -> list[Completed]:  # fmt: skip
-    """Where level planes go on beyond what is seen of them: in plain squares that hang together with it, look alike
-    from everywhere, are hidden by nothing, and through which no photo sees a point below. `up` [3] is unit, `finest`
-    the width of a cell of the field's finest grid."""
+    """Extends level planes beyond their visible parts: over plain squares that are connected to these, look alike from
+    everywhere, are not hidden, and through which no photo sees a point below. `up` [3] is unit, `finest` the width of a
+    cell of the field's finest grid."""
     levels = find_level_planes(surface.visible, up, finest, SUPPORTS)
     pictures = _pictures(poses, photos_folder)
     blocking = Caster(surface.visible)
@@ -102,7 +102,7 @@ def _complete(surface: FieldSurface, level: LevelPlane, poses: PosedPhotos, pict
     corner = np.full(2, -count * step / 2)
 
     def squares(points: np.ndarray, least: int = 1) -> np.ndarray:
-        """Those [A, B] bool below or above at least so many points [P, 3]."""
+        """Squares [A, B] bool below or above at least this many points [P, 3]."""
         index = np.floor((points @ frame[:2].T - corner) / step).astype(int)
         index = index[((index >= 0) & (index < count)).all(1)]
         return np.bincount(index[:, 0] * count + index[:, 1], minlength=count * count).reshape(count, count) >= least
@@ -135,7 +135,7 @@ def _complete(surface: FieldSurface, level: LevelPlane, poses: PosedPhotos, pict
     core = (beside >= RIM_SQUARES)[region]
     if core.sum() * step**2 < LEAST * level.area:
         return None
-    # A patch reaches past the edge of what is plain: there it is the square alone that has to look the same.
+    # A patch reaches past the edge of the plain region: there only the square itself has to look the same.
     narrow, own = alike(NARROW)
     nearest: Any = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
     same = narrow & (np.abs(own - color[tuple(nearest)]).max(2) < SAME)

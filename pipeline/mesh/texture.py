@@ -1,7 +1,7 @@
 """Textures of reconstructed meshes: charts by xatlas, and for each texel the photos that show it best.
 
-Everything here is in metres. A texture is baked in blocks of texels: which photo shows a block, and how well, is found
-once a block; the colours are then taken texel by texel, with the blocks' weights interpolated between them.
+Everything here is in metres. A texture is baked in blocks of texels: the weight of each photo is computed once per
+block; the colours are then taken texel by texel, with interpolated weights.
 """
 
 from collections.abc import Sequence
@@ -20,17 +20,18 @@ from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals, halves, joined, sample_surface, vertex_normals
 
 FACES = 40_000  # of a textured mesh: finer detail is in its texture
-PIECE = 300  # faces that xatlas gets at a time: its time grows with the square of the faces of a chart
+PIECE = 300  # faces per call of xatlas: its time grows with the square of the faces of a chart
 LARGEST = 4096  # px, longest side of a texture
-SMALLEST = 16  # texels that a mesh is long at least, also where no photo shows it
-FULL = 0.5  # share of a texture that charts can be counted on to fill
-BLOCK = 4  # texels a side
-BATCH = 1 << 21  # rays at once
-# Views are weighted by this power of how well they show a place: high enough that the best one gives nearly all of the
-# colour, as a mean of photos that are a few pixels apart is blurred; low enough that the next one takes over softly.
+SMALLEST = 16  # smallest length of a mesh in texels, even if no photo shows it
+FULL = 0.5  # share of a texture that charts will fill at least
+BLOCK = 4  # texels per side
+BATCH = 1 << 21  # rays per batch
+# Views are weighted by this power of their quality at a place: high enough that the best one gives nearly all of the
+# colour, because a mean of photos that are a few pixels apart is blurred; low enough for a soft transition to the next
+# one.
 POWER = 8.0
 LEAST = 0.05  # share of the colour below which a view is left out
-FAINT = 1e-3  # weight of the vertex colours, which count where no photo does
+FAINT = 1e-3  # weight of the vertex colours, used where no photo shows the surface
 
 
 @dataclass(frozen=True)
@@ -40,15 +41,15 @@ class Shots:
     views: Sequence[View]  # cameras, metres
     sharpness: np.ndarray  # [N] of each photo, in any unit
     folder: Path  # of the photos stage
-    blocking: Caster  # what can stand in the way of a view
-    lift: float  # m, how far along its normal a place is lifted before looking from it
+    blocking: Caster  # occluding surfaces
+    lift: float  # m, offset of a place along its normal before tracing rays from it
 
     def photo(self, view: View) -> np.ndarray:
         """Colours [H, W, 3] uint8."""
         return np.asarray(open_photo(self.folder, view))
 
     def density(self, points: np.ndarray, normals: np.ndarray) -> float:
-        """Photo pixels a metre of the surface has where it is seen best: the median over points [P, 3]."""
+        """Photo pixels per metre of the surface in the best view: the median over points [P, 3]."""
         best = np.zeros(len(points))
         for view in self.views:
             index, density, _ = _facing(view, points, normals)
@@ -74,8 +75,8 @@ class Texels:
 
 
 def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = silent) -> dict[str, Mesh]:
-    """Each mesh with a texture, fewer faces where it has many, and vertices doubled where its charts meet; its vertex
-    colours stay wherever no photo shows the surface."""
+    """Each mesh with a texture, with fewer faces if it has many, and with vertices doubled where its charts meet; its
+    vertex colours stay where no photo shows the surface."""
     made, done, total = {}, 0.0, sum(len(mesh.faces) for mesh in meshes.values())
     for name, mesh in meshes.items():
         share = len(mesh.faces) / total
@@ -95,7 +96,7 @@ def textured(mesh: Mesh, shots: Shots, on_progress: Progress = silent) -> Mesh:
 
 
 def fewer(mesh: Mesh, most: int) -> Mesh:
-    """The mesh with at most about `most` faces, its vertices in the colours of the nearest ones before."""
+    """The mesh with at most about `most` faces; its vertices have the colours of the nearest original ones."""
     if len(mesh.faces) <= most:
         return mesh
     import open3d as o3d
@@ -111,14 +112,14 @@ def fewer(mesh: Mesh, most: int) -> Mesh:
 
 
 def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int]]:
-    """Places for the faces of a mesh in a texture of `density` texels a metre, or fewer where it would be too large:
-    the mesh with `uv`, its vertices doubled where charts meet; the vertex [V'] each of them was; and the rows and
-    columns of the texture, multiples of `BLOCK`."""
+    """Lays out the faces of a mesh in a texture of `density` texels per metre, or fewer if it would be too large: the
+    mesh with `uv` and vertices doubled where charts meet; the original vertex [V'] of each; and the rows and columns of
+    the texture, multiples of `BLOCK`."""
     import xatlas
 
     pieces = halves(mesh.vertices[mesh.faces].mean(1), PIECE)
     parts = [np.unique(mesh.faces[piece], return_inverse=True) for piece in pieces]
-    extent = float(np.ptp(mesh.vertices, axis=0).max())  # xatlas takes faces of a micrometre for none
+    extent = float(np.ptp(mesh.vertices, axis=0).max())  # xatlas ignores faces of a micrometre
     density = min(max(density, SMALLEST / extent), LARGEST * np.sqrt(FULL / face_normals(mesh)[1].sum()))
     while True:
         atlas = xatlas.Atlas()
@@ -147,10 +148,10 @@ def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int
 
 
 def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels:
-    """Where the texels of a texture lie on a surface with `uv`, perhaps colours, and vertex normals [V, 3]."""
+    """The positions of a texture's texels on a surface with `uv`, optional colours, and vertex normals [V, 3]."""
     assert flat.uv is not None
     rows, columns = shape
-    # The charts lie in a plane, and a ray through each texel's centre finds which face covers it, and where.
+    # The charts lie in a plane; a ray through each texel's centre finds the face and the point that cover it.
     sheet = Caster(Mesh(np.c_[flat.uv * [columns, rows], np.zeros(len(flat.uv))], flat.faces))
     parts = []
     for first in range(0, rows * columns, BATCH):
@@ -174,11 +175,11 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
 
 
 def bake(texels: Texels, shots: Shots, on_progress: Progress = silent) -> np.ndarray:
-    """The texture [H, W, 3] uint8: of each texel the colour in the photos that show it best.
+    """The texture [H, W, 3] uint8: for each texel the colour in the photos that show it best.
 
-    A view counts by its pixels on the surface, by how straight it looks and how sharp its photo is. Within two blocks
-    of where something stands in its way, or its photo ends, it fades out, as edges of the reconstruction are not exact.
-    Photos differ in exposure, so what is larger than a few blocks has the mean colour of all photos.
+    The weight of a view depends on its pixels on the surface, its viewing angle and the sharpness of its photo. Within
+    two blocks of an occlusion, or of the photo's border, it fades out, because edges of the reconstruction are not
+    exact. Photos differ in exposure, so detail larger than a few blocks has the mean colour of all photos.
     """
     import cv2
 
@@ -209,7 +210,7 @@ def bake(texels: Texels, shots: Shots, on_progress: Progress = silent) -> np.nda
         index, density, pixels = _facing(view, sites, normals)
         free = ~shots.blocking.blocked(sites[index] + shots.lift * normals[index], view.center)
         index, pixels = index[free], pixels[free]
-        # Beside the blocks of a chart are those of none, which must not count as unseen.
+        # Next to the blocks of a chart are empty ones, which must not count as unseen.
         image = np.where(covered > 0, 0, np.inf).astype(np.float32)
         image.reshape(-1)[used[index]] = density[free] ** 2 * shots.sharpness[number] / unit
         image = np.where(covered > 0, cv2.erode(image, np.ones((3, 3))), 0)
@@ -247,8 +248,8 @@ def bake(texels: Texels, shots: Shots, on_progress: Progress = silent) -> np.nda
 
 
 def _facing(view: View, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points [S] of [P, 3] that lie in a view's photo and face it; the pixels a metre of the surface [S] that they
-    have, along the shorter side where seen at an angle; and their places [S, 2] in the photo, px."""
+    """Points [S] of [P, 3] that lie in a view's photo and face it; their pixels per metre of the surface [S], along the
+    shorter side if seen at an angle; and their positions [S, 2] in the photo, px."""
     towards = view.center - points
     away = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
     cosine = (towards * normals).sum(1) / away
@@ -259,8 +260,8 @@ def _facing(view: View, points: np.ndarray, normals: np.ndarray) -> tuple[np.nda
 
 
 def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """An image [H, W, C] whose pixels that are not known [H, W] take the colours around them. What lies between charts
-    is looked at by viewers that shrink textures, and beside them by those that interpolate."""
+    """An image [H, W, C] whose unknown pixels (not `known` [H, W]) take the colours around them, because viewers that
+    shrink textures read pixels between charts, and interpolation reads pixels next to them."""
     import cv2
 
     if known.all() or max(known.shape) == 1:

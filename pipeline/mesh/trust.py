@@ -1,7 +1,7 @@
-"""How far each place of a surface can be trusted, and which photos would help most.
+"""The uncertainty of each place of a surface, and the photos that would help most.
 
 A photo fixes a point across its line of sight, to about a pixel, and not at all along it. Lines of sight from several
-directions together fix it. What fewer than two photos see is a guess of the field.
+directions together fix it. Surface that fewer than two photos see is a guess of the field.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,9 @@ from pipeline.mesh.visibility import FAIR, Visibility, framed
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals, joined
 
-FEW = 3  # photos: what fewer see is weak
+FEW = 3  # photos: surface that fewer see is weak
 PARALLEL = 1e-12  # of lines of sight: least determinant of their information, with its trace as unit
-# Colours from the surest to the least sure place (anchors of viridis), and of what is guessed.
+# Colours from the most to the least certain place (anchors of viridis), and of guessed surface.
 SCALE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], float)
 GUESSED = np.array([255.0, 45, 45])
 WANTED = 3  # photos that are proposed
@@ -25,21 +25,22 @@ SAMPLES = 6000  # of the surface
 PLACES = 600  # directions around the scene in which cameras are tried
 HIGHER = 30.0  # degrees by which these may be above or below the cameras given; and the lowest and highest
 LOWEST, HIGHEST = -60.0, 80.0
-UNSURE = 3.0  # times the median uncertainty: from there on a place is weak however many photos see it
-CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anything solid and from the floor
-SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others
+UNSURE = 3.0  # times the median uncertainty: beyond this a place is weak however many photos see it
+CLEAR = 0.1  # times the cameras' distance: least distance of a camera from any surface and from the floor
+SHARED = 0.2  # share of a photo's view that is already well known: with less it cannot be matched with the others
 APART = 15.0  # degrees between the photos proposed
-LEAST = 0.01  # share of the surface that a photo has to help, else it is not worth the way
-NEARBY, SLIGHT = (35.0, 0.04)  # degrees up to which a way is described in metres; share of the distance not mentioned
+LEAST = 0.01  # share of the surface that a photo has to improve to be worth taking
+# Degrees up to which a move is described in metres; share of the distance that is not mentioned.
+NEARBY, SLIGHT = (35.0, 0.04)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What photos say about the positions of some points."""
+    """The photos' information on the positions of some points."""
 
     vertices: np.ndarray  # [V, 3] m, the points
     normals: np.ndarray  # [V, 3] unit, of the surface there
-    views: np.ndarray  # [V] int, photos that see each
+    views: np.ndarray  # [V] int, number of photos that see each
     information: np.ndarray  # [V, 3, 3] 1/m^2, see `information`; summed over these photos
 
     @property
@@ -48,7 +49,7 @@ class Evidence:
         return np.where(self.views > 1, sigma_along(self.information, self.normals), np.inf)
 
     def at(self, index: np.ndarray) -> "Evidence":
-        """The same of some of the points."""
+        """The same for some of the points."""
         return Evidence(self.vertices[index], self.normals[index], self.views[index], self.information[index])
 
     def nearest(self, points: np.ndarray) -> "Evidence":
@@ -56,15 +57,15 @@ class Evidence:
         return self.at(np.asarray(KDTree(self.vertices).query(points)[1]))
 
     def attributes(self) -> dict[str, np.ndarray]:
-        """What a mesh file holds of it: `views` [V] int32 and `uncertainty` [V] float32 m."""
+        """Its attributes in a mesh file: `views` [V] int32 and `uncertainty` [V] float32 m."""
         return {"views": self.views.astype(np.int32), "uncertainty": self.uncertainty.astype(np.float32)}
 
 
 def information(view: View, points: np.ndarray) -> np.ndarray:
-    """How exactly one photo fixes points [P, 3] in front of it: the inverse [P, 3, 3] of the covariance of
-    the place, in 1 / (unit of the points)^2, of rank two.
+    """The information of one photo on points [P, 3] in front of it: the inverse [P, 3, 3] of the covariance of the
+    position, in 1 / (unit of the points)^2, of rank two.
 
-    The photo is taken to be off by a standard deviation of 1 px on both axes, its camera to be exact: J^T J of the
+    The photo is assumed to have an error of 1 px (standard deviation) on both axes, and an exact camera: J^T J of the
     projection's Jacobian J (Hartley and Zisserman, Multiple View Geometry, 5.2). Lens distortion is left out.
     """
     local = points @ view.rotation.T + view.translation
@@ -84,7 +85,7 @@ def sigma_along(information: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def evidence_of(sight: Visibility, views: Sequence[View]) -> Evidence:
-    """What views say about the vertices of a mesh, all in metres."""
+    """The views' information on the vertices of a mesh, all in metres."""
     count = len(sight.vertices)
     seen, total = np.zeros(count, np.int64), np.zeros((count, 3, 3))
     for view in views:
@@ -95,14 +96,14 @@ def evidence_of(sight: Visibility, views: Sequence[View]) -> Evidence:
 
 
 def vertex_areas(mesh: Mesh) -> np.ndarray:
-    """Area [V] m^2 of the surface that each vertex stands for: a third of its faces'."""
+    """Area [V] m^2 of each vertex: a third of its faces' area."""
     area = np.repeat(face_normals(mesh)[1] / 3, 3)
     return np.bincount(mesh.faces.ravel(), area, minlength=len(mesh.vertices))
 
 
 def summary(mesh: Mesh, evidence: Evidence) -> dict:
-    """Of a mesh's area: `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
-    lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed."""
+    """Shares of a mesh's area: `seen_by` for 0, 1, 2, and 3 or more photos; `guessed` for fewer than two photos or
+    parallel lines of sight; `uncertainty_m`, the median of the rest, None if all is guessed."""
     area, uncertainty = vertex_areas(mesh), evidence.uncertainty
     known = np.isfinite(uncertainty)
     median = None
@@ -117,7 +118,7 @@ def summary(mesh: Mesh, evidence: Evidence) -> dict:
 
 
 def color_range(mesh: Mesh, uncertainty: np.ndarray) -> tuple[float, float]:
-    """Uncertainties (m) of the first and the last colour: between them lie nine tenths of the area that is known."""
+    """Uncertainties (m) of the first and the last colour: between them lie nine tenths of the known area."""
     known = np.isfinite(uncertainty)
     if not known.any():
         return 1e-3, 1e-2
@@ -127,7 +128,8 @@ def color_range(mesh: Mesh, uncertainty: np.ndarray) -> tuple[float, float]:
 
 
 def colors_of(uncertainty: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
-    """Colours [V, 3] in 0..255 of uncertainties [V] m: violet is surest, yellow least sure, red is guessed."""
+    """Colours [V, 3] in 0..255 for uncertainties [V] m: violet is most certain, yellow least certain, red is
+    guessed."""
     known = np.isfinite(uncertainty)
     position = np.log(np.where(known, uncertainty, 1.0) / limits[0]) / np.log(limits[1] / limits[0])
     place = np.clip(position, 0, 1) * (len(SCALE) - 1)
@@ -141,7 +143,7 @@ class NextPhoto:
 
     view: View  # its camera, metres, z up
     target: np.ndarray  # [3] m that it looks at
-    gain: float  # what it adds, as a share of all that photos from around could add
+    gain: float  # its gain, as a share of the gain of photos from all around
     words: str  # where to stand and where to look
 
     def to_dict(self) -> dict:
@@ -157,12 +159,13 @@ def next_photos(
     meshes: Mapping[str, Mesh], evidence: Evidence, sight: Visibility, solid: Caster, views: Sequence[View],
     counted: np.ndarray,
 ) -> tuple[list[NextPhoto], float]:  # fmt: skip
-    """The photos that help most, the best first, chosen greedily; none where none helps `LEAST` of the surface. Also
-    the share that is weak, of the surface that the photos or a camera around could show.
+    """The photos that help most, the best first, chosen greedily; empty if none improves `LEAST` of the surface. Also
+    the weak share of the surface that the photos or a camera around the scene could show.
 
-    Weak is what fewer than `FEW` photos see, or what is `UNSURE`. A photo helps a place that it sees freely and at a
-    fair angle: by the share of `FEW` photos that it lacks, else by how much less uncertain it becomes. Meshes are
-    closed, by name, in metres with the floor at z = 0; only vertices that are `counted` [V] bool matter.
+    Surface is weak if fewer than `FEW` photos see it, or if it is `UNSURE`. A photo helps a place that it sees without
+    occlusion and at a good angle: by the share of `FEW` photos that the place lacks, else by the reduction of
+    uncertainty. Meshes are closed, by name, in metres with the floor at z = 0; only vertices that are `counted` [V]
+    bool matter.
     """
     if not counted.any():
         return [], 0.0
@@ -183,7 +186,7 @@ def next_photos(
     poor = (now.views < FEW) | (now.uncertainty > limit)
     weak = poor & reachable
     short = FEW - now.views[weak]
-    lacking = float(np.where(short > 0, short * (short + 1) / (2 * FEW), 1.0).sum())  # what `worth` may add up to
+    lacking = float(np.where(short > 0, short * (short + 1) / (2 * FEW), 1.0).sum())  # largest sum of `worth`
     chosen: list[NextPhoto] = []
     free = np.ones(len(places), bool)
     while len(chosen) < WANTED:
@@ -207,7 +210,7 @@ def next_photos(
 
 
 def worth(now: Evidence, view: View, seen: np.ndarray) -> np.ndarray:
-    """How much a photo helps each of the places [S] that it sees, 0 to 1."""
+    """Gain of a photo for each of the places [S] that it sees, 0 to 1."""
     here = now.at(seen)
     after = sigma_along(here.information + information(view, here.vertices), here.normals)
     rest = np.divide(after, here.uncertainty, out=np.ones(len(seen)), where=np.isfinite(after))
@@ -217,7 +220,7 @@ def worth(now: Evidence, view: View, seen: np.ndarray) -> np.ndarray:
 def _best(
     now: Evidence, poor: np.ndarray, tried: Sequence[tuple[np.ndarray, np.ndarray]], middle: np.ndarray, lens: View
 ) -> tuple[float, View, np.ndarray, np.ndarray] | None:
-    """The photo that helps most: how much, its camera, what it looks at [3] m, and the places [S] that it helps.
+    """The photo that helps most: its gain, its camera, its target [3] m, and the places [S] that it helps.
 
     Samples are weak where `poor` [V] bool. `tried` are places [3] m with the samples [S] in sight, all around; a camera
     looks at the `middle` [3] m, or at the middle of the weak places in sight.
@@ -240,7 +243,7 @@ def _best(
 
 
 def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
-    """A camera at a place [3] that looks at another [3], held level (z up), with the lens of another."""
+    """A camera at a place [3] that looks at a target [3], held level (z up), with the lens of a given camera."""
     forward = target - place
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -271,7 +274,7 @@ def _places(views: Sequence[View], middle: np.ndarray, towards: np.ndarray, soli
 
 
 def way_to(place: np.ndarray, views: Sequence[View], middle: np.ndarray) -> str:
-    """How to get to a place [3] from where the nearest photo was taken, in words."""
+    """The way to a place [3] from the place of the nearest photo, in words."""
     nearest = min(views, key=lambda view: float(np.linalg.norm(view.center - place)))
     right = nearest.rotation[0] * [1, 1, 0]
     right /= max(np.linalg.norm(right), 1e-12)

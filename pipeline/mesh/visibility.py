@@ -1,4 +1,4 @@
-"""Which points of a surface photos, or a look from straight above, show; and in which colours."""
+"""Visibility of surface points in photos, or from straight above, and their colours."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -15,23 +15,23 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
-# Cosines between normal and line of sight. At a flatter angle (85 degrees) a point does not count as seen; at 70
-# degrees a photo begins to help.
+# Cosines between normal and line of sight. At a flatter angle than 85 degrees a point does not count as seen; from 70
+# degrees on a photo helps.
 FLATTEST, FAIR = 0.08, 0.35
 
 
 @dataclass(frozen=True)
 class PhotoColors:
-    """What the photos show of some points."""
+    """The photos' colours of some points."""
 
-    count: np.ndarray  # [V] how many views see each
-    # [V, 3] float in 0..255, the mean over photos, weighted towards those that look straight and from near
+    count: np.ndarray  # [V] number of views that see each
+    # [V, 3] float in 0..255, the mean over photos, weighted by viewing angle and nearness
     color: np.ndarray
-    weight: np.ndarray  # [V] behind the colour; 0: no photo shows the point
+    weight: np.ndarray  # [V] total weight of the colour; 0: no photo shows the point
 
 
 def heights(mesh: Mesh, at: np.ndarray) -> np.ndarray:
-    """Heights [...] m of a mesh's topmost surface over the points `at` [..., 2] m; NaN where there is none."""
+    """Heights [...] m of a mesh's topmost surface over the points `at` [..., 2] m; NaN where no surface is."""
     top = float(mesh.vertices[:, 2].max() + 0.1 * np.ptp(mesh.vertices, axis=0).max())
     origin = np.insert(at.reshape(-1, 2), 2, top, axis=1)
     distance, _ = Caster(mesh).hits(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
@@ -39,8 +39,8 @@ def heights(mesh: Mesh, at: np.ndarray) -> np.ndarray:
 
 
 class Visibility:
-    """Which vertices of a mesh which views see, lifted by `offset` along their normals, with `blocking` (or the mesh
-    itself) in the way."""
+    """The visibility of a mesh's vertices in views; vertices are lifted by `offset` along their normals, and `blocking`
+    (or the mesh itself) occludes them."""
 
     def __init__(self, mesh: Mesh, offset: float, blocking: Caster | None = None) -> None:
         self.vertices, self.normals = mesh.vertices, vertex_normals(mesh)
@@ -76,7 +76,7 @@ def framed(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = silent) -> PhotoColors:
-    """How many views see each vertex, and its colour in their photos."""
+    """The number of views that see each vertex, and its colour in their photos."""
     vertices = sight.vertices
     count = np.zeros(len(vertices), np.int32)
     color, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
@@ -99,7 +99,7 @@ def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def spread_colors(points: np.ndarray, known: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """Colours [P, C] at points [P, 3] from known ones [K, 3] with colours [K, C]: inverse-distance mean of the nearest.
-    What no photo shows, such as the place where a body stood, gets the colours around it."""
+    Points that no photo shows, such as the place where a body stood, get the colours around them."""
     nearest = min(8, len(known))
     away, index = KDTree(known).query(points, k=nearest)
     away, index = away.reshape(len(points), nearest), index.reshape(len(points), nearest)

@@ -1,20 +1,20 @@
-"""How far poses agree with the matches between photos, of which each pair was verified on its own."""
+"""Agreement of poses with the matches between photos; each pair was verified independently."""
 
 import numpy as np
 
 from pipeline.cameras import View, view_of
 
-ENOUGH = 30  # matches of a pair: fewer say nothing
-CONTRADICTION = 4.0  # px from its line, and a match contradicts the poses; what verification allows
-FINEST = 0.2  # px; poses that put matches closer than this or so need not be better
+ENOUGH = 30  # matches of a pair: fewer are not significant
+CONTRADICTION = 4.0  # px from its line: beyond this a match contradicts the poses; the limit of verification
+FINEST = 0.2  # px; poses with smaller distances than this need not be better
 
 
 def agreement(pairs: list, views: list[dict]) -> list[dict]:
-    """What the poses make of the matches (names, and pixels [M, 2] in both) of every pair with enough of them.
+    """Compares the poses with the matches (names, and pixels [M, 2] in both) of every pair that has enough of them.
 
-    An entry has medians (px) of how far they lie from the lines that the poses put them on (`error`, None where one of
-    the photos has no pose) and from the best lines that there are for this pair alone (`own`); and the share that the
-    poses leave unexplained, each match by how far it lies (`cost`).
+    An entry has the median distances (px) of matches from the epipolar lines of the poses (`error`, None if one of the
+    photos has no pose) and from the best lines for this pair alone (`own`); and the share that the poses leave
+    unexplained, with each match weighted by its distance (`cost`).
     """
     posed = {view["name"]: view_of({**view, "source": ""}) for view in views}
     found = []
@@ -32,22 +32,22 @@ def agreement(pairs: list, views: list[dict]) -> list[dict]:
 
 
 def unexplained(entries: list[dict]) -> float:
-    """Share of all matches that the poses leave unexplained; lower is better, whichever photos have poses."""
+    """Share of all matches that the poses leave unexplained; lower is better, for any set of posed photos."""
     total = sum(entry["matches"] for entry in entries)
     return sum(entry["matches"] * entry["cost"] for entry in entries) / total if total else 1.0
 
 
 def contradicting(entries: list[dict]) -> float:
-    """Share of the matches of posed photos in pairs that contradict the poses. Pairs count by their matches: a few
-    dozen matches come about by chance, also between photos that show unlike things."""
+    """Share of the matches of posed photos in pairs that contradict the poses. Pairs are weighted by their matches,
+    because a few dozen matches arise by chance, even between photos of different things."""
     posed = [entry for entry in entries if entry["error"] is not None]
     total = sum(entry["matches"] for entry in posed)
     return sum(e["matches"] for e in posed if e["error"] > CONTRADICTION) / total if total else 0.0
 
 
 def excess(entries: list[dict]) -> float:
-    """How many times farther from their lines the matches lie than they have to: of the pairs' medians, the median by
-    matches. A wrong focal length shows here; repeating things show in `contradicting`, too."""
+    """Distance of matches from their lines, divided by the best possible distance: the median of the pairs' medians,
+    weighted by matches. A wrong focal length shows here; repeating textures also show in `contradicting`."""
     posed = sorted((entry["error"] / max(entry["own"], FINEST), entry["matches"])
                    for entry in entries if entry["error"] is not None)  # fmt: skip
     half = sum(matches for _, matches in posed) / 2
@@ -86,9 +86,9 @@ def sampson(form: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarr
 
 
 def own_errors(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Sampson distances [M], px, of matched pixels [M, 2] from the lines of the bilinear form that fits them best: what
-    no poses can beat by much, whatever the focal length. The eight-point algorithm, with weights by which distances are
-    in pixels and far matches count little."""
+    """Sampson distances [M], px, of matched pixels [M, 2] from the lines of the bilinear form that fits them best: no
+    poses can be much better, whatever the focal length. The eight-point algorithm, with weights that give distances in
+    pixels and little influence to far matches."""
 
     def normal(pixels: np.ndarray) -> np.ndarray:
         middle = pixels.mean(0)

@@ -1,4 +1,4 @@
-"""Can a set of poses be trusted, and if not, what is wrong with the photos?"""
+"""Checks whether poses can be trusted, and diagnoses problems of the photos."""
 
 from dataclasses import dataclass, replace
 
@@ -15,33 +15,32 @@ FOV_RANGE = (18.0, 110.0)
 MAX_MEAN_ERROR = 2.0  # px
 MIN_TRIANGULATION = 1.5  # degrees
 FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, ENOUGH, 30, 6
-FOCAL_OFF = 1.5  # times the focal length of EXIF, and the lens is another
-# Of the matches. Right poses have up to 0.1, of looser matches 0.2; those of repeating things two thirds and more.
+FOCAL_OFF = 1.5  # times the focal length of EXIF: beyond this the lens is a different one
+# Of the matches. Right poses have up to 0.1, with looser matches 0.2; those of repeating textures two thirds and more.
 MANY_CONTRADICTIONS = 0.35
-# How many times farther from their lines than they have to matches may lie: right poses have up to 1.4, those of a
-# wrong focal length or of two zooms taken for one 2.8 and more. Of single photos right ones have up to 1.9, and a few
-# may be off.
+# Largest excess (see `excess`): right poses have up to 1.4, those of a wrong focal length or of two zooms treated as
+# one 2.8 and more. Single photos with right poses have up to 1.9, and a few may exceed that.
 MOST_EXCESS, FEW_ASTRAY = 2.0, 0.1
 # Fewer photos, or neighbours that stand farther apart (degrees, as seen from the scene), are doubtful.
 GOOD_PHOTOS, WIDE_STEP = 20, 18.0
-STILL = 0.5  # of a pair's matches not moving: the background stands still
-ONE_SIDE = 150.0  # degrees of view points around the scene below which it is seen from one side only
+STILL = 0.5  # of a pair's matches not moving: the background is static
+ONE_SIDE = 150.0  # degrees of viewpoints around the scene: below this it is seen from one side only
 COMPONENT_NAMED = 3
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What the photos of a set have in common; it does not depend on poses."""
+    """Facts about a set of photos that do not depend on poses."""
 
     components: list[list[str]]  # names of photos linked by verified matches, largest group first
     textureless: float  # share of photos with too few features
     still: float  # share of linked pairs whose matches mostly did not move
-    turn_only: float  # share of linked pairs that a turn of the camera, without a step, explains
+    turn_only: float  # share of linked pairs that a rotation of the camera, without a step, explains
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
-    """Looks at a worker's counts and pairs. Blurred photos match each other, as nothing finer is left of them; they
-    form no group of their own."""
+    """Evaluates a worker's counts and pairs. Blurred photos match each other, because they have no fine detail; they do
+    not form a separate group."""
     sound = {photo.name for photo in photos if not photo.fault}
     counts, names = result["counts"], sorted(result["counts"])
     linked = [pair for pair in result["pairs"] if pair["matches"] >= FEW_MATCHES]
@@ -66,12 +65,11 @@ def views_of(result: dict, photos: list[Photo]) -> list[View]:
 
 
 def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, known: bool = False) -> dict:
-    """Decides whether a reconstruction can be trusted, for the report: `failures` is empty when the poses may be used.
+    """Decides whether a reconstruction can be trusted, for the report: `failures` is empty if the poses may be used.
 
-    "All registered" is not "right": repeating textures and several zooms give complete but wrong reconstructions, which
-    show in matches that contradict the poses, or lie farther from their lines than they have to. `ordinary` is the
-    result at ordinary thresholds, if `result` is not: its matches show best how the camera moved. `known` cameras may
-    be off by some pixels.
+    A complete reconstruction may be wrong: with repeating textures or several zooms, matches contradict the poses, or
+    lie farther from their lines than necessary. `ordinary` is the result at ordinary thresholds, if `result` is not:
+    its matches show best how the camera moved. `known` cameras may be off by some pixels.
     """
     views = views_of(result, photos)
     posed = {view.name for view in views}
@@ -98,7 +96,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
             failures.append(f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)")
         elif around < ONE_SIDE:
             warnings.append(f"the photos show the scene from one side ({around:.0f} degrees around it): what they do "
-                            "not show is guessed, so no closed object can come of it: walk further around")  # fmt: skip
+                            "not show is guessed, so the result is not closed: walk further around")  # fmt: skip
     return {
         "photos": len(photos), "posed": len(posed), "left_out": left_out,
         "mean_error": round(result.get("mean_error", 0.0), 4), "points": result.get("points", 0),
@@ -122,15 +120,15 @@ def check_focal(
     ratios = [view.focal / known for view in views if (known := exif[view.name])]
     to_exif = float(np.median(ratios)) if ratios else 1.0
     if not 1 / FOCAL_OFF < to_exif < FOCAL_OFF:
-        # Photos that were cropped carry the focal length of the whole photo.
+        # Cropped photos still have the focal length of the whole photo.
         wrong = "poses" if doubtful else "EXIF"
         message = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
         (failures if doubtful else warnings).append(message)
 
 
 def photos_astray(result: dict) -> list[str]:
-    """The posed photos whose matches lie farther from their lines than those of right poses, if these are too many to
-    be trusted."""
+    """The posed photos whose matches lie farther from their lines than with right poses, if there are too many of
+    them."""
     agreement = result.get("agreement", [])
     photos = excess_of_photos(agreement)
     astray = [name for name, times in photos.items() if times > MOST_EXCESS]
@@ -140,8 +138,8 @@ def photos_astray(result: dict) -> list[str]:
 
 
 def why_astray(views: list[View], astray: list[str]) -> str:
-    """What may have put the matches of photos astray, the likelier first: photos that are too few or too far apart, or
-    several zooms. Neither is certain."""
+    """Possible causes of such matches, the likelier first: too few photos or too large steps, or several zooms. Neither
+    is certain."""
     zooms = "photos of several zooms, or cropped ones: give those of one zoom, or as the camera stored them, with EXIF"
     rays = focus(views)[1]
     angles = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
@@ -177,8 +175,8 @@ def check_errors(result: dict, astray: list[str], failures: list[str], warnings:
 
 
 def left_out_reason(photo: Photo, result: dict, found: Findings) -> dict:
-    """Why a photo has no pose: `kind`, the same in words (`why`), and whether a more careful attempt may find one
-    (`hopeful`)."""
+    """The reason why a photo has no pose: `kind`, the same in words (`why`), and whether a more careful attempt may
+    find one (`hopeful`)."""
 
     def reason(kind: str, why: str) -> dict:
         return {"kind": kind, "why": why, "hopeful": kind in ("overlap", "disagrees")}
@@ -199,7 +197,7 @@ def left_out_reason(photo: Photo, result: dict, found: Findings) -> dict:
 
 
 def diagnose(result: dict, views: list[View], found: Findings, failures: list[str]) -> list[str]:
-    """What is the matter with the photos as a set, likeliest first; nothing where the poses are good."""
+    """Problems of the photos as a set, likeliest first; empty if the poses are good."""
     causes = []
     if found.still > 0.5:
         causes.append("the background stands still while the object turns (a turntable?): give masks of the object, or "
@@ -230,7 +228,7 @@ def diagnose(result: dict, views: list[View], found: Findings, failures: list[st
 
 
 def failure_message(checks: dict) -> str:
-    """The failures, causes and photos left out, in one line."""
+    """The failures, their causes and the photos left out, in one line."""
     message = "camera poses: " + "; ".join(checks["failures"])
     if checks["causes"]:
         message += ". Probably " + "; and ".join(checks["causes"])
@@ -241,7 +239,7 @@ def failure_message(checks: dict) -> str:
 
 
 def failure_hint(checks: dict) -> str:
-    """What to try, from the commonest reason."""
+    """Advice, from the most common reason."""
     if checks.get("known_cameras"):
         return "check which photo belongs to which camera, and its axes; or give the folder of photos alone"
     kinds = [entry["kind"] for entry in checks["left_out"]]

@@ -1,4 +1,4 @@
-"""Photos -> camera poses and sparse points, in at most three attempts, each checked for whether it can be trusted."""
+"""Photos -> camera poses and sparse points, in at most three attempts; each result is checked."""
 
 import os
 import re
@@ -22,19 +22,20 @@ from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import read_json, replacing, write_json
 from sdfsim.base.parallel import Progress, silent
 
-# Each photo is matched with those that look most like it: at least and at most so many, and a share of all between. On
-# the bundled set 14 of 48 gave the poses that all pairs gave, in a third of the time.
+# Each photo is matched with the photos that look most like it: this minimum and maximum, and between them a share of
+# all. On the bundled set 14 of 48 gave the same poses as all pairs, in a third of the time.
 PARTNERS, SHARE = (14, 40), 0.25
-ALL_UP_TO = 150  # photos; of more, pairs that do not look alike are never matched
+ALL_UP_TO = 150  # photos; beyond this, pairs that do not look alike are never matched
 ORDINARY: dict[str, Any] = {
     "pixels": 1000, "max_features": 3000, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False,
     "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "init_inliers": 100, "init_angle": 16.0,
     "pose_inliers": 30, "exhaustive_up_to": 30,
 }  # fmt: skip
-# What each attempt asks of the worker, by its name. The first that gives poses of all photos to be trusted is the last.
+# The worker's settings for each attempt, by name. The attempts end with the first that gives trusted poses of all
+# photos.
 ATTEMPTS = {
     "ordinary": ORDINARY,
-    "without what stands still": {**ORDINARY, "moving_only": True},
+    "without static matches": {**ORDINARY, "moving_only": True},
     "more features": {
         **ORDINARY, "pixels": 1600, "max_features": 12000, "peak_threshold": 0.003, "max_ratio": 0.88, "guided": True,
         "min_inliers": 12, "min_inlier_ratio": 0.25, "init_inliers": 40, "init_angle": 6.0, "pose_inliers": 15,
@@ -42,33 +43,33 @@ ATTEMPTS = {
     },
 }  # fmt: skip
 
-WORTH = 0.05  # of the photos left out, and a careful attempt is worth its minutes
-WORSE = 1.15  # times as much of the first attempt's matches left unexplained is more than another way to the same poses
+WORTH = 0.05  # of the photos left out: from here on a careful attempt is worth its minutes
+WORSE = 1.15  # times as many unexplained matches of the first attempt: beyond this the poses are really worse
 WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose photos are matched
 
 
 def hopeful(settings: dict, first: dict) -> bool:
-    """Whether an attempt is worth its time after the first one's failed checks. Photos taken from one spot, or of a
-    background that stands still, show no more with more features."""
+    """Whether an attempt is worth its time after the first one's failed checks. More features do not help for photos
+    from one spot, or with a static background."""
     still = first["still_pairs"] > 0.5
     return still if settings["moving_only"] else first["turn_only_pairs"] <= 0.9 and not still
 
 
 def worth_more(checks: dict) -> bool:
-    """Whether a more careful attempt may pose photos that the good poses found leave out: some in twenty of them, in
-    focus and of the same thing."""
+    """Whether a more careful attempt may pose photos that good poses leave out: at least one in twenty, in focus and of
+    the same object."""
     return sum(entry["hopeful"] for entry in checks["left_out"]) > WORTH * checks["photos"]
 
 
 def better(new: tuple[dict, Path, dict], old: tuple[dict, Path, dict]) -> bool:
-    """Whether an attempt (checks, folder, result) is better than one before: poses to be trusted, then more photos,
-    unless those that both have are posed worse; where nothing can be trusted, more photos and points."""
+    """Whether an attempt (checks, folder, result) is better than an earlier one: trusted poses first, then more photos,
+    unless the photos in both are posed worse; if neither can be trusted, more photos and points."""
     checks, before = new[0], old[0]
     if bool(checks["failures"]) != bool(before["failures"]):
         return not checks["failures"]
     if checks["failures"]:
         return (checks["posed"], checks["points"]) > (before["posed"], before["points"])
-    # By the same matches, as each attempt's own are of other features.
+    # With the same matches, because each attempt has different features.
     both = [(a, b) for a, b in zip(new[2]["judged"], old[2]["judged"], strict=True) if a["own"] and b["own"]]
     worse = unexplained([a for a, _ in both]) > WORSE * unexplained([b for _, b in both])
     return checks["posed"] > before["posed"] and not worse
@@ -89,13 +90,13 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
           on_progress: Progress = silent) -> dict:  # fmt: skip
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`; returns the checks.
 
-    Makes `ATTEMPTS` until poses of all photos can be trusted, for at most `timeout` s each; each has a folder of its
-    own, in which a killed run goes on. Cameras that came with the photos are kept and checked. Raises SdfsimError (exit
-    code 3) where too few photos could be posed, or the result is not plausible.
+    Makes `ATTEMPTS` until poses of all photos can be trusted, for at most `timeout` s each; each has a separate folder,
+    in which a killed run continues. Cameras that came with the photos are kept and checked. Raises SdfsimError (exit
+    code 3) if too few photos could be posed, or if the result is not plausible.
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 4,  # of what the child writes, which a run that goes on takes up
+        "version": 4,  # of the child's files, which a resumed run reads
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
@@ -117,7 +118,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         except SdfsimError as error:
             if not tries:
                 raise
-            # What the attempts before found out says more than that this one broke.
+            # The findings of earlier attempts are more useful than this failure.
             attempts.append({"name": name, "posed": 0, "failures": [error.message]})
             continue
         checks = check(result, photos, tries[0][2] if tries else None, known=bool(job["known_cameras"]))
@@ -136,36 +137,36 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     if checks["failures"]:
         raise SdfsimError(failure_message(checks), failure_hint(checks), exit_code=EXIT_QUALITY)
     save_views(views, out / "cameras.json")
-    with replacing(out / "sparse.npz") as partial:  # A copy: the attempt's result stays whole for a run that goes on.
+    with replacing(out / "sparse.npz") as partial:  # A copy: the attempt's result stays complete for a resumed run.
         shutil.copyfile(folder / "sparse.npz", partial)
-    for _, used, _ in tries:  # Tens of megabytes that nothing reads any more; the logs stay.
+    for _, used, _ in tries:  # Tens of megabytes that are no longer needed; the logs stay.
         (used / "database.db").unlink(missing_ok=True)
         shutil.rmtree(used / "colmap", ignore_errors=True)
     return checks
 
 
 def seen_together(views: list[View]) -> list[list[str]]:
-    """Pairs of photos that may show the same, by their cameras: seen from farther round, features look different."""
+    """Pairs of photos that may show the same, by their cameras: at larger angles, features look different."""
     ahead = np.array([view.rotation[2] for view in views])
     close = ahead @ ahead.T > np.cos(np.radians(WIDEST_PAIR))
     return [[views[a].name, views[b].name] for a, b in np.argwhere(np.triu(close, 1)).tolist()]
 
 
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
-    """Runs the COLMAP child process on one job, unless the folder holds its result already; returns `result.json`.
-    Raises SdfsimError, which names its log, where it crashed or ran out of time."""
+    """Runs the COLMAP child process for one job, unless the folder already holds its result; returns `result.json`.
+    Raises SdfsimError, which names its log, if it crashed or ran out of time."""
     before: Any = None
     with suppress(SdfsimError):  # absent, or cut short
         before = read_json(folder / "job.json")
         if before == job:
             return read_json(folder / "result.json")
     if before != job:
-        shutil.rmtree(folder, ignore_errors=True)  # Of other photos or settings.
+        shutil.rmtree(folder, ignore_errors=True)  # From other photos or settings.
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "colmap.log"
     write_json(folder / "job.json", job)
     root = str(Path(__file__).resolve().parents[2])
-    # An empty entry would be the user's folder, which may hold a `pipeline` too.
+    # An empty entry would mean the user's folder, which may also contain a `pipeline`.
     paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     lines = folder / "progress.log"
@@ -199,16 +200,16 @@ def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
     phase = dict(said).get("phase", "features")
     if phase == "mapping":
         placed = [int(number) for word, number in said if word == "placed"] or [0]
-        # Further focal lengths start at no camera again, but what is done stays done.
+        # Each further focal length starts again with no camera, but the progress must not go back.
         return 0.75 + 0.25 * min(1.0, max(placed) / count), f"placing cameras, {placed[-1]} of {count}"
     table, total = "keypoints", count
     if phase == "matches":
         pairs = count * (count - 1) // 2
         if count > job["exhaustive_up_to"]:
-            pairs = min(pairs, count * job["partners"] * 3 // 5)  # Four in ten or so name each other.
+            pairs = min(pairs, count * job["partners"] * 3 // 5)  # About four in ten name each other.
         table, total = "two_view_geometries", pairs if job["pairs"] is None else len(job["pairs"])
     rows = 0
-    address = f"file:{folder / 'database.db'}?mode=ro"  # It may not be there yet, or be busy.
+    address = f"file:{folder / 'database.db'}?mode=ro"  # It may not exist yet, or be busy.
     with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True, timeout=0.2)) as found:
         rows = found.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
     part = min(1.0, rows / max(total, 1))

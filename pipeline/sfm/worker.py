@@ -1,7 +1,7 @@
 """The child process of the poses stage: COLMAP through pycolmap. Run as `python -m pipeline.sfm.worker JOB.json`.
 
-A process of its own, because a native abort or an endless loop in here must not take the user's session down. Killed
-and started again with the same job, it goes on with the features and matches that its database holds.
+It is a separate process, because a native abort or an endless loop in it must not end the user's session. If it is
+killed and started again with the same job, it continues with the features and matches in its database.
 """
 
 import json
@@ -21,27 +21,27 @@ from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_p
 from sdfsim.base.files import write_arrays, write_json
 
 # Chosen by hand on the photo sets of the project; nothing derives these numbers, and other sets may want others.
-# Of known cameras that are refined:
+# For known cameras that are refined:
 REFINE_PIXELS = (16.0, 6.0)  # px that a point may be off, at first and then
 REFINE_POINTS = 30  # points that a camera needs to be moved
-SUPPORTED = 70  # points that most cameras need for any to be moved: with fewer, a dozen photos came out worse
-TRACKED = 0.02  # m within which a phone tracks its place
-# Of poses that are found:
-DOUBTFUL = 1.8  # excess of a photo from which on other focal lengths are tried; right poses had 1.0 to 1.8
-HOPELESS = 0.5  # of all matches contradicting the poses: no focal length mends that
-# Ratio of a focal length to the next shorter one from which on they are two zooms; among photos of one zoom, each posed
-# with a focal length of its own, it was up to 1.05.
+SUPPORTED = 70  # points that most cameras need for any to be moved: with fewer, a dozen photos became worse
+TRACKED = 0.02  # m, error of a phone's tracked position
+# For poses that are estimated:
+DOUBTFUL = 1.8  # excess of a photo above which other focal lengths are tried; right poses had 1.0 to 1.8
+HOPELESS = 0.5  # of all matches contradicting the poses: no focal length fixes that
+# Ratio of a focal length to the next shorter one above which they are two zooms; among photos of one zoom, each posed
+# with its own focal length, it was up to 1.05.
 ZOOM = 1.12
-ABOUT = 1.03  # ratio of what two models leave unexplained up to which the one with fewer cameras is taken
-# Features of a photo that tell which others look like it, the largest; how much nearer than the next a match of them
-# is; and matches of them from which on photos may show the same.
+ABOUT = 1.03  # ratio of two models' unexplained matches up to which the one with fewer cameras is chosen
+# Number of a photo's largest features for finding similar photos; how much nearer than the next a match has to be; and
+# the matches above which photos may show the same.
 LARGEST, DISTINCT, COMMON = 400, 0.8, 2
-STILL = 2.0  # px between the places of a match in two photos below which it did not move
-TURNS = 200  # pairs of photos at most that are asked for turns on the spot
+STILL = 2.0  # px between the pixels of a match in two photos: below this it did not move
+TURNS = 200  # largest number of pairs of photos that are checked for turns on the spot
 
 
 def watch_parent() -> None:
-    """Ends this process when its parent is gone (killed), so that no orphan keeps computing."""
+    """Ends this process if its parent is killed, so that no orphan keeps computing."""
     parent = os.getppid()
 
     def loop() -> None:
@@ -66,7 +66,7 @@ def features(pycolmap, job: dict, database: Path) -> None:
         common = {"image_names": group["names"], "camera_mode": pycolmap.CameraMode.SINGLE}
         with pycolmap.Database.open(database) as opened:
             known = all(opened.read_image_with_name(name) is not None for name in group["names"])
-        if not known:  # Before extraction, whose threads would number photos in the order in which they happen to end.
+        if not known:  # Before extraction, whose threads would number photos in a random order.
             pycolmap.import_images(database, job["images"], options=reader, **common)
         pycolmap.extract_features(
             database, job["images"], reader_options=reader, extraction_options=extraction,
@@ -75,17 +75,17 @@ def features(pycolmap, job: dict, database: Path) -> None:
 
 
 def matches(pycolmap, job: dict, database: Path) -> None:
-    """Matches the pairs of the job, else every pair, or those that look alike where these are too many."""
+    """Matches the pairs of the job, else every pair, or, if these are too many, pairs that look alike."""
     matching = pycolmap.FeatureMatchingOptions(
         use_gpu=False, guided_matching=job["guided"], sift={"max_ratio": job["max_ratio"]}
     )
     verification = pycolmap.TwoViewGeometryOptions(
         min_num_inliers=job["min_inliers"], filter_stationary_matches=job["moving_only"],
-        # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
+        # Otherwise pairs without overlap would use all 10,000 trials each, most of the time of this stage.
         ransac={"random_seed": job["seed"], "min_inlier_ratio": job["min_inlier_ratio"]},
     )  # fmt: skip
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
-    # Small blocks only so that progress shows in the database.
+    # Small blocks, so that the database shows progress.
     pairs = job["pairs"]
     if pairs is None and job["count"] > job["exhaustive_up_to"]:
         pairs = alike(pycolmap, job, database)
@@ -100,8 +100,8 @@ def matches(pycolmap, job: dict, database: Path) -> None:
 
 
 def alike(pycolmap, job: dict, database: Path) -> list[tuple[str, str]]:
-    """Pairs of photos to match where all are too many: each photo with the `job["partners"]` that look most like it.
-    Its largest features, which are few, are matched with theirs first (preemptive matching, Wu 2013)."""
+    """Pairs of photos to match if all pairs are too many: each photo with the `job["partners"]` photos that look most
+    like it. To find these, only its largest features are matched with theirs (preemptive matching, Wu 2013)."""
     with pycolmap.Database.open(database) as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
         large = [
@@ -112,14 +112,14 @@ def alike(pycolmap, job: dict, database: Path) -> list[tuple[str, str]]:
     for a, first in enumerate(large):
         for b in range(a):
             count[a, b] = count[b, a] = in_common(first, large[b])
-    # The same for photos whose numbers are the same, whatever sorts them.
+    # Ties have the same order whatever sorts them.
     chosen = np.argsort(-count, axis=1, kind="stable")[:, : job["partners"]]
     pairs = {(min(a, b), max(a, b)) for a, row in enumerate(chosen.tolist()) for b in row if count[a, b] >= COMMON}
     return [(images[a].name, images[b].name) for a, b in sorted(pairs)]
 
 
 def largest(keypoints: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
-    """Descriptors [L, 128] float32 of unit length of the largest of some features, whose keypoints are [F, 6] (place
+    """Descriptors [L, 128] float32 of unit length of the largest of some features, whose keypoints are [F, 6] (position
     and affine shape)."""
     area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     some = descriptors[np.argsort(-area, kind="stable")[:LARGEST]].astype(np.float32)
@@ -127,8 +127,8 @@ def largest(keypoints: np.ndarray, descriptors: np.ndarray) -> np.ndarray:
 
 
 def in_common(first: np.ndarray, second: np.ndarray) -> int:
-    """How many features two photos have in common, by their descriptors [L, 128] and [M, 128] of unit length: each
-    other's nearest, and clearly nearer than the next."""
+    """Number of common features of two photos, from their descriptors [L, 128] and [M, 128] of unit length: mutual
+    nearest neighbours, clearly nearer than the next."""
     if min(len(first), len(second)) < 2:
         return 0
     cosine = first @ second.T
@@ -156,7 +156,7 @@ def mapped(pycolmap, job: dict, database: Path, out: Path):
     def count() -> None:
         nonlocal done
         done += 1
-        print(f"placed {done}", flush=True)  # for the parent, at once
+        print(f"placed {done}", flush=True)  # for the parent, without delay
 
     print("placed 0", flush=True)
     found = pycolmap.incremental_mapping(
@@ -174,10 +174,10 @@ def fresh(folder: Path) -> Path:
 
 
 def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
-    """The reconstruction that explains the matches best, or None; and the photos of each camera that it has.
+    """The reconstruction that explains the matches best, or None; and the photos of each of its cameras.
 
-    Photos of one size are taken for those of one camera at first. Where the matches doubt what comes of that, every
-    photo gets a focal length of its own, then each zoom that these show. All are judged by the same matches.
+    Photos of one size are first treated as those of one camera. If the matches contradict the result, every photo gets
+    its own focal length, then each zoom that these show. The same matches compare all results.
     """
     shared = [group["names"] for group in job["groups"]]
     tried = [(mapped(pycolmap, job, database, out), shared)]
@@ -193,13 +193,13 @@ def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
         tried += [(mapped(pycolmap, job, copy, out), zooms), (alone, [[name] for name in names])]
         costs += [unexplained(agreement(pairs, views_in(model))) for model, _ in tried[1:]]
     copy.unlink(missing_ok=True)
-    # The fewest cameras that do about as well as any.
+    # The fewest cameras that are about as good as any.
     return next(one for one, cost in zip(tried, costs, strict=True) if cost <= ABOUT * min(costs) + (ABOUT - 1) / 10)
 
 
 def doubtful(entries: list[dict]) -> bool:
     """Whether other focal lengths should be tried: photos that match others are left out, or matches lie farther from
-    the lines that the poses give than they have to."""
+    the lines of the poses than necessary."""
     posed = {entry[end] for entry in entries if entry["error"] is not None for end in "ab"}
     linked = {entry[end] for entry in entries for end in "ab"}
     worst = max(excess_of_photos(entries).values(), default=0.0)
@@ -207,8 +207,8 @@ def doubtful(entries: list[dict]) -> bool:
 
 
 def zooms_of(names: list[str], focals: dict[str, float]) -> list[list[str]]:
-    """Photos of one size in groups of about the same focal length (px). One without a pose, whose focal length is not
-    known, stands alone."""
+    """Photos of one size in groups of about the same focal length (px). A photo without a pose has no known focal
+    length and is a group alone."""
     known = sorted((name for name in names if name in focals), key=lambda name: (focals[name], name))
     steps = [k for k in range(1, len(known)) if focals[known[k]] > ZOOM * focals[known[k - 1]]]
     groups = [known[start:end] for start, end in zip([0, *steps], [*steps, len(known)], strict=True)]
@@ -216,8 +216,8 @@ def zooms_of(names: list[str], focals: dict[str, float]) -> list[list[str]]:
 
 
 def with_cameras(pycolmap, database: Path, copy: Path, groups: list[list[str]], focals: dict[str, float]) -> None:
-    """Copies a database, with a camera for each group of photos, that starts at the median of their focal lengths (px)
-    or at that which the photos' camera has now. The matches stay."""
+    """Copies a database, with one camera per group of photos, which starts at the median of their focal lengths (px) or
+    at that of the photos' current camera. The matches stay."""
     shutil.copyfile(database, copy)
     with pycolmap.Database.open(copy) as opened:
         images = {image.name: image for image in opened.read_all_images()}
@@ -239,12 +239,13 @@ def with_cameras(pycolmap, database: Path, copy: Path, groups: list[list[str]], 
                 image.camera_id = camera.camera_id
                 frame = pycolmap.Frame(frame_id=image.frame_id, rig_id=number)
                 frame.add_data_id(image.data_id)
-                opened.update_frame(frame)  # first: the image's new camera has to be in it
+                opened.update_frame(frame)  # first, because the image's new camera has to be in it
                 opened.update_image(image)
 
 
 def incremental_options(pycolmap, job: dict):
-    """Settings of incremental mapping: on one thread, as several add up in an order that differs from run to run."""
+    """Settings of incremental mapping: on one thread, because several threads sum in an order that differs between
+    runs."""
     mapper = {
         "num_threads": 1, "random_seed": job["seed"], "init_min_num_inliers": job["init_inliers"],
         "init_min_tri_angle": job["init_angle"], "abs_pose_min_num_inliers": job["pose_inliers"],
@@ -281,11 +282,11 @@ def known_cameras(pycolmap, job: dict, database: Path):
 
 
 def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
-    """Moves known cameras to where the matches between their photos say they stood, by bundle adjustment.
+    """Moves known cameras to agree with the matches between their photos, by bundle adjustment.
 
-    A phone tracks its poses to a centimetre or so, which is many pixels. The first points are allowed as much, the
-    next ones less. Every camera is drawn to where it was given, which decides where matches do not; as a whole the
-    cameras stay where they were, at the scale they had.
+    A phone tracks its poses to about a centimetre, which is many pixels. The first points may have such errors, later
+    ones less. A prior ties every camera to its given position, which decides if matches do not; as a whole the cameras
+    keep their place and scale.
     """
     given = {key: image.projection_center() for key, image in model.images.items()}
     cartesian = pycolmap.PosePriorCoordinateSystem.CARTESIAN
@@ -299,7 +300,7 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
             refine_focal_length=False, refine_extra_params=False, print_summary=False
         )
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-        adjustment.ceres.solver_options.num_threads = 1  # several add up in an order that differs from run to run
+        adjustment.ceres.solver_options.num_threads = 1  # several threads sum in an order that differs between runs
         seen = [key for key, image in found.images.items() if image.has_pose and image.num_points3D >= REFINE_POINTS]
         if np.median([image.num_points3D for image in found.images.values()]) < SUPPORTED:
             return
@@ -375,7 +376,7 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
 
 
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
-    """What the matches show without poses: `counts` of each photo, `pairs` (with the share of matches that did not
+    """Facts from the matches without poses: `counts` of each photo, `pairs` (with the share of matches that did not
     move between the photos), and the share of `turn_only` pairs."""
     result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
     sizes = {name: group for group in job["groups"] for name in group["names"]}
@@ -392,9 +393,9 @@ def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
 
 
 def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = STILL) -> float:
-    """Share of pairs of photos, of matched pixels [M, 2] each, whose matches a turn of the camera on the spot explains
-    to a median of `least` px: with the right focal length, that which explains most pairs, one rotation maps the rays
-    of all matches."""
+    """Share of pairs of photos, with matched pixels [M, 2] each, whose matches a rotation of the camera on the spot
+    explains to a median of `least` px: with the right focal length, the one that explains most pairs, one rotation maps
+    the rays of all matches."""
     best = 0.0
     for ratio in np.geomspace(0.4, 4.0, 24):
         explained = 0
@@ -410,7 +411,7 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = S
 
 
 def main(job_path: str) -> None:
-    """Runs one job file and writes `result.json` and `sparse.npz` beside it."""
+    """Runs one job file and writes `result.json` and `sparse.npz` next to it."""
     import pycolmap
 
     watch_parent()
@@ -429,7 +430,7 @@ def main(job_path: str) -> None:
     else:
         best, cameras = best_mapping(pycolmap, job, database, pairs, out)
         if len(posed_in(best)) < job["count"] and job["exhaustive_up_to"] < job["count"] <= job["all_up_to"]:
-            # What looks least alike may be what joins those that were left out to the others.
+            # The pairs that look least alike may join the photos that were left out to the others.
             print("phase matches", flush=True)
             matches(pycolmap, {**job, "exhaustive_up_to": job["count"]}, database)
             print("phase mapping", flush=True)

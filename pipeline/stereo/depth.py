@@ -1,9 +1,9 @@
-"""Depth from photos alone: for every pixel, how far away what it shows is, by comparing it with neighbouring photos.
+"""Depth from photos alone: the depth of every pixel, by comparison with neighbouring photos.
 
-Planes are swept through the scene at a small size of the photos. Around what that found, places are tried again at the
-full size, along the surface as it was found; so windows follow slopes, which planes before the camera do not. Beside
-edges the surface behind is tried too, for windows take what is behind an edge for what is before it. A pixel counts
-where other photos agree.
+Planes are swept through the scene at a small photo size. Then depths around the result are tried at the full size,
+along the slope of that surface; so windows follow slopes, unlike planes in front of the camera. Near edges the surface
+behind is tried too, because windows mix the surfaces in front of and behind an edge. A pixel counts if other photos
+agree.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from sdfsim.base.parallel import Progress, silent, threads
 
 COARSE = 320  # px of the longer side while planes are swept
 LARGER = 1.5  # times, from round to round
-NEIGHBOURS = 4  # photos that one is compared with
-ASKED = 8  # photos that have to agree on its depth, or see nothing there
+NEIGHBOURS = 4  # photos with which a photo is compared
+ASKED = 8  # photos that are checked for the same depth
 # Degrees between lines of sight at which two photos match best, and how fast they match less below and above.
 BEST_ANGLE, NARROWER, WIDER = 9.0, 4.0, 9.0
-APART = 0.7  # How much less a neighbour counts that lies in the direction of one that was chosen before.
-PLACES = 300  # sparse points by which neighbours are chosen
+APART = 0.7  # Reduced weight of a neighbour in the direction of one already chosen.
+PLACES = 300  # sparse points used to choose neighbours
 PLANES = (48, 128)  # fewest and most
-STEP = 1.25  # px that what a plane shows moves to the next one, in the photo farthest away
-FINER, TRIED = 0.5, 4  # px between the places that are tried again, and how many of them to either side
-AROUND = 9  # px, the width within which the farthest surface found is tried too
+STEP = 1.25  # px of motion from plane to plane, in the photo farthest away
+FINER, TRIED = 0.5, 4  # px between the depths that are tried again, and how many to either side
+AROUND = 9  # px, the width in which the farthest surface is also tried
 HALF = 3  # px from the middle of a window to its sides
 AGREE = 0.01  # share by which inverse depths differ at most
-FEWEST = 2  # photos that agree, where it is certain enough
-ALIKE = 0.4  # correlation below which nothing is known
-BEYOND = 1e-3  # inverse depth of what is empty as far as counts
-MARGIN = 1.25  # by which the nearest and farthest sparse points of a photo are exceeded
+FEWEST = 2  # photos that have to agree
+ALIKE = 0.4  # correlation below which a depth is unknown
+BEYOND = 1e-3  # inverse depth of empty space
+MARGIN = 1.25  # margin beyond the nearest and farthest sparse points of a photo
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What one photo shows, as far as others agree."""
+    """Depth of one photo where others agree."""
 
     view: View  # of the photo itself
     matrix: np.ndarray  # [3, 3] from camera axes to pixels, whose centres are at whole numbers
-    inverse: np.ndarray  # [H, W] float32, 1 / depth along the optical axis; 0 where nothing is known
+    inverse: np.ndarray  # [H, W] float32, 1 / depth along the optical axis; 0 where unknown
     certain: np.ndarray  # [H, W] float32, 0 to 1
 
     @property
@@ -68,7 +68,7 @@ class DepthMap:
         return pixels @ np.linalg.inv(self.matrix).T @ self.view.rotation
 
     def points(self) -> np.ndarray:
-        """Places [P, 3] of the pixels of which something is known."""
+        """Points [P, 3] of the pixels with known depth."""
         known = self.inverse > 0
         return self.view.center + self.rays[known] / self.inverse[known][:, None]
 
@@ -76,8 +76,8 @@ class DepthMap:
 def stereo(
     poses: PosedPhotos, photos_folder: Path, long_side: int, *, on_progress: Progress = silent
 ) -> list[DepthMap]:  # fmt: skip
-    """Depth of every photo in the space of the poses, no larger than `long_side` px, for what lies in the unit sphere
-    and behind it. Raises SdfsimError where a photo is missing. None where there are fewer than three photos."""
+    """Depth of every photo in the space of the poses, no larger than `long_side` px, for surfaces in the unit sphere
+    and behind it. Raises SdfsimError if a photo is missing. None if there are fewer than three photos."""
     views = poses.views
     if len(views) <= FEWEST:
         return []
@@ -122,7 +122,7 @@ def stereo(
 
 
 def only(poses: PosedPhotos, index: Sequence[int]) -> PosedPhotos:
-    """Some of the photos, and what they observe of the sparse points."""
+    """Some of the photos, with their observations of sparse points."""
     sparse, place = poses.sparse, np.full(len(poses.views), -1)
     place[index] = np.arange(len(index))
     view_of = place[sparse.view_of]
@@ -132,7 +132,7 @@ def only(poses: PosedPhotos, index: Sequence[int]) -> PosedPhotos:
 
 
 def outside_mask(depth: DepthMap, photos_folder: Path) -> DepthMap:
-    """The same where nothing but a masked object is there: what the photo's mask leaves out is empty, far beyond."""
+    """The same for a masked object: pixels outside the photo's mask are empty space, infinitely far."""
     try:
         with Image.open(Path(photos_folder) / "masks" / f"{depth.view.name}.png") as image:
             mask = np.asarray(image.convert("L").resize(depth.inverse.shape[::-1], Image.Resampling.BOX))
@@ -160,15 +160,15 @@ def stereo_summary(maps: Sequence[DepthMap], poses: PosedPhotos) -> dict[str, fl
 
 
 def pinhole(view: View, photos_folder: Path, long_side: int) -> Pinhole:
-    """The photo of a view, grey, made smaller and straight. Raises SdfsimError where it is missing."""
+    """The photo of a view, grey, reduced and undistorted. Raises SdfsimError if it is missing."""
     grey, matrix = straightened(view, photos_folder, long_side, "L")
     return Pinhole(view, np.ascontiguousarray(grey - grey.mean(), np.float32), matrix)
 
 
 def straightened(view: View, photos_folder: Path, long_side: int, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """The photo of a view, made smaller and straight, in a mode of PIL: [H, W] float32 (grey, L) or [H, W, 3] uint8
+    """The photo of a view, reduced and undistorted, in one of PIL's modes: [H, W] float32 (grey, L) or [H, W, 3] uint8
     (RGB), and the matrix [3, 3] from camera axes to its pixels, whose centres are at whole numbers. Raises SdfsimError
-    where it is missing."""
+    if it is missing."""
     import cv2
 
     try:
@@ -191,8 +191,8 @@ def straightened(view: View, photos_folder: Path, long_side: int, mode: str) -> 
 
 
 def neighbours(poses: PosedPhotos) -> list[list[int]]:
-    """Of each view the others that match it best, the best first: those that show the same sparse points from an angle
-    that is neither too narrow nor too wide, the first few to different sides."""
+    """For each view the others that match it best, the best first: they show the same sparse points from an angle that
+    is neither too narrow nor too wide, and the first few are on different sides."""
     views, sparse = poses.views, poses.sparse
     middle = focus(views)[0]
     centers = np.array([view.center for view in views])
@@ -225,7 +225,7 @@ def neighbours(poses: PosedPhotos) -> list[list[int]]:
 
 
 def span(poses: PosedPhotos, number: int) -> tuple[float, float]:
-    """Smallest and largest inverse depth that is looked for in a photo: the unit sphere, and what lies behind it."""
+    """Smallest and largest inverse depth to search in a photo: the unit sphere, and the space behind it."""
     view, sparse = poses.views[number], poses.sparse
     seen = sparse.xyz[sparse.point_of[sparse.view_of == number]]
     depth = seen @ view.rotation[2] + view.translation[2]
@@ -239,7 +239,7 @@ def span(poses: PosedPhotos, number: int) -> tuple[float, float]:
 
 
 def relation(first: Pinhole | DepthMap, second: Pinhole | DepthMap) -> tuple[np.ndarray, np.ndarray]:
-    """What leads from pixels of one photo to those of another: [3, 3] and [3], see `sweep`."""
+    """The map from pixels of one photo to those of another: [3, 3] and [3], see `sweep`."""
     turn = second.view.rotation @ first.view.rotation.T
     shift = second.view.translation - turn @ first.view.translation
     return second.matrix @ turn @ np.linalg.inv(first.matrix), second.matrix @ shift
@@ -277,8 +277,8 @@ def _search(picture: Pinhole, near: list[Pinhole], limits: tuple[float, float], 
     )
     offsets = np.arange(-TRIED, TRIED + 1) * FINER / fastest
     inverse, score = best(base, offsets)
-    # Windows that reach over an edge find what is before it, also where a pixel shows what is behind: in the mouth of
-    # a vase that is all that there is. What is nearer than the places that were tried lies on the same surface.
+    # Windows that reach over an edge find the front surface even for pixels that show the surface behind: in the mouth
+    # of a vase every window does. Surfaces nearer than the tried depths are the same surface.
     beyond = base - far > offsets[-1]
     if not beyond.any():
         return inverse, score
@@ -288,7 +288,7 @@ def _search(picture: Pinhole, near: list[Pinhole], limits: tuple[float, float], 
 
 
 def _agreement(pictures: list[Pinhole], inverse: list[np.ndarray], number: int, asked: list[int]) -> np.ndarray:
-    """How many of some photos agree [H, W] with the inverse depth of one."""
+    """The number of photos [H, W] that agree with the inverse depth of one."""
     turns, shifts = zip(*(relation(pictures[number], pictures[k]) for k in asked), strict=True)
     others, sizes = stacked([inverse[k] for k in asked])
     return agreeing(inverse[number], others, sizes, np.array(turns), np.array(shifts), AGREE)
@@ -306,7 +306,7 @@ def stacked(pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filled(inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Inverse depth [H, W] where it is `known` [H, W], without specks, and elsewhere that of the nearest such pixel."""
+    """Inverse depth [H, W] where it is `known` [H, W], without specks; elsewhere that of the nearest such pixel."""
     import cv2
 
     if not known.any():

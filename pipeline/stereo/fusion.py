@@ -1,7 +1,7 @@
-"""Depth maps -> a signed distance: the mean of what all photos say about a place, as far as they see (TSDF).
+"""Depth maps -> a signed distance: the mean over all photos that see a place (TSDF).
 
-What no photo sees takes the side of the nearest place that one does: the inside of a table's leg is solid, the air
-beside a picture's edge is empty.
+A place that no photo sees takes the sign of the nearest place that one does: the inside of a table's leg is solid, the
+air beyond a picture's edge is empty.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from pipeline.stereo.compiled import carve, paint
 from pipeline.stereo.depth import BEYOND, DepthMap, stacked, straightened
 from sdfsim.base.parallel import Progress, silent, threads
 
-BACK = 2.0  # cells before and behind a surface within which its distance counts
-# A place is empty where photos that see past it have more than this share of the weight of those that see a surface
-# there. Their distances are no part of the mean: few that are wrong would move the surface.
+BACK = 2.0  # cells in front of and behind a surface within which its distance counts
+# A place is empty if photos that see past it have more than this share of the weight of those that see a surface there.
+# Their distances are not part of the mean: a few wrong ones would move the surface.
 OUTVOTED = 0.5
-SEEN = 0.3  # weight, that of one certain pixel is 1, from which on a place is known
-DENSE = 0.4  # density, before it is made positive, of what lies behind the sphere
-EDGE = 0.05  # share of inverse depth by which neighbouring pixels on one surface differ at most
+SEEN = 0.3  # weight above which a place is known; one certain pixel has 1
+DENSE = 0.4  # density of surfaces behind the sphere, before softplus
+EDGE = 0.05  # largest relative difference of inverse depth between neighbouring pixels on one surface
 LEAST_TILT = 0.15  # cosine of the flattest angle that counts
-BATCH = 1 << 18  # places fused at once
+BATCH = 1 << 18  # places per batch
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Fused:
     coarse: np.ndarray  # [n, n, n] float32 (z, y, x), normalised units
     side: int  # fine samples along a side, 2 n - 1
     bricks: np.ndarray  # [B, 3] int16 (z, y, x), see `places_of`
-    fine: np.ndarray  # [B * 64] float32, what the fine samples of the bricks have more than the coarse ones
-    # [B * 64, 3] float32 RGB in 0..1, the mean of the photos that show the surface there; grey where none does
+    fine: np.ndarray  # [B * 64] float32, difference of the bricks' fine samples from the coarse ones
+    # [B * 64, 3] float32 RGB in 0..1, the mean of the photos that show the surface there; grey if none does
     color: np.ndarray
-    # [m, m, m, 4] float32 (z, y, x) on [-1, 1]^3: what lies behind the sphere, see `behind`; None: nothing is known
+    # [m, m, m, 4] float32 (z, y, x) on [-1, 1]^3: the background, see `behind`; None: unknown
     behind: np.ndarray | None = None
 
 
@@ -47,7 +47,7 @@ def fuse(
     maps: Sequence[DepthMap], side: int, photos_folder: Path, *, on_progress: Progress = silent
 ) -> Fused | None:  # fmt: skip
     """Fuses depth maps in the space of the unit sphere, `side` samples along each side and twice as many near the
-    surface, and the colours of their photos there; None where they show no surface."""
+    surface, with the colours of their photos; None if they show no surface."""
     given = _prepared(maps)
     line = np.linspace(-1, 1, side, dtype=np.float32)
     cell = float(line[1] - line[0])
@@ -63,7 +63,7 @@ def fuse(
     place = places_of(bricks)
     start = ndimage.map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
     value, weight = _carved(given, (cell / 2 * place[:, ::-1] - 1).astype(np.float32), cell / 2, silent)
-    # Where less is known than that, the coarse distance goes on.
+    # Where less is known, the coarse distance stays.
     share = np.clip(weight / SEEN, 0, 1) * (np.abs(start) < 1.5 * cell)
     fine = np.clip(share * (value - start), -cell, cell)
     color = _painted(maps, given, place, coarse, start + fine, cell, photos_folder)
@@ -71,9 +71,9 @@ def fuse(
 
 
 def behind(maps: Sequence[DepthMap], side: int, photos_folder: Path) -> np.ndarray:
-    """What depth maps in the space of the unit sphere show outside of it, on the contracted coordinates of a field's
-    background [side, side, side, 4]: the density is `DENSE` where something is and 0 elsewhere, colours (a tenth of
-    their logits) are the mean of the photos there, elsewhere those of the nearest such place."""
+    """The background outside the unit sphere from depth maps, on the contracted coordinates of a field's background
+    [side, side, side, 4]: the density is `DENSE` at surfaces and 0 elsewhere; colours (a tenth of their logits) are the
+    mean of the photos there, elsewhere those of the nearest such place."""
     total, count = np.zeros((side**3, 3)), np.zeros(side**3)
     for one in maps:
         known = one.inverse > BEYOND
@@ -95,7 +95,7 @@ def behind(maps: Sequence[DepthMap], side: int, photos_folder: Path) -> np.ndarr
     color = np.clip(total / np.maximum(count, 1)[:, None] / 255, 0.02, 0.98).reshape(*seen.shape, 3)
     nearest = np.asarray(ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True))
     color = color[tuple(nearest)]
-    # Rays are sampled a little more coarsely than the grid is.
+    # Rays are sampled a little more coarsely than the grid.
     found[..., 0] = DENSE * ndimage.binary_dilation(seen)
     found[..., 1:] = np.log(color / (1 - color)) / 10
     return found
@@ -123,7 +123,7 @@ def _painted(maps: Sequence[DepthMap], given: tuple[np.ndarray, ...], place: np.
 
 
 def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:
-    """What `carve` takes of depth maps, from `inverse` to `lines`, without `tilts`, and these."""
+    """The arguments of `carve` from depth maps, `inverse` to `lines` without `tilts`, and then `tilts`."""
     inverse, sizes = stacked([one.inverse for one in maps])
     slopes, tilts = np.zeros((*inverse.shape, 2), np.float32), np.zeros(inverse.shape, np.float32)
     trust = stacked([one.certain for one in maps])[0]
@@ -132,7 +132,7 @@ def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:
         rows, columns = one.inverse.shape
         slope = _slopes(one.inverse)
         slopes[n, :rows, :columns] = slope
-        # The plane of a pixel: normal . ray = inverse depth; its distance from a place one depth farther on the ray.
+        # The plane of a pixel: normal . ray = inverse depth; its distance per depth along the ray.
         row, column = np.indices(one.inverse.shape)
         rest = one.inverse - slope[..., 0] * column - slope[..., 1] * row
         normal = np.concatenate([slope, rest[..., None]], -1) @ one.matrix
@@ -146,7 +146,7 @@ def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:
 
 
 def _slopes(inverse: np.ndarray) -> np.ndarray:
-    """How fast inverse depth [H, W] changes along columns and rows [H, W, 2]; 0 beside edges and gaps."""
+    """Slope of inverse depth [H, W] along columns and rows [H, W, 2]; 0 next to edges and gaps."""
     found = np.zeros((*inverse.shape, 2), np.float32)
     for axis, slot in ((1, 0), (0, 1)):
         before, after = np.roll(inverse, 1, axis), np.roll(inverse, -1, axis)
@@ -172,8 +172,8 @@ def _carved(given: tuple[np.ndarray, ...], places: np.ndarray, cell: float, on_p
 
 
 def _distance(solid: np.ndarray, value: np.ndarray, cell: float) -> np.ndarray:
-    """Signed distance [n, n, n]: near the surface what photos say (`value`, NaN where they say nothing), elsewhere from
-    the nearest sample on the other side of the surface."""
+    """Signed distance [n, n, n]: near the surface from photos (`value`, NaN where unknown), elsewhere from the nearest
+    sample on the other side of the surface."""
     outside = np.asarray(ndimage.distance_transform_edt(~solid), np.float32)
     inside = np.asarray(ndimage.distance_transform_edt(solid), np.float32)
     rough = np.where(solid, 0.5 - inside, outside - 0.5) * cell

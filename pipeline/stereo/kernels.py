@@ -1,4 +1,4 @@
-"""What stereo does for every pixel, compiled: sweeps of planes, and the comparison of depth between photos.
+"""Compiled work of stereo per pixel: sweeps of planes, and the comparison of depth between photos.
 
 Inverse depth is along the optical axis. Pixel centres are at whole numbers here.
 """
@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-NOISE = 4.0  # grey levels squared: variance that is no texture
-NOTHING = -1.0  # score where no other photo shows a place
+NOISE = 4.0  # grey levels squared: variance of noise
+NOTHING = -1.0  # score if no other photo shows a place
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _warp(other: Any, turn: Any, shift: Any, base: Any, offset: Any, y: int, found: Any, inside: Any) -> None:
-    """Writes the grey of another photo [h, w] at what the pixels of row `y` show, in inverse depth `base` [H, W] +
-    `offset`, to `found` [W], and whether that photo shows it to `inside` [W]. A pixel (x, y) at inverse depth d lies at
-    turn (x, y, 1) + d shift in homogeneous pixels of the other."""
+    """Writes the grey of another photo [h, w] at the points of row `y`, with inverse depth `base` [H, W] + `offset`, to
+    `found` [W], and whether that photo shows them to `inside` [W]. A pixel (x, y) at inverse depth d lies at turn (x,
+    y, 1) + d shift in homogeneous pixels of the other."""
     one, row, tiny = np.float32(1), np.float32(y), np.float32(1e-6)
     right, low = np.float32(other.shape[1] - 1.001), np.float32(other.shape[0] - 1.001)
     u0 = turn[0, 1] * row + turn[0, 2]
@@ -53,7 +53,7 @@ def _window(column: Any, half: int, total: Any) -> None:
 def _alike(grey: Any, spread: Any, mean: Any, other: Any, turn: Any, shift: Any, base: Any, offset: Any, half: int,
            found: Any, inside: Any, score: Any) -> None:  # fmt: skip
     """Writes the correlation of windows around each pixel with another photo to `score` [H, W]. `mean` and `spread`
-    [H, W] are those of the windows of `grey` [H, W] itself; `found` and `inside` [H, W] are for what lies between."""
+    [H, W] are those of the windows of `grey` [H, W] itself; `found` and `inside` [H, W] are work arrays."""
     rows, columns = grey.shape
     size = 2 * half + 1
     share, noise = np.float32(1 / size**2), np.float32(NOISE * size**2)
@@ -87,7 +87,7 @@ def _alike(grey: Any, spread: Any, mean: Any, other: Any, turn: Any, shift: Any,
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _own(grey: Any, half: int) -> Any:
-    """Mean and spread [H, W] of the windows of a photo itself, as `_alike` takes them."""
+    """Mean and spread [H, W] of the windows of a photo itself, for `_alike`."""
     rows, columns = grey.shape
     size = 2 * half + 1
     mean, spread = np.zeros_like(grey), np.ones_like(grey)
@@ -107,9 +107,9 @@ def _own(grey: Any, half: int) -> Any:
 def sweep(grey: Any, others: Any, sizes: Any, turns: Any, shifts: Any, base: Any, offsets: Any, half: int) -> Any:
     """Inverse depth [H, W] of the best of `offsets` [D] (evenly spaced) + `base` [H, W], and its score [H, W].
 
-    The score is the mean correlation of windows with those two of the other photos [N, h, w] that agree best, so that
-    what hides a place in one or two of them does no harm. `sizes` [N, 2] are their heights and widths, `turns`
-    [N, 3, 3] and `shifts` [N, 3] lead to their pixels, see `_warp`. All is float32, and grey levels are about 0.
+    The score is the mean correlation of windows with the two of the other photos [N, h, w] that agree best, so that an
+    occlusion in one or two of them does no harm. `sizes` [N, 2] are their heights and widths, `turns` [N, 3, 3] and
+    `shifts` [N, 3] map to their pixels, see `_warp`. All is float32, and grey levels have mean 0.
     """
     rows, columns = grey.shape
     mean, spread = _own(grey, half)
@@ -148,8 +148,8 @@ def sweep(grey: Any, others: Any, sizes: Any, turns: Any, shifts: Any, base: Any
 
 @njit(cache=True, nogil=True)
 def agreeing(inverse: Any, others: Any, sizes: Any, turns: Any, shifts: Any, within: float) -> Any:
-    """How many other photos [H, W] uint8 have the same place at the pixel that shows it: inverse depths [N, h, w]
-    (0: none) that differ by less than a share `within`."""
+    """Number of other photos [H, W] uint8 with the same depth at the corresponding pixel: inverse depths [N, h, w] (0:
+    none) that differ by less than a share `within`."""
     rows, columns = inverse.shape
     count = np.zeros((rows, columns), np.uint8)
     for n in range(len(others)):
@@ -176,8 +176,8 @@ def agreeing(inverse: Any, others: Any, sizes: Any, turns: Any, shifts: Any, wit
 @njit(cache=True, nogil=True)
 def paint(places: Any, colors: Any, inverse: Any, sizes: Any, trust: Any, lines: Any, within: float,
           total: Any, weight: Any) -> None:  # fmt: skip
-    """Adds the colours that photos [N, h, w, 3] uint8 show of places [P, 3] to sums [P, 3] and weights [P], where the
-    places are as far away as their depth maps say, to a distance `within`; the other arguments are as of `carve`."""
+    """Adds the colours of places [P, 3] in photos [N, h, w, 3] uint8 to sums [P, 3] and weights [P], if the places
+    agree with the photos' depth maps to a distance `within`; the other arguments are those of `carve`."""
     for n in range(len(inverse)):
         line, height, width = lines[n], sizes[n, 0], sizes[n, 1]
         for p in range(len(places)):
@@ -194,7 +194,7 @@ def paint(places: Any, colors: Any, inverse: Any, sizes: Any, trust: Any, lines:
                 continue
             i, j = int(u), int(v)
             a, b = u - i, v - j
-            # Straight and near looks show more.
+            # Near photos that look straight at a surface show more.
             share = (trust[n, int(v + 0.5), int(u + 0.5)] / depth) ** 2
             for c in range(3):
                 low = colors[n, j, i, c] * (1 - a) + colors[n, j, i + 1, c] * a
@@ -206,13 +206,13 @@ def paint(places: Any, colors: Any, inverse: Any, sizes: Any, trust: Any, lines:
 @njit(cache=True, nogil=True)
 def carve(places: Any, inverse: Any, sizes: Any, slopes: Any, trust: Any, lines: Any, tilts: Any,
           back: float, total: Any, weight: Any, past: Any) -> None:  # fmt: skip
-    """Adds what depth maps say about places [P, 3] to the sums of distances and weights [P], and to the weights [P] of
-    those that see past a place.
+    """Adds the evidence of depth maps for places [P, 3] to the sums of distances and weights [P], and to the weights
+    [P] of photos that see past a place.
 
-    Of the N photos `inverse` [N, h, w] is inverse depth (0: none), `slopes` [N, h, w, 2] how fast it changes from pixel
-    to pixel, `tilts` [N, h, w] the distance from the surface's tangent plane by depth, and `trust` [N, h, w] a weight.
-    `lines` [N, 3, 4] lead from places to homogeneous pixels. Distances count up to `back` before a surface, and less
-    and less down to `back` behind it: what lies farther behind is unknown.
+    For the N photos `inverse` [N, h, w] is inverse depth (0: none), `slopes` [N, h, w, 2] its change from pixel to
+    pixel, `tilts` [N, h, w] the distance from the surface's tangent plane per depth, and `trust` [N, h, w] a weight.
+    `lines` [N, 3, 4] map places to homogeneous pixels. Distances count up to `back` in front of a surface, and with
+    falling weight down to `back` behind it: farther behind is unknown.
     """
     for n in range(len(inverse)):
         line = lines[n]

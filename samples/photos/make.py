@@ -5,10 +5,9 @@
 
 Ray casting with open3d. Every texture is made here from seeded noise and random cells and never repeats, because
 repeating textures make structure-from-motion converge to wrong cameras. Table and vase are the same in both sets.
-`room` is what one photographs: wood, glaze, tiles, a cloth and a plant in soft light, exposed a little differently from
-photo to photo; 20 of the photos look down into the vase, seven of them from near, on to its floor. `patches` has
-texture everywhere and no gloss: a benchmark for the geometry alone.
-World frame: metres, z up, floor at z = 0.
+`room` has ordinary materials: wood, glaze, tiles, a cloth and a plant in soft light, with slightly different exposures;
+20 of the photos look down into the vase, seven of them from near, on to its floor. `patches` has texture everywhere and
+no gloss: a benchmark for geometry only. World frame: metres, z up, floor at z = 0.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ import numpy as np
 
 SETS, BUNDLED = ("room", "patches"), "patches"
 WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
-# Rings of cameras: how many, degrees above the level, m from what they look at, by which share of a step they are
-# turned, and what they look at. The lowest look under the table top: what no photo shows cannot be reconstructed.
+# Rings of cameras: number, degrees above the level, distance from the target in m, rotation as a share of a step, and
+# the target. The lowest look under the table top, because unseen surfaces cannot be reconstructed.
 MIDDLE, MOUTH = (0.02, 0.0, 0.46), (0.10, -0.04, 0.70)
 RINGS = {
     "room": (
@@ -47,12 +46,12 @@ VASE_AT = (0.12, -0.05)
 BOWL_AT = (0.40, 0.16)
 PLANT_AT = (-0.36, -0.17)
 ROOM = 3.6
-# A lathe's texture: m to the radian, m from the outer side's rows to those of the inner one, m of a pixel; and how many
-# m of texture there are inside for one of height and distance from the axis together.
+# A lathe's texture: m per radian, m from the outer side's rows to those of the inner one, m per pixel; and m of texture
+# inside per m of height and distance from the axis together.
 AROUND, INSIDE, LATHE_TEXEL, DOWN = 0.12, 0.36, 0.0008, 0.8
 LIGHT = np.array([0.45, 0.35, 0.82]) / np.linalg.norm([0.45, 0.35, 0.82])
 SPREAD = 0.3  # of the light's directions in the room, standard deviation over their length
-DIRECTIONS = 160  # from which the room's light comes, and as many more from all around
+DIRECTIONS = 160  # of the room's light, and as many more from all around
 # Outer profile upwards, then inner profile downwards: radius, height above the table top (m).
 VASE_OUTER = [
     (0.0, 0.0), (0.075, 0.0), (0.105, 0.05), (0.125, 0.12), (0.115, 0.19), (0.08, 0.25), (0.06, 0.29), (0.09, 0.34)
@@ -60,7 +59,7 @@ VASE_OUTER = [
 VASE_INNER = [
     (0.075, 0.34), (0.046, 0.29), (0.064, 0.25), (0.098, 0.19), (0.108, 0.12), (0.088, 0.05), (0.05, 0.02), (0.0, 0.018)
 ]  # fmt: skip
-# Of the bowl and of the pot, likewise.
+# The same for the bowl and for the pot.
 BOWL_OUTER = [(0.0, 0.0), (0.045, 0.0), (0.05, 0.008), (0.085, 0.03), (0.105, 0.06), (0.112, 0.08)]
 BOWL_INNER = [(0.104, 0.081), (0.096, 0.06), (0.076, 0.035), (0.045, 0.018), (0.0, 0.014)]
 POT_OUTER = [(0.0, 0.0), (0.052, 0.0), (0.066, 0.075), (0.073, 0.077), (0.077, 0.108)]
@@ -80,11 +79,11 @@ class Part:
         faces: [F, 3].
         texture: [H, W, 3] float32 RGB in 0..1.
         mapping: "box" (each side its own part of the texture), "sheet" (x and y), "lathe" (angle and height),
-            "turned" (the same; inside and on what faces up, height and distance from the axis together) or "uv".
+            "turned" (the same; inside and on upward faces, height and distance from the axis together) or "uv".
         texel: metres a texture pixel covers.
-        axis: of a lathe, where it meets what it stands on, m.
+        axis: of a lathe, its point on the support, m.
         uv: [V, 2] m, places on the texture; of "uv" only.
-        gloss: share of the light that a mirror would throw back; seen in the room only.
+        gloss: share of a mirror's reflection; used only in the room.
         moved: turn [3, 3] and shift [3] m by which the part has moved since its texture was laid on it, if it has.
     """
 
@@ -99,7 +98,7 @@ class Part:
     moved: tuple[np.ndarray, np.ndarray] | None = None
 
     def before(self, points: np.ndarray) -> np.ndarray:
-        """Points [P, 3] where they were before the part moved."""
+        """Points [P, 3] at their positions before the part moved."""
         return points if self.moved is None else (points - self.moved[1]) @ self.moved[0]
 
 
@@ -141,7 +140,7 @@ def smooth_profile(points: list[tuple[float, float]], samples: int) -> np.ndarra
 
 
 def turned_solid(outer: list, inner: list, segments: int) -> tuple[np.ndarray, np.ndarray]:
-    """A hollow thing of the room, standing at the origin, from the points of its two profiles."""
+    """A hollow object of the room, standing at the origin, from the points of its two profiles."""
     return lathe(np.vstack([smooth_profile(outer, 36), smooth_profile(inner, 30)]), segments)
 
 
@@ -214,7 +213,7 @@ def build_patches() -> list[Part]:
     vertices, faces = lathe(profile)
     vase = vertices + np.array([*VASE_AT, TABLE_HEIGHT])
     parts.append(Part(vase, faces, texture(2, 900, 1000, glaze, 30), "lathe", 0.0008))
-    # Only its upper side is seen, so it is a sheet: a box would spend half of its texture on the lower one.
+    # Only its upper side is seen, so it is a sheet: a box would use half of its texture for the lower one.
     corners = np.array([[-ROOM, -ROOM, 0.0], [ROOM, -ROOM, 0], [ROOM, ROOM, 0], [-ROOM, ROOM, 0]])
     floor = (corners, np.array([[0, 1, 2], [0, 2, 3]]))
     parts.append(Part(*floor, texture(3, 3002, 3002, stone, 40, 0.18), "sheet", 0.0024))
@@ -265,7 +264,7 @@ def spotted(rng: np.random.Generator, image: np.ndarray, color: tuple, spacing: 
 
 
 def closed(image: np.ndarray, margin: int) -> np.ndarray:
-    """An image without its last columns, which fade into the first: it goes round a lathe without a seam."""
+    """An image without its last columns, which fade into the first, so that it has no seam around a lathe."""
     t = np.linspace(0, 1, margin, dtype=np.float32)[None, :, None]
     image[:, :margin] = t * image[:, :margin] + (1 - t) * image[:, -margin:]
     return image[:, :-margin]
@@ -285,7 +284,7 @@ def wood(seed: int, height: int, width: int, texel: float, stave: tuple[float, f
         shift[strip == number] = rng.uniform(0, 40, len(cuts) + 1)[piece]
         joint[strip == number] = np.abs(x[:, None] - cuts).min(1) < 0.8 * texel
     joint[np.flatnonzero(np.diff(strip)) + 1] = 1
-    # Rings are contours of a height that rises across the grain; a bump makes them go round a knot.
+    # Rings are contours of a height that rises across the grain; a bump makes them surround a knot.
     across = y[:, None] / 0.016 + shift + 1.3 * noise(rng, height, width, (40, 400), 4)
     for _ in range(int(40 * height * width * texel**2)):
         row, column, size = rng.uniform(0, y[-1]), rng.uniform(0, x[-1]), rng.uniform(0.5, 1.3)
@@ -326,7 +325,7 @@ def glaze(seed: int, dipped: float, colors: list, under: list, dots: tuple) -> n
     """A glaze for a lathe: `under` with iron dots and brush marks, and `colors` dipped over it, which runs down.
 
     Args:
-        seed: of all that is random.
+        seed: of all random numbers.
         dipped: how far up, m, the upper glaze reaches on average.
         colors: of the upper glaze, from thin to thick.
         under: the same of the lower one.
@@ -434,7 +433,7 @@ def cloth() -> Part:
     down = np.maximum(ahead - edge - bend * np.pi / 2, 0)
     rng = np.random.default_rng(21)
     wave = noise(rng, count, count, 16, 2)
-    lift = 0.0015 + 0.004 * soft(0.6, 2.2, wave) * np.cos(angle)  # it lies flat but for a few creases
+    lift = 0.0015 + 0.004 * soft(0.6, 2.2, wave) * np.cos(angle)  # it lies flat except for a few creases
     out = down * (0.09 * np.sin(2 * np.pi * across / 0.105 + 0.8) + 0.09) + lift
     y = np.minimum(ahead, edge) + bend * np.sin(angle) + out * np.sin(angle)
     z = TABLE_HEIGHT - bend * (1 - np.cos(angle)) - down + lift * np.cos(angle)
@@ -570,7 +569,7 @@ def sample_texture(part: Part, points: np.ndarray, normals: np.ndarray, uv: np.n
         offset = np.cumsum([0, size[1], size[1], size[2], size[2], size[2]])
         u = np.where(axis == 0, local[:, 1], local[:, 0])
         v = np.where(axis == 2, local[:, 1], local[:, 2]) + offset[side]
-    # remap allows at most 32767 rows or columns, hence two columns of the same query folded to many rows.
+    # remap allows at most 32767 rows or columns, so the same query is folded to many rows in two columns.
     count = len(u)
     pad = -count % 1024
     map_x = np.pad((u / part.texel).astype(np.float32), (0, pad)).reshape(-1, 1024)
@@ -627,7 +626,7 @@ def render(parts: list[Part], caster, pose: np.ndarray, rng: np.random.Generator
     point = origin + distance[:, None] * direction
     light = LIGHT + 0.12 * rng.standard_normal(point.shape)
     light = (light / np.linalg.norm(light, axis=1, keepdims=True)).astype(np.float32)
-    # The room has no roof as far as the light is concerned: only what stands on the floor casts shadows.
+    # The room has no roof for the light: only objects on the floor cast shadows.
     shadow = np.concatenate([point + 1e-4 * normal, light], 1).astype(np.float32)
     blocked = caster.cast_rays(o3d.core.Tensor(shadow))["geometry_ids"].numpy() < len(parts) - 2
     facing = np.clip((normal * light).sum(1), 0, 1) * ~blocked
@@ -642,9 +641,10 @@ def render(parts: list[Part], caster, pose: np.ndarray, rng: np.random.Generator
 
 
 class Room:
-    """The parts as a photographer sees them: soft light from above, light from all around, and what objects throw back.
+    """The parts in realistic light: soft light from above, light from all around, and reflections between objects.
 
-    Light is computed once, at the vertices of meshes that are fine enough for its shadows, and the same in all photos.
+    Light is computed once, at the vertices of meshes that are fine enough for its shadows, and is the same in all
+    photos.
     """
 
     def __init__(self, parts: list[Part]) -> None:
@@ -669,7 +669,7 @@ class Room:
         around = np.stack([np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height], 1)
         point = np.concatenate([mesh[0] + 1e-3 * mesh[2] for mesh in self.meshes]).astype(np.float32)
         normal = np.concatenate([mesh[2] for mesh in self.meshes])
-        # What the room throws back is its own colour, in part; floor and walls stand in nobody's light.
+        # The room reflects a part of the light in its own colour; floor and walls block no light.
         back = np.array([0.7 * (part.texture.mean((0, 1)) ** 2.2) for part in self.parts], np.float32)
         standing = len(self.parts) - 2
         total = np.zeros((len(point), 3), np.float32)
@@ -680,7 +680,7 @@ class Room:
                 rays = np.concatenate([point[seen], np.broadcast_to(direction, (len(seen), 3))], 1).astype(np.float32)
                 met = self.caster.cast_rays(o3d.core.Tensor(rays))["geometry_ids"].numpy()
                 blocked = met < standing
-                if strength is None:  # skylight from above, what floor and walls throw back from below
+                if strength is None:  # skylight from above, reflections of floor and walls from below
                     sky = np.float32([0.80, 0.88, 1.0]) if direction[2] > 0 else np.float32([0.52, 0.47, 0.40])
                     arriving = np.where(blocked[:, None], back[np.minimum(met, standing)], sky)
                     total[seen] += (4 / DIRECTIONS * 0.62) * facing[seen, None] * arriving
@@ -759,10 +759,10 @@ def write_truth(parts: list[Part], path: Path) -> None:
 
 
 def main() -> None:
-    """Renders a set into the folder given (default: table_vase beside this file)."""
+    """Renders a set into the given folder (default: table_vase next to this file)."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("set", nargs="?", choices=SETS, default=BUNDLED, help=f"default: {BUNDLED}, the bundled one")
-    parser.add_argument("--out", type=Path, help=f"default for {BUNDLED}: table_vase beside this file")
+    parser.add_argument("--out", type=Path, help=f"default for {BUNDLED}: table_vase next to this file")
     parser.add_argument("--views", type=int, default=None, help="render only the first N views")
     arguments = parser.parse_args()
     if arguments.out is None and arguments.set != BUNDLED:
@@ -775,8 +775,8 @@ def make_set(name: str, folder: Path, views: int | None = None) -> None:
 
     Args:
         name: of the set.
-        folder: made where it is not there.
-        views: only the first so many photos.
+        folder: made if it does not exist.
+        views: number of photos, from the first on.
     """
     import cv2
     import open3d as o3d

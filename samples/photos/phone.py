@@ -1,4 +1,4 @@
-"""Turns the bundled photo set into what a phone with LiDAR would have exported, with the errors of such a sensor.
+"""Turns the bundled photo set into the export of a phone with LiDAR, with the errors of such a sensor.
 
     python samples/photos/phone.py record3d -o capture.r3d      # or: exr, polycam, nerfstudio (folders)
 
@@ -63,7 +63,7 @@ def depths(truth: Path, poses: list[np.ndarray], focal: float, width: int, rng: 
 
 
 def drifted(poses: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
-    """The poses [4, 4] as a phone would have tracked them, in ARKit's world."""
+    """The poses [4, 4] with a phone's tracking errors, in ARKit's world."""
     from scipy.spatial.transform import Rotation
 
     walk = np.cumsum(rng.standard_normal((len(poses), 6)), 0) / np.sqrt(len(poses))
@@ -84,7 +84,7 @@ def write(layout: str, out: Path, folder: Path = PHOTOS, *, exact: bool = False,
         out: the `.r3d` file of record3d, else a folder to make.
         folder: of a set that make.py has rendered.
         exact: no drift of the poses.
-        every: only each so many-th photo.
+        every: use one in this many photos.
         seed: of all noise.
     """
     rng = np.random.default_rng(seed)

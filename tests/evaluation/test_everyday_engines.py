@@ -217,7 +217,7 @@ def test_the_table_has_our_losses_first_and_names_what_is_absent():
     assert rows == ["`slabs`", "`edges`", "`heaps`", "`slender`"]
     assert "| `edges` | 1 / 3 | 2 / 3, 2 not run | not installed here | not installed here |" in lines
     assert "| all | 3 / 6 | 4 / 7, 2 not run | not installed here | not installed here |" in lines
-    assert "- edges: b: held by PyBullet" in lines and "- edges: c: held by none" in lines
+    assert "- edges: b: passed by PyBullet" in lines and "- edges: c: passed by no other engine" in lines
     assert "- PyBullet: slow, 2 checks" in lines
 
 

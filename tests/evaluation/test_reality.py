@@ -310,6 +310,6 @@ def test_the_table_of_networks_begins_with_who_loses_most():
     assert [row[0] for row in rows] == ["worse", "better", "the solve alone"]
     row = dict(zip(head, rows[1], strict=True))
     assert row["position, %"].startswith("9.25 [") and row["rotation, degrees"].startswith("4.5 [")
-    assert row["less the solve"] == "-0.75 [-0.75, -0.75] / -0.5 [-0.5, -0.5]"  # paired: what tosses share is gone
+    assert row["minus the solve"] == "-0.75 [-0.75, -0.75] / -0.5 [-0.5, -0.5]"  # paired: what tosses share is gone
     assert "9 / 5; 9.5 / 4" in rows[1] and "18 / 17" in rows[1] and rows[1][-1] == "12"
     assert "(solve: 19)" in head[5]

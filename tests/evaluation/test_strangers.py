@@ -142,4 +142,4 @@ def test_recordings_of_one_scene_are_one_row(tmp_path, monkeypatch):
     )
     assert row.name == "a.csv and 1 more" and seen[0][:3] == ("identify", *files) and "--scene" in seen[0]
     assert row.exact == "2 % and 1 degrees off; 1 % and 5 degrees as the scene was"
-    assert row.wrong == ["what was found is farther off than what the scene said"] and row.notes == ["noise"]
+    assert row.wrong == ["the identified numbers are farther off than those of the scene"] and row.notes == ["noise"]

@@ -71,7 +71,7 @@ def test_a_wall_is_as_thick_as_it_is_only_where_photos_see_both_its_sides():
     found, line = told(CUP, together)
     assert found.wall_seen > 0.5 and line.endswith("; its wall is 18 mm thick")
     found, line = told(CUP, seen(CUP, 10))
-    assert found.wall_seen < 0.1 and "how thick its wall is, is unknown" in line
+    assert found.wall_seen < 0.1 and "the thickness of its wall is unknown" in line
 
 
 def test_what_holds_no_water_is_not_hollow():

@@ -233,6 +233,4 @@ def test_a_body_that_cannot_be_moved_stays_and_it_is_reported_why(case, words, m
     found, why = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
     assert words in why
     np.testing.assert_array_equal(found.vertices, body.vertices)
-    assert f"ball: its surface was not moved all the way to where the photos agree: {why}" in mesh_notes(
-        {"unrefined": {"ball": why}}
-    )
+    assert f"ball: its surface was not fully refined by photos: {why}" in mesh_notes({"unrefined": {"ball": why}})

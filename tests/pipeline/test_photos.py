@@ -126,7 +126,7 @@ def test_mask_files_that_only_some_photos_have_change_nothing(tmp_path):
     for k in range(4):
         found = np.asarray(Image.open(tmp_path / "in" / "images" / f"000{k}.jpg")).astype(int)
         assert np.abs(found - np.asarray(Image.open(tmp_path / "in" / f"{k}.jpg"))).mean() < 8  # JPEG, twice
-    assert notes[0].startswith("masks count only where every photo has one: 2 mask files are ignored")
+    assert notes[0].startswith("masks are used only if every photo has one: 2 mask files are ignored")
 
 
 def test_transparency_that_only_some_photos_have_is_grey_and_no_mask(tmp_path):

@@ -272,7 +272,7 @@ def climb(monkeypatch, tmp_path, results: dict, photos: int = 10) -> tuple[list[
     return tried, checks
 
 
-STILL, MORE = "without what stands still", "more features"
+STILL, MORE = "without static matches", "more features"
 
 
 def test_the_first_good_attempt_is_the_last(monkeypatch, tmp_path):

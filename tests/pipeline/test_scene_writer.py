@@ -157,7 +157,7 @@ def test_bodies_stand_where_they_were_found(fitted):
 
 
 @pytest.mark.parametrize(("deep", "told"), [(0.0015, "moved up by 0.0015 m, out of scenery"),
-                                            (0.04, "more than the 0.03 m that photos leave open")])  # fmt: skip
+                                            (0.04, "more than the 0.03 m that photos cannot resolve")])  # fmt: skip
 def test_a_body_that_photos_put_into_the_floor_starts_on_it(fitted, deep, told):
     """A cell is 2 cm wide; surfaces that touch are told apart to one and a half."""
     (fitted / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1 - deep))))

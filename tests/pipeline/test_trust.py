@@ -184,4 +184,4 @@ def test_where_all_is_photographed_nothing_is_asked_for():
     photos, weak = set_up.advice()
     assert photos == []
     told = notes({"mesh": {"trust": {}, "weak": weak, "next_photos": []}})
-    assert any("no one photo would help much" in line for line in told)
+    assert any("no single photo would help much" in line for line in told)
