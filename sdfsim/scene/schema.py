@@ -416,7 +416,7 @@ class BodyTable(Turned):
     velocity: Vector = key("velocity of the centre of mass", _ORIGIN, "m/s")
     angular_velocity: Vector = key("angular velocity in world axes", _ORIGIN, "rad/s")
     mass: Number | None = key("by default density times volume", None, "kg", gt=0)
-    density: Number = key("not used if `mass` is given", 1000.0, "kg/m^3", gt=0)
+    density: Number = key("give it or `mass`, not both", 1000.0, "kg/m^3", gt=0)
     inertia_factor: Number = key("factor on the inertia of this mass spread evenly in the shape", 1.0, gt=0, le=100)
     friction: Number = key(
         "Coulomb coefficient; a contact has the product of both bodies', 0.25 by default", 0.5, ge=0, le=1000
