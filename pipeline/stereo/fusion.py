@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from pipeline.grids.interpolation import near_bricks, places_of
 from pipeline.stereo.compiled import carve, paint
@@ -22,6 +23,10 @@ BACK = 2.0  # cells in front of and behind a surface within which its distance c
 # A place is empty if photos that see past it have more than this share of the weight of those that see a surface there.
 # Their distances are not part of the mean: a few wrong ones would move the surface.
 OUTVOTED = 0.5
+# What lies behind one surface may lie in front of another: the air in the neck of a vase. A place more than `DEEP`
+# cells behind a surface is empty if more than this share of the `NEAREST` nearest points of surfaces face it.
+DEEP, NEAREST, FACING = 0.5, 12, 0.67
+SURFACE_POINTS = 30_000  # per photo, for this search
 SEEN = 0.3  # weight above which a place is known; one certain pixel has 1
 DENSE = 0.4  # density of surfaces behind the sphere, before softplus
 EDGE = 0.05  # largest relative difference of inverse depth between neighbouring pixels on one surface
@@ -48,11 +53,11 @@ def fuse(
 ) -> Fused | None:  # fmt: skip
     """Fuses depth maps in the space of the unit sphere, `side` samples along each side and twice as many near the
     surface, with the colours of their photos; None if they show no surface."""
-    given = _prepared(maps)
+    given, surface = _prepared(maps), _surface(maps)
     line = np.linspace(-1, 1, side, dtype=np.float32)
     cell = float(line[1] - line[0])
     places = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)[:, ::-1]
-    value, weight = (part.reshape((side,) * 3) for part in _carved(given, places, cell, on_progress))
+    value, weight = (part.reshape((side,) * 3) for part in _carved(given, surface, places, cell, on_progress))
     known = weight > SEEN
     if not (known & (value < 0)).any() or not (known & (value > 0)).any():
         return None
@@ -62,7 +67,7 @@ def fuse(
     bricks = near_bricks(coarse, 2 * side - 1)
     place = places_of(bricks)
     start = ndimage.map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
-    value, weight = _carved(given, (cell / 2 * place[:, ::-1] - 1).astype(np.float32), cell / 2, silent)
+    value, weight = _carved(given, surface, (cell / 2 * place[:, ::-1] - 1).astype(np.float32), cell / 2, silent)
     # Where less is known, the coarse distance stays.
     share = np.clip(weight / SEEN, 0, 1) * (np.abs(start) < 1.5 * cell)
     fine = np.clip(share * (value - start), -cell, cell)
@@ -145,6 +150,33 @@ def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:
     return inverse, sizes, slopes, trust, np.array(lines), tilts
 
 
+def _surface(maps: Sequence[DepthMap]) -> tuple[KDTree, np.ndarray]:
+    """Some surface points of the maps, and unit normals [P, 3] there, towards the photo's camera."""
+    rng = np.random.default_rng(0)
+    points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for one in maps:
+        slope = _slopes(one.inverse)
+        row, column = np.indices(one.inverse.shape)
+        rest = one.inverse - slope[..., 0] * column - slope[..., 1] * row
+        # In camera axes the tangent plane is normal . place = 1, and this normal points away from the camera.
+        normal = np.concatenate([slope, rest[..., None]], -1)[one.inverse > 0] @ one.matrix @ one.view.rotation
+        known = one.points()
+        some = rng.permutation(len(known))[:SURFACE_POINTS]
+        points.append(known[some])
+        normals.append(-normal[some] / np.linalg.norm(normal[some], axis=1, keepdims=True))
+    return KDTree(np.concatenate(points)), np.concatenate(normals)
+
+
+def _in_front(surface: tuple[KDTree, np.ndarray], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the surface points nearest to places [P, 3] face them, and the mean distance [P] from the planes of these."""
+    tree, normals = surface
+    index = np.minimum(tree.query(places, NEAREST, workers=-1)[1], len(normals) - 1)
+    along = ((places[:, None] - tree.data[index]) * normals[index]).sum(-1)
+    front = along > 0
+    mean = np.where(front, along, 0).sum(1) / np.maximum(front.sum(1), 1)
+    return front.sum(1) > FACING * NEAREST, mean
+
+
 def _slopes(inverse: np.ndarray) -> np.ndarray:
     """Slope of inverse depth [H, W] along columns and rows [H, W, 2]; 0 next to edges and gaps."""
     found = np.zeros((*inverse.shape, 2), np.float32)
@@ -157,8 +189,8 @@ def _slopes(inverse: np.ndarray) -> np.ndarray:
     return np.stack([ndimage.uniform_filter(found[..., slot], 3) for slot in (0, 1)], -1)
 
 
-def _carved(given: tuple[np.ndarray, ...], places: np.ndarray, cell: float, on_progress: Progress
-            ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _carved(given: tuple[np.ndarray, ...], surface: tuple[KDTree, np.ndarray], places: np.ndarray, cell: float,
+            on_progress: Progress) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Distances and weights [P] at places [P, 3], for samples `cell` apart."""
     total, weight, past = np.zeros((3, len(places)), np.float32)
     parts = [slice(start, start + BATCH) for start in range(0, len(places), BATCH)]
@@ -168,7 +200,12 @@ def _carved(given: tuple[np.ndarray, ...], places: np.ndarray, cell: float, on_p
         on_progress((number + 1) / len(jobs), f"fusing depth, {number + 1} of {len(jobs)} parts")
     mean = total / np.maximum(weight, 1e-9)
     empty = (mean <= 0) & (past > OUTVOTED * weight)
-    return np.where(empty, BACK * cell, mean), weight + past
+    value = np.where(empty, BACK * cell, mean)
+    behind = np.nonzero((value < -DEEP * cell) & (weight > 0))[0]
+    if len(behind):
+        front, far = _in_front(surface, places[behind])
+        value[behind[front]] = np.minimum(far[front], BACK * cell)
+    return value, weight + past
 
 
 def _distance(solid: np.ndarray, value: np.ndarray, cell: float) -> np.ndarray:

@@ -156,6 +156,24 @@ def test_what_most_photos_see_past_is_empty(tmp_path):
     assert middle(4) > 0 and middle(8) < 0
 
 
+def test_the_air_behind_a_thin_wall_is_empty(tmp_path):
+    """A deep pot with a wall of a cell. Many photos show its outside, and two cells behind that count as solid; a few
+    show its inside, and are hardly certain. Without the search for the nearest surface the air 0.03 inside the wall is solid."""
+    pot, middle = cup(0.13, 0.04, 0.4, 0.5), (0.0, 0.0, 0.3)
+    outer, inner = ring(12, 2.2, 12, 160, 120, 210.0, middle), ring(8, 1.6, 72, 160, 120, 250.0, middle, start=12)
+    shoot([*outer, *inner], pot, tmp_path)
+    sure = exact(outer, pot)
+    unsure = [replace(one, certain=0.04 * one.certain) for one in exact(inner, pot)]
+    fused = fuse([*sure, *unsure], 48, tmp_path)
+    assert fused is not None
+    turn, height = (part.ravel() for part in np.meshgrid(np.linspace(0, 2 * np.pi, 36), np.linspace(0.2, 0.42, 12)))
+
+    def at(radius: float) -> np.ndarray:
+        return distance_at(fused, np.stack([radius * np.cos(turn), radius * np.sin(turn), height], 1))
+
+    assert (at(0.06) > 0).mean() > 0.95 and (at(0.11) < 0).mean() > 0.95
+
+
 def test_what_lies_behind_the_sphere_is_there_in_its_colours(scene, folder):
     """The plane goes on below: dense where it is in contracted space, and not above; colours are those of photos."""
     _, maps = scene
