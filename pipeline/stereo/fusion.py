@@ -168,7 +168,7 @@ def _surface(maps: Sequence[DepthMap]) -> tuple[KDTree, np.ndarray]:
 
 
 def _in_front(surface: tuple[KDTree, np.ndarray], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the surface points nearest to places [P, 3] face them, and the mean distance [P] from the planes of these."""
+    """Whether the surface points nearest to places [P, 3] face them; and the mean distance [P] from those that do."""
     tree, normals = surface
     index = np.minimum(tree.query(places, NEAREST, workers=-1)[1], len(normals) - 1)
     along = ((places[:, None] - tree.data[index]) * normals[index]).sum(-1)

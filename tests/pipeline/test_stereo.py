@@ -158,7 +158,8 @@ def test_what_most_photos_see_past_is_empty(tmp_path):
 
 def test_the_air_behind_a_thin_wall_is_empty(tmp_path):
     """A deep pot with a wall of a cell. Many photos show its outside, and two cells behind that count as solid; a few
-    show its inside, and are hardly certain. Without the search for the nearest surface the air 0.03 inside the wall is solid."""
+    show its inside, and are hardly certain. Without the search for
+    the nearest surface the air 0.03 inside the wall is solid."""
     pot, middle = cup(0.13, 0.04, 0.4, 0.5), (0.0, 0.0, 0.3)
     outer, inner = ring(12, 2.2, 12, 160, 120, 210.0, middle), ring(8, 1.6, 72, 160, 120, 250.0, middle, start=12)
     shoot([*outer, *inner], pot, tmp_path)
