@@ -184,13 +184,15 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     seen_cm = seen_depth(truth, about, float(rim))
     corners = np.asarray(truth.vertices)[np.asarray(truth.triangles)]
     truth.remove_triangles_by_mask(corners[:, :, 2].max(1) < TABLE + 1e-3)
+    scale = place.scale * to_unit.scale / move.scale  # metres of the run per true metre
     return {
         "surface": summary(errors),
         "object": summary(errors[near]),
         "missing": summary(missing),
         "body": {name: summary(distances(true_scene, points)) for name, points in standing.items()},
         "complete_percent": 100 * float((missing < 1.0).mean()),
-        "scale_error_percent": 100 * abs(place.scale * to_unit.scale / move.scale - 1),
+        "scale": float(scale),
+        "scale_error_percent": 100 * abs(scale - 1),
         "up_error_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
@@ -233,9 +235,11 @@ def vase_size(mesh: Any) -> dict[str, float]:
     return {"hollow_cm": 100 * float(top - np.median(hit)), "height_cm": 100 * float(top - TABLE)}
 
 
-def dropped_ball(folder: Path, name: str) -> dict[str, float]:
+def dropped_ball(folder: Path, name: str, scale: float = 1.0) -> dict[str, float]:
     """Drops a ball of `BALL` m radius into the vase of a run, a body, and returns its final centre: depth below the rim
-    and distance from the axis, cm, in the axes of the vase at that time."""
+    and distance from the axis, cm, in the axes of the vase at that time. Lengths of the run are `scale` times true
+    ones."""
+    radius = scale * BALL
     scene = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
     assets = {key: shape for key, shape in scene["shapes"].items() if "asset" in shape}
     bodies = [body for body in scene["bodies"] if "plane" in body or body["shape"] in assets]
@@ -243,14 +247,15 @@ def dropped_ball(folder: Path, name: str) -> dict[str, float]:
     shape = load_shape(folder / assets[vase["shape"]]["asset"])
     low, high = shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)
     middle = (low + high) / 2
-    start = [*(np.array(vase["position"][:2]) + middle[:2]), vase["position"][2] + high[2] + 2 * BALL]
+    start = [*(np.array(vase["position"][:2]) + middle[:2]), vase["position"][2] + high[2] + 2 * radius]
     ball = {"name": "ball", "shape": "ball", "position": [float(x) for x in start], "density": 1000.0}
-    scene |= {"shapes": {**assets, "ball": {"sphere": {"radius": BALL}}}, "bodies": [*bodies, ball], "duration": 3.0}
+    scene |= {"shapes": {**assets, "ball": {"sphere": {"radius": radius}}}, "bodies": [*bodies, ball], "duration": 3.0}
     write_text(folder / "ball.yaml", yaml.safe_dump(scene, sort_keys=False))
     rollout = Simulator(folder / "ball.yaml").run()
     turn = Rotation.from_quat(rollout.orientation[-1, number])
     at = turn.inv().apply(rollout.position[-1, -1] - rollout.position[-1, number]) + shape.com
-    return {"below_rim_cm": 100 * float(high[2] - at[2]), "aside_cm": 100 * float(np.linalg.norm((at - middle)[:2]))}
+    below, aside = high[2] - at[2], np.linalg.norm((at - middle)[:2])
+    return {"below_rim_cm": 100 * float(below / scale), "aside_cm": 100 * float(aside / scale)}
 
 
 def _read(file: Path) -> Any:
@@ -273,7 +278,7 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     surface = surface_errors(folder, photos, move)
     return {
         "poses": poses, "surface_percent_of_table_width": surface, "trust": trust_errors(folder, photos, move),
-        "ball": {name: dropped_ball(folder, name) for name in surface["vase"] if name != "truth"},
+        "ball": {name: dropped_ball(folder, name, surface["scale"]) for name in surface["vase"] if name != "truth"},
     }  # fmt: skip
 
 
