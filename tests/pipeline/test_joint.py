@@ -187,7 +187,7 @@ def test_nothing_and_two_things_that_move_are_told() -> None:
     try:
         found = found_in(shut, photographed(both, 2))
     except SdfsimError as error:
-        assert "one thing has moved" in f"{error.message} {error.hint}"
+        assert "only one part has moved" in f"{error.message} {error.hint}"
     else:
         assert found.follows < 0.9 and "of the moved surface does not follow the motion" in found.line(1.0)
 
