@@ -135,12 +135,8 @@ def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:
     lines = []
     for n, one in enumerate(maps):
         rows, columns = one.inverse.shape
-        slope = _slopes(one.inverse)
+        slope, normal = _tangents(one)
         slopes[n, :rows, :columns] = slope
-        # The plane of a pixel: normal . ray = inverse depth; its distance per depth along the ray.
-        row, column = np.indices(one.inverse.shape)
-        rest = one.inverse - slope[..., 0] * column - slope[..., 1] * row
-        normal = np.concatenate([slope, rest[..., None]], -1) @ one.matrix
         tilt = one.inverse / np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
         ray = np.linalg.norm(one.rays, axis=-1)
         cosine = tilt / ray
@@ -150,16 +146,21 @@ def _prepared(maps: Sequence[DepthMap]) -> tuple[np.ndarray, ...]:
     return inverse, sizes, slopes, trust, np.array(lines), tilts
 
 
+def _tangents(one: DepthMap) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes of inverse depth, see `_slopes`, and normals n [H, W, 3] in camera axes, away from the camera, of the
+    tangent planes n . place = 1."""
+    slope = _slopes(one.inverse)
+    row, column = np.indices(one.inverse.shape)
+    rest = one.inverse - slope[..., 0] * column - slope[..., 1] * row
+    return slope, np.concatenate([slope, rest[..., None]], -1) @ one.matrix
+
+
 def _surface(maps: Sequence[DepthMap]) -> tuple[KDTree, np.ndarray]:
     """Some surface points of the maps, and unit normals [P, 3] there, towards the photo's camera."""
     rng = np.random.default_rng(0)
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for one in maps:
-        slope = _slopes(one.inverse)
-        row, column = np.indices(one.inverse.shape)
-        rest = one.inverse - slope[..., 0] * column - slope[..., 1] * row
-        # In camera axes the tangent plane is normal . place = 1, and this normal points away from the camera.
-        normal = np.concatenate([slope, rest[..., None]], -1)[one.inverse > 0] @ one.matrix @ one.view.rotation
+        normal = _tangents(one)[1][one.inverse > 0] @ one.view.rotation
         known = one.points()
         some = rng.permutation(len(known))[:SURFACE_POINTS]
         points.append(known[some])
