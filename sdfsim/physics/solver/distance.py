@@ -46,7 +46,7 @@ class Shapes(NamedTuple):
     solids: Convex  # the convex pieces of the shapes
 
 
-@njit(**ENTRY)
+@njit(**BARE)
 def distance(table, brick, sample, s, p):
     """Signed distance and unit gradient of shape s at p."""
     kind = table[s, KIND]

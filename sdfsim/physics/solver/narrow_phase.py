@@ -76,6 +76,15 @@ PROBES = 12  # probes on the way from the middle of a face to its corner
 SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is tested
 
 
+class Parts(NamedTuple):
+    """The near parts of the bodies of P pairs, each pair's in the room that all of its parts would need."""
+
+    start: np.ndarray  # [P, 2] index of the first of each body's, see `Near`
+    count: np.ndarray  # [P, 2]
+    leaf: np.ndarray  # [L] int32
+    away: np.ndarray  # [L]
+
+
 class Near(NamedTuple):
     """The parts of the bodies of P pairs that may touch, until the next search for near bodies."""
 
@@ -150,24 +159,42 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, thre
             elif way == SOLIDS and side == 0:
                 pieces = shapes.solids.start[s + 1] - shapes.solids.start[s]
                 total += pieces * max(1, shapes.solids.start[t + 1] - shapes.solids.start[t])
-    wide = 0
+            elif way == ROUND and side == 0:
+                total += 1  # the body itself
+    found = Parts(start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total))
+    parts, many = reference(found), False
+    if threads is not None:  # known at compile time
+        many = count >= MANY
+        if many:
+            _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts, surfaces)
+    if not many:
+        for p in range(count):
+            _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p, surfaces)
+    return _gathered(shapes, found)
+
+
+@njit(**FAST)
+def _gathered(shapes, found):
+    """Room for what is kept of the parts that are near, without gaps: most parts of most bodies are far."""
+    count, wide = len(found.start), 0
+    start, total = np.zeros((count, 2), np.int64), 0
+    for p in range(count):
+        for side in range(2):
+            start[p, side] = total
+            total += found.count[p, side]
     for leaf in range(len(shapes.leaf_node) - 1):
         wide = max(wide, shapes.leaf_node[leaf + 1] - shapes.leaf_node[leaf])
-    near = Near(
-        start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total), np.zeros((total, 3)),
-        np.empty(count), np.empty(count), np.empty(total, np.int32), np.empty(total * wide),
-        np.empty(total, np.bool_), np.empty((total, 3)), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
-    )  # fmt: skip
+    leaf, away = np.empty(total, np.int32), np.empty(total)
     for p in range(count):
-        near.looked[p] = near.away_all[p] = -math.inf
-    parts = reference(near)
-    if threads is not None:  # known at compile time
-        if len(pairs) >= MANY:
-            _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts, surfaces)
-            return near
-    for p in range(len(pairs)):
-        _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p, surfaces)
-    return near
+        for side in range(2):
+            for i in range(found.count[p, side]):
+                here, there = start[p, side] + i, found.start[p, side] + i
+                leaf[here], away[here] = found.leaf[there], found.away[there]
+    return Near(
+        start, found.count, leaf, away, np.zeros((total, 3)), np.full(count, -math.inf), np.full(count, -math.inf),
+        np.full(total, -1, np.int32), np.empty(total * wide), np.zeros(total, np.bool_), np.empty((total, 3)),
+        np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
+    )  # fmt: skip
 
 
 @njit(parallel=True, **FAST)
@@ -219,7 +246,7 @@ def _near_leaves(shapes, world, motion, matrix, pairs, most, near, p):
             for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
                 away = beyond(shapes, t, w, c, k, own, i)
                 if away <= most:
-                    near.leaf[at], near.away[at], near.deepest[at], near.placed[at] = i, away, -1, False
+                    near.leaf[at], near.away[at] = i, away
                     at += 1
         near.count[p, side] = at - near.start[p, side]
 
