@@ -25,7 +25,7 @@ BACK = 2.0  # cells in front of and behind a surface within which its distance c
 OUTVOTED = 0.5
 # What lies behind one surface may lie in front of another: the air in the neck of a vase. A place more than `DEEP`
 # cells behind a surface is empty if most of the `NEAREST` nearest points of surfaces face it.
-DEEP, NEAREST = 0.5, 12
+DEEP, NEAREST = 0.5, 48
 SURFACE_POINTS = 30_000  # per photo, for this search
 SEEN = 0.3  # weight above which a place is known; one certain pixel has 1
 DENSE = 0.4  # density of surfaces behind the sphere, before softplus
