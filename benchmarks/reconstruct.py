@@ -2,12 +2,12 @@
 
     python -m benchmarks reconstruct -o DIR [--preset quick] [--budget MINUTES]
     python -m benchmarks reconstruct -o DIR --capture record3d      # the same photos as a phone with depth exports them
-    python -m benchmarks reconstruct room -o DIR [--capture record3d]    # or patches
+    python -m benchmarks reconstruct patches -o DIR [--capture record3d]
 
-Runs all stages on samples/photos/table_vase, or on one of the sets of samples/photos/make.py, rendered into DIR-NAME
-(or takes an existing result in the folder), moves the result onto the true cameras by a similarity, and prints pose
-errors, surface errors, their relation to the run's uncertainty, how deep a ball falls into the vase, and times. A
-folder of photos without `transforms.json` and `truth.ply` gets only the report.
+Runs all stages on samples/photos/table_vase, which is `room` of samples/photos/make.py, or on `patches`, rendered into
+DIR-patches (or takes an existing result in the folder), moves the result onto the true cameras by a similarity, and
+prints pose errors, surface errors, their relation to the run's uncertainty, how deep a ball falls into the vase, and
+times. A folder of photos without `transforms.json` and `truth.ply` gets only the report.
 
     python -m benchmarks reconstruct touching -o DIR
     python -m benchmarks reconstruct shelf -o DIR [--kind clicks]

@@ -1,6 +1,6 @@
 """Throws a ball at a body of a reconstruction, towards the nearest edge of its support.
 
-    sdfsim reconstruct samples/photos/table_vase -o table --preset quick --distance 041.jpg:68,364 041.jpg:574,341 1.2
+    sdfsim reconstruct samples/photos/table_vase -o table --preset quick --distance 026.jpg:50,200 026.jpg:428,370 1.2
     python samples/knock.py table object1           # writes table/knock.yaml
     sdfsim simulate table/knock.yaml -o run
 

@@ -10,7 +10,7 @@ sdfsim=.venv/bin/sdfsim
 echo "1/3  reconstructing samples/photos/table_vase (the table is 1.2 m wide)"
 # Two corners of the table in one of the photos.
 "$sdfsim" reconstruct samples/photos/table_vase -o "$out/scene" --preset quick --drop none \
-    --distance 041.jpg:68,364 041.jpg:574,341 1.2
+    --distance 026.jpg:50,200 026.jpg:428,370 1.2
 
 echo "2/3  throwing a ball at the vase"
 .venv/bin/python samples/knock.py "$out/scene" object1

@@ -1,7 +1,8 @@
 """Supervision of the training from structure-from-motion and depth: the object's position, its surface, and free
 space."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,6 +32,7 @@ APART = 0.2  # A scale that differs by more than this share means wrong units, o
 USUAL = 0.01  # relative error of a phone's depth, if nothing better is known
 FEWEST = 50  # sparse points on pixels with depth needed for the scale
 TRIES = 16  # points along each line checked for filled free space
+LINES = 2000  # checked at once for solids that they cross
 
 
 @dataclass(frozen=True)
@@ -124,13 +126,15 @@ class Supervision:
 
 
 def supervision_of(
-    poses: PosedPhotos, cell: float, depth: DepthPoints | None = None, noise: float = 0.0
-) -> Supervision:
+    poses: PosedPhotos, cell: float, depth: DepthPoints | None = None, noise: float = 0.0,
+    fused: Callable[[Tensor], Tensor] | None = None,
+) -> Supervision:  # fmt: skip
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
     Poses are in the unit sphere; a sensor's depth is in the world before that move. `cell` is the width of a cell of
     the field's finest grid. Pixels with depth give lines of sight as well, which end earlier by `noise`, the median
-    relative error of the depth.
+    relative error of the depth. Those that cross a solid of fused depth, the distance [P] at points [P, 3], are left
+    out: a few wrong pixels at the rim of a vase see through its wall, and lines of sight would open slits in it.
     """
     sparse = poses.sparse
     points = sparse.xyz
@@ -141,6 +145,7 @@ def supervision_of(
     use = good[sparse.point_of]
     centers = np.array([view.center for view in poses.views]).reshape(-1, 3)
     end, start = points[sparse.point_of[use]], centers[sparse.view_of[use]]
+    sparse_lines = len(end)
     measured, gap = np.zeros((0, 3)), np.full(len(end), GAP * cell)
     if depth is not None:
         rng = np.random.default_rng(0)
@@ -158,9 +163,28 @@ def supervision_of(
     # Not all the way, because a point and the surface there are a little uncertain.
     low, high = np.maximum(along - half, 0), np.minimum(along + half, length - gap)
     crosses = (half > 0) & (high > low + CLEARANCE * cell)
-    sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
+    sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)
+    if fused is not None:  # Sparse points are in more photos, so their lines stay.
+        asked = np.flatnonzero(crosses[sparse_lines:]) + sparse_lines
+        crosses[asked] = ~blocked(sight[asked], fused, cell)
+    sight = sight[crosses]
     weights = weights / max(float(weights.mean()), 1e-9) if len(weights) else weights
     return Supervision(points[inside], weights, sight, measured)
+
+
+def blocked(sight: np.ndarray, distance: Callable[[Tensor], Tensor], cell: float) -> np.ndarray:
+    """Whether lines [L, 6] cross a solid, whose distance [P] is known at points [P, 3], deeper than `FILLED` cells."""
+    start, end = np.split(sight, 2, 1)
+    along = torch.linspace(0, 1, math.ceil(2 / cell))[:, None]  # a place per cell of the longest line
+    found = np.zeros(len(sight), bool)
+    with torch.no_grad():
+        for first in range(0, len(sight), LINES):
+            low, high = (
+                torch.tensor(part[first : first + LINES], dtype=torch.float32)[:, None] for part in (start, end)
+            )
+            value = distance((low + along * (high - low)).reshape(-1, 3)).reshape(len(low), -1)
+            found[first : first + LINES] = (value.amin(1) < FILLED * cell).numpy()
+    return found
 
 
 class FreeSpace:

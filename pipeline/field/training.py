@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -529,6 +529,7 @@ def train(
     rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
     depth, agreed, noise = None, {}, 0.0
     fused: Fused | None = None
+    start: Callable[[Tensor], Tensor] | None = None
     paired: dict[str, Any] = {}
     if any(photo.depth for photo in photos):
         agreed = depth_scale(poses, depth_points(poses.views, photos, photos_folder))
@@ -546,7 +547,8 @@ def train(
         budget = None if budget is None else budget - spent
         if fused is not None and depth is None:
             depth, noise = stereo_points(maps, local), paired["spread"]
-    supervision = supervision_of(local, settings.size.finest, depth, noise)
+            start = GridField(settings.size, seed, settings.start_radius, fused).sdf
+    supervision = supervision_of(local, settings.size.finest, depth, noise, start)
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device, fused)
     checkpoint = out / "checkpoint.safetensors"

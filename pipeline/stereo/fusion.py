@@ -24,8 +24,10 @@ BACK = 2.0  # cells in front of and behind a surface within which its distance c
 # Their distances are not part of the mean: a few wrong ones would move the surface.
 OUTVOTED = 0.5
 # What lies behind one surface may lie in front of another: the air in the neck of a vase. A place more than `DEEP`
-# cells behind a surface is empty if most of the `NEAREST` nearest points of surfaces face it.
-DEEP, NEAREST = 0.5, 12
+# cells behind a surface is empty if more than a share `FACING` of the `NEAREST` nearest points of surfaces face it. So
+# many, because the very nearest points to the middle of a thin wall are near only because they are wrong. Less than
+# half, because fewer points are known of the inside of a vase than of its outside.
+DEEP, NEAREST, FACING = 0.5, 96, 0.4
 SURFACE_POINTS = 30_000  # per photo, for this search
 SEEN = 0.3  # weight above which a place is known; one certain pixel has 1
 DENSE = 0.4  # density of surfaces behind the sphere, before softplus
@@ -169,13 +171,14 @@ def _surface(maps: Sequence[DepthMap]) -> tuple[KDTree, np.ndarray]:
 
 
 def _in_front(surface: tuple[KDTree, np.ndarray], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether most surface points nearest to places [P, 3] face them; and the mean distance [P] from those that do."""
+    """Whether enough surface points nearest to places [P, 3] face them; and the mean distance [P] from those that
+    do."""
     tree, normals = surface
     index = np.minimum(tree.query(places, NEAREST, workers=-1)[1], len(normals) - 1)
     along = ((places[:, None] - tree.data[index]) * normals[index]).sum(-1)
     front = along > 0
     mean = np.where(front, along, 0).sum(1) / np.maximum(front.sum(1), 1)
-    return 2 * front.sum(1) > NEAREST, mean
+    return front.mean(1) > FACING, mean
 
 
 def _slopes(inverse: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Renders photos of a table with a hollow vase in a room, with exact poses and geometry.
 
     python samples/photos/make.py                       # writes samples/photos/table_vase/, the bundled set
-    python samples/photos/make.py room --out DIR        # or patches: one of the two sets into another folder
+    python samples/photos/make.py patches --out DIR     # or room: one of the two sets into another folder
 
 Ray casting with open3d. Every texture is made here from seeded noise and random cells and never repeats, because
 repeating textures make structure-from-motion converge to wrong cameras. Table and vase are the same in both sets.
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-SETS, BUNDLED = ("room", "patches"), "patches"
+SETS, BUNDLED = ("room", "patches"), "room"
 WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
 # Rings of cameras: number, degrees above the level, distance from the target in m, rotation as a share of a step, and
 # the target. The lowest look under the table top, because unseen surfaces cannot be reconstructed.

@@ -28,19 +28,19 @@ def demo(tmp_path_factory) -> Path:
 def test_the_surface_is_as_near_the_truth_as_it_was(demo):
     """Percent of the table's width, against the mesh that samples/photos/make.py rendered the photos from.
 
-    Three runs had a median of 0.17, 90 % within 0.55 to 0.69, 0.11 missing in the median, 99.6 % found within 1 %, a
-    vase hollow by 19 to 22 cm of 32. Earlier fields, from a ball, scattered by 0.03 and 0.05 from seed to
-    seed; the limits are some four of these away.
+    Two runs of the room had a median of 0.13 and 0.16, 90 % within 0.63 and 0.65, 0.07 and 0.10 missing in the median,
+    98.0 and 98.1 % found within 1 % (the set before, without thin leaves, 99.6 %), and a vase hollow by 32 cm of 32.
+    Earlier fields, from a ball, scattered by 0.03 and 0.05 from seed to seed; the limits are some four of these away.
     """
     truth, report = evaluate(demo / "scene", PHOTOS), read_json(demo / "scene" / "report.json")
     assert truth["poses"]["center_error_worst_percent"] < 0.5
-    assert report["psnr"] > 20
+    assert report["psnr"] > 21.5
     found = truth["surface_percent_of_table_width"]
     assert found["surface"]["median"] < 0.28
     assert found["surface"]["p90"] < 0.85
     assert found["missing"]["median"] < 0.2
-    assert found["complete_percent"] > 98
-    assert found["vase"]["object1"]["hollow_cm"] > 14
+    assert found["complete_percent"] > 96.5
+    assert found["vase"]["object1"]["hollow_cm"] > 28
 
 
 @pytest.mark.gate

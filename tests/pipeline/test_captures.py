@@ -66,13 +66,15 @@ def test_every_layout_gives_the_same_cameras_and_depth(layout, tmp_path):
 
 
 def test_the_poses_of_a_phone_are_refined(tmp_path):
-    phone.write("polycam", tmp_path / "capture", every=3)
+    """Every second photo: with every third one of the room, few pairs look into the vase from near, and the error only
+    halves."""
+    phone.write("polycam", tmp_path / "capture", every=2)
     folder, out = tmp_path / "photos", tmp_path / "poses"
     folder.mkdir()
     out.mkdir()
     photos, _ = prepare_photos(tmp_path / "capture", folder)
     solve(photos, folder, out)
-    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::3]
+    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::2]
     true = np.array([(phone.TO_ARKIT @ np.array(frame["transform_matrix"]))[:3, 3] for frame in frames])
 
     def shape_error(views: list[View]) -> float:

@@ -179,6 +179,23 @@ def test_lines_of_sight_of_a_sensor_end_before_its_noise():
     assert np.linalg.norm(ends[:, None] - found.sight[:, 3:], axis=2).min(1).max() < 1e-9
 
 
+def test_lines_of_sight_through_a_fused_solid_are_left_out():
+    """A ball in the middle of four cameras: points before it keep their lines, those behind it lose theirs. The lines
+    of sparse points stay."""
+    views, radius = ring(4), 0.2
+    centers = np.array([view.center for view in views])
+    towards = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
+    depth = DepthPoints(np.concatenate([-0.4 * towards, 0.4 * towards]), np.zeros((8, 2)), np.tile(np.arange(4), 2))
+    sparse = Sparse(0.4 * towards[:1], np.zeros((1, 3), np.uint8), np.full(1, 0.5), np.zeros(3, int), np.arange(3))
+    poses = PosedPhotos(tuple(views), sparse)
+    found, every = (supervision_of(poses, CELL, depth, 0.0, ball) for ball in (lambda p: p.norm(dim=1) - radius, None))
+    assert len(every.sight) == 11 and len(found.sight) == 7
+    np.testing.assert_array_equal(found.sight[:3], every.sight[:3])
+    passed = np.linalg.norm(found.sight[3:, 3:], axis=1)
+    np.testing.assert_allclose(passed, 0.4 + GAP * CELL, atol=1e-9)
+    np.testing.assert_array_equal(found.depth, every.depth)
+
+
 def test_points_of_stereo_are_those_that_are_certain():
     """Of a photo with more than are used. Half the certainty makes half of the points, less than 0.3 none."""
     view = replace(ring(4)[0], width=400, height=400)
