@@ -18,6 +18,7 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import ConvexHull, KDTree
 
 from pipeline.cameras import View, frame_of
+from pipeline.grids.connected import largest
 from pipeline.inputs.labels import UNKNOWN
 from pipeline.mesh.extraction import Volume
 from pipeline.mesh.visibility import Visibility
@@ -348,7 +349,7 @@ def _walled(solid: ConnectedSolid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:
 
 def flood(solid: ConnectedSolid, label: np.ndarray, found: list[Seam]) -> np.ndarray:
     """Part [X, Y, Z] of each sample: that of the nearest vertex through the inside, without crossing a flat seam; -1
-    outside."""
+    outside. Each part is connected."""
     from skimage.segmentation import watershed
 
     cell = solid.volume.cell
@@ -368,6 +369,10 @@ def flood(solid: ConnectedSolid, label: np.ndarray, found: list[Seam]) -> np.nda
     part = watershed(np.zeros(marks.shape, np.uint8), marks * free, mask=free)
     for place, side in walls:
         part[place] = side
+    # A body is in one piece: a pocket of one within another comes from vertices at a flaw inside the solid.
+    for number in np.unique(part[part > 0]):
+        here = part == number
+        part[here & ~largest(here)[0]] = 0
     return np.where(solid.inside, _spread(part, part > 0) - 1, -1)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from pipeline.grids.connected import largest
 from pipeline.grids.interpolation import near_bricks, places_of
 from pipeline.stereo.compiled import carve, paint
 from pipeline.stereo.depth import BEYOND, DepthMap, stacked, straightened
@@ -81,21 +82,12 @@ def without_cavities(solid: np.ndarray) -> np.ndarray:
     """A solid [n, n, n] bool with its cavities filled: air that is not connected to the largest part of the air, or
     only by ways that are at most two samples wide. No photo sees into them. They come from wrong pixels, which now and
     then see past the front of a thick body; nothing else is known about its inside."""
-    air = _largest(~solid)[0]
-    core, part = _largest(ndimage.binary_erosion(air, border_value=1))
+    air = largest(~solid)[0]
+    core, part = largest(ndimage.binary_erosion(air, border_value=1))
     if not core.any():
         return ~air
     nearest = ndimage.distance_transform_edt(part == 0, return_distances=False, return_indices=True)
     return ~(air & core[tuple(np.asarray(nearest))])
-
-
-def _largest(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The largest connected part of places [n, n, n] bool, likewise; and the numbers of all parts, 0 elsewhere."""
-    part = np.zeros(places.shape, np.int32)
-    ndimage.label(places, output=part)
-    size = np.bincount(part.ravel())
-    size[0] = 0
-    return (part == np.argmax(size)) & places, part
 
 
 def behind(maps: Sequence[DepthMap], side: int, photos_folder: Path) -> np.ndarray:
