@@ -114,6 +114,13 @@ def exact(views: list[View], distance: Distance) -> list[DepthMap]:
     return maps
 
 
+def with_far_pixels(maps: list[DepthMap], share: float, times: float) -> list[DepthMap]:
+    """Maps in which a share of all pixels is so many times as far as it should be."""
+    rng = np.random.default_rng(0)
+    return [replace(one, inverse=np.where(rng.random(one.inverse.shape) < share, one.inverse / times, one.inverse))
+            for one in maps]  # fmt: skip
+
+
 def distance_at(fused: Fused, points: np.ndarray) -> np.ndarray:
     """The coarse distance [P] at points [P, 3]."""
     return map_coordinates(fused.coarse, ((points + 1) / 2 * (len(fused.coarse) - 1)).T[::-1], order=1)
@@ -123,9 +130,7 @@ def test_the_few_pixels_that_see_past_a_surface_do_not_move_it(tmp_path):
     """One pixel in twenty lies far behind. In a mean with the others these took the surface back by half a cell."""
     views = ring(12, 2.4, 35, 100, 75, 105.0)
     shoot(views, ball_on_plane, tmp_path)
-    rng = np.random.default_rng(0)
-    maps = [replace(one, inverse=np.where(rng.random(one.inverse.shape) < 0.05, one.inverse / 1.5, one.inverse))
-            for one in exact(views, ball_on_plane)]  # fmt: skip
+    maps = with_far_pixels(exact(views, ball_on_plane), 0.05, 1.5)
     fused = fuse(maps, 48, tmp_path)
     assert fused is not None
     turn = np.linspace(0, 2 * np.pi, 400)
@@ -224,9 +229,7 @@ def test_the_inside_of_thick_bodies_is_solid_whatever_wrong_pixels_see(tmp_path)
         return np.minimum(side, points[..., 2] + half)
 
     shoot(views, crate, tmp_path)
-    rng = np.random.default_rng(0)
-    maps = [replace(one, inverse=np.where(rng.random(one.inverse.shape) < 0.01, one.inverse / 1.6, one.inverse))
-            for one in exact(views, crate)]  # fmt: skip
+    maps = with_far_pixels(exact(views, crate), 0.01, 1.6)
     fused = fuse(maps, 48, tmp_path)
     assert fused is not None
     line = np.linspace(-1, 1, 48)
