@@ -167,10 +167,10 @@ def load_poses(folder: Path) -> PosedPhotos:
 
 
 def frame_of(normal: np.ndarray) -> np.ndarray:
-    """A right-handed rotation [3, 3] whose last row is a unit normal [3]."""
-    side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    side /= np.linalg.norm(side)
-    return np.stack([side, np.cross(normal, side), normal])
+    """A right-handed rotation [..., 3, 3] whose last row is a unit normal [..., 3]."""
+    side = np.cross(normal, np.eye(3)[np.abs(normal).argmin(-1)])
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    return np.stack([side, np.cross(normal, side), normal], -2)
 
 
 def nearest_to_axes(centers: np.ndarray, axes: np.ndarray, anchor: np.ndarray | None = None) -> np.ndarray:

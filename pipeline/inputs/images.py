@@ -219,3 +219,14 @@ def sharpness(pixels: np.ndarray) -> float:
     chosen = np.argsort(coarse)[-max(1, len(fine) // 10) :]
     strong = float(coarse[chosen].mean())
     return float(np.sqrt(fine[chosen].mean() / strong)) if strong > 1e-6 else 0.0
+
+
+def stacked(pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures [N, h, w] float32 of different sizes in one array, and their heights and widths [N, 2]."""
+    sizes = np.array([picture.shape for picture in pictures])
+    if (sizes == sizes[0]).all():
+        return np.array(pictures, np.float32), sizes
+    whole = np.zeros((len(pictures), *sizes.max(0)), np.float32)
+    for number, picture in enumerate(pictures):
+        whole[number, : picture.shape[0], : picture.shape[1]] = picture
+    return whole, sizes

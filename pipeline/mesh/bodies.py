@@ -51,6 +51,7 @@ from sdfsim.geometry.mesh import Mesh, face_normals
 # Shares, without unit, chosen by hand on the rendered sets (table_vase, `shelf`, touching bodies); other sets may need
 # other values.
 LEVEL_SHARE = 0.1  # of the largest level plane: smaller planes carry nothing; the lid of a box is not a table
+SMALLEST_PLANE = 0.005  # of the visible surface: less is a flat place on something, such as fur
 LARGEST_FOOT = 0.5  # largest share of its plane that a body covers; more is relief
 CARRIED = 0.3  # share of a level plane with a component's samples below it: from here on it carries the plane
 SEEN_SHARE = 0.2  # of a body's surface, that photos have to show
@@ -137,6 +138,7 @@ def find_level_planes(shown: Mesh, up: np.ndarray, width: float, share: float = 
     """Level planes of a surface, largest first, down to a `share` of that one's area; `up` [3] is unit, and faces
     within `width` belong to one plane."""
     normals, areas = face_normals(shown)
+    least = SMALLEST_PLANE * areas.sum()
     centers = shown.vertices[shown.faces].mean(1)
     flat = normals @ up > LEVEL_NORMAL
     normals, areas, centers = normals[flat], areas[flat], centers[flat]
@@ -148,7 +150,7 @@ def find_level_planes(shown: Mesh, up: np.ndarray, width: float, share: float = 
         # Must not miss a plane on the border of two bins.
         fullest = int(np.argmax(total + np.append(total[1:], 0)))
         member = (bins == fullest) | (bins == fullest + 1)
-        if levels and areas[member].sum() < share * levels[0].area:
+        if areas[member].sum() < max(least, share * levels[0].area if levels else 0.0):
             break
         middle = np.average(centers[member], axis=0, weights=areas[member])
         offset = centers[member] - middle
@@ -183,7 +185,9 @@ def find_bodies(surface: FieldSurface, levels: list[LevelPlane], layer: float, s
         count = int(ndimage.label(solid & (height > layer), output=label))  # type: ignore[arg-type]
         others = [other for other in levels if other is not level and level.above(other.height * other.normal) > layer]
         samples = np.bincount(label.ravel())
-        hangs = np.asarray(ndimage.minimum(height, label, np.arange(count + 1))) > layer + 1.5 * volume.cell
+        lowest = np.full(count + 1, np.inf, np.float32)
+        np.minimum.at(lowest, label[label > 0], height[label > 0])
+        hangs = lowest > layer + 1.5 * volume.cell
         for number, box in enumerate(ndimage.find_objects(label, count), start=1):
             mine = label[box] == number
             if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < FEWEST_SAMPLES:
@@ -286,14 +290,17 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     return replace(body, hollow=np.asarray(ndimage.binary_fill_holes(cut)) & ~cut, corner=flat.min(0))
 
 
-def body_mesh(body: FoundBody, field: Distance, cell: float) -> Mesh:
-    """The closed mesh of a body, sampled `cell` apart along its plane; crumbs are left out."""
+def body_mesh(body: FoundBody, field: Distance, cell: float) -> Mesh | None:
+    """The closed mesh of a body, sampled `cell` apart along its plane; crumbs are left out. None if it is so thin that
+    no sample is inside."""
     frame = frame_of(body.level.normal)
     turned = (body.low + body.cell * np.argwhere(body.own)) @ frame.T
     low, high = turned.min(0), turned.max(0)
     low[2] = max(low[2], body.level.height - 2 * cell)
     distance = body.distance(field)
     volume = sample_box(lambda p: distance(p @ frame), low - 2 * cell, high + 2 * cell, cell)
+    if not (volume.values < 0).any():
+        return None
     sampled = volume.mesh()
     mesh = Mesh(sampled.vertices @ frame, sampled.faces)
     label = components(mesh)
@@ -388,14 +395,15 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
                 whole, pieces = [*whole, *loose], [*pieces, *(replace(body, name=name) for body in loose)]
     largest = {body.name: body.size for body in sorted(pieces, key=lambda body: body.size)}
     pieces = [body for body in pieces if not body.name or body.size > SCRAP * largest[body.name]]
-    if not pieces:
+    sampled: dict[FoundBody, Mesh] = {}
+    for body in pieces:
+        mesh = body_mesh(body, distance, min(max(FINER * finest, body.size / ENOUGH), surface.volume.cell))
+        if mesh is not None:
+            sampled[body] = mesh
+    if not sampled:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
-    sampled = {
-        body: body_mesh(body, distance, min(max(FINER * finest, body.size / ENOUGH), surface.volume.cell))
-        for body in pieces
-    }
     noise = _noise(sampled, poses.sparse.xyz, finest)
-    called = _names([body for body in pieces if body not in noise])
+    called = _names([body for body in sampled if body not in noise])
     meshes, unrefined, pictures = {}, {}, load_grey_photos(poses.views, photos_folder)
     for body, name in called.items():
         # Lifted off the occluding surface, which is sampled more coarsely.
@@ -410,7 +418,9 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     solid, shown = (None, None) if alone else scenery(surface, whole, distance)
     pairs = [(called[a], called[b], by) for a, b, by in touching if a in called and b in called]
     missing = [name for name in names if name not in meshes]
-    return Parts(solid, shown, meshes, smallest, pairs, missing, [body.size for body in noise], unrefined)
+    return Parts(
+        solid, shown, meshes, smallest, pairs, missing, [body.size for body in pieces if body not in called], unrefined
+    )
 
 
 def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smallest: float,

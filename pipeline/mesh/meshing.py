@@ -51,7 +51,7 @@ def make_meshes(
     posed = load_poses(poses).moved(to_unit)
     alone = bool(trained.report["masked"])
     inner, limit = field_distance(field), ball
-    inside = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
+    inside: Distance = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
     volume = sample_volume(inside, RESOLUTION[options.preset], on_progress=share_of(on_progress, 0.0, 0.25))
     surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.2))
     scale = None
@@ -79,7 +79,7 @@ def make_meshes(
         completed = complete(surface, level, field.finest, posed, photos)
     if completed:
         for one in completed:
-            volume = one.filled(volume)
+            volume, inside = one.filled(volume), one.within(inside)
         known = on_any(completed, volume.cell)
         surface = surface_of(volume, field, posed, photos, limit, known=known,
                              on_progress=share_of(on_progress, 0.45, 0.05))  # fmt: skip

@@ -6,7 +6,7 @@ show it; so the patch is moved along the normal until it does (normalised cross-
 information: there the surface is the smallest one between known places on both sides, which removes bulges.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,10 +15,16 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
+from pipeline.inputs.images import stacked
 from pipeline.inputs.photos import open_photo
 from pipeline.mesh.visibility import FAIR, Visibility
+from sdfsim.base.parallel import threads
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
+from sdfsim.physics import solver as kernels
+
+with kernels.kept():
+    from pipeline.mesh.patch_kernel import read_patches
 
 # Chosen by hand on the rendered sets, mostly `shelf`; other sets may need other values.
 LONG_SIDE = 640  # px; larger photos are reduced, because otherwise the right place would lie too many pixels away
@@ -27,12 +33,12 @@ LONG_SIDE = 640  # px; larger photos are reduced, because otherwise the right pl
 PHOTOS, FEWEST = 5, 3
 HALF = 3  # px from a patch's middle to its sides
 PLACES = 25  # tried along the normal
-NOISE = 4.0  # grey levels squared: variance that is no texture
 # An object that is not reconstructed may block a photo. Such a photo agrees with no other one there: with the best two
 # of ASKED photos less than CLEAR times as well as the best photo does. One vertex in SELDOM is checked.
 ASKED, CLEAR, SELDOM = 8, 0.5, 16
 # Largest move of vertices per round, in cells of the field's finest grid, and rounds; half as far in the last.
 REACH, ROUNDS = 1.3, 3
+BATCH = 400  # vertices compared at once; their patches take 10 MB
 EVERY = 4  # one vertex of so many is compared, the others follow
 ALIKE, SURE = 0.35, 0.9  # correlations between which the trust in a place rises from 0 to 1
 # A place is not trusted beyond SPREAD times the usual difference from the surface around it. The places around define
@@ -56,6 +62,13 @@ class GreyPhoto:
     view: View  # its camera, for the pixels of the file
     scale: float  # of the pixels of `grey` to those
     grey: np.ndarray  # [H, W] float32
+
+    @property
+    def camera(self) -> np.ndarray:
+        """[16] its row for `read_patches`."""
+        middle = self.scale * np.array([self.view.cx, self.view.cy]) - 0.5
+        return np.concatenate([self.view.rotation.ravel(), self.view.translation, [self.view.focal * self.scale],
+                               middle, [self.view.k]])  # fmt: skip
 
 
 def load_grey_photos(views: Sequence[View], photos_folder: Path) -> list[GreyPhoto]:
@@ -149,9 +162,12 @@ def patch_correlation(
     """Similarity of the patches [P, M] around vertices [P], moved [M] along normals [P, 3], between photos: the mean
     correlation of all pairs of photos that are `clear` [K, P], -1 if too few show a vertex."""
     result = np.full((len(normal), len(moves)), -1.0)
-    for part, number, found in patches(sight, normal, pictures, moves, clear, PHOTOS):
+
+    def compare(part: np.ndarray, number: np.ndarray, found: np.ndarray) -> None:
         used = (number >= 0).sum(0)[:, None]
         result[part] = ((found.sum(2) ** 2).sum(2) - used) / (used * (used - 1))
+
+    with_patches(compare, sight, normal, pictures, moves, clear, PHOTOS)
     return result
 
 
@@ -162,7 +178,8 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], 
     support = np.zeros((len(pictures), len(normal)), np.float32)
     asked = np.zeros((len(pictures), len(normal)), bool)
     every = np.ones((len(pictures), len(picked)), bool)
-    for part, number, found in patches(sight.at(picked), normal[picked], pictures, moves, every, ASKED):
+
+    def compare(part: np.ndarray, number: np.ndarray, found: np.ndarray) -> None:
         alike = found @ found.swapaxes(2, 3)  # [S, M, ASKED, ASKED]
         alike[:, :, range(len(number)), range(len(number))] = -1
         best = np.sort(alike, 3)[..., -(FEWEST - 1) :].mean(3)
@@ -170,6 +187,8 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], 
         vertex, slot = np.nonzero(number.T >= 0)
         at = number[slot, vertex], picked[part[vertex]]
         support[at], asked[at] = best[vertex, slot], True
+
+    with_patches(compare, sight.at(picked), normal[picked], pictures, moves, every, ASKED)
     for photo, there in zip(support, asked, strict=True):  # photo by photo, because all at once may not fit into memory
         total, weight = photo.astype(float), there.astype(float)
         for _ in range(AROUND if there.any() else 0):
@@ -179,14 +198,15 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], 
     return (support >= CLEAR * asked_best) | (asked_best <= 0)
 
 
-def patches(
-    sight: Visibility, normal: np.ndarray, pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray, most: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The patches around vertices [P], moved [M] along normals [P, 3], in the photos with the best viewing angle, at
-    most `most`, and only those that are `clear` [K, P].
+def with_patches(
+    compare: Callable[[np.ndarray, np.ndarray, np.ndarray], None], sight: Visibility, normal: np.ndarray,
+    pictures: list[GreyPhoto], moves: np.ndarray, clear: np.ndarray, most: int,
+) -> None:  # fmt: skip
+    """Calls `compare` with the patches around vertices [P], moved [M] along normals [P, 3], in the photos with the best
+    viewing angle, at most `most`, and only those that are `clear` [K, P].
 
-    Yields batches of vertices [S], the number of each photo [most, S], -1 for none, and grey levels [S, M, most, G] as
-    in `normalised`; only vertices that `FEWEST` photos show.
+    It gets batches of vertices [S], in several threads: their numbers, those of their photos [most, S], -1 for none,
+    and the grey levels [S, M, most, G] of `read_patches`; only vertices that `FEWEST` photos show.
     """
     cosine = np.zeros((len(pictures), len(normal)), np.float32)
     for number, picture in enumerate(pictures):
@@ -198,31 +218,19 @@ def patches(
     centers = np.array([picture.view.center for picture in pictures])[chosen[0]]
     pixel = np.array([1 / (picture.view.focal * picture.scale) for picture in pictures])[chosen[0]]
     pixel = pixel * np.linalg.norm(centers - sight.vertices, axis=1)
-    frames = np.stack([frame_of(n)[:2] for n in normal])
-    grid = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].reshape(2, -1)
-    patch = pixel[:, None, None] * np.einsum("kg,pkc->pgc", grid, frames)
-    for part in np.array_split(np.flatnonzero(shown.sum(0) >= FEWEST), len(normal) // 400 + 1):
-        middle = sight.vertices[part][:, None] + moves[:, None] * normal[part][:, None]
-        points = middle[:, :, None] + patch[part][:, None]
+    sides = pixel[:, None, None] * frame_of(normal)[:, :2]
+    greys, sizes = stacked([picture.grey for picture in pictures])
+    cameras = np.array([picture.camera for picture in pictures])
+
+    def read(part: np.ndarray) -> None:
         number = np.where(shown[:, part], chosen[:, part], -1)
-        found = np.zeros((*points.shape[:2], len(number), points.shape[2]), np.float32)
-        for slot, which in enumerate(number):
-            for one in np.unique(which[which >= 0]):
-                mine = np.flatnonzero(which == one)
-                found[mine, :, slot] = normalised(pictures[one], points[mine])
-        yield part, number, found
+        found = np.zeros((len(part), len(moves), len(number), (2 * HALF + 1) ** 2), np.float32)
+        read_patches(greys, sizes, cameras, sight.vertices[part], normal[part], sides[part], moves, number, HALF, found)
+        compare(part, number, found)
 
-
-def normalised(picture: GreyPhoto, points: np.ndarray) -> np.ndarray:
-    """Grey levels [..., G] of patches of points [..., G, 3] in a photo, with mean 0 and length 1."""
-    import cv2
-
-    pixels = (picture.view.project(points.reshape(-1, 3))[0] * picture.scale - 0.5).astype(np.float32)
-    columns, rows = (axis.reshape(-1, points.shape[-2]) for axis in pixels.T)
-    grey = cv2.remap(picture.grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    grey -= grey.mean(1, keepdims=True)
-    grey /= np.sqrt((grey**2).sum(1, keepdims=True) + NOISE * grey.shape[1])
-    return grey.reshape(points.shape[:-1])
+    parts = np.array_split(np.flatnonzero(shown.sum(0) >= FEWEST), len(normal) // BATCH + 1)
+    for _ in threads(read, [(part,) for part in parts if len(part)]):
+        pass
 
 
 def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

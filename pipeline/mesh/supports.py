@@ -17,7 +17,7 @@ from pipeline.cameras import PosedPhotos, View, frame_of
 from pipeline.inputs.images import reduced
 from pipeline.inputs.photos import open_photo
 from pipeline.mesh.bodies import LevelPlane, find_level_planes
-from pipeline.mesh.extraction import MIN_SEEN, RIM, FieldSurface, Volume, marked
+from pipeline.mesh.extraction import MIN_SEEN, RIM, Distance, FieldSurface, Volume, marked
 from pipeline.mesh.visibility import bilinear, framed
 from sdfsim.geometry.bvh import Caster
 
@@ -34,6 +34,7 @@ CROSSED = 2  # lines of sight through a square to points below: from here on the
 RIM_SQUARES = 12  # next to visible parts of the plane that a region needs
 SUPPORTS = 0.04  # of the largest level plane's area: visible part of another plane to be completed, such as a mat
 LEAST = 0.05  # of the visible area of the plane: less is not worth the change
+GROWN = 10.0  # of the visible area: a larger region is not known to be the same surface
 POINTS = 30  # sparse points for the brightness of a photo
 LONG_SIDE = 480  # px, longer side of the photos used
 
@@ -63,18 +64,26 @@ class Completed:
 
     def filled(self, volume: Volume) -> Volume:
         """The samples with a slab below the squares, and without matter that the field piled up on them."""
+        values = volume.values.copy()
         height = volume.along(self.level.normal) - self.level.height
-        band = (height > -SLAB * volume.cell) & (height < BULGE * volume.cell)
-        index = np.argwhere(band)
-        mine = self.covers(volume.low + volume.cell * index)
-        index, values = index[mine], volume.values.copy()
-        at, away = tuple(index.T), height[tuple(index.T)]
-        # A field piles up false matter only to a limited height; higher samples do not change.
-        over = np.minimum(away, (BULGE * volume.cell - away) / 2)
-        values[at] = np.where(away > 0, np.maximum(values[at], over), np.minimum(values[at], away))
-        near = np.abs(away) < ON * volume.cell  # between samples, the two nearest define the surface
-        values[tuple(index[near].T)] = away[near]
-        return replace(volume, values=values.astype(np.float32))
+        index = np.argwhere((height > -SLAB * volume.cell) & (height < BULGE * volume.cell))
+        at = tuple(index.T)
+        values[at] = self._changed(volume.low + volume.cell * index, values[at])
+        return replace(volume, values=values)
+
+    def within(self, distance: Distance) -> Distance:
+        """The same change of a signed distance [P] at points [P, 3]."""
+        return lambda points: self._changed(points, distance(points))
+
+    def _changed(self, points: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Signed distances [P] at points [P, 3], with the slab and without what is piled up on it."""
+        cell, away = self.step / STEP, self.level.above(points)
+        mine = (away > -SLAB * cell) & (away < BULGE * cell) & self.covers(points)
+        # A field piles up false matter only to a limited height; higher places do not change.
+        over = np.minimum(away, (BULGE * cell - away) / 2)
+        changed = np.where(away > 0, np.maximum(values, over), np.minimum(values, away))
+        changed = np.where(np.abs(away) < ON * cell, away, changed)  # the two nearest samples define a surface
+        return np.where(mine, changed, values).astype(values.dtype)
 
 
 def complete(surface: FieldSurface, up: np.ndarray, finest: float, poses: PosedPhotos, photos_folder: Path
@@ -140,7 +149,8 @@ def _complete(surface: FieldSurface, level: LevelPlane, poses: PosedPhotos, pict
     nearest: Any = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
     same = narrow & (np.abs(own - color[tuple(nearest)]).max(2) < SAME)
     grown = ndimage.binary_dilation(core, iterations=int(PATCH) + 1, mask=core | (same & open_))
-    return Completed(level, corner, step, np.asarray(grown, bool))
+    found = Completed(level, corner, step, np.asarray(grown, bool))
+    return found if found.area < GROWN * level.area else None
 
 
 def _crossings(level: LevelPlane, poses: PosedPhotos, clear: float) -> np.ndarray:

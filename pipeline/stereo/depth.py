@@ -17,7 +17,7 @@ from PIL import Image
 from scipy import ndimage
 
 from pipeline.cameras import PosedPhotos, View, focus
-from pipeline.inputs.images import reduced
+from pipeline.inputs.images import reduced, stacked
 from pipeline.stereo.compiled import agreeing, sweep
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent, threads
@@ -292,17 +292,6 @@ def _agreement(pictures: list[Pinhole], inverse: list[np.ndarray], number: int, 
     turns, shifts = zip(*(relation(pictures[number], pictures[k]) for k in asked), strict=True)
     others, sizes = stacked([inverse[k] for k in asked])
     return agreeing(inverse[number], others, sizes, np.array(turns), np.array(shifts), AGREE)
-
-
-def stacked(pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures [N, h, w] float32 of different sizes in one array, and their heights and widths [N, 2]."""
-    sizes = np.array([picture.shape for picture in pictures])
-    if (sizes == sizes[0]).all():
-        return np.array(pictures, np.float32), sizes
-    whole = np.zeros((len(pictures), *sizes.max(0)), np.float32)
-    for number, picture in enumerate(pictures):
-        whole[number, : picture.shape[0], : picture.shape[1]] = picture
-    return whole, sizes
 
 
 def filled(inverse: np.ndarray, known: np.ndarray) -> np.ndarray:

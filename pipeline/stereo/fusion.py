@@ -16,8 +16,9 @@ from scipy.spatial import KDTree
 
 from pipeline.grids.connected import largest
 from pipeline.grids.interpolation import near_bricks, places_of
+from pipeline.inputs.images import stacked
 from pipeline.stereo.compiled import carve, paint
-from pipeline.stereo.depth import BEYOND, DepthMap, stacked, straightened
+from pipeline.stereo.depth import BEYOND, DepthMap, straightened
 from sdfsim.base.parallel import Progress, silent, threads
 
 BACK = 2.0  # cells in front of and behind a surface within which its distance counts

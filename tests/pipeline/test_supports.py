@@ -132,6 +132,32 @@ def test_nothing_is_completed_where_all_of_it_is_seen_or_patterned(photographed)
     assert complete(whole, UP, CELL, poses, folder) == []
 
 
+def test_a_distance_is_completed_as_its_samples_are(photographed):
+    surface, poses, folder = photographed
+    (one,) = complete(surface, UP, CELL, poses, folder)
+    points = surface.volume.points().reshape(-1, 3)
+    samples = one.filled(surface.volume).values.reshape(-1)
+    changed = one.within(surface.volume.at)(points)
+    np.testing.assert_allclose(changed, samples, atol=1e-5)
+    assert np.abs(changed - surface.volume.values.reshape(-1)).max() > 2 * CELL
+
+
+def test_flat_spots_of_a_round_thing_are_no_tables(photographed):
+    """A plain ball has flat spots on top of itself; what photos show around them is as plain as they are."""
+    surface, poses, folder = photographed
+    ball = np.linalg.norm(surface.volume.points() - [0, 0, FLOOR], axis=-1) - 0.4
+    bumps = 0.01 * np.sin(40 * surface.volume.points()).prod(-1)
+    volume = replace(surface.volume, values=(ball + bumps).astype(np.float32))
+    raw = volume.mesh()
+    raw = replace(raw, colors=np.full(raw.vertices.shape, 128, np.uint8))
+    whole = FieldSurface(volume, raw, np.ones(len(raw.vertices), bool), *[np.ones(len(raw.faces), bool)] * 2, [])
+    plain = folder.parent / "plain"
+    (plain / "images").mkdir(parents=True, exist_ok=True)
+    for view in poses.views:
+        Image.new("RGB", (240, 180), (150, 105, 70)).save(plain / "images" / view.name)
+    assert complete(whole, UP, CELL, poses, plain) == []
+
+
 def test_the_report_says_what_was_completed():
     (line,) = mesh_notes({"completed_m2": [0.3412]})
     assert line.startswith("0.34 m^2 of a level surface without texture were completed as a plane")
