@@ -153,7 +153,7 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
     "poses": Stage(do_poses, "poses", version=6),
     "distill": Stage(do_distill, "distill", version=11),
-    "mesh": Stage(do_mesh, "mesh", version=14),
+    "mesh": Stage(do_mesh, "mesh", version=15),
     "fit": Stage(do_fit, "assets", version=3),
     "scene": Stage(do_scene, "scene", version=6),
 }

@@ -17,6 +17,7 @@ from pipeline.grids.interpolation import interpolate
 EPSILON = 0.1  # of opacity
 START = 128  # first samples of every ray, and samples added to rays that need more
 COARSE = 4  # cells of the cached SDF between points where the field is always evaluated
+SLACK = 1.4  # factor by which a field may be steeper than a distance
 BINS = 0.75  # reads of the cached SDF along a ray, per cell of a side
 ROUNDS, BISECTIONS = 5, 10
 
@@ -25,8 +26,8 @@ ROUNDS, BISECTIONS = 5, 10
 def sdf_cache(field: Field, cell: float) -> Tensor:
     """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), used to choose samples along rays.
 
-    Its cells are no wider than `cell`. Every `COARSE`-th value is the field's, the others only in blocks that the
-    surface may cross; elsewhere they are interpolated.
+    Its cells are no wider than `cell`. Every `COARSE`-th value is the field's, the others only in blocks in reach of
+    the unit sphere that the surface may cross; elsewhere they are interpolated.
     """
     device, coarse = field.background.device, COARSE
     resolution = math.ceil(2 / cell / coarse - 1e-6) * coarse + 1
@@ -39,8 +40,11 @@ def sdf_cache(field: Field, cell: float) -> Tensor:
     rough = values(knots.view(-1, 3).flip(1)).view(1, 1, *knots.shape[:3])
     cache = functional.interpolate(rough, size=(resolution,) * 3, mode="trilinear", align_corners=True)[0, 0]
     low, high = -functional.max_pool3d(-rough, 2, 1), functional.max_pool3d(rough, 2, 1)
-    reach = 3**0.5 * coarse * float(line[1] - line[0])
-    block = torch.nonzero((low < reach) & (high > -reach))[:, 2:] * coarse
+    diagonal = 3**0.5 * coarse * float(line[1] - line[0])
+    reach = 0.5 * SLACK * diagonal  # No place in a block is farther than half of it from a corner.
+    middle = (line[:-1:coarse] + line[coarse::coarse]) / 2
+    inside = (middle**2)[:, None, None] + (middle**2)[:, None] + middle**2 < (1 + 0.5 * diagonal) ** 2
+    block = torch.nonzero((low < reach) & (high > -reach) & inside)[:, 2:] * coarse
     step = torch.stack(torch.meshgrid(*[torch.arange(coarse + 1, device=device)] * 3, indexing="ij"), -1).view(-1, 3)
     near = torch.zeros_like(cache, dtype=torch.bool)
     index = (block[:, None] + step).reshape(-1, 3)
