@@ -25,11 +25,11 @@ from sdfsim.base.parallel import Progress, silent
 # Each photo is matched with the photos that look most like it: this minimum and maximum, and between them a share of
 # all. On the bundled set 14 of 48 gave the same poses as all pairs, in a third of the time.
 PARTNERS, SHARE = (14, 40), 0.25
-ALL_UP_TO = 150  # photos; beyond this, pairs that do not look alike are never matched
 ORDINARY: dict[str, Any] = {
-    "pixels": 1000, "max_features": 3000, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False,
+    "pixels": 1000, "max_features": 3000, "largest": 0, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False,
     "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "init_inliers": 100, "init_angle": 16.0,
     "pose_inliers": 30, "exhaustive_up_to": 30,
+    "all_up_to": 150,  # photos; beyond this, pairs that do not look alike are never matched
 }  # fmt: skip
 # The worker's settings for each attempt, by name. The attempts end with the first that gives trusted poses of all
 # photos.
@@ -37,9 +37,9 @@ ATTEMPTS = {
     "ordinary": ORDINARY,
     "without static matches": {**ORDINARY, "moving_only": True},
     "more features": {
-        **ORDINARY, "pixels": 1600, "max_features": 12000, "peak_threshold": 0.003, "max_ratio": 0.88, "guided": True,
+        **ORDINARY, "pixels": 1600, "max_features": 12000, "largest": 12000, "peak_threshold": 0.003, "max_ratio": 0.88,
         "min_inliers": 12, "min_inlier_ratio": 0.25, "init_inliers": 40, "init_angle": 6.0, "pose_inliers": 15,
-        "exhaustive_up_to": ALL_UP_TO,
+        "exhaustive_up_to": 40, "all_up_to": 40,  # A pair takes most of a second.
     },
 }  # fmt: skip
 
@@ -96,12 +96,12 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 4,  # of the child's files, which a resumed run reads
+        "version": 5,  # of the child's files, which a resumed run reads
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
         "pairs": seen_together(load_views(known)) if known.exists() else None,
-        "partners": int(np.clip(SHARE * len(photos), *PARTNERS)), "all_up_to": ALL_UP_TO,
+        "partners": int(np.clip(SHARE * len(photos), *PARTNERS)),
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []
     attempts: list[dict] = []
