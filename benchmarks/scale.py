@@ -3,7 +3,7 @@
     python -m benchmarks scale growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
         bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, with networks and two engines
     python -m benchmarks scale large -o DIR
-        heaps, shoes and knots to the end on all cores, each with a movie
+        heaps, shoes and knots to the end on all cores
     python -m benchmarks scale many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
     python -m benchmarks scale roofline
@@ -151,7 +151,7 @@ def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None
 
 
 def to_the_end(name: str, home: Path) -> dict[str, Any]:
-    """A large scene run like by a user: the command, its recording, and a movie."""
+    """A large scene run like by a user: the command and its recording."""
     scene, run = home / name / "scene.yaml", home / name / "run"
     if not scene.exists():
         write_scene(name, home / name)
@@ -160,7 +160,6 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
     subprocess.run([*command, "simulate", str(scene), "-o", str(run)], check=True, capture_output=True)
     seconds = time.perf_counter() - began
     mib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-    subprocess.run([*command, "render", str(run), "-o", str(home / f"{name}.mp4")], check=True, capture_output=True)
     loaded, rollout = load_scene(scene), Rollout.load(run / "rollout.npz")
     depth = depths(Ran(loaded, rollout), every=20)
     moving = [k for k, b in enumerate(loaded.bodies) if b.motion == "dynamic"]
