@@ -26,7 +26,7 @@ from sdfsim.base.parallel import Progress, silent
 # all. On the bundled set 14 of 48 gave the same poses as all pairs, in a third of the time.
 PARTNERS, SHARE = (14, 40), 0.25
 ORDINARY: dict[str, Any] = {
-    "pixels": 1000, "max_features": 3000, "largest": 0, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False,
+    "pixels": 1000, "max_features": 3000, "largest": 0, "peak_threshold": 0.0066667, "max_ratio": 0.8,
     "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "init_inliers": 100, "init_angle": 16.0,
     "pose_inliers": 30, "exhaustive_up_to": 30,
     "all_up_to": 150,  # photos; beyond this, pairs that do not look alike are never matched

@@ -101,9 +101,7 @@ def by_size(keypoints: np.ndarray) -> np.ndarray:
 
 def matches(pycolmap, job: dict, database: Path) -> None:
     """Matches the pairs of the job, else every pair, or, if these are too many, pairs that look alike."""
-    matching = pycolmap.FeatureMatchingOptions(
-        use_gpu=False, guided_matching=job["guided"], sift={"max_ratio": job["max_ratio"]}
-    )
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, sift={"max_ratio": job["max_ratio"]})
     verification = pycolmap.TwoViewGeometryOptions(
         min_num_inliers=job["min_inliers"], filter_stationary_matches=job["moving_only"],
         # Otherwise pairs without overlap would use all 10,000 trials each, most of the time of this stage.
