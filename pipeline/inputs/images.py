@@ -1,4 +1,5 @@
-"""One image file -> upright pixels, its mask, the lens data of EXIF, and whether it is sharp and well lit."""
+"""One image file -> upright pixels, its mask, the lens data of EXIF, and whether it is sharp and well
+lit; and pictures of different sizes in one array."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -26,6 +26,8 @@ from sdfsim.base.parallel import Progress, silent
 # all. On the bundled set 14 of 48 gave the same poses as all pairs, in a third of the time.
 PARTNERS, SHARE = (14, 40), 0.25
 ORDINARY: dict[str, Any] = {
+    # COLMAP keeps whole levels of detail, so up to three times `max_features`; no more than `largest` of them stay, 0
+    # for all: the thresholds here were chosen with all.
     "pixels": 1000, "max_features": 3000, "largest": 0, "peak_threshold": 0.0066667, "max_ratio": 0.8,
     "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "init_inliers": 100, "init_angle": 16.0,
     "pose_inliers": 30, "exhaustive_up_to": 30,

@@ -257,6 +257,25 @@ def test_the_cache_is_the_field_near_its_surface_and_has_its_signs_everywhere():
     assert sum(asked) < 0.6 * 41**3 and not torch.equal(cache, dense)
 
 
+@pytest.mark.parametrize("slope", [0.5, 1.0, 1.35])
+@pytest.mark.parametrize("radius", [0.012, 0.04])
+def test_the_cache_misses_no_speck_of_the_unit_sphere(slope, radius):
+    """Balls smaller than the distance of coarse samples, anywhere and right at the sphere; flat and steep fields."""
+    rng = np.random.default_rng(3)
+    place = rng.normal(size=(12, 3))
+    place *= np.append(rng.uniform(0.2, 0.9, 8), 4 * [0.99 - radius])[:, None] / np.linalg.norm(place, axis=1)[:, None]
+    middles = torch.tensor(place, dtype=torch.float32)
+    balls = SimpleNamespace(
+        background=torch.zeros(1), sdf=lambda points: slope * (torch.cdist(points, middles).amin(1) - radius)
+    )
+    cache = sdf_cache(balls, 2 / 128)[..., 0]  # type: ignore[arg-type]
+    line = torch.linspace(-1, 1, len(cache))
+    points = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).flip(-1).reshape(-1, 3)
+    wanted = balls.sdf(points).view(cache.shape)
+    inside = (points.norm(dim=1) <= 1).view(cache.shape)
+    assert (wanted[inside] < 0).any() and ((cache < 0) == (wanted < 0))[inside].all()
+
+
 @pytest.mark.parametrize("radius", [0.05, 0.3])
 def test_a_filled_hollow_is_emptied_by_its_lines_of_sight(radius):
     """A field that is a ball everywhere learns from lines of sight alone that a part of it is empty."""
