@@ -152,7 +152,7 @@ class Stage:
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
     "poses": Stage(do_poses, "poses", version=7),
-    "distill": Stage(do_distill, "distill", version=12),
+    "distill": Stage(do_distill, "distill", version=13),
     "mesh": Stage(do_mesh, "mesh", version=15),
     "fit": Stage(do_fit, "assets", version=3),
     "scene": Stage(do_scene, "scene", version=6),

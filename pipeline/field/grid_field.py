@@ -28,7 +28,7 @@ class FieldSize:
     levels: tuple[int, ...] = (16, 32, 64, 128)  # grid points per side of each level, coarse to fine
     channels: tuple[int, ...] = (4, 4, 4, 2)  # features per level
     width: int = 64  # hidden width of both small networks
-    background: int = 64  # grid points per side of the background
+    background: int = 64  # grid points per side of the finest level of the background
     finer: tuple[int, ...] = (2,)  # cells per cell of the last level along a side, in bricks near the surface
     finer_channels: tuple[int, ...] = (4,)  # features there
 
@@ -84,14 +84,46 @@ def contract(points: Tensor) -> Tensor:
     return points / radius * (2 - 1 / radius) / 2
 
 
+class Background(nn.Module):
+    """Density and colour outside the unit sphere, on contracted coordinates: a sum of grids, each half as wide as the
+    next. A single fine grid is filled with noise where a few rays cross a cell; coarse ones move with many rays."""
+
+    def __init__(self, side: int) -> None:
+        super().__init__()
+        # [n, n, n, 4], channel 0 a tenth of the density before softplus, channels 1 to 3 of the colour before sigmoid
+        self.levels = nn.ParameterList([torch.zeros(n, n, n, 4) for n in (side // 8, side // 4, side // 2, side)])
+
+    def along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
+        """RGB [R, 3] behind the unit sphere along rays [R, 3], by rendering; `jitter` [R, S] in 0..1 is the position of
+        each sample within its step of inverse radius."""
+        count = jitter.shape[1]
+        inverse = 1 - (torch.arange(count, device=jitter.device) + jitter) / count * 0.995
+        radius = 1 / inverse
+        along = -(origins * directions).sum(1, keepdim=True)
+        closest = (origins * origins).sum(1, keepdim=True) - along**2
+        distance = along + torch.sqrt((radius**2 - closest).clamp_min(1e-6))
+        points = contract(origins[:, None] + distance[..., None] * directions[:, None]).view(-1, 3)
+        values = torch.stack([interpolate(level, points) for level in self.levels]).sum(0).view(*jitter.shape, 4)
+        # Optical depth per step of inverse radius, so that far steps do not weigh more than near ones.
+        depth = functional.softplus(values[..., 0] * 10 - 1.0)
+        depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
+        weights, _ = render_weights(depth, torch.ones_like(depth))
+        return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
+
+
 class Field(nn.Module, ABC):
     """SDF and colour in the unit sphere, and a background outside; the base of both encodings."""
 
-    background: nn.Parameter  # [n, n, n, 4], channel 0 density before softplus, channels 1 to 3 colour before sigmoid
+    background: Background
     size: Any  # of the encoding, a dataclass
     start_radius: float  # radius of the sphere that the SDF starts from
     active: int = 0  # how many levels of detail are in use
     view_dependence: float = 1.0  # dependence of colour on direction, 0 to 1
+
+    @property
+    def device(self) -> torch.device:
+        """Of its parameters."""
+        return next(self.parameters()).device
 
     @property
     def finest(self) -> float:
@@ -109,23 +141,6 @@ class Field(nn.Module, ABC):
     def sdf(self, points: Tensor) -> Tensor:
         """Signed distance [P] in normalised units at points [P, 3]."""
         return self.geometry_at(points)[0]
-
-    def background_along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
-        """RGB [R, 3] of the background behind the unit sphere along rays [R, 3], by rendering its grid; `jitter` [R, S]
-        in 0..1 is the position of each sample within its step of inverse radius."""
-        count = jitter.shape[1]
-        inverse = 1 - (torch.arange(count, device=jitter.device) + jitter) / count * 0.995
-        radius = 1 / inverse
-        along = -(origins * directions).sum(1, keepdim=True)
-        closest = (origins * origins).sum(1, keepdim=True) - along**2
-        distance = along + torch.sqrt((radius**2 - closest).clamp_min(1e-6))
-        points = origins[:, None] + distance[..., None] * directions[:, None]
-        values = interpolate(self.background, contract(points).view(-1, 3)).view(*jitter.shape, 4)
-        # Optical depth per step of inverse radius, so that far steps do not weigh more than near ones.
-        depth = functional.softplus(values[..., 0] * 10 - 1.0)
-        depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
-        weights, _ = render_weights(depth, torch.ones_like(depth))
-        return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
 
 
 class Bricks(nn.Module):
@@ -211,15 +226,12 @@ class GridField(Field):
         seen = GEOMETRY + 8 + seen_features
         last = layer(width, 3, gain=0.3)
         self.color = nn.Sequential(layer(seen, width), nn.ReLU(), last)
-        n = size.background
-        self.background = uniform(n, n, n, 4, bound=1e-2)
+        self.background = Background(size.background)
         if fused is not None:
             self.start = torch.from_numpy(fused.coarse)[..., None].contiguous()
             with torch.no_grad():  # An untrained network must not change the known distance.
                 self.head.weight[0] *= 0.05
                 last.weight *= 0.1
-                if fused.behind is not None:
-                    self.background.add_(torch.from_numpy(fused.behind))
             for level, side in zip(self.bricks, size.sides, strict=True):
                 if side == fused.side:
                     given = torch.from_numpy(np.concatenate([fused.fine[:, None], fused.color - 0.5], 1))

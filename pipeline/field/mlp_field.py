@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.field.grid_field import Field
+from pipeline.field.grid_field import Background, Field
 
 SHARPNESS = 100.0  # of the Softplus
 SPAN = 3.0  # the networks see the unit sphere with the paper's radius of 3, for which Softplus and waves are made
@@ -22,7 +22,7 @@ class MlpSize:
     frequencies: int = 6  # octaves of the positional encoding of positions
     color_depth: int = 4  # hidden layers of the colour network
     view_frequencies: int = 4  # octaves of the encoding of directions
-    background: int = 64  # grid points a side of the background
+    background: int = 64  # grid points a side of the finest level of the background
 
     @property
     def finest(self) -> float:
@@ -52,8 +52,7 @@ class MlpField(Field):
         rng = torch.Generator().manual_seed(seed)
         super().__init__()
         self.size, self.start_radius = size, start_radius
-        n = size.background
-        self.background = nn.Parameter((torch.rand(n, n, n, 4, generator=rng) * 2 - 1) * 1e-2)
+        self.background = Background(size.background)
         inputs = 3 + 6 * size.frequencies
         self.skip = size.depth // 2
         layers = []

@@ -29,7 +29,7 @@ def sdf_cache(field: Field, cell: float) -> Tensor:
     Its cells are no wider than `cell`. Every `COARSE`-th value is the field's, the others only in blocks in reach of
     the unit sphere that the surface may cross; elsewhere they are interpolated.
     """
-    device, coarse = field.background.device, COARSE
+    device, coarse = field.device, COARSE
     resolution = math.ceil(2 / cell / coarse - 1e-6) * coarse + 1
     line = torch.linspace(-1, 1, resolution, device=device)
 
@@ -134,7 +134,7 @@ def render(
     chosen = choose_samples(cache, origins, directions, beta, middle)
     behind = backdrop
     if behind is None:
-        behind = field.background_along(origins, directions, middle[:, :BACKGROUND_SAMPLES])
+        behind = field.background.along(origins, directions, middle[:, :BACKGROUND_SAMPLES])
     return composite(field, chosen, field.geometry_at(chosen.points.view(-1, 3)), beta, behind)
 
 

@@ -4,7 +4,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ from pipeline.field.supervision import (
 from pipeline.inputs.images import BACKDROP, reduced
 from pipeline.inputs.photos import load_photos
 from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
-from pipeline.stereo.fusion import Fused, behind, fuse
+from pipeline.stereo.fusion import Fused, fuse
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
 from sdfsim.base.parallel import Progress, choose_threads, share_of, silent
@@ -60,7 +60,8 @@ EXPOSURE_RATE = 0.004  # Adam's rate for the photos' gains and offsets, at the s
 # Standard deviation of the gains above which held-out photos are compared at their own exposure; in rendered sets with
 # one exposure it was below 0.01.
 VARIED = 0.03
-BACKGROUND_RATE = 0.02  # for the background's grid with the MLP
+# Adam's rate for the background, at the start: its values count ten times, and more made it noisy.
+BACKGROUND_RATE = 0.002
 FEWEST_STEPS = 100  # for any budget
 PACE = 25  # steps between checks of the clock
 # One in this many pixels along each side of a held-out photo is rendered, if that leaves this many on the long side.
@@ -237,8 +238,9 @@ class Trainer:
         """The optimiser of a field, in its initial state."""
         assert isinstance(field, GridField)
         networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "bricks", "background"))]
-        features = [*field.grids, *(level.values for level in field.bricks), field.background]
-        groups = _groups((features, self.settings.rate), (networks, self.settings.rate / 4), self.exposures())
+        features = [*field.grids, *(level.values for level in field.bricks)]
+        groups = _groups((features, self.settings.rate), (networks, self.settings.rate / 4),
+                         (list(field.background.parameters()), BACKGROUND_RATE), self.exposures())  # fmt: skip
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
     def exposures(self) -> tuple[list, float]:
@@ -343,7 +345,7 @@ class Trainer:
         samples = self.sample(origins, directions, uniforms[:, : settings.samples])
         behind = torch.full((3,), BACKDROP, device=self.device)
         if self.rays.mask is None:
-            behind = field.background_along(origins, directions, uniforms[:, settings.samples :])
+            behind = field.background.along(origins, directions, uniforms[:, settings.samples :])
         slopes = self.slope_queries(self.regularised(samples, rng))
         pick = torch.randint(max(1, len(self.points)), (min(256, len(self.points)),), generator=rng).to(self.device)
         empty, clearance = self.free.pick(512, rng)
@@ -458,8 +460,9 @@ class MlpTrainer(Trainer):
         return MlpField(self.settings.size, self.seed, self.settings.start_radius).to(self.device)
 
     def optimizer_of(self, field: Field) -> torch.optim.Adam:
-        networks = [p for name, p in field.named_parameters() if name != "background"]
-        groups = _groups((networks, self.settings.rate), ([field.background], BACKGROUND_RATE), self.exposures())
+        networks = [p for name, p in field.named_parameters() if not name.startswith("background")]
+        groups = _groups((networks, self.settings.rate), (list(field.background.parameters()), BACKGROUND_RATE),
+                         self.exposures())  # fmt: skip
         return torch.optim.Adam(groups)
 
     @property
@@ -540,14 +543,13 @@ def train(
         maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
         carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
         fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
-        if fused is not None and not masked:
-            fused = replace(fused, behind=behind(maps, settings.size.background, photos_folder))
         spent = time.monotonic() - begun
         paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
         budget = None if budget is None else budget - spent
         if fused is not None and depth is None:
             depth, noise = stereo_points(maps, local), paired["spread"]
-            start = GridField(settings.size, seed, settings.start_radius, fused).sdf
+            untrained = GridField(settings.size, seed, settings.start_radius, fused)
+            start = lambda points: untrained.start_of(points)[0]  # noqa: E731
     supervision = supervision_of(local, settings.size.finest, depth, noise, start)
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device, fused)

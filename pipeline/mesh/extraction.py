@@ -146,7 +146,7 @@ def field_distance(field: Field) -> Distance:
 
     @torch.no_grad()
     def distance(points: np.ndarray) -> np.ndarray:
-        there = torch.from_numpy(np.ascontiguousarray(points, np.float32)).to(field.background.device)
+        there = torch.from_numpy(np.ascontiguousarray(points, np.float32)).to(field.device)
         return field.sdf(there).cpu().numpy()
 
     return distance
@@ -192,7 +192,7 @@ def surface_of(
 @torch.no_grad()
 def field_colors(field: Field, mesh: Mesh) -> np.ndarray:
     """The field's colour [V, 3] in 0..1 of each vertex, seen straight on."""
-    device = field.background.device
+    device = field.device
     points = torch.tensor(mesh.vertices, dtype=torch.float32, device=device)
     against = -torch.tensor(vertex_normals(mesh), dtype=torch.float32, device=device)
     parts = []

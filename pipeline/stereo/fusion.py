@@ -18,7 +18,7 @@ from pipeline.grids.connected import largest
 from pipeline.grids.interpolation import near_bricks, places_of
 from pipeline.inputs.images import stacked
 from pipeline.stereo.compiled import carve, paint
-from pipeline.stereo.depth import BEYOND, DepthMap, straightened
+from pipeline.stereo.depth import DepthMap, straightened
 from sdfsim.base.parallel import Progress, silent, threads
 
 BACK = 2.0  # cells in front of and behind a surface within which its distance counts
@@ -32,7 +32,6 @@ OUTVOTED = 0.5
 DEEP, NEAREST, FACING = 0.5, 96, 0.4
 SURFACE_POINTS = 30_000  # per photo, for this search
 SEEN = 0.3  # weight above which a place is known; one certain pixel has 1
-DENSE = 0.4  # density of surfaces behind the sphere, before softplus
 EDGE = 0.05  # largest relative difference of inverse depth between neighbouring pixels on one surface
 LEAST_TILT = 0.15  # cosine of the flattest angle that counts
 BATCH = 1 << 18  # places per batch
@@ -48,8 +47,6 @@ class Fused:
     fine: np.ndarray  # [B * 64] float32, difference of the bricks' fine samples from the coarse ones
     # [B * 64, 3] float32 RGB in 0..1, the mean of the photos that show the surface there; grey if none does
     color: np.ndarray
-    # [m, m, m, 4] float32 (z, y, x) on [-1, 1]^3: the background, see `behind`; None: unknown
-    behind: np.ndarray | None = None
 
 
 def fuse(
@@ -89,37 +86,6 @@ def without_cavities(solid: np.ndarray) -> np.ndarray:
         return ~air
     nearest = ndimage.distance_transform_edt(part == 0, return_distances=False, return_indices=True)
     return ~(air & core[tuple(np.asarray(nearest))])
-
-
-def behind(maps: Sequence[DepthMap], side: int, photos_folder: Path) -> np.ndarray:
-    """The background outside the unit sphere from depth maps, on the contracted coordinates of a field's background
-    [side, side, side, 4]: the density is `DENSE` at surfaces and 0 elsewhere; colours (a tenth of their logits) are the
-    mean of the photos there, elsewhere those of the nearest such place."""
-    total, count = np.zeros((side**3, 3)), np.zeros(side**3)
-    for one in maps:
-        known = one.inverse > BEYOND
-        points = one.view.center + one.rays[known] / one.inverse[known][:, None]
-        picture = straightened(one.view, photos_folder, max(one.inverse.shape), "RGB")[0][known]
-        radius = np.linalg.norm(points, axis=1)
-        outside = radius > 1
-        radius = radius[outside, None]
-        at = points[outside] / radius * (2 - 1 / radius) / 2
-        index = np.round((at[:, ::-1] + 1) / 2 * (side - 1)).astype(int)
-        number = np.ravel_multi_index(tuple(index.T), (side,) * 3)
-        count += np.bincount(number, minlength=side**3)
-        for c in range(3):
-            total[:, c] += np.bincount(number, picture[outside, c], side**3)
-    found = np.zeros((side, side, side, 4), np.float32)
-    seen = (count > 0).reshape((side,) * 3)
-    if not seen.any():
-        return found
-    color = np.clip(total / np.maximum(count, 1)[:, None] / 255, 0.02, 0.98).reshape(*seen.shape, 3)
-    nearest = np.asarray(ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True))
-    color = color[tuple(nearest)]
-    # Rays are sampled a little more coarsely than the grid.
-    found[..., 0] = DENSE * ndimage.binary_dilation(seen)
-    found[..., 1:] = np.log(color / (1 - color)) / 10
-    return found
 
 
 def _painted(maps: Sequence[DepthMap], given: tuple[np.ndarray, ...], place: np.ndarray, coarse: np.ndarray,

@@ -35,7 +35,7 @@ class Drawn:
     """A field that is known exactly, and red where it is high."""
 
     finest = 2 / 63
-    background = torch.zeros(1)
+    device = torch.device("cpu")
 
     def to(self, device: str) -> "Drawn":
         return self

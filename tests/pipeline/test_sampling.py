@@ -266,7 +266,7 @@ def test_the_cache_misses_no_speck_of_the_unit_sphere(slope, radius):
     place *= np.append(rng.uniform(0.2, 0.9, 8), 4 * [0.99 - radius])[:, None] / np.linalg.norm(place, axis=1)[:, None]
     middles = torch.tensor(place, dtype=torch.float32)
     balls = SimpleNamespace(
-        background=torch.zeros(1), sdf=lambda points: slope * (torch.cdist(points, middles).amin(1) - radius)
+        device=torch.device("cpu"), sdf=lambda points: slope * (torch.cdist(points, middles).amin(1) - radius)
     )
     cache = sdf_cache(balls, 2 / 128)[..., 0]  # type: ignore[arg-type]
     line = torch.linspace(-1, 1, len(cache))
@@ -304,7 +304,7 @@ def test_a_filled_hollow_is_emptied_by_its_lines_of_sight(radius):
 def test_a_field_is_sampled_as_finely_as_it_has_detail(preset, side, reads, monkeypatch):
     """At least once in each cell of the finest grid that is everywhere; three times in four cells along a ray."""
     size, asked = PRESETS[preset].size, []
-    ball = SimpleNamespace(background=torch.zeros(1), sdf=lambda points: points.norm(dim=1) - 0.5)
+    ball = SimpleNamespace(device=torch.device("cpu"), sdf=lambda points: points.norm(dim=1) - 0.5)
     cache = sdf_cache(ball, size.sampling)  # type: ignore[arg-type]
     assert cache.shape == (side, side, side, 1) and 2 / (side - 1) <= size.sampling
     plain = rendering.interpolate

@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from pipeline.cameras import PosedPhotos, View
 from pipeline.grids.interpolation import places_of
 from pipeline.stereo.depth import BEYOND, DepthMap, neighbours, only, outside_mask, stereo, stereo_summary
-from pipeline.stereo.fusion import Fused, behind, fuse
-from tests.helpers.balls import BALL, GROUND, Distance, ball_on_plane, camera, cup, grey_of, ring, shoot, true_depth
+from pipeline.stereo.fusion import Fused, fuse
+from tests.helpers.balls import BALL, Distance, ball_on_plane, camera, cup, grey_of, ring, shoot, true_depth
 
 
 @pytest.fixture(scope="module")
@@ -235,21 +235,6 @@ def test_the_inside_of_thick_bodies_is_solid_whatever_wrong_pixels_see(tmp_path)
     line = np.linspace(-1, 1, 48)
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., ::-1]
     assert (fused.coarse[np.abs(points).max(-1) < half - 2 / 47] < 0).all()
-
-
-def test_what_lies_behind_the_sphere_is_there_in_its_colours(scene, folder):
-    """The plane goes on below: dense where it is in contracted space, and not above; colours are those of photos."""
-    _, maps = scene
-    found = behind(maps, 48, folder)
-    line = np.linspace(-1, 1, 48)
-    at = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., ::-1]
-    size = np.linalg.norm(at, axis=-1)
-    dense = (found[..., 0] > 0) & (size > 0.5) & (size < 0.75)
-    points = at[dense] / size[dense][:, None] / (2 - 2 * size[dense])[:, None]
-    assert dense.sum() > 300 and np.median(np.abs(points[:, 2] - GROUND)) < 0.15  # one to two cells there
-    assert (points[:, 2] < 0.3).mean() > 0.95
-    grey = 1 / (1 + np.exp(-10 * found[dense][:, 1:]))
-    assert 0.3 < grey.mean() < 0.7 and np.abs(grey[:, 0] - grey[:, 2]).max() < 0.05
 
 
 def test_what_no_photo_shows_makes_no_surface(scene, tmp_path):

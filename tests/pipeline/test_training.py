@@ -78,7 +78,7 @@ class Ball:
 
     def __init__(self) -> None:
         self.field = SimpleNamespace(
-            background=torch.zeros(1), sdf=lambda p: p.norm(dim=1) - 0.5,
+            device=torch.device("cpu"), sdf=lambda p: p.norm(dim=1) - 0.5,
             geometry_at=lambda p: (p.norm(dim=1) - 0.5, p, p),
             color_of=lambda geometry, features, directions: torch.tensor(RED).expand(len(geometry), 3) / 255,
         )  # fmt: skip
