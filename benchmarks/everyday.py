@@ -5,9 +5,9 @@
 The scenes and checks are those of `python -m sdfsim.evaluation.everyday` at 10 cm, with closed forms for shapes that
 have one. Engines use inner steps of 4 ms (for bodies of a metre; for smaller ones in proportion to the square root of
 their size), ours its default, which is the same. Closed forms are native to each engine; meshes that are not convex
-become pieces by CoACD (tetrahedra in Drake). Engines do not sleep. Scenes that an engine cannot express, or that take
-longer than a minute, are not run, and their checks do not count. DIR keeps results. All scenes take five minutes on one
-core.
+become pieces by CoACD (tetrahedra in Drake). Newton has triangles for all but spheres and boxes. Engines do not sleep.
+Scenes that an engine cannot express, or that take longer than a minute, are not run, and their checks do not count.
+DIR keeps results.
 """
 
 import importlib.util
@@ -24,12 +24,23 @@ from typing import Any
 import numpy as np
 
 from benchmarks.engines.drake import drake
+from benchmarks.engines.newton import newton
+from benchmarks.engines.rapier import rapier
 from benchmarks.results import progress, write_section
 from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import SUBSTEPS
 from sdfsim.evaluation import engines, everyday
-from sdfsim.evaluation.engines import LONGEST, Engine, Ran, Runner, TooSlow, by_engine, by_model, still
+from sdfsim.evaluation.engines import (
+    LONGEST,
+    Engine,
+    Ran,
+    Runner,
+    TooSlow,
+    by_engine,
+    by_model,
+    still,
+)
 from sdfsim.evaluation.everyday import ROWS, Check, Setting, checks
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
 from sdfsim.physics.units import scene_units
@@ -38,12 +49,14 @@ from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.convex_pieces import convex_vertices
 from sdfsim.shape.shape import own_pieces
 
-OURS, DRAKE = "sdfsim", "Drake"
+OURS, DRAKE, NEWTON = "sdfsim", "Drake", "Newton"
 ENGINES: dict[str, tuple[str, Engine | None]] = {  # package and runner of each
     OURS: ("sdfsim", None),
     "PyBullet": ("pybullet", engines.bullet),
     "MuJoCo": ("mujoco", partial(engines.mujoco, elliptic=True)),
+    "Rapier": ("rapier3d", rapier),
     DRAKE: ("pydrake", drake),
+    NEWTON: ("newton", newton),
 }
 
 
@@ -80,13 +93,14 @@ def unknown_to(name: str, scene: Scene) -> str:
     """The coefficients of a scene that an engine cannot express; empty if there are none."""
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     others = [b for b in scene.bodies if b.motion == "static"]
-    if name in ("MuJoCo", DRAKE) and len({(b.friction, b.restitution) for b in moving}) > 1:
+    if name in ("MuJoCo", DRAKE, NEWTON) and len({(b.friction, b.restitution) for b in moving}) > 1:
         return "coefficients of pairs of several materials"
     bounces = [one.restitution * other.restitution for one in moving[:1] for other in (*others, *moving[1:])]
-    if name == DRAKE and any(bounces):
+    if name in (DRAKE, NEWTON) and any(bounces):
         return "restitution"
-    # The harmonic mean of two coefficients is less than twice the smaller one.
-    if name == DRAKE and len(moving) > 1 and any(b.friction > 2.0 * moving[0].friction for b in others):
+    # The harmonic mean of two coefficients is less than twice the smaller one, the mean more than half the larger one.
+    apart = name == DRAKE and len(moving) > 1 and any(b.friction > 2.0 * moving[0].friction for b in others)
+    if apart or (name == NEWTON and any(2.0 * b.friction < one.friction for b in others for one in moving)):
         return "friction of two materials that are so different"
     return ""
 
@@ -205,8 +219,11 @@ def table(results: Results) -> str:
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
     content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday)]
-    sources = inspect.getsource(engines) + inspect.getsource(sys.modules[drake.__module__])
-    how = {name: sources if name != OURS else "" for name in ENGINES}
+    how = dict.fromkeys(ENGINES, "")
+    for name, (_, engine) in ENGINES.items():
+        if engine is not None:
+            module = getattr(engine, "func", engine).__module__
+            how[name] = inspect.getsource(engines) + inspect.getsource(sys.modules[module])
     jobs = [
         Job(row, name, [content, how[name]], counted, (row, at, name, out / "scenes"))
         for name in ENGINES

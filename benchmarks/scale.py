@@ -193,7 +193,7 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     """Write the section: scenes a second by workers."""
     from distributed import LocalCluster
 
-    recorded, shapes = load_recorded(data, "train", most=DISTINCT)
+    recorded, shapes = load_recorded(data, "validation", most=DISTINCT)
     distinct = [scene_of([t], [0], shapes, conditions_of(data).floor)[0] for t in recorded]
     repeated = [distinct[k % len(distinct)] for k in range(scenes)]
     jobs = [(repeated[k : k + CHUNK], STEPS) for k in range(0, scenes, CHUNK)]

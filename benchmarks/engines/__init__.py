@@ -1,1 +1,1 @@
-"""Engines for comparisons only: Drake and Newton."""
+"""Engines for comparisons only: Drake, Newton and Rapier."""

@@ -15,8 +15,9 @@ ITERATIONS = 10  # of XPBD in an inner step
 def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
     """Newton's motion on the CPU, by XPBD on triangle meshes, contacts searched in every inner step.
 
-    It takes the mean of two coefficients of friction. So every body gets its square, and the floor the value for the
-    median body: exact if all have one friction. Its kernels compile for a minute on a machine's first run.
+    It takes the mean of two coefficients of friction. So every moving body gets its square, and floor and static bodies
+    the value for the median body: exact if all moving bodies have one friction, of at most twice the others'. Its
+    kernels compile for a minute on a machine's first run.
 
     Raises:
         SdfsimError: Newton is not installed, or the motion fails.
@@ -28,9 +29,13 @@ def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
     def surface(friction: float) -> Any:
         return lib.ModelBuilder.ShapeConfig(mu=friction, density=0.0)
 
-    own = t.friction**2
+    moves = t.friction[~t.static] if (~t.static).any() else t.friction
+
+    def beside(friction: float) -> float:
+        return max(0.0, float(np.median(2.0 * friction * moves - moves**2)))
+
     if start.floor:
-        builder.add_ground_plane(cfg=surface(max(0.0, float(np.median(2.0 * start.floor[0] * t.friction - own)))))
+        builder.add_ground_plane(cfg=surface(beside(start.floor[0])))
     meshes, moving = {}, []
     for i, name in enumerate(map(str, t.shape)):
         kind, sizes = form_of(start.urdfs[name])
@@ -39,7 +44,8 @@ def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
             inertia = warp.mat33(np.diag(t.inertia[i]))
             body = builder.add_body(xform=place, mass=float(t.mass[i]), inertia=inertia, lock_inertia=True)
             moving.append(i)
-        shape = {"cfg": surface(float(own[i])), "xform": place if body < 0 else None}
+        friction = beside(t.friction[i]) if t.static[i] else float(t.friction[i] ** 2)
+        shape = {"cfg": surface(friction), "xform": place if body < 0 else None}
         if kind == "sphere":
             builder.add_shape_sphere(body, radius=scale * float(sizes[0]), **shape)
         elif kind == "box":

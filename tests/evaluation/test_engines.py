@@ -9,6 +9,7 @@ pytest.importorskip("pybullet")
 
 from benchmarks.engines.drake import drake
 from benchmarks.engines.newton import newton
+from benchmarks.engines.rapier import rapier
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.evaluation import hard_cases
@@ -41,7 +42,8 @@ def test_a_scene_is_a_start_in_the_model_s_units(tmp_path):
 
 @pytest.mark.parametrize("substeps", [5, 2])
 @pytest.mark.parametrize(
-    ("run", "package"), [(bullet, "pybullet"), (mujoco, "mujoco"), (drake, "pydrake"), (newton, "newton")]
+    ("run", "package"),
+    [(bullet, "pybullet"), (mujoco, "mujoco"), (rapier, "rapier3d"), (drake, "pydrake"), (newton, "newton")],
 )
 def test_engines_fly_freely_and_rest(tmp_path, run, package, substeps):
     pytest.importorskip(package)

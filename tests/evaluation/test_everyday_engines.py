@@ -184,6 +184,17 @@ def test_what_takes_too_long_is_not_run_and_what_breaks_is_missed(tmp_path, thre
     assert len(found["missed"]) == 6 and not found["held"] and not found["not_run"]
 
 
+def test_newton_knows_no_restitution_and_one_friction_of_all_that_move():
+    def newton(*bodies: Put) -> str:
+        return unknown_to("Newton", scene_of(*bodies))
+
+    a, b = Put("a", CUBE, [0, 0, 2], mu=0.3), Put("b", CUBE, [3, 0, 2], mu=0.3)
+    assert newton(a, b, replace(floor(), mu=0.15)) == newton(a, replace(floor(), mu=1.0)) == ""
+    assert newton(replace(a, e=0.1), replace(floor(), e=0.5)) == "restitution"
+    assert "several materials" in newton(a, replace(b, mu=0.4))
+    assert "so different" in newton(a, replace(floor(), mu=0.1))
+
+
 def test_drake_knows_no_restitution_and_one_friction_of_all_that_move():
     def drake(*bodies: Put) -> str:
         return unknown_to("Drake", scene_of(*bodies))
