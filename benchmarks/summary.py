@@ -143,7 +143,8 @@ def summary() -> str:
     losses = [
         "[Hard shapes](#hard-shapes-beside-other-engines), slower than an engine at the same step: "
         f"{joined(longer)} time.",
-        f"Bodies overlap more than in both engines: {joined(list(deeper()))} of the smallest body.",
+        "Bodies overlap more than in both engines (25 November, earlier contacts): "
+        f"{joined(list(deeper()))} of the smallest body.",
         f"[Real tosses](#real-tosses-of-a-cube), engines with smaller errors: {joined(nearer)}. "
         f"[Elbows](../docs/joints.md#real-tosses-of-an-elbow): {joined(of_elbows())}.",
         f"[MOVi-B](#movi-b), 50 steps: an error of {solver[0]:g} m, and {engine[0]:g} m for PyBullet itself from "
@@ -153,10 +154,10 @@ def summary() -> str:
         f"[Joints](../docs/joints.md#time), slower than MuJoCo: {joined(slow_joints)} times its time.",
         f"[Cold start](#cold-start): a falling box takes {start['a box that falls for 0.4 s'][1]} s, in MuJoCo "
         f"{start['the same in MuJoCo'][1]} s.",
-        f"[Growth](../docs/notes/growth.md), time divided by ours for each number of spheres: PyBullet "
-        f"{joined(growth['PyBullet'])}; MuJoCo {joined(growth['MuJoCo'])}.",
     ]
     wins = [
+        "[Growth](../docs/notes/growth.md), an engine's time divided by ours for each number of spheres (below 1 ours "
+        f"is slower): PyBullet {joined(growth['PyBullet'])}; MuJoCo {joined(growth['MuJoCo'])}.",
         f"Hard shapes, relative to the time of PyBullet and MuJoCo: {joined(less)}. 512 spheres in a bowl take "
         f"{steps['512 spheres in a bowl'][5]} of PyBullet's.",
         f"Engines that collide meshes without pieces, like ours, take {number(at_least, 2)} to {number(at_most, 2)} "
