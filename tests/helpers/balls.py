@@ -1,4 +1,4 @@
-"""Photos of solids with a closed form: a ball on a plane, and a cup, in a texture that never repeats."""
+"""Photos of solids with a closed form: a ball on a plane, and hollow things, in a texture that never repeats."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +30,33 @@ def cup(radius: float, wall: float, depth: float, height: float) -> Distance:
     def distance(points: np.ndarray) -> np.ndarray:
         outside = rod(points, radius, -0.02, height)
         hollow = rod(points, radius - wall, height - depth, height + 1.0)
+        return np.minimum(np.maximum(outside, -hollow), points[..., 2])
+
+    return distance
+
+
+def bowl(radius: float, wall: float, height: float) -> Distance:
+    """The same for a bowl: the part below `height` of a hollow ball of this radius around (0, 0, `height`), on a plane
+    that flattens its bottom."""
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        away = np.linalg.norm(points - [0, 0, height], axis=-1)
+        shell = np.maximum(away - radius, radius - wall - away)
+        return np.minimum(np.maximum(shell, points[..., 2] - height), points[..., 2])
+
+    return distance
+
+
+def crate(sides: tuple[float, float], wall: float, depth: float, height: float) -> Distance:
+    """The same for a box with these sides, hollow from its rim down by `depth`, on a plane."""
+
+    def box(points: np.ndarray, half: list[float], middle: float) -> np.ndarray:
+        beyond = np.abs(points - [0, 0, middle]) - half
+        return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        outside = box(points, [0.5 * sides[0], 0.5 * sides[1], height / 2 + 0.02], height / 2)
+        hollow = box(points, [0.5 * sides[0] - wall, 0.5 * sides[1] - wall, depth], height)
         return np.minimum(np.maximum(outside, -hollow), points[..., 2])
 
     return distance
