@@ -1,5 +1,7 @@
 """Measures of rollouts: errors as Rubanova et al. (2024) report them, energy, rest, survival."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -13,8 +15,8 @@ LIMITS = (0.1, 0.25, 0.5)  # m, translation errors up to which a body survives
 Motions = list[Trajectory]
 
 
-def errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
-    """Errors of motions, over the dynamic bodies.
+def errors(motions: Motions, recorded: Motions, horizons: Iterable[int] = HORIZONS) -> dict[str, dict]:
+    """Errors of motions, over the dynamic bodies, at these horizons, as far as recordings reach, and at their end.
 
     Returns:
         Horizon in steps -> seconds, translation_rmse m and rotation_error degrees over all bodies and steps up to
@@ -25,7 +27,7 @@ def errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
     bodies = np.array([(~t.static).sum() for t in recorded])
     share = bodies / bodies.mean()
     report = {}
-    for h in sorted({h for h in HORIZONS if h <= longest} | {longest}):
+    for h in sorted({h for h in horizons if h <= longest} | {longest}):
         upto, there = (
             np.array([compared(motion, truth, frames) for motion, truth in zip(motions, recorded, strict=True)])
             for frames in (slice(1, h + 1), slice(h, h + 1))

@@ -284,15 +284,18 @@ def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[st
     """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up."""
     if not all(np.isfinite(m.position).all() and np.isfinite(m.orientation).all() for m in motions):
         raise SdfsimError("a state is not finite")
-    there = errors(motions, [every(first_frames(t, cases.steps + 1), stride) for t in cases.recorded])
-    found = {str(stride * int(steps)): error for steps, error in there.items()}
-    horizons = [h for h in found if int(h) in (HORIZON, cases.steps)]
+    horizons = sorted({min(HORIZON, cases.steps), cases.steps})
+    recorded = [every(first_frames(t, cases.steps + 1), stride) for t in cases.recorded]
+    there = errors(motions, recorded, [h // stride for h in horizons])
+    found = {str(h): there[str(h // stride)] for h in horizons}
     gain = energy_gain([first_frames(m, cases.steps + 1) for m in motions])
     depth = penetration(motions, cases.solids)["percentile_95"]
     return {
-        "translation_rmse": {h: cases.length * found[h]["translation_rmse"] for h in horizons},
-        "translation_rmse_95": {h: [cases.length * end for end in found[h]["translation_rmse_95"]] for h in horizons},
-        "rotation_error": {h: found[h]["rotation_error"] for h in horizons},
+        "translation_rmse": {h: cases.length * error["translation_rmse"] for h, error in found.items()},
+        "translation_rmse_95": {
+            h: [cases.length * end for end in error["translation_rmse_95"]] for h, error in found.items()
+        },
+        "rotation_error": {h: error["rotation_error"] for h, error in found.items()},
         "penetration_p95": None if depth is None else cases.length * depth,
         "energy_gain": gain["worst"],
         "exploded": gain["worst"] is not None and gain["worst"] > EXPLODED,

@@ -11,9 +11,11 @@ import torch
 pytest.importorskip("pybullet")
 
 from sdfsim.base.errors import SdfsimError
+from sdfsim.data.batching import every, first_frames
 from sdfsim.evaluation import tradeoff as study
 from sdfsim.evaluation.tradeoff import Variant, arranged, cases_of_scene, load_cases, variants
 from sdfsim.learned.model import load_model
+from sdfsim.physics.motion import MOTION
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
 from tests.helpers.scene_files import SCENE
@@ -52,6 +54,20 @@ def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
     t = np.arange(len(recorded.position)) * recorded.dt * cases.time
     path = np.array([3.0, 0.0, 8.5]) + np.outer(t, [1.0, 0, 0]) + 0.5 * np.outer(t * t, [0, 0, -9.81])
     assert np.abs(cases.length * recorded.position[:, 1] - path).max() < 1e-4
+
+
+@pytest.mark.parametrize(("steps", "stride"), [(60, 1), (60, 2), (61, 2), (30, 2), (31, 2)])
+def test_half_as_many_steps_are_judged_over_the_same_time(cases, steps, stride):
+    """A motion that drifts from its recording at a constant speed has the errors of that speed."""
+    recorded = [replace(t, **{name: np.repeat(getattr(t, name)[:1], 62, 0) for name in MOTION}) for t in cases.recorded]
+    few = replace(cases, recorded=[first_frames(t, steps + 1) for t in recorded])
+    drift = 0.01 * np.arange(steps + 1)[:, None, None] * [1.0, 0, 0]
+    motions = [every(replace(t, position=t.position + drift), stride) for t in few.recorded]
+    found = study._judged(motions, few, stride)["translation_rmse"]
+    assert list(found) == sorted({str(min(50, steps)), str(steps)}, key=int)
+    for horizon, error in found.items():
+        at = 0.01 * stride * np.arange(1, int(horizon) // stride + 1)
+        assert error == pytest.approx(np.sqrt((at**2).mean()), rel=1e-6)
 
 
 def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
