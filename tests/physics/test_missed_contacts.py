@@ -5,6 +5,7 @@ Where they touch is found on their true surfaces alone (`true_surfaces`), which 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import combinations_with_replacement
 
@@ -139,3 +140,38 @@ def test_a_step_tells_every_contact(kinds):
 def test_a_step_tells_every_contact_of_many(kinds):
     asked, wrong = missed(kinds, MANY, seed=1)
     assert asked > FEW and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])
+
+
+def joined(name: str, boxes: list[tuple[tuple, tuple]], *, pieces: bool) -> Shape:
+    """A body made of boxes, given by their lowest and highest corners; with these as convex pieces, or as a surface."""
+    parts = [primitives.box(np.subtract(high, low)) for low, high in boxes]
+    parts = [
+        Mesh(part.vertices + np.add(low, high) / 2, part.faces) for part, (low, high) in zip(parts, boxes, strict=True)
+    ]
+    faces = np.concatenate([part.faces + 8 * k for k, part in enumerate(parts)])
+    whole = mesh_shape(Mesh(np.concatenate([part.vertices for part in parts]), faces), name=name, kind="mesh")
+    return replace(whole, pieces=tuple(part.vertices for part in parts)) if pieces else whole
+
+
+LOW = ((0.4, -0.3, 0.0), (1.0, 0.3, 0.8))  # a block that is lower than the one beside it
+LEG = ((0.2, -0.05, 0.5), (0.3, 0.05, 1.01))  # of a hook that hangs down in front of the low block
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 4.0])
+@pytest.mark.parametrize("pieces", [True, False])
+def test_what_hangs_below_its_support_meets_walls(pieces, speed):
+    """A hook slides on the higher of two blocks, which are one body; its leg stops at the lower one, all of which is
+    below the plane that the hook stands on. Such a block is no wall only for what is above that plane."""
+    hook = joined("hook", [((-0.45, -0.05, 1.0), (0.35, 0.05, 1.1)), LEG], pieces=pieces)
+    blocks = joined("blocks", [((-0.5, -0.3, 0.0), (0.0, 0.3, 1.0)), LOW], pieces=True)
+    bodies = [
+        body("blocks", 0, blocks.com, 1.0, restitution=0.0, motion="static"),
+        body("hook", 1, hook.com, 1.0, restitution=0.0, friction=0.0, velocity=(speed, 0.0, 0.0)),
+    ]
+    simulator = Simulator(Scene((blocks, hook), tuple(bodies), np.array([0.0, 0.0, -9.81]), 1.0), "solver")
+    low, high = np.array(LEG)
+    corners = low + (high - low) * np.stack(np.meshgrid([0, 1], [0, 1], np.linspace(0, 1, 20)), -1).reshape(-1, 3)
+    for state in simulator.steps(4 + round(8 / speed)):  # for 16 cm and a little, where the gap is 10 cm
+        there = state.position[1] + Rotation.from_quat(state.orientation[1]).apply(corners - hook.com)
+        beyond = np.maximum(there - np.array(LOW)[1], np.array(LOW)[0] - there).max(1)
+        assert beyond.min() > -0.005

@@ -90,8 +90,8 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
 
 @njit(**BARE)
 def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
-    """Whether the first (side 0) or second (1) body of pair p stands on something with another normal, and above
-    everything that it meets at point k; and this normal, towards the body."""
+    """Whether the first (side 0) or second (1) body of pair p stands on something with another normal, its part at
+    point k is above that plane, and everything that it meets there is below it; and this normal, towards the body."""
     body, other = manifolds.pair[p, side], manifolds.pair[p, 1 - side]
     n = _normal(manifolds, p, k, side)
     if shapes.solids.start[world.shape[other] + 1] == shapes.solids.start[world.shape[other]]:
@@ -121,6 +121,9 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
             foot = add(get(motion.position, ground), foot)
             if _reach(shapes, world, work, motion, other, key, side, m) - dot(m, foot) > LEVEL * rules.slop:
                 continue
+            bottom = _lowest(shapes, world, work, motion, manifolds, p, k, side, m)
+            if dot(m, foot) + min(manifolds.point[q, e, GAP], 0.0) - bottom > LEVEL * rules.slop:
+                continue  # for what is below the plane as well, it is a wall
             if q == p or _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
                 return True, m
     return False, n
@@ -152,6 +155,18 @@ def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
         if size * outside(convex, piece, place) <= rules.contact_margin:
             return True
     return False
+
+
+@njit(**BARE)
+def _lowest(shapes, world, work, motion, manifolds, p, k, side, m):
+    """The least height along m of what touches at a contact of the first (side 0) or second (1) body: its piece, or
+    the point itself if bodies are not tested by their pieces."""
+    body, other, point = manifolds.pair[p, side], manifolds.pair[p, 1 - side], manifolds.point[p, k]
+    if pair_kind(shapes, world.shape[body], world.shape[other]) == SOLIDS:
+        return -_reach(shapes, world, work, motion, body, point[KEY], 1 - side, scale(m, -1.0))
+    column = FIRST if side == 0 else SECOND
+    place = turn(work.matrix, body, (point[column], point[column + 1], point[column + 2]))
+    return dot(m, add(get(motion.position, body), place))
 
 
 @njit(**BARE)
