@@ -255,12 +255,10 @@ def test_numbers_are_the_same_on_every_page(places):
 
 
 def test_times_and_errors_of_large_scenes_are_the_same_everywhere():
-    paper, tradeoff = page("docs/paper.md"), {row[0].rstrip(" *"): row for row in cells_of(measured("tradeoff"))[1:]}
+    paper = page("docs/paper.md")
     seconds = {row[0]: float(numbers(row[4])[0]) for row in cells_of(measured("large scenes"))[1:]}
     told = "{:.0f}, {:.0f} and {:.0f} s from command".format(*(seconds[n] for n in ("shoes", "knots", "heaps")))
     assert told in paper
-    few, usual = (numbers(tradeoff[name][3])[0] for name in ("solver, nodes grid 7", "solver"))
-    assert f"{few:.3f} m in place of {usual:g} m on 20 test trajectories" in paper
     steps = {row[0]: numbers(row[5])[0] for row in cells_of(measured("contact step"))[1:]}
     simulator = page("docs/simulator.md")
     assert 0.55 < steps["a MOVi-B step"] < 0.78 and "about two thirds of PyBullet's time" in simulator

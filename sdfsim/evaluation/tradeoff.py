@@ -193,13 +193,15 @@ class Variant:
         return next((f"{name}: {what}" for k, what in knobs.items() if getattr(self, k) != getattr(usual, k)), name)
 
 
-def variants(models: Sequence[str], *, quick: bool) -> list[Variant]:
-    """Each model with each of its settings changed separately, and two useful combinations."""
+def variants(models: Sequence[str], *, quick: bool, nodes: bool = True) -> list[Variant]:
+    """Each model with each of its settings changed separately, and two useful combinations; without `nodes`, those of
+    nodes are left out."""
     chosen = []
     for name in models:
         knobs: list[dict[str, Any]] = [{}]
-        knobs += [{"nodes": f"thin {k}"} for k in ((64,) if quick else (32, 64, 128, 256))]
-        knobs += [{"nodes": f"grid {k}"} for k in ((7,) if quick else (5, 7, 10))]
+        if nodes:
+            knobs += [{"nodes": f"thin {k}"} for k in ((64,) if quick else (32, 64, 128, 256))]
+            knobs += [{"nodes": f"grid {k}"} for k in ((7,) if quick else (5, 7, 10))]
         if not stepper_of(load_model(name, weights=False)).network:
             knobs += [{"substeps": k} for k in ((2, 10) if quick else (1, 2, 3, 10, 20))]
             knobs += [{"sdf": kind} for kind in (() if quick else ("mlp", *(f"grid {k}" for k in GRIDS), "mesh"))]
@@ -355,7 +357,8 @@ def tradeoff(
             cases = cases_of_scene(scene, names[0], out / "engine", quick=quick)
         kinds, families, jobs = {FLOOR_LABEL: "floor"}, {}, []
         content = [VERSION, machine(), replace(cases, urdfs={}, solids={})]
-        for variant in variants(names, quick=quick):
+        by_nodes = not all(own_pieces(shape) for shape in cases.shapes.values())  # convex pieces need no nodes
+        for variant in variants(names, quick=quick, nodes=by_nodes):
             kinds[variant.label] = "ours" if variant.contact else "baseline"
             families[variant.label] = variant.family
             weights = load_model(variant.model) if variant.contact else None

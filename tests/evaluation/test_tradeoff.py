@@ -31,6 +31,7 @@ def test_every_setting_has_a_label_of_its_own():
         chosen = variants(["solver", "small"], quick=quick)
         assert len({s.label for s in chosen}) == len(chosen) and not any("/" in s.label for s in chosen)
         assert chosen[0] == Variant("solver") and Variant("small") in chosen and chosen[-1].label == "ballistic"
+        assert {s.nodes for s in variants(["solver"], quick=quick, nodes=False)} == {"own"} != {s.nodes for s in chosen}
 
 
 def test_networks_and_shapes_are_what_a_setting_says(cases):

@@ -162,16 +162,70 @@ LEG = ((0.2, -0.05, 0.5), (0.3, 0.05, 1.01))  # of a hook that hangs down in fro
 def test_what_hangs_below_its_support_meets_walls(pieces, speed):
     """A hook slides on the higher of two blocks, which are one body; its leg stops at the lower one, all of which is
     below the plane that the hook stands on. Such a block is no wall only for what is above that plane."""
-    hook = joined("hook", [((-0.45, -0.05, 1.0), (0.35, 0.05, 1.1)), LEG], pieces=pieces)
-    blocks = joined("blocks", [((-0.5, -0.3, 0.0), (0.0, 0.3, 1.0)), LOW], pieces=True)
+    hook = joined("hook", [((-1.2, -0.05, 1.0), (0.35, 0.05, 1.1)), LEG], pieces=pieces)
+    blocks = joined("blocks", [((-1.3, -0.3, 0.0), (0.0, 0.3, 1.0)), LOW], pieces=True)
     bodies = [
-        body("blocks", 0, blocks.com, 1.0, restitution=0.0, motion="static"),
-        body("hook", 1, hook.com, 1.0, restitution=0.0, friction=0.0, velocity=(speed, 0.0, 0.0)),
+        body("blocks", 0, np.zeros(3), 1.0, restitution=0.0, motion="static"),
+        body("hook", 1, np.zeros(3), 1.0, restitution=0.0, friction=0.0, velocity=(speed, 0.0, 0.0)),
     ]
     simulator = Simulator(Scene((blocks, hook), tuple(bodies), np.array([0.0, 0.0, -9.81]), 1.0), "solver")
     low, high = np.array(LEG)
     corners = low + (high - low) * np.stack(np.meshgrid([0, 1], [0, 1], np.linspace(0, 1, 20)), -1).reshape(-1, 3)
-    for state in simulator.steps(4 + round(8 / speed)):  # for 16 cm and a little, where the gap is 10 cm
+    for state in simulator.steps(4 + round(8 / speed)):  # enough for 16 cm, where the gap is 10 cm
         there = state.position[1] + Rotation.from_quat(state.orientation[1]).apply(corners - hook.com)
         beyond = np.maximum(there - np.array(LOW)[1], np.array(LOW)[0] - there).max(1)
         assert beyond.min() > -0.005
+
+
+JACK = [
+    ((-0.5, -0.1, -0.1), (0.5, 0.1, 0.1)),
+    ((-0.1, -0.5, -0.1), (0.1, 0.5, 0.1)),
+    ((-0.1, -0.1, -0.5), (0.1, 0.1, 0.5)),
+]
+TABLE = [((-0.5, -0.4, -0.05), (0.5, 0.4, 0.05))]
+TABLE += [((x - 0.06, y - 0.06, -0.6), (x + 0.06, y + 0.06, 0.05)) for x in (-0.4, 0.4) for y in (-0.3, 0.3)]
+
+
+def deepest(boxes: list, points: np.ndarray) -> float:
+    """m, how deep the deepest of points [P, 3] is in any of some boxes."""
+    return float(
+        max((-np.maximum(np.array(low) - points, points - np.array(high)).max(-1)).max() for low, high in boxes)
+    )
+
+
+def spread(boxes: list, count: int = 12) -> np.ndarray:
+    """Points [P, 3] on the surfaces of boxes, `count` along an edge."""
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 1, count)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    grid = grid[((grid == 0) | (grid == 1)).any(1)]
+    return np.concatenate([np.array(low) + np.subtract(high, low) * grid for low, high in boxes])
+
+
+def test_bodies_of_several_pieces_do_not_pass_into_each_other():
+    """Jacks and tables that fly and spin into each other, 8 m/s at most. When contacts with parts below the plane of
+    another contact were given up, a quarter of such pairs went 2 to 10 cm into each other; now they go 5 mm at most."""
+    draw, kinds, bodies = np.random.default_rng(3), (JACK, TABLE), []
+    shapes = [joined(name, boxes, pieces=True) for name, boxes in zip(("jack", "table"), kinds, strict=True)]
+    for k in range(20):
+        way = draw.normal(size=3)
+        way, speed = way / np.linalg.norm(way), draw.uniform(2, 6)
+        for side in (0, 1):
+            place = [20.0 * k, 0, 0] + side * (2.0 * way + draw.uniform(-0.3, 0.3, 3))
+            bodies.append(body(
+                f"{k} {side}", int(draw.integers(2)), place, 1.0, restitution=0.0, friction=0.3,
+                quat_xyzw=Rotation.random(random_state=draw).as_quat(), velocity=-side * speed * way,
+                angular_velocity=draw.uniform(-4, 4, 3),
+            ))  # fmt: skip
+    simulator = Simulator(Scene(tuple(shapes), tuple(bodies), np.zeros(3), 1.0), "solver")
+    points, worst, met = [spread(boxes) for boxes in kinds], 0.0, set()
+    for state in simulator.steps(60):
+        turn = Rotation.from_quat(state.orientation)
+        met |= {point.first.split()[0] for point in simulator.contact_points()}
+        for one in range(len(bodies)):
+            other = one ^ 1
+            s, t = bodies[one].shape, bodies[other].shape
+            place = state.position[one] + turn[one].apply(points[s] - shapes[s].com)
+            worst = max(
+                worst, deepest(kinds[t], turn[other].inv().apply(place - state.position[other]) + shapes[t].com)
+            )
+    assert len(met) > 10  # of 20 pairs
+    assert worst < 0.01
