@@ -91,7 +91,8 @@ class Background(nn.Module):
     def __init__(self, side: int) -> None:
         super().__init__()
         # [n, n, n, 4], channel 0 a tenth of the density before softplus, channels 1 to 3 of the colour before sigmoid
-        self.levels = nn.ParameterList([torch.zeros(n, n, n, 4) for n in (side // 8, side // 4, side // 2, side)])
+        sides = [max(2, side // times) for times in (8, 4, 2, 1)]  # a cell needs two points
+        self.levels = nn.ParameterList([torch.zeros(n, n, n, 4) for n in sides])
 
     def along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
         """RGB [R, 3] behind the unit sphere along rays [R, 3], by rendering; `jitter` [R, S] in 0..1 is the position of
