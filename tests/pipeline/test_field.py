@@ -188,11 +188,12 @@ def test_masks_make_what_they_exclude_transparent():
 
 
 def test_depth_draws_the_surface_to_where_a_sensor_saw_it():
-    """Colours say nothing here (all grey): with the points of a ball of another size the surface goes there."""
+    """Colours say nothing here (all grey): with the points of a ball of another size the surface goes there. It starts
+    nearer than 0.1, from where these points pull."""
     rays = toy_rays()
     grey = replace(rays, rgb=torch.full_like(rays.rgb, 128))
     directions = np.random.default_rng(0).normal(size=(4000, 3))
-    ball = 0.45 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    ball = 0.33 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     nothing = supervision_of(NOTHING, SMALL.finest)
     settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=120, surface_points=64)
     off = []
