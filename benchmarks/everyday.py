@@ -31,16 +31,7 @@ from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import SUBSTEPS
 from sdfsim.evaluation import engines, everyday
-from sdfsim.evaluation.engines import (
-    LONGEST,
-    Engine,
-    Ran,
-    Runner,
-    TooSlow,
-    by_engine,
-    by_model,
-    still,
-)
+from sdfsim.evaluation.engines import LONGEST, Engine, Ran, Runner, TooSlow, by_engine, by_model, still
 from sdfsim.evaluation.everyday import ROWS, Check, Setting, checks
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
 from sdfsim.physics.units import scene_units
