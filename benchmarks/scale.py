@@ -57,7 +57,7 @@ from sdfsim.simulate.steppers import stepper_of
 BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
 PARTS = (16, 4, 1)  # of the nodes of a knot
-DISTINCT, CHUNK, STEPS = 100, 10, 96  # scenes that differ, scenes of a job, steps of a scene
+DISTINCT, CHUNK, STEPS = 100, 50, 96  # scenes that differ, scenes of a job, steps of a scene
 COLUMNS = {"ms": "ms a step", "peak_mib": "MiB", "contacts": "contacts", "depth_95": "deepest 95 %, mm", "lost": "lost"}
 
 

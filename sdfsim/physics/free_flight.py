@@ -10,7 +10,7 @@ import numpy as np
 from sdfsim.physics.bodies import Bodies, State, awake
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
-from sdfsim.physics.pose import from_rotvec, multiply, normalise, to_matrix
+from sdfsim.physics.pose import cross, from_rotvec, multiply, normalise, to_matrix
 
 MAX_TURN = 0.1  # rad of rotation per inner step of the torque-free rotation
 MOST_TURN = 100.0  # rad of rotation in a step, beyond which it is not exact
@@ -70,8 +70,8 @@ def _rkmk4(q: np.ndarray, start: np.ndarray, spin: Callable[[np.ndarray], np.nda
 
     def slope(u: np.ndarray) -> np.ndarray:
         w = spin(multiply(from_rotvec(u), q))
-        uw = np.cross(u, w)
-        return h * (w - 0.5 * uw + np.cross(u, uw) / 12.0)  # dexp^-1, to the order needed
+        uw = cross(u, w)
+        return h * (w - 0.5 * uw + cross(u, uw) / 12.0)  # dexp^-1, to the order needed
 
     k1 = h * start
     k2 = slope(0.5 * k1)

@@ -49,36 +49,55 @@ def hull(vertices: np.ndarray) -> ConvexPiece:
     from scipy.spatial import ConvexHull
 
     found = ConvexHull(vertices)
-    corners = vertices[found.vertices]
+    corners, planes = vertices[found.vertices], found.equations[:, :3]
     number = np.full(len(vertices), -1)
     number[found.vertices] = np.arange(len(corners))
-    normals, loops, triangles = [], [], number[found.simplices]
+    triangles = number[found.simplices]
     sides = np.diff(corners[triangles], axis=1)
-    facing = (np.cross(sides[:, 0], sides[:, 1]) * found.equations[:, :3]).sum(1) > 0.0
+    facing = (np.cross(sides[:, 0], sides[:, 1]) * planes).sum(1) > 0.0
     triangles[~facing] = triangles[~facing][:, ::-1]
-    left, owner = np.ones(len(triangles), bool), np.zeros(len(triangles), np.int64)
-    for k, normal in enumerate(found.equations[:, :3]):
-        if not left[k]:
-            continue
-        alike = left & (np.abs(found.equations[:, :3] - normal).sum(1) < FLAT)
-        left &= ~alike
-        owner[alike] = len(normals)
-        normals.append(normal)
-        several = np.count_nonzero(alike) > 1
-        loops.append(_around(corners, np.unique(triangles[alike]), normal) if several else triangles[k])
-    widths = [np.ptp(corners @ normal) for normal in normals]
+    first, owner = np.unique(_flat(planes), return_inverse=True)
+    normals = planes[first]
+    of_face = _grouped(owner, np.arange(len(triangles)), len(first))
+    loops = tuple(
+        triangles[one[0]] if len(one) == 1 else _around(corners, np.unique(triangles[one]), normal)
+        for one, normal in zip(of_face, normals, strict=True)
+    )
+    thickness = min(float(np.ptp(corners @ some.T, axis=0).min()) for some in _blocks(normals, len(corners)))
     middle = 0.5 * (corners.min(0) + corners.max(0))
     ball = np.array([*middle, np.linalg.norm(corners - middle, axis=1).max()])
     sides = np.concatenate([triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))])
     beside = _grouped(sides[:, 0], sides[:, 1], len(corners))
     around = _grouped(triangles.reshape(-1), np.repeat(owner, 3), len(corners))
-    return ConvexPiece("hull", (), ball, float(min(widths)), corners, np.array(normals), tuple(loops), beside, around)
+    return ConvexPiece("hull", (), ball, thickness, corners, normals, loops, beside, around)
+
+
+def _flat(normals: np.ndarray) -> np.ndarray:
+    """[F] for each triangle of a hull, with unit normals [F, 3], the first one that is in the same flat face."""
+    from scipy.spatial import KDTree
+
+    # Qhull gives most triangles of a flat face exactly the same normal; those that differ by less than FLAT are rare.
+    _, first, same = np.unique(normals, axis=0, return_index=True, return_inverse=True)
+    near = first[KDTree(normals[first]).query_pairs(FLAT, 1, output_type="ndarray")]
+    leader = np.arange(len(normals))
+    for one, other in sorted(np.sort(near, axis=1).tolist()):
+        if leader[one] == one and leader[other] == other:
+            leader[other] = one
+    return leader[first[same]]
+
+
+def _blocks(rows: np.ndarray, width: int) -> list[np.ndarray]:
+    """Parts of `rows`, few enough for tables of `width` columns each."""
+    return np.array_split(rows, max(1, len(rows) * width // 2**22))
 
 
 def _grouped(owner: np.ndarray, value: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
     """The different values that belong to each of `count` owners."""
-    pairs = np.unique(np.stack([owner, value], axis=1), axis=0)
-    return tuple(np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, count))))
+    most = int(value.max()) + 1
+    pairs = np.unique(owner * most + value)
+    ends = np.searchsorted(pairs, most * np.arange(count + 1))
+    pairs %= most
+    return tuple(pairs[i:j] for i, j in zip(ends, ends[1:], strict=False))
 
 
 def _around(corners: np.ndarray, chosen: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -86,9 +105,10 @@ def _around(corners: np.ndarray, chosen: np.ndarray, normal: np.ndarray) -> np.n
     places = corners[chosen] - corners[chosen].mean(0)
     one = places[np.argmax(np.linalg.norm(places, axis=1))]
     one = one - (one @ normal) * normal
-    two = np.cross(normal, one)
+    x, y, z = normal
+    two = np.array([y * one[2] - z * one[1], z * one[0] - x * one[2], x * one[1] - y * one[0]])
     loop = chosen[np.argsort(np.arctan2(places @ two, places @ one), kind="stable")]
-    return loop[np.linspace(0, len(loop), min(len(loop), CORNERS), endpoint=False).astype(int)]
+    return loop if len(loop) <= CORNERS else loop[np.linspace(0, len(loop), CORNERS, endpoint=False).astype(int)]
 
 
 _convex: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
