@@ -1,6 +1,7 @@
 """The convex pieces of a shape that contacts use: closed forms, and hulls with flat faces."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -97,7 +98,7 @@ def _grouped(owner: np.ndarray, value: np.ndarray, count: int) -> tuple[np.ndarr
     pairs = np.unique(owner * most + value)
     ends = np.searchsorted(pairs, most * np.arange(count + 1))
     pairs %= most
-    return tuple(pairs[i:j] for i, j in zip(ends, ends[1:], strict=False))
+    return tuple(pairs[i:j] for i, j in pairwise(ends))
 
 
 def _around(corners: np.ndarray, chosen: np.ndarray, normal: np.ndarray) -> np.ndarray:
