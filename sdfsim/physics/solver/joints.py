@@ -894,8 +894,9 @@ def _step(moves, rows, count, r, total, change):
         return 0.0
     rows.impulse[r] = total
     if len(rows.see):
+        now, seen = rows.now, rows.see[r]  # names outside of the loop, so that it becomes vector code
         for q in range(count):
-            rows.now[q] += step * rows.see[r, q]
+            now[q] += step * seen[q]
     else:
         _give(moves, rows, r, step, change)
     return abs(step) * rows.give[r]
@@ -922,12 +923,31 @@ def _driven(now, aim, give, most, grip):
 
 
 @njit(**BARE)
+def _grip(moves, rows, count, r, change):
+    """Relax the three rows of a ball joint's friction, which are bounded together. Returns the largest change."""
+    known = rows.impulse[r], rows.impulse[r + 1], rows.impulse[r + 2]
+    for q in range(r, r + 3):
+        if rows.give[q] > 0.0:
+            _step(moves, rows, count, q, rows.impulse[q] + _short(rows, q, change) / rows.give[q], change)
+    length = math.sqrt(rows.impulse[r] ** 2 + rows.impulse[r + 1] ** 2 + rows.impulse[r + 2] ** 2)
+    if length > rows.grip[r]:
+        for q in range(r, r + 3):
+            _step(moves, rows, count, q, rows.impulse[q] * rows.grip[r] / length, change)
+    worst = 0.0
+    for x in range(3):
+        worst = max(worst, abs(rows.impulse[r + x] - known[x]) * rows.give[r + x])
+    return worst
+
+
+@njit(**BARE)
 def _sweep(moves, cone, rows, count, change):
     """Relax all bounded rows one after the other, friction of contacts last. Returns the largest change."""
-    worst = 0.0
+    worst, last = 0.0, -1
     for r in range(count):
         kind = rows.kind[r]
-        if kind == TANGENT_ROW or rows.give[r] <= 0.0:
+        if kind == GRIP_ROW and r > last:
+            worst, last = max(worst, _grip(moves, rows, count, r, change)), r + 2
+        if kind == GRIP_ROW or kind == TANGENT_ROW or rows.give[r] <= 0.0:
             continue
         total = rows.impulse[r] + _short(rows, r, change) / rows.give[r]
         if kind == NORMAL_ROW or kind == STOP_ROW:
@@ -937,11 +957,6 @@ def _sweep(moves, cone, rows, count, change):
             now = aim - _short(rows, r, change) - rows.impulse[r] * rows.give[r]
             total = _driven(now, aim, rows.give[r], rows.strong[r], rows.grip[r])
         worst = max(worst, _step(moves, rows, count, r, total, change))
-        if kind == GRIP_ROW and (r + 1 == count or rows.of[r + 1] != rows.of[r] or rows.kind[r + 1] != GRIP_ROW):
-            length = math.sqrt(rows.impulse[r] ** 2 + rows.impulse[r - 1] ** 2 + rows.impulse[r - 2] ** 2)
-            if length > rows.grip[r]:
-                for q in range(r - 2, r + 1):
-                    _step(moves, rows, count, q, rows.impulse[q] * rows.grip[r] / length, change)
     r = 0
     while r < count:
         if rows.kind[r] != TANGENT_ROW:
