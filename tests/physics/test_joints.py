@@ -247,3 +247,22 @@ def test_a_four_bar_linkage_moves_as_its_closed_form():
         b = joined(rollout.joint_position[k, 0], b)
         assert rollout.position[k, 2, :2] == pytest.approx(0.5 * (b + np.array([ground, 0.0])), abs=1e-4)
     assert rollout.joint_position[-1, 0] == pytest.approx(4.0 * rollout.time[-1], rel=5e-3)
+
+
+@pytest.mark.parametrize("held_by", ["world", "other"])
+def test_a_spinning_ball_on_a_ball_joint_is_braked_by_its_friction(held_by):
+    """The torque of friction opposes the spin about any axis, has its full strength until the spin ends, and then
+    holds; on another body in free space it acts as well."""
+    built, spin = scene(gravity=(0, 0, 0)), np.array([3.0, -2.0, 6.0])
+    built.add("ball", **ball(0.2), mass=1.5, angular_velocity=spin.tolist())
+    built.add("other", **ball(0.3), mass=2.0, position=(0, 0, 0 if held_by == "other" else 5))
+    built.join("socket", "ball", "ball", held_by, anchor=(0, 0, 0), friction=0.3)
+    own, others = 0.4 * 1.5 * 0.2**2, 0.4 * 2.0 * 0.3**2
+    rollout, rate = Simulator(built).run(1.2), np.linalg.norm(spin)
+    slowing = 0.3 / own + (0.3 / others if held_by == "other" else 0.0)
+    end = own / (own + others) if held_by == "other" else 0.0  # share of the spin that both have at last
+    left = np.maximum(1.0 - slowing / rate * rollout.time, 0.0)
+    assert left[-1] == 0.0 < left[len(left) // 5]
+    seen = rollout.angular_velocity[:, 0] - rollout.angular_velocity[:, 1]
+    assert seen == pytest.approx(left[:, None] * spin, abs=2e-2)
+    assert rollout.angular_velocity[-1, 0] == pytest.approx(end * spin, abs=1e-6)
