@@ -2,7 +2,8 @@
 
     python -m benchmarks rivals shapes DATA -o DIR
     python -m benchmarks rivals turns DATA -o DIR
-        ours and the engines on convex pieces in turn: medians and ranges of 7 rounds at 4 ms
+        ours and the engines on convex pieces in turn, each with the longest inner step at which `shapes` found bodies
+        at most 1 % deep in each other: medians and ranges of 7 rounds
     python -m benchmarks rivals large -o DIR
         the first 20 steps of large scenes with inner steps of 4 ms: as they fall, and at rest
 
@@ -317,19 +318,29 @@ def shapes(data: Path, *, out: Path) -> None:
     write_section("rivals", "python -m benchmarks rivals shapes DATA -o DIR", markdown(rows))
 
 
+def enough(result: dict[str, Any]) -> int:
+    """Inner steps per step: the fewest with which bodies are at most `DEEP` in each other and none is lost; the most
+    that were tried if there is no such number."""
+    tried = result["inner"]
+    return next((n for n in INNER if tried[str(n)]["deep"] <= DEEP and not tried[str(n)]["lost"]), INNER[-1])
+
+
 @one_thread()
 def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
-    """The fast engines in alternating runs, so that other work on the machine slows all of them alike."""
-    rows: list[tuple[str, ...]] = [("case, ms per s at 4 ms", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
+    """The fast engines at equal depth in alternating runs, so that other work on the machine slows all of them
+    alike."""
+    rows: list[tuple[str, ...]] = [("case, ms per s", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
+    found = compared(SHAPES, data, out)
     for k, case in enumerate(SHAPES):
-        scenes = scenes_of(case, data, out / "scenes")
+        scenes, inner = scenes_of(case, data, out / "scenes"), {name: enough(found[case, name]) for name in FAST}
 
-        def mean(name: str, scenes: list[Scene] = scenes) -> float:
-            return float(np.mean([moved(name, scene, STEPS, USUAL, out / "scenes")[1] for scene in scenes]))
+        def mean(name: str, scenes: list[Scene] = scenes, inner: dict[str, int] = inner) -> float:
+            return float(np.mean([moved(name, scene, STEPS, inner[name], out / "scenes")[1] for scene in scenes]))
 
         taken = in_turn([partial(mean, name) for name in FAST], rounds)
         progress((k + 1) / len(SHAPES), case)
-        rows.append((case, *map(spread, [*taken.T, *(taken[:, :1] / taken[:, 1:]).T])))
+        cells = [f"{20 // inner[name]} ms: {spread(times)}" for name, times in zip(FAST, taken.T, strict=True)]
+        rows.append((case, *cells, *map(spread, (taken[:, :1] / taken[:, 1:]).T)))
     write_section("rivals in turn", "python -m benchmarks rivals turns DATA -o DIR", markdown(rows))
 
 

@@ -145,7 +145,7 @@ def summary() -> str:
     solver, engine = errors["`solver`"], errors["the engine again, starts 1e-3 m/s off"]
     fewer, growth = grown()
     losses = [
-        "[Hard shapes](#hard-shapes-beside-other-engines), slower than an engine at the same step: "
+        "[Hard shapes](#hard-shapes-beside-other-engines), slower than an engine at equal depth: "
         f"{joined(longer)} time.",
         f"[Spheres in a bowl](../docs/notes/growth.md), slower than an engine: {joined(fewer)} time.",
         f"Bodies overlap more than in both engines: {joined(list(deeper()))} of the smallest body.",
@@ -163,8 +163,8 @@ def summary() -> str:
         "[Spheres in a bowl](../docs/notes/growth.md), an engine's time divided by ours for each number of spheres: "
         + "; ".join(f"{name} {joined(ratios)}" for name, ratios in growth.items())
         + ".",
-        f"Hard shapes, relative to the time of PyBullet and MuJoCo: {joined(less)}. 512 spheres in a bowl take "
-        f"{steps['512 spheres in a bowl'][5]} of PyBullet's.",
+        f"Hard shapes at equal depth, relative to the time of PyBullet and MuJoCo: {joined(less)}. 512 spheres in a "
+        f"bowl take {steps['512 spheres in a bowl'][5]} of PyBullet's.",
         f"Engines that collide meshes without pieces, like ours, take {number(at_least, 2)} to {number(at_most, 2)} "
         f"times as long ([all of them](../docs/notes/hard-shapes.md)). {joined(lost)}.",
         *([f"Real tosses: a smaller position error than every other engine, by {lead[0]}."] if lead[0] else []),
