@@ -99,9 +99,9 @@ class ContactGeometry:
         """m, of the thinnest walls, or of the thinnest solid; infinite for a plane."""
         if isinstance(self.sdf, PlaneSdf):
             return np.inf
-        if self.grid is None:
-            return float(np.ptp(self.sdf.bounds, axis=0).min())
-        return min(piece.thickness for piece in self.solids) if self.solids else self.grid.thickness
+        if self.solids and not isinstance(self.sdf, ClosedForm):
+            return min(piece.thickness for piece in self.solids)
+        return float(np.ptp(self.sdf.bounds, axis=0).min()) if self.grid is None else self.grid.thickness
 
     @cached_property
     def surface(self) -> ContactSurface:

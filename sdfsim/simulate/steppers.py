@@ -108,6 +108,7 @@ class Stepper:
     forces: ClassVar[bool] = True  # whether bodies can be pulled, and contacts report impulses
     sleeps: ClassVar[bool] = False  # whether it freezes bodies at rest
     network: ClassVar[bool] = False  # whether a network takes part
+    solids: ClassVar[bool] = False  # whether shapes with convex pieces collide as these
 
     @property
     def distances(self) -> bool:
@@ -141,7 +142,7 @@ class Stepper:
             return Carry(bodies, options)
         from sdfsim.physics.solver.prepare import Compiled
 
-        return Carry(bodies, options, scene=Compiled(bodies, state, shared))
+        return Carry(bodies, options, scene=Compiled(bodies, state, shared, grids=not self.solids))
 
     def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
         """The state after the user has changed pose, velocities or load of the bodies `changed` [N] bool, or gravity.
@@ -190,7 +191,7 @@ class Solver(Stepper):
     """The contact solve."""
 
     distances = True  # type: ignore[assignment]
-    sleeps = True
+    sleeps = solids = True
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
         """The solve has no training. A line if its inner step is longer than any that its laws were checked with."""

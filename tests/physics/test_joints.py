@@ -266,3 +266,43 @@ def test_a_spinning_ball_on_a_ball_joint_is_braked_by_its_friction(held_by):
     seen = rollout.angular_velocity[:, 0] - rollout.angular_velocity[:, 1]
     assert seen == pytest.approx(left[:, None] * spin, abs=2e-2)
     assert rollout.angular_velocity[-1, 0] == pytest.approx(end * spin, abs=1e-6)
+
+
+def door(built: Scene, deep: float) -> tuple[dict, float]:
+    """On a vertical hinge, in the floor."""
+    built.add("floor", plane={})
+    built.add("it", box={"size": (0.8, 0.04, 2.0)}, position=(0.4, 0, 1 - deep), mass=20.0, velocity=(0, 0.4, 0),
+              angular_velocity=(0, 0, 1))  # fmt: skip
+    return {"type": "hinge", "anchor": (0, 0, 1), "axis": (0, 0, 1)}, 0.4
+
+
+def drawer(built: Scene, deep: float) -> tuple[dict, float]:
+    """Between two shelves that are too near to each other."""
+    for name, z in (("low", -0.05), ("high", 0.25)):
+        built.add(name, box={"size": (1, 0.6, 0.1)}, position=(0, 0, z), motion="static")
+    built.add("it", box={"size": (0.6, 0.4, 0.2 + 2 * deep)}, position=(0, 0, 0.1), mass=5.0, velocity=(0.5, 0, 0))
+    return {"type": "slider", "axis": (1, 0, 0)}, 0.5
+
+
+def cart(built: Scene, deep: float) -> tuple[dict, float]:
+    """On a rail above the floor, driven by a motor."""
+    built.add("floor", plane={}, friction=0.0)
+    built.add("it", box={"size": (0.3, 0.3, 0.3)}, position=(0, 0, 0.15 - deep), mass=5.0, velocity=(0.5, 0, 0))
+    return {"type": "slider", "axis": (1, 0, 0), "motor": {"speed": 0.5, "most": 500.0}}, 0.5
+
+
+@pytest.mark.parametrize("deep", [0.0, 5e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("kind", [door, drawer, cart])
+def test_a_joint_bears_what_pushes_where_it_allows_no_motion(kind, deep):
+    """Bodies that overlap in a direction in which a joint holds them stay on the joint, which bears their weight. They
+    were thrown off at up to 1e12 m/s."""
+    built = scene()
+    joint, speed = kind(built, deep)
+    built.join("joint", joint.pop("type"), "it", **joint)
+    simulator = Simulator(built)
+    rollout = simulator.run(1.0)
+    row = rollout.names.index("it")
+    assert np.ptp(rollout.position[:, row, 2]) < 1e-6
+    assert np.linalg.norm(rollout.velocity[:, row], axis=-1) == pytest.approx(speed, abs=1e-4)
+    weight = (20.0 if kind is door else 5.0) * G
+    assert simulator.joint("joint").force[2] == pytest.approx(weight, rel=1e-3)

@@ -1,32 +1,31 @@
 """Internal edges of a surface that consists of several bodies or pieces, compiled: bodies must not catch on them.
 
 A body that slides over a floor of tiles may hit the side of the next tile if it has sunk in slightly, or if its gap to
-the next edge closes. But that side is covered. A body that is completely below the plane on which another stands cannot
-be a wall: it can only support along that plane's normal, so such contacts get this normal. (Jolt and Box3D remove such
-edges by their position in a mesh; here tiles may be separate bodies.)
+the next edge closes, however far that edge is. But what is completely below the plane on which a body stands is no wall
+for what is above that plane: it can only support along the plane's normal, so such contacts get this normal. (Jolt and
+Box3D remove such edges by their position in a mesh; here tiles may be separate bodies.)
 """
 
 from __future__ import annotations
 
 from numba import njit
 
-from sdfsim.physics.solver.convex import farthest, outside, rounding
-from sdfsim.physics.solver.distance import CELL, GRID, KIND, PLANE, distance_alone
+from sdfsim.physics.solver.convex import farthest, rounding
+from sdfsim.physics.solver.distance import KIND, PLANE
 from sdfsim.physics.solver.manifold import renewed
 from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, pair_kind
 from sdfsim.physics.solver.surface_distance import KEYS
-from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, turn
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
 STEEPEST = -0.1  # cosine below which they face each other
-ROUGH = 0.5  # cells: largest error of a grid at an edge
 LEVEL = 4.0  # slops: a body that is higher than the support by no more than this is not a wall
 
 
 @njit(**BARE, inline="always")
 def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
-    """Give contacts with bodies that are beside a support and below its plane the support's normal, or void them."""
+    """Give contacts with bodies that are below the plane of a support the support's normal, or void them."""
     latest, following = work.latest, near.following
     pairs = len(near.start)
     several = False
@@ -40,7 +39,9 @@ def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
                 following[2 * p + side] = latest[body]
                 if not world.moves[body]:
                     continue  # a body that does not move needs no support
-                several = several or latest[body] >= 0 or manifolds.point[p, 0, KEY] != 0.0
+                several = several or latest[body] >= 0
+                for k in range(1, manifolds.count[p]):
+                    several = several or manifolds.point[p, k, KEY] != manifolds.point[p, 0, KEY]
                 latest[body] = 2 * p + side
     if not several:
         return
@@ -124,8 +125,7 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
             bottom = _lowest(shapes, world, work, motion, manifolds, p, k, side, m)
             if dot(m, foot) + min(manifolds.point[q, e, GAP], 0.0) - bottom > LEVEL * rules.slop:
                 continue  # for what is below the plane as well, it is a wall
-            if q == p or _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
-                return True, m
+            return True, m
     return False, n
 
 
@@ -134,27 +134,6 @@ def _normal(manifolds, p, k, side):
     """The normal of a contact towards the first (side 0) or second (1) of its bodies."""
     sign, point = 1.0 if side == 0 else -1.0, manifolds.point[p, k]
     return sign * point[NORMAL], sign * point[NORMAL + 1], sign * point[NORMAL + 2]
-
-
-@njit(**BARE)
-def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
-    """Whether another body extends to the point where a contact touches the other body of the pair."""
-    other, column = manifolds.pair[p, 1 - side], SECOND if side == 0 else FIRST
-    point = manifolds.point[p, k]
-    place = turn(work.matrix, other, (point[column], point[column + 1], point[column + 2]))
-    place = add(sub(get(motion.position, other), get(motion.position, ground)), place)
-    size, t, convex = world.scale[ground], world.shape[ground], shapes.solids
-    place = scale(add(turn_back(work.matrix, ground, place), get(world.com, ground)), 1.0 / size)
-    first, last = convex.start[t], convex.start[t + 1]
-    if shapes.table[t, KIND] != GRID or first == last:
-        rough = ROUGH * shapes.table[t, CELL] if shapes.table[t, KIND] == GRID else 0.0
-        return (
-            size * (distance_alone(shapes.table, shapes.brick, shapes.sample, t, place) - rough) <= rules.contact_margin
-        )
-    for piece in range(first, last):
-        if size * outside(convex, piece, place) <= rules.contact_margin:
-            return True
-    return False
 
 
 @njit(**BARE)

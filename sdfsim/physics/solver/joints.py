@@ -94,6 +94,9 @@ SOFTEN = 1e-10  # relative to the effect of a unit impulse along a row: makes re
 GIVES = 0.2  # share of an overrun limit that an inner step resolves
 AHEAD = 0.05  # model lengths (and rad): nearer limits are taken into account
 EXACT = 0.01  # relative to the precision to which contacts without joints are solved
+# Relative to its effect without joints: if the effect of a bounded row is less, joints allow no motion along it, and
+# what is left is rounding. The joints then bear all of it.
+BLOCKED = 1e-7
 DENSE = 240  # largest number of bounded rows of an island for which all effects through the joints are stored
 
 
@@ -872,7 +875,7 @@ def _see(world, work, motion, graph, factors, reply, rows, count):
                             reply[graph.node[i], x] = factors.x[i, x]
         for q in range(count):
             rows.see[r, q] = _read(rows, q, reply)
-        rows.give[r] = rows.see[r, r]
+        rows.give[r] = rows.see[r, r] if rows.see[r, r] > BLOCKED * rows.give[r] else 0.0
         for s in range(2):
             b = rows.body[r, s]
             if b >= 0:
@@ -947,7 +950,10 @@ def _sweep(moves, cone, rows, count, change):
         kind = rows.kind[r]
         if kind == GRIP_ROW and r > last:
             worst, last = max(worst, _grip(moves, rows, count, r, change)), r + 2
-        if kind == GRIP_ROW or kind == TANGENT_ROW or rows.give[r] <= 0.0:
+        if kind == GRIP_ROW or kind == TANGENT_ROW:
+            continue
+        if rows.give[r] <= 0.0:
+            _step(moves, rows, count, r, 0.0, change)
             continue
         total = rows.impulse[r] + _short(rows, r, change) / rows.give[r]
         if kind == NORMAL_ROW or kind == STOP_ROW:
@@ -964,15 +970,19 @@ def _sweep(moves, cone, rows, count, change):
             continue
         most = rows.grip[r] * rows.impulse[r - 1]
         if cone:
-            give = max(rows.give[r], rows.give[r + 1])
-            one = rows.impulse[r] + _short(rows, r, change) / give
-            other = rows.impulse[r + 1] + _short(rows, r + 1, change) / give
+            give, one, other = max(rows.give[r], rows.give[r + 1]), 0.0, 0.0
+            if rows.give[r] > 0.0:
+                one = rows.impulse[r] + _short(rows, r, change) / give
+            if rows.give[r + 1] > 0.0:
+                other = rows.impulse[r + 1] + _short(rows, r + 1, change) / give
             share = _within(one, other, most)
             worst = max(worst, _step(moves, rows, count, r, share * one, change))
             worst = max(worst, _step(moves, rows, count, r + 1, share * other, change))
         else:
             for q in range(r, r + 2):
-                total = rows.impulse[q] + _short(rows, q, change) / rows.give[q]
+                total = 0.0
+                if rows.give[q] > 0.0:
+                    total = rows.impulse[q] + _short(rows, q, change) / rows.give[q]
                 worst = max(worst, _step(moves, rows, count, q, min(max(total, -most), most), change))
         r += 2
     return worst

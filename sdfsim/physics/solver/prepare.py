@@ -47,28 +47,31 @@ class SharedShapes:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        # Separate for scenes in which shapes meet as surfaces, and for others, which need no surfaces.
-        self._known: dict[bool, tuple[tuple[ContactGeometry, ...], kinds.Shapes]] = {}
+        # Separate for scenes in which shapes meet as surfaces, and for others, which need no surfaces and often no
+        # grids.
+        self._known: dict[tuple[bool, bool], tuple[tuple[ContactGeometry, ...], kinds.Shapes]] = {}
 
-    def of(self, contact: Sequence[ContactGeometry]) -> tuple[kinds.Shapes, np.ndarray]:
-        """Compiled shapes, and the index [S] int64 of each shape of a scene among them."""
+    def of(self, contact: Sequence[ContactGeometry], *, grids: bool = True) -> tuple[kinds.Shapes, np.ndarray]:
+        """Compiled shapes, and the index [S] int64 of each shape of a scene among them; `grids` as for `Compiled`."""
         with self._lock:
             met = meet_as_surfaces(contact)
-            known, shapes = self._known.get(met, ((), None))
+            kind = met, grids or met
+            known, shapes = self._known.get(kind, ((), None))
             if shapes is None or not set(contact) <= set(known):
                 known = tuple(dict.fromkeys((*known, *contact)))
-                shapes = compiled_shapes(known)
-                self._known[met] = known, shapes
+                shapes = compiled_shapes(known, grids=grids)
+                self._known[kind] = known, shapes
         place = {shape: k for k, shape in enumerate(known)}
         return shapes, np.array([place[shape] for shape in contact], np.int64)
 
 
 class Compiled:
-    """One scene in the form that the compiled step needs, in model units. Scenes can share shapes."""
+    """One scene in the form that the compiled step needs, in model units. Scenes can share shapes. Without `grids` no
+    distances are baked if all shapes collide as solids."""
 
-    def __init__(self, bodies: Bodies, state: State, shared: SharedShapes | None = None) -> None:
+    def __init__(self, bodies: Bodies, state: State, shared: SharedShapes | None = None, *, grids: bool = True) -> None:
         self.bodies = bodies
-        self.shapes, row = (shared or SharedShapes()).of(bodies.contact)
+        self.shapes, row = (shared or SharedShapes()).of(bodies.contact, grids=grids)
         self._shape = np.where(bodies.shape >= 0, row[bodies.shape], -1) if len(row) else bodies.shape
         self.place(state)
 
@@ -313,8 +316,8 @@ def meet_as_surfaces(shapes: Sequence[ContactGeometry]) -> bool:
     return any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
 
 
-def compiled_shapes(shapes: Sequence[ContactGeometry]) -> kinds.Shapes:
-    """The shapes of a scene; those without a closed form are baked."""
+def compiled_shapes(shapes: Sequence[ContactGeometry], *, grids: bool = True) -> kinds.Shapes:
+    """The shapes of a scene; those without a closed form are baked, if any meets as a surface or with `grids`."""
     table = np.zeros((len(shapes), kinds.FIELDS))
     table[:, kinds.CELL], table[:, kinds.PATCH] = 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
@@ -329,8 +332,10 @@ def compiled_shapes(shapes: Sequence[ContactGeometry]) -> kinds.Shapes:
         if isinstance(shape.sdf, ClosedForm):
             sizes = shape.sdf.sizes
             row[kinds.KIND], row[kinds.SIZE : kinds.SIZE + len(sizes)] = FORMS[shape.sdf.KIND], sizes
-        elif (grid := shape.grid) is not None:
-            row[kinds.KIND], row[kinds.CELL] = kinds.GRID, grid.cell
+            continue
+        row[kinds.KIND] = kinds.GRID
+        if (met or grids) and (grid := shape.grid) is not None:
+            row[kinds.CELL] = grid.cell
             row[kinds.LOW : kinds.LOW + 3], row[kinds.BRICKS : kinds.BRICKS + 3] = grid.low, grid.brick.shape
             row[kinds.COARSE], row[kinds.BRICK] = sum(map(len, sample)), sum(map(len, brick))
             sample.append(grid.coarse.reshape(-1))
