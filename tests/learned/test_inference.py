@@ -71,7 +71,7 @@ def test_recordings_in_a_batch_move_as_each_alone(box_shape):
 
 def test_a_shape_off_its_centre_of_mass_is_made_ready_once_for_all_recordings(box_shape, monkeypatch):
     made, known = [], prepare.compiled_shapes
-    monkeypatch.setattr(prepare, "compiled_shapes", lambda shapes: made.append(shapes) or known(shapes))
+    monkeypatch.setattr(prepare, "compiled_shapes", lambda shapes, **how: made.append(shapes) or known(shapes, **how))
     box = replace(box_shape, com=np.array([0.01, 0.0, 0.0]))
     assert len(roll_out(load_model("solver"), recordings((2, 1, 3, 2)), {"box": box}, 2)) == 4
     assert len(made) == 1 and made[0][0] is box.contact

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.geometry import primitives
 from sdfsim.learned import inference, near
 from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.graphs import sdf_sim_graph
@@ -15,10 +16,12 @@ from sdfsim.learned.tensors import state_arrays
 from sdfsim.physics import free_flight
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Effects, Scene, Waypoints
-from sdfsim.shape.make import analytic_shape
+from sdfsim.shape import contact_geometry
+from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.simulate import steppers
 from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import contact_edges, make_body, random_model, surface_model
+from tests.physics.test_missed_contacts import joined
 
 
 def same(one, other) -> bool:
@@ -49,6 +52,19 @@ def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(drop
     assert Simulator(alone, model).bodies.shape.tolist() == [-1] * 4  # there is no SDF to ask
     off = Simulator(replace(dropped, effects=Effects(contact="off")), model).run(steps=6)
     assert same(off, Simulator(alone, model).run(steps=6))
+
+
+def test_shapes_that_collide_as_solids_are_not_sampled(forbid):
+    """Distances on a grid are only for shapes that meet as surfaces, and for whatever meets these."""
+    forbid(contact_geometry, "baked")
+    table = joined("table", [((-0.5, -0.5, 0.4), (0.5, 0.5, 0.5)), ((-0.1, -0.1, 0.0), (0.1, 0.1, 0.4))], pieces=True)
+    block = mesh_shape(primitives.box((0.4, 0.4, 0.4)), name="block", kind="mesh")
+    bowl = mesh_shape(primitives.bowl(), name="bowl", kind="mesh")
+    bodies = (make_body("table", 0, [0, 0, 0], motion="static"), make_body("block", 1, [0, 0, 0.7], restitution=0.0))
+    ran = Simulator(Scene((table, block), bodies, np.array([0, 0, -9.81]), 1.0)).run(steps=3)
+    assert ran.contact_count[-1] > 0 and abs(ran.position[-1, 1, 2] - 0.7) < 1e-3
+    with pytest.raises(AssertionError, match="a stage that is off"):
+        Simulator(Scene((table, block, bowl), (*bodies, make_body("bowl", 2, [3, 0, 0])), np.zeros(3), 1.0)).step()
 
 
 def test_no_weights_are_read_that_nothing_asks(dropped, tmp_path):

@@ -153,7 +153,9 @@ def test_what_cannot_be_is_refused(what, message):
 
 def test_scenes_with_some_shapes_in_common_share_them_and_are_what_they_would_be_alone(monkeypatch):
     made, known = [], prepare.compiled_shapes
-    monkeypatch.setattr(prepare, "compiled_shapes", lambda shapes: made.append(len(shapes)) or known(shapes))
+    monkeypatch.setattr(
+        prepare, "compiled_shapes", lambda shapes, **how: made.append(len(shapes)) or known(shapes, **how)
+    )
     floor = make_body("floor", 0, [0, 0, 0], 0.0, motion="static")
     plane, vase = analytic_shape("plane"), load_shape(Path(__file__).parents[2] / "samples" / "shapes" / "vase")
     shapes = (cube(1.0), ball(1.0), analytic_shape("capsule", radius=0.2, height=1.0), vase)

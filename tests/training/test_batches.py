@@ -107,9 +107,9 @@ def test_shapes_are_compiled_once_for_all_batches(ball_data, monkeypatch):
     made = []
     known = prepare.compiled_shapes
 
-    def counted(shapes):
+    def counted(shapes, **how):
         made.append(shapes)
-        return known(shapes)
+        return known(shapes, **how)
 
     monkeypatch.setattr(prepare, "compiled_shapes", counted)
     task = SurfaceTask(ball_data, "train", PRESETS["sdf-sim"])
