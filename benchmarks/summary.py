@@ -146,8 +146,7 @@ def summary() -> str:
     fewer, growth = grown()
     losses = [
         "[Hard shapes](#hard-shapes-beside-other-engines), slower than an engine at equal depth: "
-        f"{joined(longer)} time.",
-        f"[Spheres in a bowl](../docs/notes/growth.md), slower than an engine: {joined(fewer)} time.",
+        f"{joined(longer)} time; at the same step [spheres in a bowl](../docs/notes/growth.md): {joined(fewer)}.",
         f"Bodies overlap more than in both engines: {joined(list(deeper()))} of the smallest body.",
         f"[Real tosses](#real-tosses-of-a-cube), engines with smaller errors: {joined(nearer)}. "
         f"[Elbows](../docs/joints.md#real-tosses-of-an-elbow): {joined(of_elbows())}.",
@@ -160,7 +159,7 @@ def summary() -> str:
         f"{start['the same in MuJoCo'][1]} s.",
     ]
     wins = [
-        "[Spheres in a bowl](../docs/notes/growth.md), an engine's time divided by ours for each number of spheres: "
+        "[Spheres in a bowl](../docs/notes/growth.md), an engine's time divided by ours at the same step: "
         + "; ".join(f"{name} {joined(ratios)}" for name, ratios in growth.items())
         + ".",
         f"Hard shapes at equal depth, relative to the time of PyBullet and MuJoCo: {joined(less)}. 512 spheres in a "
