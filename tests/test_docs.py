@@ -168,6 +168,16 @@ def test_the_readmes_errors_are_the_results(row, other):
         assert degrees == pytest.approx(true_degrees, abs=0.06)
 
 
+@pytest.mark.parametrize("engine", ["sdfsim", "MuJoCo", "Drake", "PyBullet"])
+def test_the_readmes_errors_on_real_tosses_are_the_results(engine):
+    """MuJoCo's with its better cone."""
+    name = "MuJoCo, elliptic" if engine == "MuJoCo" else f"{engine} |"
+    told = [numbers(cell)[0] for cell in cells(measured("reality"), name)[:2]]
+    at = cells(page("README.md"), "mean error").index(engine)
+    shown = [cells(page("README.md"), row)[at] for row in ("position, % of its side", "rotation, degrees")]
+    assert [float(cell) for cell in shown] == told
+
+
 def test_errors_on_movi_b_are_the_results_on_every_page():
     """Of the solver wherever they stand, of `small` in its card, where those of its training stand beside them."""
     table = measured("MOVi-B")
