@@ -2,13 +2,17 @@
 
     python -m benchmarks movi_b DATA
     python -m benchmarks movi_b DATA --contacts
+    python -m benchmarks movi_b DATA --bundled
 
-DATA is a MOVi-B dataset; its test split is rolled out. Results have the form `error [95 % interval over trajectories]`.
-A second table has the steps nearest to the instants of HOPNet's errors. Its recordings have 240 frames a second
-(`frame_rate` in samples/MOVi-B/*/metadata.json of github.com/AmauryWEI/hopnet), so its frame 100 is 0.417 s.
+DATA is a MOVi-B dataset, with `--bundled` one of the MOVi-C recipe; its test split is rolled out. Results have the
+form `error [95 % interval over trajectories]`. A second table has the steps nearest to the instants of HOPNet's errors.
+Its recordings have 240 frames a second (`frame_rate` in samples/MOVi-B/*/metadata.json of
+github.com/AmauryWEI/hopnet), so its frame 100 is 0.417 s.
 
 `--contacts` measures instead which contacts differ: every recorded frame of DATA's test split is stepped once, so that
 errors do not accumulate.
+
+`--bundled` writes the errors of the solver and of all bundled models to the section MOVi-C of docs/paper.md.
 """
 
 from dataclasses import replace
@@ -39,12 +43,24 @@ BESIDE = 0.02  # m between the bounding balls of two bodies, up to which they ar
 RATE, HOPNET = 240, {50: (0.047, None), 75: (0.101, None), 100: (0.176, 17.9)}
 
 
-def main(data: Path, *, contacts: bool = False) -> None:
-    if contacts:
-        differing(data)
+def main(data: Path, *, contacts: bool = False, bundled: bool = False) -> None:
+    if contacts or bundled:
+        (differing if contacts else of_models)(data)
         return
     horizons(data)
     instants(data)
+
+
+def of_models(data: Path) -> None:
+    """Write the section: errors of the solver and of all bundled models, with exact free flight."""
+    found = {}
+    for model in ("solver", "small", "gnn", "sdf-sim"):
+        report = evaluate(data, model=model, steps=100, chaos_floor=model == "solver", errors_only=True)
+        found[f"`{model}`"] = report["model"]
+        if model == "solver":
+            found["all contact ignored"] = report["ballistic"]
+            found["the engine again, starts 1e-3 m/s off"] = report["chaos_floor"]["perturbations"]["1e-3"]
+    write_section("MOVi-C", f"{COMMAND} --bundled", table(found))
 
 
 def horizons(data: Path) -> None:
@@ -55,6 +71,11 @@ def horizons(data: Path) -> None:
     found = {"`solver`": solver["model"], "`small`": small["model"], "all contact ignored": small["ballistic"]}
     for size, errors in small["chaos_floor"]["perturbations"].items():
         found[f"the engine again, starts {size} m/s off"] = errors
+    write_section("MOVi-B", COMMAND, table(found))
+
+
+def table(found: dict[str, dict]) -> str:
+    """Errors at both horizons, a row for each motion."""
     rows: list[tuple[str, ...]] = [("", *(f"{unit}, {steps} steps" for steps in STEPS for unit in ("m", "degrees")))]
     for name, errors in found.items():
         cells = []
@@ -62,7 +83,7 @@ def horizons(data: Path) -> None:
             metres, low, high = map(number, (errors[steps]["translation_rmse"], *errors[steps]["translation_rmse_95"]))
             cells += [f"{metres} [{low}, {high}]", number(errors[steps]["rotation_error"])]
         rows.append((name, *cells))
-    write_section("MOVi-B", COMMAND, markdown(rows))
+    return markdown(rows)
 
 
 def instants(data: Path) -> None:
