@@ -64,7 +64,8 @@ def hull(vertices: np.ndarray) -> ConvexPiece:
         triangles[one[0]] if len(one) == 1 else _around(corners, np.unique(triangles[one]), normal)
         for one, normal in zip(of_face, normals, strict=True)
     )
-    thickness = min(float(np.ptp(corners @ some.T, axis=0).min()) for some in _blocks(normals, len(corners)))
+    parts = np.array_split(normals, max(1, normals.size * len(corners) // 2**23))  # so that tables stay small
+    thickness = min(float(np.ptp(corners @ part.T, axis=0).min()) for part in parts)
     middle = 0.5 * (corners.min(0) + corners.max(0))
     ball = np.array([*middle, np.linalg.norm(corners - middle, axis=1).max()])
     sides = np.concatenate([triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))])
@@ -85,11 +86,6 @@ def _flat(normals: np.ndarray) -> np.ndarray:
         if leader[one] == one and leader[other] == other:
             leader[other] = one
     return leader[first[same]]
-
-
-def _blocks(rows: np.ndarray, width: int) -> list[np.ndarray]:
-    """Parts of `rows`, few enough for tables of `width` columns each."""
-    return np.array_split(rows, max(1, len(rows) * width // 2**22))
 
 
 def _grouped(owner: np.ndarray, value: np.ndarray, count: int) -> tuple[np.ndarray, ...]:

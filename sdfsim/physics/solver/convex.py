@@ -105,17 +105,6 @@ def outermost(convex, p, d):
     return best
 
 
-@njit(**BARE)
-def outside(convex, p, place):
-    """A lower bound of how far a point, in the hull's frame, is outside: its largest height above the plane of a
-    face."""
-    most = -math.inf
-    for f in range(convex.face_start[p], convex.face_start[p + 1]):
-        n = get(convex.face, f)
-        most = max(most, dot(n, sub(place, get(convex.vertex, convex.loop[convex.loop_start[f]]))))
-    return most
-
-
 @njit(**INLINED)
 def core(convex, p, d):
     """The point of the core of piece p, in its own frame, that is farthest along d."""
