@@ -68,6 +68,7 @@ def simulate(
     print_failed(session, report)
     if "recording" in report:
         lines.append(f"watch it: sdfsim view {out}   (or: rerun {report['recording']})")
+    lines.append(f"laws: surfaces measured in {report['frames_measured']} of {report['frames']} frames, energy in all")
     lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
     session.report(report, lines)
     if viewer == "web":

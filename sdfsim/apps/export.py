@@ -501,6 +501,8 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     folder = out.with_name(f"{out.stem}_assets").name
     add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
     add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
+    if scene.joints:  # with the explicit default, stiff motors of light links chatter
+        root[-1].set("integrator", "implicitfast")
     if sampled:  # number of starts and iterations with which MuJoCo searches the nearest points of two bodies
         root[-1].attrib |= {"sdf_initpoints": "40", "sdf_iterations": "10"}
     add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than the default

@@ -13,6 +13,7 @@ from sdfsim.scene.scene import Body, Joint, Scene
 
 NESTING = ("hinge", "slider", "ball", "fixed")  # kinds of joints by which one body can hold another in a tree
 KEEN = 20.0  # s/rad or s/m: gain of a motor, its largest force divided by the speed error at which it gives this force
+LEAST_TIME = 1e-3  # s: shorter times to a position give no larger stiffness
 EFFORT = 1e6  # N m or N, and rad/s or m/s: URDF requires limits, so these are given where there are none
 
 
@@ -109,12 +110,9 @@ def start_of(scene: Scene, one: Held, child: int) -> float:
     if one.joint.kind == "hinge":
         vector = (theirs.inv() * own).as_rotvec()
         angle = one.sense * vector[0]
-        # Full turns add up, but a pose does not show them: take the angle within the limits.
-        low, high = one.joint.limits or (-math.pi, math.pi)
+        # Full turns add up, but a pose does not show them.
         whole = 2.0 * math.pi
-        return float(angle + whole * max(0, math.ceil((low - 1e-9 - angle) / whole)) - whole * max(
-            0, math.ceil((angle - high - 1e-9) / whole)
-        ))  # fmt: skip
+        return float(angle + whole * round((one.joint.start - angle) / whole))
     if one.joint.kind == "slider":
         apart = here + turn.apply(one.anchor) - there - other.apply(one.parent_anchor)
         return float(one.sense * theirs.apply([1.0, 0.0, 0.0]) @ apart)
@@ -153,6 +151,18 @@ def left_out(joints: Sequence[Joint], *, breaks: bool = True, spring_of: Sequenc
     }
     lines |= {f"springs of {kind}s": any(j.kind == kind and j.spring for j in joints) for kind in spring_of}
     return [line for line, there in lines.items() if there]
+
+
+def gains(joint: Joint) -> tuple[float, float]:
+    """Stiffness and damping of a motor for programs that know nothing else, N m/rad and N m s/rad (or N/m and N s/m);
+    0 if it has no target."""
+    motor = joint.motor
+    if motor is None or (motor.speed is None and motor.position is None):
+        return 0.0, 0.0
+    if motor.speed is not None:
+        return 0.0, motor.gain or KEEN * motor.most
+    kp = motor.gain or KEEN * motor.most / max(motor.time, LEAST_TIME)
+    return kp, kp * motor.time
 
 
 # --- MJCF ---
@@ -245,14 +255,14 @@ def mjcf_rest(
             add(into["contact"], "exclude", body1=bodies[first], body2=bodies[second])
         if joint.motor is None or joint in tree.loops:
             continue
-        speed = KEEN * joint.motor.most
+        kp, kv = gains(joint)
         keys = {"name": f"{names[joint.name]}_motor", "joint": names[joint.name]}
         keys |= {"forcerange": _text((-joint.motor.most, joint.motor.most))}
         if joint.motor.speed is not None:
-            add(into["actuator"], "velocity", kv=_text(speed), **keys)
+            add(into["actuator"], "velocity", kv=_text(kv), **keys)
             controls.append(joint.motor.speed)
         elif joint.motor.position is not None:
-            add(into["actuator"], "position", kp=_text(speed / joint.motor.time), kv=_text(speed), **keys)
+            add(into["actuator"], "position", kp=_text(kp), kv=_text(kv), **keys)
             controls.append(joint.motor.position)
         else:  # no target is set
             add(into["actuator"], "motor", **keys)
@@ -366,11 +376,10 @@ def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[st
     drive = physics.DriveAPI.Apply(made.GetPrim(), "angular" if joint.kind == "hinge" else "linear")
     drive.CreateTypeAttr("force")
     if joint.motor is not None:
-        told_none = joint.motor.speed is None and joint.motor.position is None
-        keen = 0.0 if told_none else KEEN * joint.motor.most
+        kp, kv = gains(joint)
         drive.CreateMaxForceAttr(joint.motor.most)
-        drive.CreateDampingAttr(keen / degrees)
-        drive.CreateStiffnessAttr(0.0 if joint.motor.position is None else keen / joint.motor.time / degrees)
+        drive.CreateDampingAttr(kv / degrees)
+        drive.CreateStiffnessAttr(kp / degrees)
         if joint.motor.speed is not None:
             drive.CreateTargetVelocityAttr(joint.motor.speed * degrees)
         elif joint.motor.position is not None:

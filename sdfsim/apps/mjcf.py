@@ -311,10 +311,11 @@ class _Reader:
                 if model.jnt_limited[joint] and goal != (near := float(np.clip(goal, *model.jnt_range[joint]))):
                     self.notes.append(f"actuator {called} aims at {goal:.6g}: {near:.6g} is the nearest of its limits")
                     goal = near
-                found[name] = {"position": goal, "most": most}
-                found[name] |= {"time": float(bias[2] / bias[1])} if bias[2] < 0 else {}
+                stiff = float(-bias[1] * gear**2)
+                found[name] = {"position": goal, "most": most, "gain": stiff, "time": float(bias[2] / bias[1])}
             else:
-                found[name] = {"speed": wanted / (-bias[2] * gear), "most": most}
+                speed, gain = wanted / (-bias[2] * gear), float(-bias[2] * gear**2)
+                found[name] = {"speed": speed, "most": most, "gain": gain}
         if idle:
             self.notes.append(named("motors do nothing until an effort or a target of their joint is set", idle))
         if freely:

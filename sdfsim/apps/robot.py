@@ -80,7 +80,7 @@ class LinkJoint:
     start: float = 0.0  # rad or m
     limits: tuple[float, float] | None = None  # rad or m; for a ball the cone, for a distance a rope
     spring: tuple[float, float] | None = None  # stiffness, and rest position
-    motor: dict[str, float] | None = None  # speed or position (rad or m) or neither; most; time
+    motor: dict[str, float] | None = None  # speed or position (rad or m) or neither; most; time; gain
     others: dict[str, Any] = field(default_factory=dict)  # further keys of scene.yaml
     loop: bool = False  # closes a loop: its links may touch
 

@@ -255,6 +255,7 @@ def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
     return {
         "model": rollout.meta["model"],
         "steps": len(rollout),
+        "frames": len(rollout.time),
         "dt_s": rollout.meta["dt"],
         "simulated_s": float(rollout.time[-1]),
         "wall_s": round(wall, 3),

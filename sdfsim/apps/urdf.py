@@ -401,4 +401,8 @@ class _Reader:
         if low > high:  # PyBullet's way to say "no limits"
             self.notes.append(f"joint {name} has its lower limit above its upper one: nothing bounds it")
             return None
+        if low == high == 0.0:
+            self.notes.append(
+                f"joint {name} has limits of 0 and 0, which lock it: give them, or lower above upper for none"
+            )
         return low, high

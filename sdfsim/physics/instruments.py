@@ -31,6 +31,7 @@ FADE = 0.9  # whenever energy falls to a new low, this part of the earlier avail
 PART, LEAST = 0.05, 0.1  # part of a run's time that measuring surfaces may take, and s that it may always take
 FEW, MANY = 32, 4096  # pairs that are measured together: at first, and at most
 LOOSE = 0.001  # relative to the size of the smaller body: how far a joint's parts may be apart
+IMPACTS = 6  # frames after an impact in which surfaces are always measured
 FEW_BODIES = 64  # dynamic bodies: with more, only their total energy is accounted for
 
 
@@ -104,9 +105,10 @@ def judged(
 ) -> Verdict:  # fmt: skip
     """Check a motion of a scene against the laws that hold for all rigid bodies.
 
-    Surfaces are measured in every `every`-th frame; if that would take longer than `seconds`, in fewer frames, spread
-    evenly and always including the last. `on_progress` is called with the share of these frames that are measured. A
-    scene that is not loaded yet is loaded as `Simulator` does.
+    Surfaces are always measured in the first frame, the last, and those after the hardest impacts; and in every
+    `every`-th frame, or in fewer of these, spread evenly, if that would take longer than `seconds`. `on_progress` is
+    called with the share of these frames that are measured. A scene that is not loaded yet is loaded as `Simulator`
+    does.
     """
     scene = loaded(scene)
     energy = energy_account(scene, rollout)
@@ -298,6 +300,28 @@ def _climb(
 # --- surfaces ---
 
 
+def telling_frames(scene: Scene, rollout: Rollout) -> list[int]:
+    """The frames that are measured however long it takes, so that a verdict does not depend on the clock: the last, the
+    first, and those after the `IMPACTS` largest changes of a body's velocity other than by gravity, apart from each
+    other in time."""
+    last = len(rollout.time) - 1
+    dynamic = [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
+    size = np.array([scene.bodies[k].scale * largest_extent(scene.shapes[scene.bodies[k].shape]) for k in dynamic])
+    change = np.diff(rollout.velocity[:, dynamic], axis=0) - scene.gravity * np.diff(rollout.time)[:, None, None]
+    hit = np.linalg.norm(change, axis=2) + size * np.linalg.norm(
+        np.diff(rollout.angular_velocity[:, dynamic], axis=0), axis=2
+    )
+    hardest = np.concatenate([[0.0], (hit / np.sqrt(size)).max(1, initial=0.0)])
+    found = list(dict.fromkeys((last, 0)))
+    apart = max(1, last // (4 * IMPACTS))
+    while len(found) < 2 + IMPACTS and hardest.max() > 0.0:
+        frame = int(hardest.argmax())
+        hardest[max(0, frame - apart) : frame + apart + 1] = 0.0
+        if frame not in found:
+            found.append(frame)
+    return found
+
+
 def in_order(count: int) -> Iterator[int]:
     """The numbers of `count` frames, each once: the last, the first, the middle, the quarters, ..."""
     seen = set()
@@ -339,14 +363,13 @@ def _surfaces(
     course = _Course(scene, rollout, solids, dynamic, group, allowed, pushed)
     deepest: Near | None = None
     widest: Near | None = None
-    done, chunk = 0, 1
-    frames = [every * k if k else 0 for k in in_order(-(-len(rollout.time) // every))]
-    if frames and frames[0] != len(rollout.time) - 1:
-        frames.insert(0, len(rollout.time) - 1)
+    always = telling_frames(scene, rollout)
+    done, chunk = 0, len(always)
+    frames = list(dict.fromkeys([*always, *(every * k for k in in_order(-(-len(rollout.time) // every)))]))
     while done < len(frames):
         some = np.array(frames[done : done + chunk])
         before = time.perf_counter()
-        deep, wide = _measured(course, some, started + seconds)
+        deep, wide = _measured(course, some, started + seconds if done else np.inf)
         done += len(some)
         on_progress(done / len(frames), f"{done} of {len(frames)} frames measured")
         if deep and (deepest is None or deep.part > deepest.part):

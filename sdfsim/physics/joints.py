@@ -15,6 +15,7 @@ from sdfsim.physics.joint_columns import (
     DRAG,
     FORCE,
     FRESH,
+    GAIN,
     HIGH,
     KINDS,
     LENGTH,
@@ -48,6 +49,7 @@ class Joints:
     anchor: np.ndarray  # [J, 2, 3] from the centres of mass, in the bodies' axes
     axes: np.ndarray  # [J, 2, 3, 3] the axes of the joint's frames in body axes, one per row
     number: np.ndarray  # [J, NUMBERS], see the columns
+    start: np.ndarray  # [J] angles of hinges and positions of sliders at the start
     target: np.ndarray  # [J] targets of motors
     collides: np.ndarray  # [J] bool, whether the two bodies may touch
 
@@ -59,13 +61,14 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
     """The joints of a scene; `com` [N, 3] are the centres of mass from the shapes' origins, in model units of `length`
     m, `time` s and `mass` kg."""
     count = len(joints)
-    number, target = np.zeros((count, NUMBERS)), np.zeros(count)
+    number, start, target = np.zeros((count, NUMBERS)), np.zeros(count), np.zeros(count)
     number[:, LOW], number[:, HIGH], number[:, LENGTH] = -np.inf, np.inf, -1.0
     force = mass * length / time**2
     torque = force * length
     for row, joint, k in zip(number, joints, range(count), strict=True):
         turns = joint.kind in ("hinge", "ball")
         unit, effort = (1.0, torque) if turns else (length, force)
+        start[k] = joint.start / unit
         if joint.limits is not None:
             one_sided = joint.kind in ("ball", "distance")
             row[LOW] = -np.inf if one_sided else joint.limits[0] / unit
@@ -76,9 +79,11 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
         if joint.spring is not None:
             row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
         if (motor := joint.motor) is not None:
-            row[MOST], row[TIME] = motor.most / effort, motor.time / time
+            row[MOST], row[TIME], gain = motor.most / effort, motor.time / time, motor.gain or 0.0
+            row[GAIN] = gain * unit / effort
             if motor.speed is not None:
                 row[MOTOR], target[k] = TO_SPEED, motor.speed * time / unit
+                row[GAIN] /= time
             elif motor.position is not None:
                 row[MOTOR], target[k] = TO_PLACE, motor.position / unit
         if joint.length is not None:
@@ -91,17 +96,14 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
     axes = np.ascontiguousarray(turned.reshape(count, 2, 3, 3).swapaxes(2, 3))
     kind = np.array([KINDS.index(joint.kind) for joint in joints], np.int64)
     collides = np.array([joint.collides for joint in joints], bool)
-    return Joints(body, kind, anchor, axes, number, target, collides)
+    return Joints(body, kind, anchor, axes, number, start, target, collides)
 
 
 def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
     """[J, STATE] of joints at the start, when only the poses of bodies are known."""
     state = np.zeros((len(joints), STATE))
     state[:, TARGET], state[:, FRESH] = joints.target, 1.0
-    # A hinge may be more than half a turn from its zero: take the angle that is within its limits.
-    ends = joints.number[:, LOW : HIGH + 1]
-    state[:, COORD] = np.where(np.isfinite(ends), ends, 0.0).mean(1)
-    state[:, COORD] = coordinates(joints, state[:, COORD], position, orientation)
+    state[:, COORD] = coordinates(joints, joints.start, position, orientation)
     return state
 
 

@@ -51,7 +51,7 @@ def held(
             place, back = known[body].position, Rotation.from_quat(known[body].quat_xyzw).inv()
         anchors.append(back.apply(point - place))
         frames.append((back * axes).as_quat())
-    return Joint(name, kind, bodies, np.stack(anchors), np.stack(frames), **others)
+    return Joint(name, kind, bodies, np.stack(anchors), np.stack(frames), start, **others)
 
 
 def joints_of(
@@ -111,7 +111,7 @@ def _joint(
         damping=table.damping,
         friction=table.friction,
         spring=spring and Spring(spring.stiffness, math.radians(spring.rest_deg) if hinge else spring.rest),
-        motor=motor and Motor(motor.most, motor.speed, place_of, motor.time),
+        motor=motor and Motor(motor.most, motor.speed, place_of, motor.time, motor.gain),
         breaks_force=math.inf if breaks is None or breaks.force is None else breaks.force,
         breaks_torque=math.inf if breaks is None or breaks.torque is None else breaks.torque,
         collides=table.collide == "on",

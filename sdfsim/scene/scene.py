@@ -95,12 +95,14 @@ class Spring:
 class Motor:
     """The motor of a hinge (rad, N m) or a slider (m, N). It keeps `speed`, or goes to `position`, with at most the
     torque or force `most`. The distance to the position shrinks by a factor e in `time` s. If both are None it does
-    nothing until a target is set."""
+    nothing until a target is set. With a `gain` the torque or force is gain * (position - now - time * its rate of
+    change), in N m/rad or N/m, or gain * (speed - now), in N m s/rad or N s/m; without, as much as that takes."""
 
     most: float
     speed: float | None = None
     position: float | None = None
     time: float = 0.1
+    gain: float | None = None
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,8 @@ class Joint:
         anchor: [2, 3] float64 m, the frames' origins relative to the shapes' origins, in body axes, with the bodies'
             scale applied (for the world: world coordinates).
         quat_xyzw: [2, 4] float64 unit quaternions, the frames' axes -> the bodies' axes.
+        start: rad or m, the angle of a hinge or the position of a slider at the start. Poses show it only up to full
+            turns.
         limits: the least and the largest angle (rad), position (m), angle between the axes of a ball (rad; the least is
             0), or distance (m; for a rope the least is 0); None if nothing bounds it.
         length: m, length of a rod; None for any other joint.
@@ -136,6 +140,7 @@ class Joint:
     bodies: tuple[int, int]
     anchor: np.ndarray
     quat_xyzw: np.ndarray
+    start: float = 0.0
     limits: tuple[float, float] | None = None
     length: float | None = None
     restitution: float = 0.0
@@ -211,8 +216,9 @@ def _held(joints: Sequence[Joint]) -> list:
     springs = _six_digits([(j.spring.stiffness, j.spring.rest) if j.spring else (0.0, 0.0) for j in joints])
     known = [_six_digits([getattr(j, name) for j in joints]) for name in ("anchor", "quat_xyzw", "restitution")]
     drags = _six_digits([(j.damping, j.friction, j.length or 0.0) for j in joints])
+    turns = [round(j.start / (2.0 * math.pi)) for j in joints if j.kind == "hinge"]
     bears = _six_digits([[min(most, 1e30) for most in (j.breaks_force, j.breaks_torque)] for j in joints])
-    return [kinds, limits, springs, *known, drags, bears]
+    return [kinds, limits, springs, *known, drags, bears, turns]
 
 
 def _described(shape: Shape) -> list:

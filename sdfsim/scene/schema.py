@@ -506,8 +506,13 @@ class MotorTable(Table):
     position_deg: Number | None = key("target angle of a hinge", None, "degrees")
     most: Number = key("largest torque of a hinge in N m, or largest force of a slider in N", gt=0)
     time: Number = key(
-        "time in which the distance to the target shrinks by a factor e; not with `speed`", 0.1, "s", gt=0
+        "time in which the distance to the target shrinks by a factor e; not with `speed`", 0.1, "s", ge=0
     )
+    gain: Number | None = key(
+        "torque or force is `gain` times (target - `time` times the rate of change - now), or times (speed - now); in "
+        "N m/rad or N m s/rad for a hinge, else in N/m or N s/m; by default as much as the target takes, up to `most`",
+        None, gt=0,
+    )  # fmt: skip
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:

@@ -12,6 +12,7 @@ from sdfsim.physics.joint_columns import (
     COORD,
     DAMPING,
     DRAG,
+    GAIN,
     MOST,
     MOTOR,
     NOTHING,
@@ -26,6 +27,8 @@ from sdfsim.physics.joint_columns import (
 from sdfsim.physics.joints import EFFORT
 from sdfsim.scene.scene import Joint, Motor
 from sdfsim.simulate.body import LiveScene
+
+EXACT = 1e-9  # rad, or model lengths: a reading of the joint may be this far beyond a limit
 
 
 class JointHandle:
@@ -95,7 +98,7 @@ class JointHandle:
         aim = self._finite("target", value)
         does = TO_SPEED if self._keeps_speed else TO_PLACE
         ends = self._joint.limits
-        if does == TO_PLACE and ends is not None and not ends[0] <= aim <= ends[1]:
+        if does == TO_PLACE and ends is not None and max(ends[0] - aim, aim - ends[1]) > EXACT * self._unit:
             # Only a warning: a target out of reach is a way to press against a limit.
             message = f"joint {self.name!r}: target {aim:g} is beyond the limits, {ends[0]:.4g} to {ends[1]:.4g}"
             warnings.warn(message, stacklevel=2)
@@ -129,7 +132,7 @@ class JointHandle:
     def most(self, value: float) -> None:
         self._need("most", "hinge", "slider")
         most = self._finite("most", value, least=0.0) / self._strength
-        time = self._number[TIME] or Motor(1.0).time / self._simulator.units.time
+        time = self._number[TIME] if self._number[MOST] else Motor(1.0).time / self._simulator.units.time
         self._tell({MOST: most, TIME: time})
 
     @property
@@ -143,10 +146,23 @@ class JointHandle:
 
     @time.setter
     def time(self, value: float) -> None:
-        known, time = self.time, self._finite("time", value, least=0.0)
-        if not time > 0.0:
-            raise SdfsimError(f"joint {self.name!r}: time: must be above 0 (got {value!r}; now {known:g})")
-        self._tell({TIME: time / self._simulator.units.time})
+        _ = self.time  # is one for positions
+        self._tell({TIME: self._finite("time", value, least=0.0) / self._simulator.units.time})
+
+    @property
+    def gain(self) -> float | None:
+        """The motor's torque or force for an error of its target: N m/rad or N/m for a position, N m s/rad or N s/m for
+        a speed; None if it is as much as the target takes, up to `most`. Raises SdfsimError if there is no motor."""
+        unit = self._strength / self._aim
+        return float(self._number[GAIN]) * unit or None
+
+    @gain.setter
+    def gain(self, value: float | None) -> None:
+        unit = self._strength / self._aim
+        found = 0.0 if value is None else self._finite("gain", value, least=0.0)
+        if value is not None and not found > 0.0:
+            raise SdfsimError(f"joint {self.name!r}: gain: must be above 0, or None (got {value!r})")
+        self._tell({GAIN: found / unit})
 
     @property
     def damping(self) -> float:

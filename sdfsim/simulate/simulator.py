@@ -230,7 +230,7 @@ class Simulator(LiveScene):
         if not np.array_equal(options.gravity, self._options.gravity):
             self._accept()
             nobody = np.zeros(len(self.bodies), bool)
-            self._state = self._good = self.stepper.announce(self._state, self.carry, nobody, gravity=True)
+            self._state = self._good = self.stepper.announce(self._state, self.carry, nobody, nobody, gravity=True)
         self._options = options
         if self._carry is not None:
             self._carry.options, self._carry.weights, self._carry.tensors = options, None, None
@@ -405,7 +405,7 @@ class Simulator(LiveScene):
             raise self._broke(broken, stacked(good, [], self.bodies, self._options) if keep else None)
         gravity = self._options.gravity
         self._given += sum(energies_of(self.bodies, state, gravity)) - sum(energies_of(self.bodies, good, gravity))
-        self._state = self._good = self.stepper.announce(state, self.carry, changed)
+        self._state = self._good = self.stepper.announce(state, self.carry, changed, differing_motion(state, good))
 
     def _described(self, fault: Fault) -> str:
         return f"body {self._names[fault.body]!r}: {fault.described(self.units, self._options.dt)}"
@@ -457,9 +457,7 @@ def _whole(count: int) -> int:
 
 def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
     """[N] bool, the bodies whose motion, pulling force or motors differ between the two states."""
-    found = np.zeros(len(bodies), bool)
-    for name in MOTION:
-        found |= np.any(getattr(state, name) != getattr(other, name), axis=-1)
+    found = differing_motion(state, other)
     pulled = [np.zeros((1, 6)) if one.load is None else one.load for one in (state, other)]
     found |= np.any(pulled[0] != pulled[1], axis=-1)
     if bodies.joints is not None and state.joints is not None and other.joints is not None:
@@ -467,6 +465,14 @@ def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
         driven = (state.joints[:, TARGET] != other.joints[:, TARGET]) | np.any(numbers[0] != numbers[1], axis=-1)
         held = bodies.joints.body[driven]
         found[held[held >= 0]] = True
+    return found
+
+
+def differing_motion(state: State, other: State) -> np.ndarray:
+    """[N] bool, the bodies whose pose or velocities differ between the two states."""
+    found = np.zeros(len(state.position), bool)
+    for name in MOTION:
+        found |= np.any(getattr(state, name) != getattr(other, name), axis=-1)
     return found
 
 

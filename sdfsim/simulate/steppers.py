@@ -144,9 +144,12 @@ class Stepper:
 
         return Carry(bodies, options, scene=Compiled(bodies, state, shared, grids=not self.solids))
 
-    def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
-        """The state after the user has changed pose, velocities or load of the bodies `changed` [N] bool, or gravity.
-        Data precomputed from static bodies is made again if one of them has changed."""
+    def announce(
+        self, state: State, carry: Carry, changed: np.ndarray, moved: np.ndarray, *, gravity: bool = False
+    ) -> State:
+        """The state after the user has changed pose, velocities, load or motors of the bodies `changed` [N] bool, pose
+        or velocities of those that he `moved` [N], or gravity. Data precomputed from static bodies is made again if one
+        of them has changed."""
         scene = carry.scene
         if scene is not None and (changed & ~(scene.world.moves | scene.world.scripted)).any():
             scene.place(state)
@@ -200,10 +203,12 @@ class Solver(Stepper):
             return []
         return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
 
-    def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
+    def announce(
+        self, state: State, carry: Carry, changed: np.ndarray, moved: np.ndarray, *, gravity: bool = False
+    ) -> State:
         from sdfsim.physics.solver.prepare import disturbed
 
-        return disturbed(carry.bodies, super().announce(state, carry, changed), changed, gravity=gravity)
+        return disturbed(carry.bodies, super().announce(state, carry, changed, moved), changed, moved, gravity=gravity)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         from sdfsim.physics.solver.prepare import contact_points
@@ -299,9 +304,11 @@ class OnSurfaces(Stepper):
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
         return with_history(state, bodies, options)
 
-    def announce(self, state: State, carry: Carry, changed: np.ndarray, *, gravity: bool = False) -> State:
+    def announce(
+        self, state: State, carry: Carry, changed: np.ndarray, moved: np.ndarray, *, gravity: bool = False
+    ) -> State:
         """The earlier positions of changed bodies are computed from their velocities."""
-        return with_history(super().announce(state, carry, changed), carry.bodies, carry.options, changed)
+        return with_history(super().announce(state, carry, changed, moved), carry.bodies, carry.options, changed)
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         """The edges were found at the start of the step; their points are returned for the poses of `state`."""

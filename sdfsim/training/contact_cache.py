@@ -214,7 +214,7 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
         for now in range(count - 1):
             state = replace(state_at(group, [now] * len(group), start), touch=touch)
             state = _disturbed(bodies, state, how, rng) if draw else state
-            after, _ = solver.advance(solver.announce(state, carry, moves), carry)
+            after, _ = solver.advance(solver.announce(state, carry, moves, moves), carry)
             touch = after.touch
             recorded = state_at(group, [now + 1] * len(group), start)
             parts += _of_step(bodies, state, after, cast("Edges", carry.edges), recorded, options, found.floor)

@@ -183,6 +183,8 @@ def test_actuators_of_an_mjcf_become_motors_as_strong_as_theirs(tmp_path: Path) 
     assert motors["ja"].position == pytest.approx(np.radians(10)) and motors["ja"].time == pytest.approx(0.1)
     assert (motors["jb"].most, motors["jb"].position, motors["jb"].speed) == (pytest.approx(15.0), None, None)
     assert (motors["jc"].most, motors["jc"].speed) == (pytest.approx(3.0), 0.0)
+    # Torques at the joint: a gear of 2 multiplies both the place that the actuator sees and its force.
+    assert (motors["ja"].gain, motors["jc"].gain) == (pytest.approx(200.0), pytest.approx(7.0))
     told = "\n".join(report["notes"])
     assert "bodies without a joint to the world stand still" in told and "base" in told
     assert "motors do nothing until an effort or a target of their joint is set (1: mb)" in told
@@ -192,6 +194,118 @@ def test_actuators_of_an_mjcf_become_motors_as_strong_as_theirs(tmp_path: Path) 
     sim.joint("jb").target = 0.5
     sim.step(5)
     assert sim.joint("jb").speed > 0.1
+
+
+def servos(armature: float) -> str:
+    """An arm of seven links, light at its end, with servos as stiff as those of a real one."""
+    bodies, ends, actuators = "", "", ""
+    rows = [(3, 4500), (2.5, 4500), (2, 3500), (2, 3500), (2, 2000), (1, 2000), (0.1, 2000)]
+    for k, (mass, kp) in enumerate(rows):
+        axis = "0 0 1" if k in (0, 2, 4) else "0 1 0"
+        bodies += (
+            f'<body name="l{k}" pos="0.03 0 .15"><joint name="j{k}" axis="{axis}" range="-2.9 2.9" damping="1" '
+            f'armature="{armature}"/><geom type="capsule" fromto="0 0 0 0 0 .1" size=".04" mass="{mass}" '
+            'contype="0" conaffinity="0"/>'
+        )
+        ends += "</body>"
+        actuators += (
+            f'<general joint="j{k}" biastype="affine" gainprm="{kp}" biasprm="0 -{kp} -{kp // 10}" '
+            f'forcerange="-{87 if k < 4 else 12} {87 if k < 4 else 12}"/>'
+        )
+    start = "0.1 0.6 -0.3 0.8 0.2 0.5 0.4"
+    return f"""<mujoco><compiler autolimits="true" angle="radian"/><option integrator="implicitfast"/>
+      <worldbody>{bodies}{ends}</worldbody><actuator>{actuators}</actuator>
+      <keyframe><key name="start" qpos="{start}" ctrl="{start}"/></keyframe></mujoco>"""
+
+
+def in_mujoco(file: Path, seconds: float) -> tuple[np.ndarray, int]:
+    """Positions of joints at the end, and how often a motor's force changes its sign by more than a thousandth of the
+    largest force."""
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    forces = []
+    while data.time < seconds:
+        mujoco.mj_step(model, data)
+        forces.append(data.actuator_force.copy())
+    force = np.array(forces)
+    sign = np.sign(np.where(np.abs(force) > 1e-3 * np.abs(force).max(), force, 0.0))
+    return data.qpos.copy(), int((sign[1:] * sign[:-1] < 0).sum())
+
+
+@pytest.mark.parametrize("armature", [0.1, 0.001])
+def test_a_robot_with_stiff_servos_moves_alike_here_and_after_its_export(tmp_path: Path, armature: float) -> None:
+    """All three sag by the same angles; MuJoCo's motors do not chatter."""
+    source = write(tmp_path, "robot.xml", servos(armature))
+    scene, _ = imported(source)
+    export(tmp_path / "scene.yaml", tmp_path / "out.xml")
+    (own, _), (exported, chatter) = in_mujoco(source, 2.0), in_mujoco(tmp_path / "out.xml", 2.0)
+    sim = Simulator(scene)
+    start = np.array([sim.joint(f"j{k}").angle for k in range(7)])
+    sim.step(sim.steps_in(2.0))
+    here = np.array([sim.joint(f"j{k}").angle for k in range(7)])
+    assert np.abs(own - start).max() > 1e-3
+    assert exported == pytest.approx(own, abs=1e-5) and here == pytest.approx(own, abs=1e-5)
+    assert chatter <= 20
+
+
+def test_motors_of_every_kind_move_alike_after_their_export(tmp_path: Path) -> None:
+    scene = SceneBuilder(gravity=(0, 0, -9.81))
+    motors = {
+        "goes": ("hinge", {"position_deg": 40, "most": 60}),
+        "quick": ("hinge", {"position_deg": 40, "most": 60, "time": 0.02}),
+        "soft": ("hinge", {"position_deg": 40, "most": 60, "gain": 30, "time": 0.2}),
+        "turns": ("hinge", {"speed": 2, "most": 60}),
+        "drags": ("hinge", {"speed": 2, "most": 60, "gain": 5}),
+        "lifts": ("slider", {"position": 0.2, "most": 60, "gain": 400, "time": 0.1}),
+    }
+    for k, (name, (kind, motor)) in enumerate(motors.items()):
+        scene.add(name, box={"size": (0.3, 0.05, 0.05)}, position=(0.15, k, 2), mass=1.0, collides_with=[])
+        axis = (0, 0, 1) if kind == "slider" else (0, 1, 0)
+        scene.join(f"of {name}", kind, name, anchor=(0, k, 2), axis=axis, motor=motor)
+    export(scene.save(tmp_path / "scene.yaml"), tmp_path / "out.xml")
+    there, _ = in_mujoco(tmp_path / "out.xml", 2.0)
+    sim = Simulator(load_scene(tmp_path / "scene.yaml"))
+    sim.step(sim.steps_in(2.0))
+    joints = [sim.joint(f"of {name}") for name in motors]
+    here = [j.position if kind == "slider" else j.angle for j, (kind, _) in zip(joints, motors.values(), strict=True)]
+    assert here == pytest.approx(there.tolist(), abs=0.02)
+
+
+TURNS = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass value="1"/>
+  <inertia ixx=".01" iyy=".01" izz=".01"/></inertial><visual><geometry><box size=".3 .1 .1"/></geometry></visual></link>
+  <joint name="pin" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+  <limit lower="{}" upper="{}" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(("low", "high", "start"), [(0, 6.2832, 0), (-6.2832, 0, 0), (7, 9, 7), (-0.1, 12, 0)])
+def test_a_urdf_s_joints_start_at_zero_or_the_limit_next_to_it(tmp_path: Path, low: float, high: float, start: float):
+    """Its links are only seen: nothing in the scene can touch anything."""
+    scene, _ = imported(write(tmp_path, "r.urdf", TURNS.format(low, high)))
+    sim = Simulator(scene)
+    sim.step(10)
+    assert sim.joint("pin").angle == pytest.approx(start, abs=1e-4)
+
+
+def test_limits_of_zero_and_zero_are_told(tmp_path: Path) -> None:
+    _, report = imported(write(tmp_path, "r.urdf", TURNS.format(0, 0)))
+    assert any("joint pin" in line and "lock" in line for line in report["notes"])
+
+
+def test_an_mjcf_hinge_of_more_than_a_turn_falls_as_in_mujoco(tmp_path: Path) -> None:
+    text = """<mujoco><compiler angle="degree" autolimits="true"/><worldbody><body pos="0 0 1">
+      <joint name="pin" axis="0 1 0" range="0 400" damping=".3"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/></body></worldbody></mujoco>"""
+    scene, _ = imported(write(tmp_path, "pin.xml", text))
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    while data.time < 6.0:
+        mujoco.mj_step(model, data)
+    sim = Simulator(scene)
+    sim.step(sim.steps_in(6.0))
+    assert sim.joint("pin").angle == pytest.approx(data.qpos[0], abs=0.01)
+    export(tmp_path / "scene.yaml", tmp_path / "out.xml")
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")).key_qpos[0] == pytest.approx([0.0], abs=1e-9)
 
 
 def test_an_exported_motor_without_a_target_comes_back(tmp_path: Path) -> None:

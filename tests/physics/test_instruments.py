@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.apps.run import summary
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.physics.instruments import in_order, judged
+from sdfsim.physics.instruments import in_order, judged, telling_frames
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.true_surfaces import Gaps, Placed, gaps, true_surface
 from sdfsim.scene.scene import Body, Scene, Waypoints
@@ -464,6 +464,30 @@ def test_little_time_measures_few_frames_and_the_last():
     verdict = judged(crossing(0.02), motion(crossing(0.02), place, np.zeros_like(place)), seconds=0.02)
     assert 1 <= verdict.frames < 2000
     assert verdict.overlap is not None and verdict.overlap.at_s == pytest.approx(DT * 1999)
+
+
+@pytest.mark.parametrize("hit", [0, 700, 1300])
+def test_a_fault_at_the_start_or_after_an_impact_is_told_without_any_time(hit: int):
+    """Bodies that start in each other, or that a hit drives into each other, are not left to the clock."""
+    scene = crossing(0.02)
+    place = np.zeros((2000, 2, 3))
+    place[:] = np.stack([b.position for b in scene.bodies])
+    place[hit, 1, 2] -= 0.04
+    velocity = np.zeros_like(place)
+    velocity[:hit, 1, 2] = -np.linspace(0.0, 1.0, hit)
+    rollout = motion(scene, place, velocity)
+    verdicts = [judged(scene, rollout, seconds=0.0) for _ in range(2)]
+    assert verdicts[0] == verdicts[1] and verdicts[0].frames == len(telling_frames(scene, rollout))
+    assert verdicts[0].overlap is not None and verdicts[0].overlap.at_s == pytest.approx(DT * hit)
+
+
+def test_few_frames_are_told_apart_whatever_happens():
+    scene = crossing(0.02)
+    for count in (1, 2, 3, 50, 2000):
+        place = np.broadcast_to(np.stack([b.position for b in scene.bodies]), (count, 2, 3)).copy()
+        velocity = np.random.default_rng(0).normal(size=place.shape)
+        found = telling_frames(scene, motion(scene, place, velocity))
+        assert len(found) == len(set(found)) <= 8 and {0, count - 1} <= set(found)
 
 
 def test_a_report_has_what_the_instruments_say():

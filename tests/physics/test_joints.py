@@ -306,3 +306,136 @@ def test_a_joint_bears_what_pushes_where_it_allows_no_motion(kind, deep):
     assert np.linalg.norm(rollout.velocity[:, row], axis=-1) == pytest.approx(speed, abs=1e-4)
     weight = (20.0 if kind is door else 5.0) * G
     assert simulator.joint("joint").force[2] == pytest.approx(weight, rel=1e-3)
+
+
+def rod(joint: dict, gravity: float = G, **more) -> Simulator:
+    """A rod of 0.5 m and 2 kg, level, on a hinge at its end about y."""
+    built = scene(gravity=(0, 0, -gravity))
+    built.add("rod", box={"size": (0.5, 0.05, 0.05)}, position=(0.25, 0, 0), mass=2.0, **more)
+    built.join("pin", "hinge", "rod", anchor=(0, 0, 0), axis=(0, 1, 0), **joint)
+    return Simulator(built)
+
+
+ABOUT_END = 2.0 * ((0.5**2 + 0.05**2) / 12 + 0.25**2)  # kg m^2
+WEIGHT = 2.0 * G * 0.25  # N m about the end, level
+
+
+@pytest.mark.parametrize(
+    ("limits", "start"),
+    [((0, 720), 0), ((-720, 0), 0), ((0, 720), 400), ((-900, 10), -500), ((0, 360), 0), ((0, 360), 360), (None, 270)],
+)
+def test_a_hinge_starts_at_the_angle_that_is_given(limits, start):
+    """A pose shows an angle up to full turns only."""
+    ends = {"limits_deg": limits} if limits else {"spring": {"stiffness": 5.0, "rest_deg": start}}
+    simulator = rod({"start_deg": start, **ends}, gravity=0.0)
+    for _ in range(2):
+        assert math.degrees(simulator.joint("pin").angle) == pytest.approx(start, abs=1e-9)
+        assert simulator.joint("pin").speed == pytest.approx(0.0, abs=1e-9)
+        simulator.step(20)
+
+
+def test_jointed_bodies_with_nothing_to_touch_swing():
+    free, alone = rod({}), rod({}, collides_with=[])
+    free.step(50)
+    alone.step(50)
+    assert alone.joint("pin").angle == pytest.approx(free.joint("pin").angle, abs=1e-12)
+    assert alone.contact_points() == []
+
+
+MOTORS = {
+    "as strong as it takes": {"position_deg": 0, "most": 50.0},
+    "keen": {"position_deg": 0, "most": 50.0, "time": 0.02},
+    "weak": {"position_deg": 0, "most": 2.0},
+    "with a gain": {"position_deg": 0, "most": 50.0, "gain": 60.0, "time": 0.05},
+    "speed": {"speed": 0.0, "most": 3.0},
+}
+
+
+@pytest.mark.parametrize("motor", MOTORS.values(), ids=MOTORS.keys())
+@pytest.mark.parametrize("gravity", [0.0, G])
+def test_the_work_of_a_motor_is_what_energy_grows_by(motor: dict, gravity: float):
+    simulator = rod({"motor": motor}, gravity)
+    start, goal = simulator.initial_rollout(), 3.0 if "speed" in motor else 0.5
+    simulator.step(3)
+    simulator.joint("pin").target = goal
+    after = list(simulator.frames(60))
+    energy = np.concatenate([energy_of(part) for part in (start, *after)])
+    given = np.concatenate([part.counters["energy_given"] for part in after])
+    swing = max(np.ptp(energy), 0.1)
+    assert np.abs(np.cumsum(given) - (energy[1:] - energy[0])).max() < 2e-3 * swing
+
+
+def test_a_gripper_that_lifts_makes_no_energy():
+    """Targets change in each step while contacts hold: what the solve knows of impulses stays valid."""
+    built = scene()
+    built.add("floor", plane={}, friction=1.0)
+    built.add("cup", box={"size": (0.06, 0.06, 0.1)}, position=(0, 0, 0.05), mass=0.3, friction=1.0)
+    built.add("hand", box={"size": (0.2, 0.1, 0.02)}, position=(0, 0, 0.3), mass=1.0)
+    for name, x in (("left", -0.06), ("right", 0.06)):
+        built.add(name, box={"size": (0.02, 0.04, 0.16)}, position=(x, 0, 0.16), mass=0.1, friction=1.0)
+        close = {"position": 0.05, "most": 20.0}
+        built.join(f"{name} rail", "slider", name, "hand", axis=(-np.sign(x), 0, 0), motor=close)
+    built.join("lift", "slider", "hand", axis=(0, 0, 1), motor={"position": 0.0, "most": 100.0})
+    simulator = Simulator(built)
+    parts = list(simulator.frames(80))
+    for k in range(200):
+        simulator.joint("lift").target = 0.2 + 0.05 * math.sin(0.3 * k)
+        parts += list(simulator.frames(1))
+    energy = np.concatenate([energy_of(part) for part in parts])
+    given = np.concatenate([part.counters["energy_given"] for part in parts])
+    gained = np.diff(energy) - given[1:]
+    assert simulator["cup"].position[2] > 0.15
+    assert np.cumsum(gained).max() < 0.01 * 1.5 * G * 0.2  # of what lifts all of it
+    assert simulator["cup"].position[:2] == pytest.approx([0.0, 0.0], abs=1e-4)
+
+
+@pytest.mark.parametrize("gain", [50.0, 1e3, 1e5, 1e7])
+@pytest.mark.parametrize("time", [0.0, 0.02, 0.3])
+def test_a_motor_with_a_gain_sags_by_the_load_over_it(gain: float, time: float):
+    simulator = rod({"motor": {"position_deg": 0, "most": 1e6, "gain": gain, "time": time}, "damping": 3.0})
+    simulator.step(2000)
+    angle = simulator.joint("pin").angle
+    assert angle == pytest.approx(WEIGHT * math.cos(angle) / gain, rel=1e-3)
+    assert simulator.joint("pin").speed == pytest.approx(0.0, abs=1e-3 * WEIGHT / gain)
+
+
+@pytest.mark.parametrize(("gain", "time"), [(20.0, 0.0), (20.0, 0.02), (20.0, 0.3), (400.0, 0.01)])
+def test_a_motor_with_a_gain_moves_as_a_damped_oscillator(gain: float, time: float):
+    rollout = rod({"motor": {"position_deg": 30, "most": 1e6, "gain": gain, "time": time}}, gravity=0.0).run(2.0)
+
+    def rates(_: float, y: np.ndarray) -> list[float]:
+        return [y[1], gain * (math.pi / 6 - y[0] - time * y[1]) / ABOUT_END]
+
+    known = solve_ivp(rates, (0.0, 3.0), [0.0, 0.0], t_eval=rollout.time, rtol=1e-9, atol=1e-12).y[0]
+    assert np.abs(rollout.joint_position[:, 0] - known).max() < 0.01 * math.pi / 6
+
+
+def test_a_motor_with_a_gain_has_friction_and_a_largest_torque_beside_it():
+    motor = {"position_deg": 60, "most": 1.0, "gain": 20.0, "time": 0.02}
+    weak = rod({"motor": motor}, gravity=0.0).run(0.3)
+    assert weak.joint_position[-1, 0] == pytest.approx(0.5 * weak.time[-1] ** 2 / ABOUT_END, rel=2e-3)
+    stiff = rod({"motor": {"speed": 2.0, "most": 100.0, "gain": 3.0}, "friction": 0.5}, gravity=0.0)
+    stiff.step(300)
+    assert stiff.joint("pin").speed == pytest.approx(2.0 - 0.5 / 3.0, rel=1e-4)
+    stuck = rod({"motor": motor | {"position_deg": 1.0}, "friction": 0.5}, gravity=0.0)
+    stuck.step(100)
+    assert abs(stuck.joint("pin").angle) < 1e-12  # 20 N m/rad of a degree is less than the friction
+
+
+@pytest.mark.parametrize(("stiffness", "damping"), [(1e3, 25.9), (1e6, 245.0), (1e4, 3.0)])
+def test_a_lever_on_a_spring_rests_where_its_weight_says(stiffness: float, damping: float):
+    simulator = rod({"spring": {"stiffness": stiffness}, "damping": damping})
+    simulator.step(3000)
+    assert simulator.joint("pin").angle == pytest.approx(WEIGHT / stiffness, rel=1e-3)
+    assert simulator.joint("pin").speed == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_target_at_the_joint_s_own_reading_is_within_its_limits(recwarn):
+    simulator = rod({"limits_deg": (0, 90), "motor": {"position_deg": 0, "most": 50.0}})
+    simulator.step(100)
+    for _ in range(20):
+        simulator.joint("pin").target = simulator.joint("pin").angle
+        simulator.step(1)
+    assert not recwarn
+    with pytest.warns(UserWarning, match="beyond the limits"):
+        simulator.joint("pin").target = -0.01

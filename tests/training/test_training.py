@@ -54,7 +54,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
     scene, touch, found = Compiled(bodies, state), None, []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0))
-        state = disturbed(bodies, replace(state, touch=touch), bodies.moves)
+        state = disturbed(bodies, replace(state, touch=touch), bodies.moves, bodies.moves)
         made = scene.advance(state, options, 1, NO_LIMITS)
         solved, edges, touch = made.state, made.edges, made.state.touch
         if len(edges.pair):

@@ -27,6 +27,7 @@ from sdfsim.physics.joint_columns import (
     DRIVE,
     FORCE,
     FRESH,
+    GAIN,
     GIVEN,
     HIGH,
     HINGE,
@@ -92,6 +93,8 @@ ROUNDS = 6  # rounds of the search for impulses after which rows hold
 BREAKS = 4  # rounds in which joints may break in one inner step
 SOFTEN = 1e-10  # relative to the effect of a unit impulse along a row: makes redundant rows solvable
 GIVES = 0.2  # share of an overrun limit that an inner step resolves
+# (Phase of a motor with a gain in an inner step)^2 up to which it is not damped: ten inner steps a period.
+RESOLVED = 0.4
 AHEAD = 0.05  # model lengths (and rad): nearer limits are taken into account
 EXACT = 0.01  # relative to the precision to which contacts without joints are solved
 # Relative to its effect without joints: if the effect of a bounded row is less, joints allow no motion along it, and
@@ -199,6 +202,7 @@ class Bounded(NamedTuple):
     base: np.ndarray
     strong: np.ndarray
     grip: np.ndarray
+    soft: np.ndarray  # [R] compliance of a motor with a gain: how much its speed lags behind for a unit impulse
     give: np.ndarray  # [R] effect of a unit impulse along its own row, through the joints if that is known
     now: np.ndarray  # [R] the change so far
     known: np.ndarray  # [R] the impulses before
@@ -408,6 +412,13 @@ def _eased(world, work, rules, row, a, b, out):
 
 
 @njit(**BARE)
+def _late(z):
+    """The share that the velocity after an inner step has in the mean that damps exactly; `z` is the damping relative
+    to what stops the row in an inner step."""
+    return 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
+
+
+@njit(**BARE)
 def _springs(world, work, motion, rules, each, lines, j):
     """Springs and damping as soft rows, with the mean of the forces before and after the inner step."""
     number, state, kind, h = each.number, each.state, each.kind[j], rules.substep_dt
@@ -422,8 +433,7 @@ def _springs(world, work, motion, rules, each, lines, j):
         else:
             for x in range(12):
                 lines.line[j, e, x] = each.axis[j, 0, x]
-        z = damping * h * _eased(world, work, rules, lines.line[j, e], a, b, lines.eased[0])
-        late = 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
+        late = _late(damping * h * _eased(world, work, rules, lines.line[j, e], a, b, lines.eased[0]))
         give = h * (0.25 * stiff * h + damping * late)
         before = _reads(lines.line[j, e], motion, a, b)
         lines.active[j, e] = 2
@@ -766,17 +776,43 @@ def _limited(world, work, motion, rules, graph, each, c, rows, count, steady):
                 rows.impulse[count], rows.grip[count] = state[j, DRIVE + e], grip
                 count += 1
         elif grip > 0.0 or most > 0.0:
-            aim = 0.0
+            aim, soft, gain = 0.0, 0.0, number[j, GAIN]
             if motor == 1.0:
                 aim = state[j, TARGET]
             elif motor == 2.0:
                 aim = (state[j, TARGET] - coord) / max(number[j, TIME], h)
-            for x in range(12):
-                rows.row[count, x] = each.axis[j, 0, x]
-            _begin(world, work, motion, rules, each, rows, count, DRIVE_ROW, j, aim, free)
-            rows.impulse[count], rows.grip[count], rows.strong[count] = state[j, DRIVE], grip, most
-            count += 1
+            if motor > 0.0 and gain > 0.0:
+                ease = _eased(world, work, rules, each.axis[j, 0], a, b, rows.row[count])
+                aim, soft = _servo(motor, gain, number[j, TIME], state[j, TARGET], coord, before, h, ease)
+            # A motor with a gain and friction are rows of their own.
+            for part in range(2 if soft > 0.0 and grip > 0.0 else 1):
+                for x in range(12):
+                    rows.row[count, x] = each.axis[j, 0, x]
+                _begin(world, work, motion, rules, each, rows, count, DRIVE_ROW, j, aim if part == 0 else 0.0, free)
+                rows.impulse[count], rows.grip[count], rows.strong[count] = state[j, DRIVE], grip, most
+                if soft > 0.0:
+                    own = state[j, DRIVE + 1]
+                    rows.impulse[count] = own if part == 0 else state[j, DRIVE] - own
+                    rows.grip[count], rows.strong[count] = grip * part, most * (1 - part)
+                    rows.soft[count] = soft * (1 - part)
+                count += 1
     return count
+
+
+@njit(**BARE)
+def _servo(motor, gain, time, target, coord, before, h, ease):
+    """The speed and the compliance of a motor with a gain, as a row; `ease` is the effect of a unit impulse on it. The
+    force is the mean over the inner steps around (1/4, 1/2, 1/4), with damping where the inner step does not resolve
+    the period."""
+    if motor == 1.0:
+        late = _late(gain * h * ease)
+        return (target - (1.0 - late) * before) / late, 1.0 / (h * gain * late)
+    damping = gain * time
+    late = _late(damping * h * ease)
+    coarse = max(0.0, 1.0 - RESOLVED / (gain * h * h * ease))
+    stiff = gain * h * (0.25 + coarse) + damping * late
+    push = gain * (target - coord) + (0.25 * gain * h - damping * (1.0 - late)) * before
+    return push / stiff, 1.0 / (h * stiff)
 
 
 @njit(**BARE)
@@ -784,7 +820,7 @@ def _begin(world, work, motion, rules, each, rows, r, kind, j, aim, base):
     rows.kind[r], rows.of[r] = kind, j
     rows.body[r, 0], rows.body[r, 1] = each.body[j, 0], each.body[j, 1]
     rows.base[r], rows.want[r] = base, aim - base
-    rows.strong[r] = rows.grip[r] = 0.0
+    rows.strong[r] = rows.grip[r] = rows.soft[r] = 0.0
     rows.give[r] = _eased(world, work, rules, rows.row[r], each.body[j, 0], each.body[j, 1], rows.row[r])
 
 
@@ -961,7 +997,10 @@ def _sweep(moves, cone, rows, count, change):
         elif kind == DRIVE_ROW:
             aim = rows.base[r] + rows.want[r]
             now = aim - _short(rows, r, change) - rows.impulse[r] * rows.give[r]
-            total = _driven(now, aim, rows.give[r], rows.strong[r], rows.grip[r])
+            if rows.soft[r] > 0.0:
+                total = min(max((aim - now) / (rows.give[r] + rows.soft[r]), -rows.strong[r]), rows.strong[r])
+            else:
+                total = _driven(now, aim, rows.give[r], rows.strong[r], rows.grip[r])
         worst = max(worst, _step(moves, rows, count, r, total, change))
     r = 0
     while r < count:
@@ -1070,7 +1109,7 @@ def _room(count):
     return Bounded(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64), np.empty((count, 24)),
         np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
-        np.empty(count), np.empty(count), np.empty((0, 0)),
+        np.empty(count), np.empty(count), np.empty(count), np.empty((0, 0)),
     )  # fmt: skip
 
 
@@ -1132,13 +1171,16 @@ def _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island,
             _record_held(world, work, motion, rules, graph, each, lines, held.calm, comps[i], touched or deep)
         for r in range(count):
             if rows.kind[r] >= STOP_ROW:
-                _record_bounded(world, work, motion, rules, each, rows, r)
+                rows.known[r] = _record_bounded(world, work, motion, rules, each, rows, r)
         broke = False
         for i in range(lo, hi):
             if _broken(graph, each, lines, comps[i]):
                 broke = True
                 _factor(world, work, motion, rules, graph, factors, each, lines, comps[i])
         if not broke:
+            for r in range(count):
+                if rows.kind[r] >= STOP_ROW:
+                    each.state[rows.of[r], GIVEN] += rows.known[r]
             break
         # Broken joints no longer hold: find all impulses again.
         _clear(graph, system, island, comps, lo, hi, work.change)
@@ -1153,8 +1195,8 @@ def _solve_rows(world, work, motion, rules, system, held, comps, lo, hi, island,
 @njit(**FAST)
 def _seen(rows, count):
     return Bounded(
-        rows.kind, rows.of, rows.body, rows.row, rows.want, rows.impulse, rows.base, rows.strong, rows.grip, rows.give,
-        rows.now, rows.known, np.empty((count, count)),
+        rows.kind, rows.of, rows.body, rows.row, rows.want, rows.impulse, rows.base, rows.strong, rows.grip, rows.soft,
+        rows.give, rows.now, rows.known, np.empty((count, count)),
     )  # fmt: skip
 
 
@@ -1199,23 +1241,24 @@ def _add_pull(matrix, each, j, row, force):
 
 @njit(**BARE)
 def _record_bounded(world, work, motion, rules, each, rows, r):
-    """Record the impulse of a bounded row of a joint."""
+    """Record the impulse of a bounded row of a joint. Returns the work of its motor."""
     j, kind, impulse, h, state = rows.of[r], rows.kind[r], rows.impulse[r], rules.substep_dt, each.state
     _add_pull(work.matrix, each, j, rows.row[r], impulse / h)
     if kind == STOP_ROW:
         state[j, STOP] += rows.grip[r] * impulse
     elif kind == DRIVE_ROW:
-        state[j, DRIVE] = impulse
+        state[j, DRIVE] += impulse  # a motor with a gain and friction are two rows
         if rows.strong[r] > 0.0:
             before = _reads(each.axis[j, 0], motion, each.body[j, 0], each.body[j, 1])
             mean = 0.5 * (before + state[j, SPEED])
             own = impulse + (rows.grip[r] if mean > 0.0 else -rows.grip[r])
             state[j, DRIVE + 1] = min(max(own, -rows.strong[r]), rows.strong[r])
-            state[j, GIVEN] += state[j, DRIVE + 1] * mean
+            return state[j, DRIVE + 1] * mean
     else:
         for e in range(3):
             if rows.row[r, 3 + e] != 0.0:
                 state[j, DRIVE + e] = impulse
+    return 0.0
 
 
 @njit(**BARE)
@@ -1353,8 +1396,9 @@ def _resting(touching, graph, c):
 
 @njit(**BARE)
 def _kick(world, work, motion, rules, graph, each, lines, c, share):
-    """Add to velocities a share of the impulses of springs, damping, motors and friction in the last inner step."""
-    state = each.state
+    """Add to velocities a share of the impulses of springs, damping, motors and friction in the last inner step, and to
+    the work of motors what that is at the speeds before. Returns whether there were any."""
+    state, found = each.state, False
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] >= 0:
             continue
@@ -1366,20 +1410,45 @@ def _kick(world, work, motion, rules, graph, each, lines, c, share):
             impulse = share * (state[j, SOFT + e] + state[j, DRIVE + e])
             if impulse == 0.0:
                 continue
+            found = True
             row = each.axis[j, 0]
             if each.kind[j] == BALL:
                 row = lines.line[j, 3 + e]
                 _write_turn(row, _unit(e))
-            eased = _eased(world, work, rules, row, a, b, lines.eased[0])
-            if each.kind[j] != BALL and state[j, DRIVE + 1] != 0.0:  # for which the motor's work is recorded
-                before = _reads(row, motion, a, b)
-                state[j, GIVEN] += share * state[j, DRIVE + 1] * (before + 0.5 * impulse * eased)
+            else:
+                state[j, GIVEN] += 0.5 * share * state[j, DRIVE + 1] * _reads(row, motion, a, b)
+            _eased(world, work, rules, row, a, b, lines.eased[0])
             for s in range(2):
                 body = each.body[j, s]
                 if body >= 0 and world.moves[body]:
                     for x in range(3):
                         motion.velocity[body, x] += impulse * lines.eased[0, 12 + 6 * s + x]
                         motion.angular[body, x] += impulse * lines.eased[0, 15 + 6 * s + x]
+    return found
+
+
+@njit(**BARE)
+def _projected(world, work, motion, rules, held, one, share, limits):
+    """Change the velocities of a component, after `_kick` by `share`, to those that its joints allow; with `limits`,
+    also those limits that hold."""
+    graph, each, c = held.graph, held.each, one[0]
+    rows = _room(np.int64(2 * (graph.comp[c + 1] - graph.comp[c])))
+    count = np.int64(0)
+    if limits:
+        count = _limited(world, work, motion, rules, graph, each, c, reference(rows), count, True)
+    _hold_steady(world, work, motion, rules, held, one, _seen(rows, count if count <= DENSE else 0), count)
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        n = graph.node[k]
+        if n >= 0:
+            for x in range(3):
+                motion.velocity[n, x] += work.change[n, x]
+                if rules.options.rotation:
+                    motion.angular[n, x] += work.change[n, 3 + x]
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        if graph.node[k] < 0 and each.kind[-1 - graph.node[k]] != BALL:
+            j = -1 - graph.node[k]
+            speed = _reads(each.axis[j, 0], motion, each.body[j, 0], each.body[j, 1])
+            each.state[j, GIVEN] += 0.5 * share * each.state[j, DRIVE + 1] * speed
 
 
 @njit(**FAST, inline="always")
@@ -1396,12 +1465,24 @@ def begin_step(world, work, motion, rules, held):
             _ready(world, work, rules, graph, c, 1.0)
     if fresh:
         _find_first(world, work, motion, rules, held)
+    kicked = np.zeros(len(graph.comp) - 1, np.bool_)
     for c in range(len(graph.comp) - 1):
         if not asleep(motion.island, graph, c) and not _resting(motion.touching, graph, c):
             for k in range(graph.comp[c], graph.comp[c + 1]):
                 if graph.node[k] < 0:
                     _coordinate(each, motion.position, work.matrix, -1 - graph.node[k])
-            _kick(world, work, motion, rules, graph, each, lines, c, -0.5)
+            kicked[c] = _kick(world, work, motion, rules, graph, each, lines, c, -0.5)
+    if not kicked.any():
+        return
+    one = np.empty(1, np.int64)
+    for c in range(len(graph.comp) - 1):
+        if kicked[c]:
+            _ready(world, work, rules, graph, c, 0.0)
+    assemble(world, work, motion, rules, held, False)
+    for c in range(len(graph.comp) - 1):
+        if kicked[c]:
+            one[0] = c
+            _projected(world, work, motion, rules, held, one, -0.5, False)
 
 
 @njit(**FAST)
@@ -1453,21 +1534,7 @@ def end_step(world, work, motion, rules, held):
             continue
         _kick(world, work, motion, rules, graph, each, lines, c, 0.5)
         one[0] = c
-        rows = _room(np.int64(2 * (graph.comp[c + 1] - graph.comp[c])))
-        count = _limited(world, work, motion, rules, graph, each, c, reference(rows), np.int64(0), True)
-        _hold_steady(world, work, motion, rules, held, one, _seen(rows, count if count <= DENSE else 0), count)
-        for k in range(graph.comp[c], graph.comp[c + 1]):
-            n = graph.node[k]
-            if n >= 0:
-                for x in range(3):
-                    motion.velocity[n, x] += work.change[n, x]
-                    if rules.options.rotation:
-                        motion.angular[n, x] += work.change[n, 3 + x]
-            else:
-                j = -1 - n
-                a, b = each.body[j, 0], each.body[j, 1]
-                speed = _reads(each.axis[j, 0], motion, a, b)
-                each.state[j, SPEED] = speed + _reads_six(each.axis[j, 0], work.change, a, b)
+        _projected(world, work, motion, rules, held, one, 0.5, True)
     for j in range(len(each.body)):
         a, b = each.body[j, 0], each.body[j, 1]
         each.state[j, SPEED] = _reads(each.axis[j, 0], motion, a, b)

@@ -249,12 +249,13 @@ def _touch(motion: compiled.Motion, manifolds: compiled.Manifolds) -> Touch:
     )  # fmt: skip
 
 
-def disturbed(bodies: Bodies, state: State, changed: np.ndarray, *, gravity: bool = False) -> State:
+def disturbed(bodies: Bodies, state: State, changed: np.ndarray, moved: np.ndarray, *, gravity: bool = False) -> State:
     """The state after a user has changed the bodies `changed` [N] bool, or `gravity`: these bodies are woken, and so
-    are those that slept with them or on them."""
+    are those that slept with them or on them. Pose or velocities of the bodies `moved` [N] have changed, not only what
+    acts on them."""
     touch = state.touch
-    if bodies.joints is not None and state.joints is not None and changed.any():
-        # Impulses of joints at changed bodies, and at all bodies connected to them, are no longer known.
+    if bodies.joints is not None and state.joints is not None and moved.any():
+        # Impulses of joints at moved bodies, and at all bodies connected to them, are no longer known.
         place = jointed.coordinates(
             bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
         )
@@ -269,7 +270,7 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, *, gravity: boo
     restless[beside[changed[beside[:, 1]], 0]] = True
     restless[beside[changed[beside[:, 0]], 1]] = True
     up = np.full(len(island), gravity) | np.isin(island, island[restless & (island >= 0)])
-    island[up], quiet[up | changed], touching[changed] = -1, 0, False
+    island[up], quiet[up | changed], touching[moved] = -1, 0, False
     return replace(state, touch=replace(touch, island=island, quiet=quiet, touching=touching))
 
 
@@ -411,12 +412,15 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
     moves = array["moves"]
     eigen = np.linalg.eigvalsh(inertia)
     isotropic = eigen[:, 2] - eigen[:, 0] <= 1e-9 * eigen[:, 2]
+    touched = array["shape"] >= 0
+    thickness = np.full(len(moves), np.inf)
+    thickness[touched] = shapes.table[array["shape"][touched], kinds.THICKNESS] * array["scale"][touched]
     scripted = np.zeros(len(moves), bool)
     if bodies.tracks is not None:
         scripted[bodies.tracks.body] = True
     infinite = ~np.isfinite(array["radius"])
-    plane = np.flatnonzero(infinite & (array["shape"] >= 0))
-    still = np.flatnonzero(~infinite & ~moves & ~scripted & (array["shape"] >= 0))
+    plane = np.flatnonzero(infinite & touched)
+    still = np.flatnonzero(~infinite & ~moves & ~scripted & touched)
     centre, half = bounds.mean(1), 0.5 * (bounds[:, 1] - bounds[:, 0])
     turn = pose.to_matrix(state.orientation[still])
     middle = state.position[still] + np.einsum("nij,nj->ni", turn, centre[still])
@@ -427,7 +431,7 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
     low, high = low[order], high[order]
     return compiled.World(
         shape=array["shape"], scale=array["scale"], com=array["com"], centre=centre, half=half, radius=array["radius"],
-        thickness=np.where(array["shape"] >= 0, shapes.table[array["shape"], kinds.THICKNESS] * array["scale"], np.inf),
+        thickness=thickness,
         inverse_mass=array["inverse_mass"], inertia=inertia,
         inverse_inertia=np.linalg.inv(inertia) * moves[:, None, None], isotropic=isotropic,
         friction=array["friction"], restitution=array["restitution"], moves=moves, scripted=scripted,
