@@ -54,8 +54,10 @@ SURE = 1.96  # half of an interval of 95 %, in standard deviations
 SHOWN = 0.25  # relative to its width: how precisely windows must determine a parameter, with noise of `OUTLIER`
 IMPACT = 3.0  # times the change of velocity by gravity in a frame: larger changes do not come from weight and friction
 HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are searched
+STILL, JITTER = 1e-5, 6.0  # relative to a size (and rad), and to the noise: smaller changes are those of rest
 HELD = 6  # every sixth recording is kept out of the fit, if there are at least `ENOUGH`
 ENOUGH = 4
+COVERED = 0.8  # of the recorded way: if whole motions have less, that is said
 TRIES = 15, 15, 8  # largest numbers of iterations of the fits to short windows, and to long ones
 DRAWS = 400  # random draws of recordings, for intervals
 POINTS, BEYOND = 4, 2.0  # points of a profile on each side, and their farthest distance, in half intervals
@@ -199,6 +201,28 @@ class Problem:
             raise SdfsimError("bodies on paths: identify supports free and static bodies only")
         if any(r.dt == 0.0 for r in recordings):
             raise SdfsimError("a recording has a single frame")
+        self.tells = [self._telling(r) for r in recordings]
+
+    def _telling(self, r: Recording) -> np.ndarray:
+        """[T] bool, the frames that are compared: all but rest, of which only the first `WINDOW` says anything new. A
+        long rest would outweigh the motion before it."""
+        span = max(1, round(0.5 * WINDOW * self.units.time / r.dt))
+        frames = np.arange(len(r.known))
+        around = np.clip(frames[:, None] + np.arange(-span, span + 1), 0, len(frames) - 1)
+        sizes = [largest_extent(self.scene.shapes[b.shape]) * b.scale for b in self.moving]
+        moves = np.zeros(len(frames), bool)
+        for d, size in enumerate(sizes):
+            ways = np.linalg.norm(r.goal[0][around, d] - r.goal[0][:, None, d], axis=2)
+            turns = np.linalg.norm(
+                pose.to_rotvec(pose.multiply(r.goal[1][around, d], pose.conjugate(r.goal[1][:, None, d]))), axis=2
+            )
+            for away, noise, least in ((ways, r.noise[0], STILL * size), (turns, r.noise[1], STILL)):
+                far = away > max(JITTER * noise, least)
+                moves |= (far & r.seen[around, d]).any(1) & r.seen[:, d]
+        if not moves.any():
+            return np.ones(len(frames), bool)
+        last = np.maximum.accumulate(np.where(moves, frames, -len(frames)))
+        return moves | (frames - last <= 2 * span)
 
     def short(self, chosen: Sequence[int]) -> Windows:
         """The short windows of these recordings in which something touches; this also sets the parameters, by the pairs
@@ -208,7 +232,7 @@ class Problem:
             r = self.recordings[k]
             every = max(1, round(EVERY * self.units.time / r.dt))
             last = len(r.known) - max(3, round(WINDOW * self.units.time / r.dt))
-            near = np.flatnonzero(r.known[: max(0, last)])
+            near = np.flatnonzero((r.known & self.tells[k])[: max(0, last)])
             begin += [(k, int(rows[0])) for rows in _groups(near, every)]
         if not begin:
             hint = "give longer ones, of more frames a second"
@@ -223,19 +247,37 @@ class Problem:
         return Windows(self, WINDOW, [windows.begin[w] for w in rows[:: -(-len(rows) // MOST)]])
 
     def whole(self, chosen: Sequence[int]) -> Windows:
-        """Consecutive long windows of these recordings, from the first frame with known velocities; the last one is at
-        least half as long."""
+        """Consecutive long windows of these recordings, from the first frame with known velocities up to rest; the last
+        one is at least half as long."""
         begin = []
         for k in chosen:
             r, t = self.recordings[k], 0
-            frames = LONG * self.units.time / r.dt
-            while t == 0 or len(r.known) - t > 0.5 * frames:
+            frames, end = LONG * self.units.time / r.dt, 1 + int(np.flatnonzero(self.tells[k])[-1])
+            while t == 0 or end - t > 0.5 * frames:
                 t += int(r.known[t:].argmax())
-                if not r.known[t] or len(r.known) - t < 4:
+                if not r.known[t] or end - t < 4:
                     break
                 begin.append((k, t))
                 t += max(4, round(frames))
         return Windows(self, LONG, begin)
+
+    def covered(self, windows: Windows) -> float:
+        """The share of the recorded way, and of the turns, in these windows."""
+        ways, there = [], []
+        for k in np.unique(windows.recording).tolist():
+            r = self.recordings[k]
+            sizes = np.array([largest_extent(self.scene.shapes[b.shape]) * b.scale for b in self.moving])
+            turn = pose.to_rotvec(pose.multiply(r.goal[1][1:], pose.conjugate(r.goal[1][:-1])))
+            step = np.linalg.norm(np.diff(r.goal[0], axis=0), axis=2) + 0.5 * sizes * np.linalg.norm(turn, axis=2)
+            step = np.where(r.seen[1:] & r.seen[:-1] & self.tells[k][1:, None], step, 0.0).sum(1)
+            inside = np.zeros(len(step), bool)
+            for part in windows.parts:
+                for of, t in part.begin:
+                    if of == k:
+                        inside[t : t + part.length] = True
+            ways.append(step.sum())
+            there.append(step[inside].sum())
+        return float(sum(there) / sum(ways)) if sum(ways) > 0.0 else 1.0
 
     def _choose(self, touched: list[tuple[int, int, int, np.ndarray, bool]]) -> None:
         many = len(self.moving)
@@ -483,7 +525,8 @@ class _Part:
         for w, (r, (_, t), n) in enumerate(zip(some, begin, ends, strict=True)):
             rows = slice(t + 1, t + 1 + n)
             both = np.concatenate([r.goal[0][rows] / u.length, r.goal[1][rows]], -1)
-            self.goal[:n, w] = np.where(r.seen[rows][..., None], both, np.nan)
+            there = r.seen[rows] & problem.tells[begin[w][0]][rows, None]
+            self.goal[:n, w] = np.where(there[..., None], both, np.nan)
         self.shape = (self.length, count, many, 6)
         self.size = self.bodies.size[:many].copy()
         self.carry = self.solver.init(self.bodies, self.start, self.options)
@@ -612,6 +655,7 @@ def identify(
     confirmed: dict[str, Any] = {
         "recordings": len(held), "before": before.mean(0).tolist(), "after": after.mean(0).tolist(),
         "change": change.mean(0).tolist(), "change_95": sure.tolist() if np.isfinite(sure).all() else None,
+        "covered": problem.covered(whole),
     }  # fmt: skip
     error = float(np.sqrt(np.nanmean(np.concatenate([e[..., :3].ravel() for e in short.run(best)]) ** 2)))
     by, there = slope(last, best, every), errors_of(last, best)
@@ -619,7 +663,8 @@ def identify(
     drawn = _profiles(problem, best, by, there, partial(errors_of, last), found) if profiles else []
     return Identified(
         found, len(short.begin),
-        error * math.sqrt(3.0) * problem.units.length, confirmed, _notes(recordings), _scene_values(problem, best),
+        error * math.sqrt(3.0) * problem.units.length, confirmed, [*_notes(recordings), *_late(confirmed["covered"])],
+        _scene_values(problem, best),
         _joint_values(problem, best), drawn,
     )  # fmt: skip
 
@@ -760,6 +805,13 @@ def _profiles(
             y.append(loss(values) / least if step else 1.0)
         found.append(Profile(kind, p.name, unit, value, interval, x, y))
     return found
+
+
+def _late(covered: float) -> list[str]:
+    if covered >= COVERED:
+        return []
+    what = "earlier frames are not smooth enough to begin from"
+    return [f"these whole motions are {100.0 * covered:.2g} % of the recorded way: {what}"]
 
 
 def _notes(recordings: Sequence[Recording]) -> list[str]:

