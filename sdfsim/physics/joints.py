@@ -136,7 +136,7 @@ def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple
     if not effort.any():
         return number, target
     number = number.copy()
-    number[effort, MOTOR], number[effort, MOST] = TO_SPEED, np.abs(target[effort])
+    number[effort, MOTOR], number[effort, MOST], number[effort, GAIN] = TO_SPEED, np.abs(target[effort]), 0.0
     return number, np.where(effort, NEVER * np.sign(target), target)
 
 

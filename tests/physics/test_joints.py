@@ -417,6 +417,10 @@ def test_a_motor_with_a_gain_has_friction_and_a_largest_torque_beside_it():
     stiff = rod({"motor": {"speed": 2.0, "most": 100.0, "gain": 3.0}, "friction": 0.5}, gravity=0.0)
     stiff.step(300)
     assert stiff.joint("pin").speed == pytest.approx(2.0 - 0.5 / 3.0, rel=1e-4)
+    pushed = rod({"motor": motor | {"gain": 1e-5}}, gravity=0.0)
+    pushed.joint("pin").effort = 0.8
+    pushed.step(20)
+    assert pushed.joint("pin").speed == pytest.approx(0.8 * pushed.steps_done * pushed.dt / ABOUT_END, rel=1e-6)
     stuck = rod({"motor": motor | {"position_deg": 1.0}, "friction": 0.5}, gravity=0.0)
     stuck.step(100)
     assert abs(stuck.joint("pin").angle) < 1e-12  # 20 N m/rad of a degree is less than the friction
@@ -439,3 +443,20 @@ def test_a_target_at_the_joint_s_own_reading_is_within_its_limits(recwarn):
     assert not recwarn
     with pytest.warns(UserWarning, match="beyond the limits"):
         simulator.joint("pin").target = -0.01
+
+
+@pytest.mark.parametrize("hold", [None, {"position_deg": 0, "most": 400}, {"position_deg": 0, "most": 40, "gain": 90}])
+def test_the_work_of_two_motors_of_an_arm_is_what_energy_grows_by(hold: dict | None):
+    built = scene(gravity=(0, 0, 0))
+    built.add("upper", box={"size": (0.5, 0.05, 0.05)}, position=(0.25, 0, 0), mass=2.0)
+    built.add("lower", box={"size": (0.5, 0.05, 0.05)}, position=(0.75, 0, 0), mass=1.0)
+    built.join("shoulder", "hinge", "upper", anchor=(0, 0, 0), axis=(0, 1, 0), motor={"position_deg": 0, "most": 100})
+    built.join(
+        "elbow", "hinge", "lower", "upper", anchor=(0.5, 0, 0), axis=(0, 1, 0), **({"motor": hold} if hold else {})
+    )
+    simulator = Simulator(built)
+    simulator.joint("shoulder").target = 3.0
+    rollout = simulator.run(2.0)
+    energy = energy_of(rollout)
+    off = np.cumsum(rollout.counters["energy_given"]) - (energy - energy[0])
+    assert np.abs(off).max() < 1e-3 * np.ptp(energy)

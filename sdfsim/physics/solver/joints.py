@@ -1395,10 +1395,21 @@ def _resting(touching, graph, c):
 
 
 @njit(**BARE)
+def _work_at(motion, graph, each, c, share):
+    """Add to the work of motors that of a share of their impulses in the last inner step at the present speeds."""
+    for k in range(graph.comp[c], graph.comp[c + 1]):
+        j = -1 - graph.node[k]
+        if j >= 0 and each.kind[j] != BALL and each.state[j, DRIVE + 1] != 0.0:
+            speed = _reads(each.axis[j, 0], motion, each.body[j, 0], each.body[j, 1])
+            each.state[j, GIVEN] += share * each.state[j, DRIVE + 1] * speed
+
+
+@njit(**BARE)
 def _kick(world, work, motion, rules, graph, each, lines, c, share):
-    """Add to velocities a share of the impulses of springs, damping, motors and friction in the last inner step, and to
-    the work of motors what that is at the speeds before. Returns whether there were any."""
+    """Add to velocities a share of the impulses of springs, damping, motors and friction in the last inner step.
+    `_projected` completes it. Returns whether there were any."""
     state, found = each.state, False
+    _work_at(motion, graph, each, c, 0.5 * share)
     for k in range(graph.comp[c], graph.comp[c + 1]):
         if graph.node[k] >= 0:
             continue
@@ -1415,8 +1426,6 @@ def _kick(world, work, motion, rules, graph, each, lines, c, share):
             if each.kind[j] == BALL:
                 row = lines.line[j, 3 + e]
                 _write_turn(row, _unit(e))
-            else:
-                state[j, GIVEN] += 0.5 * share * state[j, DRIVE + 1] * _reads(row, motion, a, b)
             _eased(world, work, rules, row, a, b, lines.eased[0])
             for s in range(2):
                 body = each.body[j, s]
@@ -1444,11 +1453,7 @@ def _projected(world, work, motion, rules, held, one, share, limits):
                 motion.velocity[n, x] += work.change[n, x]
                 if rules.options.rotation:
                     motion.angular[n, x] += work.change[n, 3 + x]
-    for k in range(graph.comp[c], graph.comp[c + 1]):
-        if graph.node[k] < 0 and each.kind[-1 - graph.node[k]] != BALL:
-            j = -1 - graph.node[k]
-            speed = _reads(each.axis[j, 0], motion, each.body[j, 0], each.body[j, 1])
-            each.state[j, GIVEN] += 0.5 * share * each.state[j, DRIVE + 1] * speed
+    _work_at(motion, graph, each, c, 0.5 * share)
 
 
 @njit(**FAST, inline="always")
