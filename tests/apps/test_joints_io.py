@@ -224,6 +224,18 @@ def test_a_floor_is_under_the_lowest_link(tmp_path: Path) -> None:
     assert scene.bodies[0].name == "floor" and base.motion == "dynamic"
 
 
+def test_a_floor_carries_only_what_touches(tmp_path: Path) -> None:
+    """A visual that hangs far below, and a link without any geometry, for which a large ball stands in."""
+    shown = '<link name="lamp"><inertial><mass value="0.1"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" '
+    shown += 'izz="1e-3"/></inertial><visual><origin xyz="0 0 -3"/><geometry><sphere radius="0.1"/></geometry></visual>'
+    shown += '</link><joint name="hang" type="continuous"><parent link="tip"/><child link="lamp"/></joint>'
+    shown += '<link name="bare"><inertial><mass value="0.1"/><inertia ixx="9" ixy="0" ixz="0" iyy="9" iyz="0" izz="9"/>'
+    shown += '</inertial></link><joint name="bar" type="continuous"><parent link="tip"/><child link="bare"/></joint>'
+    scene, _ = imported(write(tmp_path, "arm.urdf", ARM.replace("</robot>", shown + "</robot>")), floor=True)
+    base = next(body for body in scene.bodies if body.name == "base")
+    assert base.position[2] == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
