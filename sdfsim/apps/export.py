@@ -44,7 +44,7 @@ _log = logging.getLogger(__name__)
 
 # Concavity relative to the size; and a search a third as long as CoACD's default, which finds equally good pieces.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
-RATE = 60.0  # USD time codes per second; programs step through whole ones
+RATE = 60.0  # USD time codes per second if no frame rate is given; programs step through whole ones
 # Schemas of PhysX (Isaac Sim, ManiSkill) and Newton for sampled distances, and the attribute for the number of cells
 # along the longest side. None of them is part of OpenUSD.
 USD_GRIDS = {
@@ -79,6 +79,7 @@ class Take:
     position: np.ndarray  # [T, N, 3] m, of the shapes' own origins
     quat_xyzw: np.ndarray  # [T, N, 4], with the sign that is nearer to the time before
     collide: Collide = "pieces"
+    rate: float = RATE  # USD time codes per second
 
     @property
     def moving(self) -> bool:
@@ -99,7 +100,7 @@ class Take:
         count = int(np.ceil((self.time[-1] - self.time[0]) * fps - 1e-3)) + 1
         time = self.time[0] + np.arange(count) / fps
         place, turn = between(self.time, self.position, self.quat_xyzw, time)
-        return replace(self, time=time, position=place, quat_xyzw=turn)
+        return replace(self, time=time, position=place, quat_xyzw=turn, rate=fps)
 
 
 Written = tuple[list[Path], list[str]]  # the files of an export, and what is left out, one line each
@@ -358,11 +359,12 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
     gravity = physics.Scene.Define(stage, "/World/physics")
     gravity.CreateGravityDirectionAttr(gf.Vec3f(*(take.scene.gravity / strength if strength else (0.0, 0.0, -1.0))))
     gravity.CreateGravityMagnitudeAttr(strength)
+    codes = np.round(take.rate * take.time, 9)  # whole numbers at a given frame rate
     if take.moving:
-        stage.SetTimeCodesPerSecond(RATE)
-        stage.SetFramesPerSecond(RATE)
-        stage.SetStartTimeCode(RATE * float(take.time[0]))
-        stage.SetEndTimeCode(RATE * float(take.time[-1]))
+        stage.SetTimeCodesPerSecond(take.rate)
+        stage.SetFramesPerSecond(take.rate)
+        stage.SetStartTimeCode(float(codes[0]))
+        stage.SetEndTimeCode(float(codes[-1]))
 
     drawn: dict[tuple[int, bool], str] = {}
     materials: dict[tuple[float, float], Any] = {}
@@ -372,7 +374,7 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         turn = geom.Xformable(prim).AddOrientOp(geom.XformOp.PrecisionDouble)
         animated = take.moving and body.motion != "static"
         for t in range(len(take.time) if animated else 1):
-            code = usd.TimeCode(RATE * float(take.time[t])) if animated else usd.TimeCode.Default()
+            code = usd.TimeCode(float(codes[t])) if animated else usd.TimeCode.Default()
             place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
             turn.Set(gf.Quatd(*_wxyz(take.quat_xyzw[t, k]).tolist()), code)
         tint = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)

@@ -254,6 +254,23 @@ def test_options_that_a_format_has_no_use_for_are_refused(dropped, tmp_path):
 # --- USD ---
 
 
+@pytest.mark.parametrize("fps", [24, 29.97])
+def test_a_usd_stage_plays_whole_frames_at_the_rate_that_was_asked_for(dropped, tmp_path, fps):
+    """A program that plays one time code a frame shows the ball where it was at that time."""
+    from pxr import Usd, UsdGeom
+
+    export(dropped.folder, tmp_path / "run.usda", fps=fps, allow_outside=True)
+    stage = Usd.Stage.Open(str(tmp_path / "run.usda"))
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == fps
+    place = UsdGeom.Xformable(stage.GetPrimAtPath("/World/ball")).GetOrderedXformOps()[0]
+    codes = place.GetTimeSamples()
+    assert codes == list(range(len(codes))) and (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, codes[-1])
+    true, time = dropped.rollout.position[:, dropped.index("ball")], np.array(codes) / fps
+    for axis in range(3):
+        found = [place.Get(code)[axis] for code in codes]
+        np.testing.assert_allclose(found, np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
+
+
 @pytest.mark.parametrize("ending", ["usda", "usdc"])
 def test_a_usd_stage_has_the_motion_and_the_physics(dropped, ending):
     from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
