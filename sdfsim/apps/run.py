@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from sdfsim.apps.beside import FILE, Beside
+from sdfsim.apps.beside import FILE, Beside, beside_of
 from sdfsim.apps.recording import Playback, framed, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
 from sdfsim.base.console import columns, plain
@@ -225,6 +225,23 @@ def read_run(
         message = f"{file}: {scene.path} is not the scene that it was made from: other {' and '.join(other)}"
         raise SdfsimError(message, "simulate it again, or give the original scene: --scene")
     return scene, rollout
+
+
+def recorded(
+    place: Path, scene_file: Path | None = None, *, say: Callable[[str], None] = lambda line: None,
+    allow_outside: bool = False, on_progress: Progress = silent,
+) -> Path:  # fmt: skip
+    """What `view` shows: `place` itself, or for a run without a recording (its folder or rollout.npz) a recording that
+    is drawn from rollout.npz and written beside it. Raises as `read_run` does."""
+    rollout = place / "rollout.npz" if place.is_dir() else place
+    if rollout.suffix != ".npz" or not rollout.is_file():
+        return place
+    recording = rollout.with_suffix(".rrd")
+    if not recording.exists():
+        scene, motion = read_run(place, scene_file, allow_outside=allow_outside, on_progress=on_progress)
+        save_rollout(scene, motion, recording, beside_of(place, scene))
+        say(f"wrote {recording}, drawn from {rollout.name}: the run has no recording")
+    return recording
 
 
 def resting(scene: Scene, rollout: Rollout) -> np.ndarray:
