@@ -53,9 +53,10 @@ def simulate(
         recorded = load_beside(beside, scene, allow_outside=allow_outside, on_progress=shapes)
     more = {"beside": recorded, "on_progress": session.stage_progress, "say": session.say}
     report = run.simulate(scene, **session.given("scene", "beside"), **more)
-    median = report["step_ms_median"]
+    median, compiling = report["step_ms_median"], report.get("compiling_s", 0.0)
     lines = [
         f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
+        + (f", after {duration(compiling)} of compiling" if compiling >= 1.0 else "")
         + ("" if median is None else f" (median {float(f'{median:.2g}'):g} ms a step)"),
         f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
         *run.ending_lines(report),

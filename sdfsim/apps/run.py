@@ -13,6 +13,7 @@ import yaml
 from sdfsim.apps.beside import FILE, Beside, beside_of
 from sdfsim.apps.recording import Playback, framed, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
+from sdfsim.base.compiling import running, seconds_spent
 from sdfsim.base.console import columns, plain
 from sdfsim.base.devices import check_device
 from sdfsim.base.errors import SdfsimError
@@ -101,6 +102,7 @@ def simulate(
     known = fingerprints(scene)
     if beside is not None:
         scene = beside.begun(scene)
+    compiled = seconds_spent()
     simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
     asked = model or scene.model or ""
@@ -142,7 +144,7 @@ def simulate(
             live.log_static()
             live.log_steps(join(parts))
 
-        started, broken = time.monotonic(), None
+        started, broken = running(), None
         still = [row.all() for row in resting(scene, join(parts))]  # for each frame, whether everything rests
 
         def settled() -> bool:
@@ -171,7 +173,8 @@ def simulate(
         rollout = replace(rollout, meta=rollout.meta | {"scene": known})
         on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
-        report = summary(scene, rollout, time.monotonic() - started) | {
+        report = summary(scene, rollout, running() - started) | {
+            "compiling_s": round(seconds_spent() - compiled, 3),
             "status": "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted",
             "folder": out,
             "identity": kept.identity,

@@ -191,7 +191,7 @@ def _recording(place: Path) -> Path:
         wanted = "go on with the run: sdfsim simulate SCENE -o FOLDER --resume" if unfinished else wanted
         raise SdfsimError(f"{place}: neither rollout.rrd nor rollout.npz is in this folder", wanted)
     if not file.is_file():
-        raise SdfsimError(f"{place}: no such file or folder", wanted)
+        raise SdfsimError(f"{place}: no such recording", wanted)
     if file.open("rb").read(3) != b"RRF":
         raise SdfsimError(f"{file}: not a recording of rerun", wanted)
     return file
