@@ -15,6 +15,7 @@ from typing import Any, Unpack
 
 from pipeline.options import COMMAND, OptionKeys, Options, options_of, read_config, write_config
 from pipeline.report import write_report
+from sdfsim.base.compiling import say_compiling
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import CONFIG, check_own, locked, write_json
 from sdfsim.base.parallel import Progress, StageProgress
@@ -164,6 +165,7 @@ def reconstruct(
     progress: StageProgress | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
     """Photos -> a scene, by all stages; see `pipeline.states.reconstruct`."""
+    say_compiling()
     resolved = options_of(photos=str(Path(photos).absolute()), **options)
     wanted = wanted_stages(from_stage, until_stage)
     project = Project(Path(out), resolved, progress)

@@ -53,9 +53,10 @@ def simulate(
         recorded = load_beside(beside, scene, allow_outside=allow_outside, on_progress=shapes)
     more = {"beside": recorded, "on_progress": session.stage_progress, "say": session.say}
     report = run.simulate(scene, **session.given("scene", "beside"), **more)
-    median = report["step_ms_median"]
+    median, compiling = report["step_ms_median"], report.get("compiling_s", 0.0)
     lines = [
         f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
+        + (f", after {duration(compiling)} of compiling" if compiling >= 1.0 else "")
         + ("" if median is None else f" (median {float(f'{median:.2g}'):g} ms a step)"),
         f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
         *run.ending_lines(report),
@@ -72,7 +73,7 @@ def simulate(
     lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
     session.report(report, lines)
     if viewer == "web":
-        session.hold("the page stays up until Ctrl-C")
+        session.hold("the page stays up until Ctrl-C, or until this process is ended")
 
 
 @command
@@ -108,16 +109,20 @@ def samples(
 @command
 def view(
     session: Session,
-    recording: Annotated[Path, typer.Argument(help="Run folder or rollout.rrd.", show_default=False)],
+    recording: Annotated[Path, typer.Argument(help="Run folder, rollout.rrd or rollout.npz.", show_default=False)],
+    scene: OfRun = None,
     web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
     picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,
+    allow_outside: Outside = False,
 ) -> None:
-    """Watch a recording, or take a picture of it."""
+    """Watch a recording, or take a picture of it. A run without one is drawn from its rollout.npz first."""
     if at is not None and picture is None:
         raise SdfsimError("--at needs --screenshot", exit_code=EXIT_USAGE)
-    from sdfsim.apps import viewer
+    from sdfsim.apps import run, viewer
 
+    shapes = partial(session.stage_progress, "shapes")
+    recording = run.recorded(recording, scene, say=session.say, allow_outside=allow_outside, on_progress=shapes)
     if picture is not None:
         viewer.screenshot(recording, picture, at=at)
         session.report({"screenshot": picture})

@@ -26,7 +26,7 @@ from sdfsim.apps.observed import COLUMNS
 from sdfsim.apps.recording import body_colors, framed, is_infinite, shown, with_normals
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import check_writable, write_bytes, write_text
+from sdfsim.base.files import cached_arrays, check_writable, digest, user_cache, write_bytes, write_text
 from sdfsim.base.lazy import optional
 from sdfsim.base.parallel import StageProgress, of_stage, silent_stages
 from sdfsim.geometry.gltf import GltfWriter, light
@@ -44,7 +44,8 @@ _log = logging.getLogger(__name__)
 
 # Concavity relative to the size; and a search a third as long as CoACD's default, which finds equally good pieces.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
-RATE = 60.0  # USD time codes per second; programs step through whole ones
+PIECES_VERSION = 1  # of cached pieces; a new one if they are made otherwise
+RATE = 60.0  # USD time codes per second if no frame rate is given; programs step through whole ones
 # Schemas of PhysX (Isaac Sim, ManiSkill) and Newton for sampled distances, and the attribute for the number of cells
 # along the longest side. None of them is part of OpenUSD.
 USD_GRIDS = {
@@ -79,6 +80,7 @@ class Take:
     position: np.ndarray  # [T, N, 3] m, of the shapes' own origins
     quat_xyzw: np.ndarray  # [T, N, 4], with the sign that is nearer to the time before
     collide: Collide = "pieces"
+    rate: float = RATE  # USD time codes per second
 
     @property
     def moving(self) -> bool:
@@ -99,7 +101,7 @@ class Take:
         count = int(np.ceil((self.time[-1] - self.time[0]) * fps - 1e-3)) + 1
         time = self.time[0] + np.arange(count) / fps
         place, turn = between(self.time, self.position, self.quat_xyzw, time)
-        return replace(self, time=time, position=place, quat_xyzw=turn)
+        return replace(self, time=time, position=place, quat_xyzw=turn, rate=fps)
 
 
 Written = tuple[list[Path], list[str]]  # the files of an export, and what is left out, one line each
@@ -228,19 +230,35 @@ def _inertia(body: Body, shape: Shape) -> np.ndarray:
     return body.inertia if body.inertia is not None else body.mass / shape.volume * body.scale**2 * shape.inertia
 
 
-def convex_pieces(shape: Shape) -> list[Mesh]:
-    """Convex pieces [m]: the shape's own, or CoACD's. Raises SdfsimError if there are none."""
+def convex_pieces(shape: Shape, *, warn: bool = False) -> list[Mesh]:
+    """Convex pieces [m]: the shape's own, or CoACD's, which are cut once for each mesh and then taken from the user's
+    cache. With `warn`, a warning says so when that takes long. Raises SdfsimError if there are none."""
     if own := own_pieces(shape):
         return own
+    known = digest(shape.mesh.vertices, shape.mesh.faces, COACD)
+    kept = cached_arrays(
+        user_cache("pieces") / f"{known}-{PIECES_VERSION}.npz", "convex pieces", lambda: _cut(shape, warn=warn)
+    )
+    ends = np.cumsum(kept["count"])[:-1]
+    return [convex_hull(vertices) for vertices in np.split(kept["vertices"], ends)]
+
+
+def _cut(shape: Shape, *, warn: bool) -> dict[str, Any]:
+    """The vertices [V, 3] m of CoACD's pieces, one after the other, and how many each has."""
+    if warn:
+        _log.warning(
+            "cutting the shape %s into convex pieces: some seconds, or minutes; once for this mesh", shape.name
+        )
     import open3d  # noqa: F401  (it fails to load after CoACD)
 
     coacd = optional("coacd", "coacd", "export")
     coacd.set_log_level("off")
     try:
         found = coacd.run_coacd(coacd.Mesh(shape.mesh.vertices, shape.mesh.faces), **COACD)
-        return [convex_hull(np.asarray(vertices)) for vertices, _ in found]
+        hulls = [convex_hull(np.asarray(vertices)).vertices for vertices, _ in found]
     except (RuntimeError, ValueError, SdfsimError) as error:
         raise SdfsimError(f"shape {shape.name}: CoACD cannot cut it into convex pieces ({error})") from error
+    return {"vertices": np.concatenate(hulls), "count": [len(hull) for hull in hulls]}
 
 
 def _write_assets(
@@ -262,9 +280,7 @@ def _write_assets(
     for done, k in enumerate(drawn):
         on_progress("convex pieces", done / len(drawn), f"of {shapes[k].name}")
         seen[k] = obj(take.shapes[k], shapes[k].mesh)
-        if k in wanted and on_progress is silent_stages and not own_pieces(shapes[k]):
-            _log.warning("cutting the shape %s into convex pieces: some seconds, or a minute", shapes[k].name)
-        pieces = convex_pieces(shapes[k]) if k in wanted else []
+        pieces = convex_pieces(shapes[k], warn=on_progress is silent_stages) if k in wanted else []
         cut[k] = [obj(f"{take.shapes[k]}-{i}", piece) for i, piece in enumerate(pieces)]
     return seen, cut
 
@@ -358,11 +374,12 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
     gravity = physics.Scene.Define(stage, "/World/physics")
     gravity.CreateGravityDirectionAttr(gf.Vec3f(*(take.scene.gravity / strength if strength else (0.0, 0.0, -1.0))))
     gravity.CreateGravityMagnitudeAttr(strength)
+    codes = np.round(take.rate * take.time, 9)  # whole numbers at a given frame rate
     if take.moving:
-        stage.SetTimeCodesPerSecond(RATE)
-        stage.SetFramesPerSecond(RATE)
-        stage.SetStartTimeCode(RATE * float(take.time[0]))
-        stage.SetEndTimeCode(RATE * float(take.time[-1]))
+        stage.SetTimeCodesPerSecond(take.rate)
+        stage.SetFramesPerSecond(take.rate)
+        stage.SetStartTimeCode(float(codes[0]))
+        stage.SetEndTimeCode(float(codes[-1]))
 
     drawn: dict[tuple[int, bool], str] = {}
     materials: dict[tuple[float, float], Any] = {}
@@ -372,7 +389,7 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         turn = geom.Xformable(prim).AddOrientOp(geom.XformOp.PrecisionDouble)
         animated = take.moving and body.motion != "static"
         for t in range(len(take.time) if animated else 1):
-            code = usd.TimeCode(RATE * float(take.time[t])) if animated else usd.TimeCode.Default()
+            code = usd.TimeCode(float(codes[t])) if animated else usd.TimeCode.Default()
             place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
             turn.Set(gf.Quatd(*_wxyz(take.quat_xyzw[t, k]).tolist()), code)
         tint = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)

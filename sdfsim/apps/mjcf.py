@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.apps import mjcf_fields as fields
 from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, named, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.lazy import optional
@@ -18,6 +19,7 @@ from sdfsim.geometry.primitives import sphere
 START = "start"  # the keyframe that our own exports have
 SOFTEST = 1.99  # damping ratio from which contacts count as not rebounding
 USUAL = (0.02, 1.0)  # MuJoCo's default time and damping ratio of contacts
+ALIKE = 1e-3  # smallest difference of two coefficients of friction that is told
 NEAR = 1e-4  # m, or relative to a length: how far ends of a loop may be apart
 # Contents of a model that a scene cannot have: the field that counts them, and their name.
 COUNTED = {
@@ -30,6 +32,9 @@ COUNTED = {
     "nplugin": "plugins",
     "npair": "contact pairs with coefficients of their own: those of the two bodies are used",
     "ntex": "textures: colours replace them",
+    "nnumeric": "custom numbers",
+    "ntext": "custom texts",
+    "ntuple": "custom tuples",
 }
 
 
@@ -53,6 +58,7 @@ class _Reader:
         self.mj, self.path, self.model, self.data = mujoco, path, model, mujoco.MjData(model)
         self.left: list[str] = []
         self.notes: list[str] = []
+        self._switched_off()
         keys = [model.key(k).name or f"key {k}" for k in range(model.nkey)]
         if key is not None and key not in keys:
             there = ", ".join(keys) or "none"
@@ -65,6 +71,21 @@ class _Reader:
             self.left.append(named("keyframes: give one with --key", others))
         self._within_limits()
         mujoco.mj_forward(model, self.data)
+
+    def _switched_off(self) -> None:
+        """Do what the file's flags say: what is switched off becomes zero in the model."""
+        model, said = self.model, fields.flags(self.mj, self.model)
+        done = [flag for flag in said if flag.endswith("disable") and flag.split()[0] in fields.SWITCHED]
+        self.off = {flag.split()[0] for flag in done}
+        for name in (name for flag in self.off for name in fields.SWITCHED[flag]):
+            if hasattr(model, name):  # older versions lack some
+                getattr(model, name)[:] = 0
+        if "gravity" in self.off:
+            model.opt.gravity[:] = 0.0
+        if done:
+            self.notes.append(named("the file switches off", [flag.split()[0] for flag in done]))
+        if others := [flag for flag in said if flag not in done]:
+            self.left.append(named("flags of MuJoCo", others))
 
     def _within_limits(self) -> None:
         model, types = self.model, self.mj.mjtJoint
@@ -99,15 +120,85 @@ class _Reader:
             links += [link for link, _ in made]
             geoms += [own for _, own in made]
         joints = [joint for b in range(1, model.nbody) for joint in self._joints(b)]
-        motors = self._motors()
+        motors = {} if "actuation" in self.off else self._motors()
         joints = [replace(joint, motor=motors.get(joint.name)) for joint in joints]
         if rotors := sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(model.dof_armature)}):
             self.left.append(named("armature of joints", list(map(self._joint_name, rotors))))
         joints += [*self._loops(), *self._ropes()]
+        apart = self._apart(geoms)
+        meets = self.off.isdisjoint(("contact", "constraint"))
+        self._left_out([g for own in geoms for g in own] if meets else [])
+        links = self._slippery(links, geoms, apart) if meets else links
         return Robot(
-            self.path.stem, tuple(links), tuple(joints), np.array(model.opt.gravity), self._apart(geoms),
-            tuple(self.left), tuple(self.notes),
+            self.path.stem, tuple(links), tuple(joints), np.array(model.opt.gravity), apart,
+            tuple(self.left), tuple(self.notes), contact=meets,
         )  # fmt: skip
+
+    def _left_out(self, solid: list[int]) -> None:
+        """Name every field of the model that says something and is not used. Geoms count that touch others: `solid`."""
+        model, mj = self.model, self.mj
+        plain = mj.MjModel.from_xml_string(fields.PLAIN)
+        if options := fields.settings(model, plain):
+            self.left.append(named("options of MuJoCo's step", options))
+        if str(model.vis) != str(plain.vis):
+            self.left.append("settings of MuJoCo's viewer")
+        free = [j for j in range(model.njnt) if model.jnt_type[j] == mj.mjtJoint.mjJNT_FREE]
+        drag = ("dof_damping", "dof_dampingpoly", "dof_frictionloss")
+        held = [
+            j for j in free if model.jnt_stiffness[j]
+            or any(np.any(getattr(model, name, np.zeros(model.nv))[model.jnt_dofadr[j] :][:6]) for name in drag)
+        ]  # fmt: skip
+        if held:
+            self.left.append(named("damping, stiffness and friction of free joints", list(map(self._joint_name, held))))
+        if rolls := [g for g in solid if model.geom_condim[g] > 3]:
+            self.left.append(named("friction against spinning and rolling", self._names(model.geom, rolls)))
+        found: dict[str, dict[str, None]] = {}
+        for element, line, rows in fields.unused(model, plain):
+            rows = [int(k) for k in rows if element != "geom" or k in solid]
+            if element in ("jnt", "dof"):
+                joints = rows if element == "jnt" else [int(model.dof_jntid[k]) for k in rows]
+                names = list(map(self._joint_name, joints))
+            else:
+                known = getattr(model, {"eq": "eq", "mat": "material"}.get(element, element), None)
+                names = self._names(known, rows) if callable(known) else [f"number {k}" for k in rows]
+            if names or not element:
+                found.setdefault(line, {}).update(dict.fromkeys(names))
+        self.left += [named(line, list(names)) if names else line for line, names in found.items()]
+
+    def _slippery(self, links: list[Link], geoms: list[list[int]], apart: frozenset[tuple[int, int]]) -> list[Link]:
+        """The links, without friction if none of their contacts in MuJoCo has any (condim 1). A note says where the
+        product of two bodies' friction is not what MuJoCo takes: the larger one, or that of the geom with the higher
+        priority."""
+        model, met = self.model, [g for own in geoms for g in own]
+        owner = np.array([k for k, own in enumerate(geoms) for _ in own], np.int64)
+        weld = model.body_weldid[model.geom_bodyid[met]]
+        above = model.body_weldid[model.body_parentid[weld]]
+        order, dims, slides = model.geom_priority[met], model.geom_condim[met], model.geom_friction[met, 0]
+
+        def mixed(values: np.ndarray) -> np.ndarray:
+            one, other = np.broadcast_arrays(values[:, None], values)
+            first, second = np.broadcast_arrays(order[:, None], order)
+            return np.where(first > second, one, np.where(first < second, other, np.maximum(one, other)))
+
+        # [G, G] the friction of each pair of geoms, and whether they touch.
+        friction = np.where(mixed(dims) == 1, 0.0, mixed(slides))
+        denied = np.eye(len(links), dtype=bool)
+        for a, b in apart:
+            denied[a, b] = denied[b, a] = True
+        child = (weld[:, None] == above) & (above != 0)  # a body and its parent do not touch, unless it is the world
+        meet = ~(denied[owner[:, None], owner] | (weld[:, None] == weld) | child | child.T)
+        rough = {int(k) for k in owner[(meet & (friction > 0.0)).any(1)]}
+        smooth = {int(k) for k in owner[meet.any(1)]} - rough
+        links = [replace(link, friction=0.0) if k in smooth else link for k, link in enumerate(links)]
+        has = np.array([link.friction for link in links])[owner]
+        off = np.where(meet, np.abs(has[:, None] * has - friction), 0.0)
+        if off.max(initial=0.0) > ALIKE:
+            a, b = np.unravel_index(np.argmax(off), off.shape)
+            pairs = {tuple(sorted(pair)) for pair in np.stack([owner[i] for i in np.nonzero(off > ALIKE)], 1).tolist()}
+            one, other = (links[owner[k]].name for k in (a, b))
+            worst = f"{has[a] * has[b]:.3g} in place of {friction[a, b]:.3g} between {one} and {other}"
+            self.notes.append(f"friction of {len(pairs)} pairs of bodies is the product of theirs: at worst {worst}")
+        return links
 
     def _names(self, of: Any, which: Any) -> list[str]:
         return [of(int(k)).name or f"number {k}" for k in which]
@@ -328,16 +419,19 @@ class _Reader:
     def _loops(self) -> list[LinkJoint]:
         """Connect and weld equalities of two bodies, which close loops."""
         model, mj = self.model, self.mj
-        found, others = [], []
+        found, others, idle = [], [], []
         for k in range(model.neq):
             kind, name = mj.mjtEq(int(model.eq_type[k])), model.eq(k).name or f"equality_{k}"
+            if not self.data.eq_active[k]:
+                idle.append(name)
+                continue
             if kind == mj.mjtEq.mjEQ_TENDON:
                 continue
             ends = [int(model.eq_obj1id[k]), max(int(model.eq_obj2id[k]), 0)]
             of_bodies = int(model.eq_objtype[k]) == int(mj.mjtObj.mjOBJ_BODY)
             both = [self.link[b] for b in ends] if of_bodies else [-1, -1]
             moves = of_bodies and any(model.body_weldid[b] != 0 for b in ends)
-            known = kind in (mj.mjtEq.mjEQ_CONNECT, mj.mjtEq.mjEQ_WELD) and moves and self.data.eq_active[k]
+            known = kind in (mj.mjtEq.mjEQ_CONNECT, mj.mjtEq.mjEQ_WELD) and moves
             if not known:
                 others.append(name)
                 continue
@@ -354,6 +448,8 @@ class _Reader:
             found.append(LinkJoint(name, "ball" if ball else "fixed", child, parent, places[0], loop=True))
         if others:
             self.left.append(named("equalities other than connect or weld of two bodies", others))
+        if idle:
+            self.left.append(named("equalities that are switched off", idle))
         return found
 
     def _ropes(self) -> list[LinkJoint]:

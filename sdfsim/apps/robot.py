@@ -95,6 +95,7 @@ class Robot:
     apart: frozenset[tuple[int, int]] | None = None
     left_out: tuple[str, ...] = ()  # what is left out, one line each
     notes: tuple[str, ...] = ()  # what was changed, one line each
+    contact: bool = True  # whether its links touch anything
 
 
 def named(what: str, names: Sequence[str]) -> str:
@@ -131,7 +132,8 @@ def write_scene(
     """
     whole, notes = _apart(_merged(robot, {WORLD, FLOOR} if floor else {WORLD}))
     folder = out.with_name(f"{out.stem}_shapes")
-    scene = SceneBuilder(**({} if whole.gravity is None else {"gravity": _round(whole.gravity)}))
+    settings: dict[str, Any] = {} if whole.gravity is None else {"gravity": _round(whole.gravity)}
+    scene = SceneBuilder(**settings, **({} if whole.contact else {"effects": {"contact": "off"}}))
     made: list[tuple[Shape | None, dict[str, Any], np.ndarray, dict[str, Any]]] = []
     for k, link in enumerate(whole.links):
         on_progress(k / len(whole.links), link.name)
@@ -139,10 +141,11 @@ def write_scene(
     poses = [link.pose @ frame for link, (_, _, frame, _) in zip(whole.links, made, strict=True)]
     lift = np.zeros(3)
     if floor:
+        # Only links that touch others stand: a camera's housing or a ball in place of a frame may hang lower.
         corners = [
             moved(shape.mesh, pose).vertices[:, 2].min()
-            for (shape, *_), pose in zip(made, poses, strict=True)
-            if shape is not None and np.isfinite(shape.sdf.bounds).all()
+            for link, (shape, *_), pose in zip(whole.links, made, poses, strict=True)
+            if link.solid and shape is not None and np.isfinite(shape.sdf.bounds).all()
         ]
         lift[2] = -min(corners, default=0.0)
         scene.add(FLOOR, plane={}, friction=1.0, restitution=0.0)

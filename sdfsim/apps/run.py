@@ -10,9 +10,10 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from sdfsim.apps.beside import FILE, Beside
+from sdfsim.apps.beside import FILE, Beside, beside_of
 from sdfsim.apps.recording import Playback, framed, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
+from sdfsim.base.compiling import running, seconds_spent
 from sdfsim.base.console import columns, plain
 from sdfsim.base.devices import check_device
 from sdfsim.base.errors import SdfsimError
@@ -101,6 +102,7 @@ def simulate(
     known = fingerprints(scene)
     if beside is not None:
         scene = beside.begun(scene)
+    compiled = seconds_spent()
     simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
     asked = model or scene.model or ""
@@ -142,7 +144,7 @@ def simulate(
             live.log_static()
             live.log_steps(join(parts))
 
-        started, broken = time.monotonic(), None
+        started, broken = running(), None
         still = [row.all() for row in resting(scene, join(parts))]  # for each frame, whether everything rests
 
         def settled() -> bool:
@@ -171,7 +173,8 @@ def simulate(
         rollout = replace(rollout, meta=rollout.meta | {"scene": known})
         on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
-        report = summary(scene, rollout, time.monotonic() - started) | {
+        report = summary(scene, rollout, running() - started) | {
+            "compiling_s": round(seconds_spent() - compiled, 3),
             "status": "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted",
             "folder": out,
             "identity": kept.identity,
@@ -225,6 +228,23 @@ def read_run(
         message = f"{file}: {scene.path} is not the scene that it was made from: other {' and '.join(other)}"
         raise SdfsimError(message, "simulate it again, or give the original scene: --scene")
     return scene, rollout
+
+
+def recorded(
+    place: Path, scene_file: Path | None = None, *, say: Callable[[str], None] = lambda line: None,
+    allow_outside: bool = False, on_progress: Progress = silent,
+) -> Path:  # fmt: skip
+    """What `view` shows: `place` itself, or for a run without a recording (its folder or rollout.npz) a recording that
+    is drawn from rollout.npz and written beside it. Raises as `read_run` does."""
+    rollout = place / "rollout.npz" if place.is_dir() else place
+    if rollout.suffix != ".npz" or not rollout.is_file():
+        return place
+    recording = rollout.with_suffix(".rrd")
+    if not recording.exists():
+        scene, motion = read_run(place, scene_file, allow_outside=allow_outside, on_progress=on_progress)
+        save_rollout(scene, motion, recording, beside_of(place, scene))
+        say(f"wrote {recording}, drawn from {rollout.name}: the run has no recording")
+    return recording
 
 
 def resting(scene: Scene, rollout: Rollout) -> np.ndarray:

@@ -1,5 +1,6 @@
 """From URDF to links and joints, which `robot` turns into a scene."""
 
+import codecs
 import os
 import re
 from collections import Counter
@@ -20,7 +21,14 @@ from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
 from sdfsim.scene.scene import WORLD
 
 MOST_BYTES = 64 * 2**20  # largest size of a file
-OPTIONAL = re.compile(rb"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: an environment variable, or else the rest
+OPTIONAL = re.compile(r"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: an environment variable, or else the rest
+MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
+}  # fmt: skip
+# Encodings by the zero bytes in the first four, as XML begins with ASCII.
+ZEROS = {(1, 2, 3): "utf-32-le", (0, 1, 2): "utf-32-be", (1, 3): "utf-16-le", (0, 2): "utf-16-be"}
+DECLARED = re.compile(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([^\"'>]*)[\"']")
 KINDS = {
     "revolute": "hinge",
     "continuous": "hinge",
@@ -48,9 +56,9 @@ def read_urdf(path: Path, *, packages: Sequence[Path] = (), fixed: bool = False)
     return _Reader(path, packages).robot(fixed)
 
 
-def _environment(found: re.Match[bytes]) -> bytes:
-    value = os.environ.get(found[1].decode(), found[2].decode(errors="replace").strip())
-    return value.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;").encode()
+def _environment(found: re.Match[str]) -> str:
+    value = os.environ.get(found[1], found[2].strip())
+    return value.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
 
 
 class _Reader:
@@ -72,7 +80,8 @@ class _Reader:
             content = self.path.read_bytes()
         except OSError as error:
             raise SdfsimError(f"{self.path}: cannot be read ({error.strerror or error})") from error
-        builder, parser = TreeBuilder(), expat.ParserCreate()
+        text = self._decoded(content).rstrip("\0 \t\r\n")
+        builder, parser = TreeBuilder(), expat.ParserCreate("utf-8")  # whatever the file declares
 
         def start(tag: str, attributes: dict[str, str]) -> None:
             self.line[id(builder.start(tag, attributes))] = parser.CurrentLineNumber
@@ -81,9 +90,8 @@ class _Reader:
         parser.EndElementHandler = lambda tag: builder.end(tag)
         try:
             # Blanks before the first element and zero bytes after the last are not valid XML, but common.
-            text = content.lstrip().rstrip(b"\0 \t\r\n")
-            self.skipped = content[: len(content) - len(text)].count(b"\n")
-            parser.Parse(OPTIONAL.sub(_environment, text), True)
+            self.skipped = text[: len(text) - len(text.lstrip())].count("\n")
+            parser.Parse(OPTIONAL.sub(_environment, text.lstrip()).encode(), True)
         except expat.ExpatError as error:
             line = error.lineno + self.skipped
             raise SdfsimError(f"{self.path}:{line}: not valid XML ({expat.ErrorString(error.code)})") from error
@@ -93,6 +101,26 @@ class _Reader:
         if any(element.tag.startswith("xacro:") for element in root.iter()):
             raise self.wrong(root, "holds xacro macros", "expand them first: xacro robot.urdf.xacro > robot.urdf")
         return root
+
+    def _decoded(self, content: bytes) -> str:
+        """The text of the file, in the encoding that its first bytes show or that it declares, else UTF-8. As in other
+        readers, a byte that this encoding does not have is replaced, with a note: most are in comments."""
+        zeros = tuple(k for k, byte in enumerate(content[:4]) if byte == 0)
+        name = next((name for mark, name in MARKS.items() if content.startswith(mark)), ZEROS.get(zeros))
+        if name is None:
+            declared = DECLARED.match(content)
+            name = declared[1].decode("ascii", "replace") if declared else "utf-8"
+            # What can be read byte by byte is not of two or four bytes a character, whatever it says.
+            name = "utf-8" if re.match(r"(?i)utf.?(16|32)|ucs", name) else name
+        try:
+            text = content.decode(name, "replace")
+        except (LookupError, UnicodeError) as error:
+            hint = 'save the file in UTF-8, and declare it: <?xml version="1.0" encoding="utf-8"?>'
+            raise SdfsimError(f"{self.path}:1: unknown encoding {name!r}", hint) from error
+        if (at := text.find("\ufffd")) >= 0:
+            line = text[:at].count("\n") + 1
+            self.notes.append(f"line {line} has bytes that are not {name}: a mark replaces them, here and further on")
+        return text
 
     def where(self, element: Element) -> str:
         return f"{self.path}:{self.line[id(element)] + self.skipped}: <{element.tag}>"

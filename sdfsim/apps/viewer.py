@@ -6,11 +6,13 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import webbrowser
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from types import FrameType
 
 from sdfsim.apps.recording import Playback
 from sdfsim.base.errors import SdfsimError
@@ -67,9 +69,25 @@ def _command(port: int, options: list[str]) -> list[str]:
 
 def _launch(port: int, options: list[str]) -> subprocess.Popen:
     """Start a viewer in its own process group, so that Ctrl-C for this process does not end it."""
+    _end_orderly()
     quiet, group = subprocess.DEVNULL, getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)  # Windows has no sessions
     command = _command(port, options)
     return subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True, creationflags=group)
+
+
+def _end_orderly() -> None:
+    """From now on this process ends as with `exit` if it is asked to (by `kill`, a service manager, or a terminal that
+    closes), so that it ends its viewer too. Elsewhere than in the main thread, and where the caller has handlers of its
+    own, nothing changes."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        mine = threading.current_thread() is threading.main_thread()
+        if number is not None and mine and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, leave)
 
 
 def check_screen(kind: str) -> None:
@@ -91,6 +109,7 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
     if not web:
         check_screen("native")
     options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
+    _end_orderly()
     viewer, announced = subprocess.Popen(_command(port, [str(recording), *options])), False
     try:
         if web and _started(viewer, page_port):  # before that, the address does not work
@@ -166,10 +185,15 @@ def _recording(place: Path) -> Path:
     """The recording of a run folder or of a reconstruction, or the file itself. Raises SdfsimError if there is none."""
     inside = [place / name for name in ("rollout.rrd", "reconstruction.rrd") if (place / name).is_file()]
     file = inside[0] if inside else place
-    if not file.is_file() or file.open("rb").read(3) != b"RRF":
-        raise SdfsimError(
-            f"{place}: no such recording", "give a run folder, or a rollout.rrd that simulate has written"
-        )
+    wanted = "give a run folder, or a rollout.rrd or rollout.npz that simulate has written"
+    if place.is_dir() and not inside:
+        unfinished = (place / "checkpoint").is_dir()
+        wanted = "go on with the run: sdfsim simulate SCENE -o FOLDER --resume" if unfinished else wanted
+        raise SdfsimError(f"{place}: neither rollout.rrd nor rollout.npz is in this folder", wanted)
+    if not file.is_file():
+        raise SdfsimError(f"{place}: no such recording", wanted)
+    if file.open("rb").read(3) != b"RRF":
+        raise SdfsimError(f"{file}: not a recording of rerun", wanted)
     return file
 
 

@@ -5,6 +5,7 @@ import json
 import logging
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from threading import Lock
@@ -12,7 +13,10 @@ from typing import Any
 
 _log = logging.getLogger(__name__)
 _lock = Lock()
-_ready: set[str] = set()  # functions that this process has compiled, or found compiled
+_ready: set[tuple] = set()  # functions with types of arguments that this process has compiled, or found compiled
+_spent = 0.0  # s, see `seconds_spent`
+_open: list[float] = []  # when the compilations began that are going on in this process
+_watched = _said = False
 
 
 # The module path comes first: reading the types imports modules from it.
@@ -32,24 +36,63 @@ def compile_before(
     that has just been compiled rounds differently, so a run could not be repeated bit by bit. If the cache cannot be
     written, the first call compiles.
     """
+    from numba import typeof
+    from numba.core.serialize import dumps
+
+    global _said, _spent
+    types = tuple(typeof(each) for each in arguments)
     with _lock:  # if several threads need it, one of them compiles
-        if what in _ready:
+        if (what, types) in _ready:
             return
-        _ready.add(what)
-        if is_compiled(function, missing):
+        _ready.add((what, types))
+        # These types exactly: arrays of another type or layout need a form of their own.
+        if not hasattr(function, "signatures") or types in _forms(function):
             return
-        _log.warning("compiling %s, once for this version: about %s", what, takes)
+        again = ", for other types of arrays" if is_compiled(function, missing) else ""
+        _log.warning("compiling %s%s, once for this version: about %s", what, again, takes)
+        _said = True
         try:
             function._cache._impl.locator.ensure_cache_path()
         except (AttributeError, OSError):
             return
-        from numba import typeof
-        from numba.core.serialize import dumps
-
-        name = (function.py_func.__module__, function.py_func.__qualname__)
-        wanted = dumps((*name, tuple(typeof(each) for each in arguments)))
+        started = time.perf_counter()
+        wanted = dumps((function.py_func.__module__, function.py_func.__qualname__, types))
         path = json.dumps([*sys.path]).encode() + b"\n"
         subprocess.run([sys.executable, "-c", _CHILD], input=path + wanted, capture_output=True, check=False)
+        _spent += time.perf_counter() - started
+
+
+def say_compiling() -> None:
+    """From now on warn, once, when this process begins to compile anything of numba; some functions take seconds."""
+    global _watched
+    if not _watched:
+        _watched = True
+        from numba.core import event
+
+        class Watch(event.Listener):
+            def on_start(self, event: Any) -> None:
+                global _said
+                if not _said:
+                    _said = True
+                    _log.warning("compiling code for this machine, once for this version: some seconds")
+                _open.append(time.perf_counter())
+
+            def on_end(self, event: Any) -> None:
+                global _spent
+                began = _open.pop()
+                _spent += time.perf_counter() - began if not _open else 0.0
+
+        event.register("numba:compile", Watch())
+
+
+def seconds_spent() -> float:
+    """s that this process has spent on compiling so far."""
+    return _spent
+
+
+def running() -> float:
+    """s, a clock that stands still while this process compiles: for the time of steps and runs."""
+    return time.perf_counter() - _spent
 
 
 def _compile_here(wanted: bytes) -> None:
@@ -70,13 +113,16 @@ def is_compiled(function: Any, missing: Mapping[int, bool] | None = None) -> boo
     """
     if not hasattr(function, "signatures"):
         return True
-    if any(_fits(arguments, missing) for arguments in function.signatures):
-        return True
+    return any(_fits(arguments, missing) for arguments in _forms(function))
+
+
+def _forms(function: Any) -> list[tuple]:
+    """The types of arguments for which a numba function is in memory, or in the cache for its source as it is now."""
     try:
-        # The entries for the source file as it is now; empty if it has changed since.
-        return any(_fits(key[0], missing) for key in function._cache._cache_file._load_index())
+        kept = [key[0] for key in function._cache._cache_file._load_index()]
     except (AttributeError, OSError):  # there is no cache, or it cannot be read
-        return False
+        kept = []
+    return [*function.signatures, *kept]
 
 
 def _fits(arguments: tuple, missing: Mapping[int, bool] | None) -> bool:

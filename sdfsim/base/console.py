@@ -121,8 +121,8 @@ class Session:
         return {name: value for name, value in self.options.items() if name not in others}
 
     def hold(self, why: str) -> None:
-        """Wait for Ctrl-C, if stdin is a terminal."""
-        if not self.as_json and sys.stdin.isatty():
+        """Wait for Ctrl-C or another end of the process, such as `kill`; with --json go on, as a program reads it."""
+        if not self.as_json:
             self.say(why)
             with contextlib.suppress(KeyboardInterrupt):
                 threading.Event().wait()

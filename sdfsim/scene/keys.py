@@ -29,6 +29,7 @@ class BodyKeys(TypedDict, total=False):
     units: Literal["m", "cm", "mm", "in"] | None
     cap: Switch | None
     thicken: float | None
+    centre: Switch | None
     wall: float | None
     sdf: SdfKind | None
     resolution: int | None

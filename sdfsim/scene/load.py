@@ -18,7 +18,9 @@ from sdfsim.scene.joints import joints_of
 from sdfsim.scene.scene import Body, Effects, Motion, Scene, Waypoints
 from sdfsim.scene.schema import FITTED, UNITS, BodyTable, SceneTable, ShapeTable
 from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
-from sdfsim.shape.shape import Shape, load_shape, with_nodes, with_sdf, with_wall
+from sdfsim.shape.shape import Shape, centred, load_shape, with_nodes, with_sdf, with_wall
+
+FAR_OFF = 10.0  # sizes of a shape: a note tells of an origin that is farther away
 
 
 def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
@@ -68,6 +70,12 @@ def load_scene(
     loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
     notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", []))
+    away = [(float(np.linalg.norm(s.com)), s) for of, s in loaded if of.mesh or of.asset]
+    notes += tuple(
+        f"{s.name}: its origin is {far:.3g} m from its centre of mass; centre: on moves it there"
+        for far, s in away
+        if far > FAR_OFF * np.ptp(s.mesh.vertices, axis=0).max()
+    )
     if on_progress is silent:
         for note in notes:
             warn_once(note)
@@ -131,7 +139,8 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
     else:
         shape = analytic_shape(kind, name=name, **dict(getattr(entry, kind)))
     shape = with_wall(shape, entry.wall) if entry.wall else shape
-    return with_nodes(shape, entry.nodes) if entry.nodes else shape
+    shape = with_nodes(shape, entry.nodes) if entry.nodes else shape
+    return centred(shape) if entry.centre == "on" else shape
 
 
 def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:

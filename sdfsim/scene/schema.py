@@ -309,6 +309,7 @@ class ShapeTable(Table):
     nodes: Whole | None = key(
         "N of the N^3 grid whose points become surface nodes; by default a shape keeps its own", None, ge=3, le=128
     )
+    centre: Literal["on", "off"] = key("moves the origin of an asset or a mesh to its centre of mass", "off")
     wall: Number | None = key(
         "makes the shape hollow: only the layer of this thickness below its surface has mass", None, "m", gt=0
     )
@@ -320,6 +321,8 @@ class ShapeTable(Table):
         for key in ("units", "cap", "thicken"):
             if key in data and kind not in ("mesh", None):
                 yield (key,), f"is for mesh only (this is a {kind})"
+        if "centre" in data and kind not in (*_WITH_SDF, None):
+            yield ("centre",), f"is for {', '.join(_WITH_SDF)} only (a {kind} is about its centre)"
         if "sdf" in data and kind not in (*_WITH_SDF, None):
             yield ("sdf",), f"is for {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
         if "resolution" in data and data.get("sdf") in (None, "mlp", "mesh"):

@@ -247,6 +247,30 @@ def scaled(shape: Shape, factor: float) -> Shape:
     )
 
 
+def centred(shape: Shape) -> Shape:
+    """The same shape with its origin at its centre of mass. Raises SdfsimError for a closed form whose mass lies
+    elsewhere."""
+    away = -shape.com
+    if not np.any(away):
+        return shape
+    if isinstance(shape.sdf, ClosedForm):
+        raise SdfsimError(f"{shape.name}: a {shape.sdf.KIND} is about its origin, wherever its mass is")
+
+    def moved(mesh: Mesh) -> Mesh:
+        return replace(mesh, vertices=mesh.vertices + away)
+
+    sdf, mesh = shape.sdf, moved(shape.mesh)
+    if isinstance(sdf, MlpSdf | GridSdf):
+        sdf = replace(sdf, frame=replace(sdf.frame, centre=sdf.frame.centre + away), bounds=sdf.bounds + away)
+    else:
+        assert isinstance(sdf, MeshSdf)
+        sdf = MeshSdf(mesh if sdf.mesh is shape.mesh else moved(sdf.mesh))
+    return replace(
+        shape, mesh=mesh, skin=shape.skin and moved(shape.skin), sdf=sdf, nodes=shape.nodes + away,
+        pieces=tuple(piece + away for piece in shape.pieces), com=np.zeros(3),
+    )  # fmt: skip
+
+
 def own_pieces(shape: Shape) -> list[Mesh]:
     """Convex pieces [m] that a shape has, or that its primitive has; empty if there are none."""
     if shape.pieces:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from sdfsim.base.compiling import running, say_compiling
 from sdfsim.base.devices import check_device, pick_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import Progress, parallel, silent, threads
@@ -121,6 +121,7 @@ class Simulator(LiveScene):
         dt: float | None = None,
         free_flight: FreeFlight = "exact",
     ) -> None:
+        say_compiling()
         self.scene = scene = loaded(scene)
         check_device(device)
         effects = plan(scene)
@@ -213,9 +214,9 @@ class Simulator(LiveScene):
             self._advance(0, keep=True)  # so that compiling and loading do not count for the time of a step
         while made < count:
             some = min(some, count - made)
-            started = time.perf_counter()
+            started = running()
             self._advance(some, keep=True)
-            spent = time.perf_counter() - started
+            spent = running() - started
             yield self._rollout(cast("Frames", self.carry.frames), 1e3 * spent / some)
             made += some
             if at_once is None:

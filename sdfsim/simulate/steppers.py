@@ -9,7 +9,6 @@ sleeping body costs nothing until something moves beside it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 
+from sdfsim.base.compiling import running
 from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.model import SOLVER, SURFACE, Model
 from sdfsim.learned.training_ranges import outside_training
@@ -92,9 +92,9 @@ class Carry:
     @contextmanager
     def timed(self, phase: str) -> Iterator[None]:
         """Add the time that a block takes to a phase."""
-        started = time.perf_counter()
+        started = running()
         yield
-        self.counts[phase] += 1e3 * (time.perf_counter() - started)
+        self.counts[phase] += 1e3 * (running() - started)
 
 
 @dataclass(frozen=True)
@@ -218,9 +218,9 @@ class Solver(Stepper):
 
     def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
         """All steps in one call of compiled code."""
-        started = time.perf_counter()
+        started = running()
         made = self._steps(state, carry, n, limits(carry.options.dt) if carry.checked else NO_LIMITS, keep=keep)
-        spent = 1e3 * (time.perf_counter() - started) / max(n, 1)
+        spent = 1e3 * (running() - started) / max(n, 1)
         carry.done, carry.fault, carry.given = made.done, made.fault, made.given
         carry.frames = None
         if made.done:

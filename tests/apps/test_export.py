@@ -254,6 +254,23 @@ def test_options_that_a_format_has_no_use_for_are_refused(dropped, tmp_path):
 # --- USD ---
 
 
+@pytest.mark.parametrize("fps", [24, 29.97])
+def test_a_usd_stage_plays_whole_frames_at_the_rate_that_was_asked_for(dropped, tmp_path, fps):
+    """A program that plays one time code a frame shows the ball where it was at that time."""
+    from pxr import Usd, UsdGeom
+
+    export(dropped.folder, tmp_path / "run.usda", fps=fps, allow_outside=True)
+    stage = Usd.Stage.Open(str(tmp_path / "run.usda"))
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == fps
+    place = UsdGeom.Xformable(stage.GetPrimAtPath("/World/ball")).GetOrderedXformOps()[0]
+    codes = place.GetTimeSamples()
+    assert codes == list(range(len(codes))) and (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, codes[-1])
+    true, time = dropped.rollout.position[:, dropped.index("ball")], np.array(codes) / fps
+    for axis in range(3):
+        found = [place.Get(code)[axis] for code in codes]
+        np.testing.assert_allclose(found, np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
+
+
 @pytest.mark.parametrize("ending", ["usda", "usdc"])
 def test_a_usd_stage_has_the_motion_and_the_physics(dropped, ending):
     from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
@@ -441,9 +458,11 @@ def assets(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path, caplog):
+def test_a_solid_without_pieces_is_cut_once_by_coacd(tmp_path, monkeypatch, caplog):
+    import coacd
     import mujoco
 
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     half = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]) * 0.1
     vertices = np.concatenate([np.column_stack([half, np.full(6, z)]) for z in (0.0, 0.1)])
     flat = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)])
@@ -459,6 +478,16 @@ def test_a_solid_without_pieces_is_cut_by_coacd(tmp_path, caplog):
     stages = []
     export(tmp_path / "angle", tmp_path / "angle.urdf", on_progress=lambda stage, *_: stages.append(stage))
     assert told not in caplog.text and "convex pieces" in stages
+    # The same mesh under another name is not cut again; another mesh is.
+    monkeypatch.setattr(coacd, "run_coacd", lambda *args, **keys: pytest.fail("cut again"))
+    replace(shape, name="bracket").save(tmp_path / "bracket")
+    export(tmp_path / "bracket", tmp_path / "bracket.xml")
+    pieces = [assets(tmp_path / f"{name}_assets") for name in ("angle", "bracket")]
+    assert list(pieces[0].values()) == list(pieces[1].values())
+    larger = mesh_shape(replace(mesh, vertices=1.1 * mesh.vertices), name="larger", kind="mesh")
+    larger.save(tmp_path / "larger")
+    with pytest.raises(pytest.fail.Exception, match="cut again"):
+        export(tmp_path / "larger", tmp_path / "larger.xml")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "angle.xml"))
     assert model.body("angle").mass[0] == pytest.approx(1000 * 0.003)
     corners = model.mesh_vert.reshape(-1, 3)

@@ -331,11 +331,55 @@ def test_what_other_readers_pass_over_is_passed_over(tmp_path: Path) -> None:
         import_robot(tmp_path / "arm.urdf", tmp_path / "scene.yaml")
 
 
+@pytest.mark.parametrize(
+    ("encoding", "declared"),
+    [
+        ("gb2312", "GB2312"), ("gbk", "gbk"), ("shift_jis", "Shift_JIS"), ("utf-16", "utf-16"), ("utf-16", ""),
+        ("utf-16-le", "UTF-16"), ("utf-16-be", ""), ("utf-32", "utf-32"), ("utf-8-sig", ""), ("utf-8-sig", "utf-8"),
+        ("utf-8", "utf-16"), ("utf-8", ""), ("iso2022_jp", "ISO-2022-JP"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("before", ["", "\n  "])
+def test_a_urdf_is_read_in_any_encoding(tmp_path: Path, encoding: str, declared: str, before: str) -> None:
+    text = f'<?xml version="1.0" encoding="{declared}"?>\n' if declared else ""
+    text = before + text + ARM.replace('name="tip"', 'name="\u5de5\u5177"').replace('link="tip"', 'link="\u5de5\u5177"')
+    (tmp_path / "arm.urdf").write_bytes(text.encode(encoding))
+    scene, report = imported(tmp_path / "arm.urdf")
+    assert [body.name for body in scene.bodies] == ["base", "upper", "slide", "\u5de5\u5177"]
+    assert not any("bytes" in note for note in report["notes"])
+    (tmp_path / "arm.urdf").write_bytes(text.replace('<axis xyz="0 0 -2"/>', '<axis xyz="0"/>').encode(encoding))
+    line = text[: text.index('<axis xyz="0 0 -2"/>')].count("\n") + 1
+    with pytest.raises(SdfsimError, match=rf"arm\.urdf:{line}: <axis> xyz must be 3 numbers"):
+        import_robot(tmp_path / "arm.urdf", tmp_path / "scene.yaml")
+
+
+def test_bytes_of_another_encoding_are_told_and_unknown_encodings_refused(tmp_path: Path) -> None:
+    comment = "\n<!-- \u673a\u5668\u4eba -->".encode("gb2312")
+    (tmp_path / "arm.urdf").write_bytes(ARM.encode().replace(b">", b">" + comment, 1))
+    _, report = imported(tmp_path / "arm.urdf")
+    assert "line 2 has bytes that are not utf-8: a mark replaces them, here and further on" in report["notes"]
+    (tmp_path / "arm.urdf").write_text(f'<?xml version="1.0" encoding="klingon"?>{ARM}')
+    with pytest.raises(SdfsimError, match=r"arm\.urdf:1: unknown encoding 'klingon'"):
+        import_robot(tmp_path / "arm.urdf", tmp_path / "scene.yaml")
+
+
 def test_a_floor_is_under_the_lowest_link(tmp_path: Path) -> None:
     scene, _ = imported(write(tmp_path, "arm.urdf", ARM), floor=True)
     base = next(body for body in scene.bodies if body.name == "base")
     assert base.position[2] == pytest.approx(0.1)  # half its height, of a frame in its middle
     assert scene.bodies[0].name == "floor" and base.motion == "dynamic"
+
+
+def test_a_floor_carries_only_what_touches(tmp_path: Path) -> None:
+    """A visual that hangs far below, and a link without any geometry, for which a large ball stands in."""
+    shown = '<link name="lamp"><inertial><mass value="0.1"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" '
+    shown += 'izz="1e-3"/></inertial><visual><origin xyz="0 0 -3"/><geometry><sphere radius="0.1"/></geometry></visual>'
+    shown += '</link><joint name="hang" type="continuous"><parent link="tip"/><child link="lamp"/></joint>'
+    shown += '<link name="bare"><inertial><mass value="0.1"/><inertia ixx="9" ixy="0" ixz="0" iyy="9" iyz="0" izz="9"/>'
+    shown += '</inertial></link><joint name="bar" type="continuous"><parent link="tip"/><child link="bare"/></joint>'
+    scene, _ = imported(write(tmp_path, "arm.urdf", ARM.replace("</robot>", shown + "</robot>")), floor=True)
+    base = next(body for body in scene.bodies if body.name == "base")
+    assert base.position[2] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(

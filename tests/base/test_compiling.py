@@ -4,6 +4,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -136,3 +137,36 @@ def test_what_is_compiled_already_is_not_reported(caplog):
     compiling._ready.clear()
     Simulator(sim.scene).step(1)
     assert "compiling" not in caplog.text
+
+
+def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeypatch, caplog):
+    """Arrays of another layout need code of their own, which used to be compiled without a word."""
+    from numba.core import config
+
+    (tmp_path / "layouts.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(compiling, "_ready", set())
+    double, before = importlib.import_module("layouts").double, compiling.seconds_spent()
+    for array, told in ((np.ones((2, 2)), 1), (np.zeros((3, 3)), 1), (np.ones((4, 4))[::2], 2), (np.ones((2, 2)), 2)):
+        compile_before(double, (array,), "doubling", "a second")
+        assert len(caplog.messages) == told
+        assert double(array).tolist() == (2 * array).tolist()
+    assert not double.stats.cache_misses  # nothing was compiled here
+    assert "doubling, for other types of arrays, once" in caplog.messages[1]
+    assert compiling.seconds_spent() > before
+
+
+def test_whatever_else_is_compiled_is_told_once_and_is_no_part_of_the_time(tmp_path, monkeypatch, caplog):
+    file = tmp_path / "alone.py"
+    file.write_text(SOURCE.replace("cache=True", "cache=False"))
+    monkeypatch.setattr(compiling, "_said", False)
+    compiling.say_compiling()
+    function, other = loaded(file), loaded(file)
+    began, clock, before = time.perf_counter(), compiling.running(), compiling.seconds_spent()
+    assert function(3) == 6 and other(3.0) == 6.0
+    took, spent = time.perf_counter() - began, compiling.seconds_spent() - before
+    assert caplog.messages == ["compiling code for this machine, once for this version: some seconds"]
+    assert 0.5 * took < spent < took
+    assert compiling.running() - clock == pytest.approx(took - spent, abs=0.01)
