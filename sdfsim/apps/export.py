@@ -202,6 +202,8 @@ def _read(
         com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
         offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
         place = run.position - offset.reshape(run.position.shape)
+        planes = [k for k, body in enumerate(scene.bodies) if is_infinite(scene.shapes[body.shape])]
+        place[:, planes] = np.reshape([scene.bodies[k].position for k in planes], (-1, 3))
     else:
         time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
         place = np.array([[body.position for body in scene.bodies]])
@@ -227,28 +229,27 @@ def _near(scene: Scene) -> tuple[Scene, list[str]]:
     def moved(mesh: Mesh, middle: np.ndarray) -> Mesh:
         return replace(mesh, vertices=mesh.vertices - middle)
 
-    shapes = tuple(
-        replace(
-            shape, mesh=moved(shape.mesh, c), skin=shape.skin and moved(shape.skin, c), nodes=shape.nodes - c,
-            com=shape.com - c, pieces=tuple(piece - c for piece in shape.pieces),
-        )
-        for shape, c in zip(scene.shapes, middles, strict=True)
-    )  # fmt: skip
-    arms = [body.scale * middles[body.shape] for body in scene.bodies]
-    bodies = tuple(
-        replace(
-            body,
-            position=body.position + Rotation.from_quat(body.quat_xyzw).apply(arm),
-            path=body.path
-            and replace(body.path, position=body.path.position + Rotation.from_quat(body.path.quat_xyzw).apply(arm)),
-        )
-        for body, arm in zip(scene.bodies, arms, strict=True)
-    )
+    shapes, arms, bodies = [], [], []
+    for shape, c in zip(scene.shapes, middles, strict=True):
+        skin, pieces = shape.skin and moved(shape.skin, c), tuple(piece - c for piece in shape.pieces)
+        shape = replace(shape, mesh=moved(shape.mesh, c), skin=skin, pieces=pieces)
+        shapes.append(replace(shape, nodes=shape.nodes - c, com=shape.com - c))
+    for body in scene.bodies:
+        arms.append(body.scale * middles[body.shape])
+        path, place = body.path, body.position + Rotation.from_quat(body.quat_xyzw).apply(arms[-1])
+        if path is not None:
+            path = replace(path, position=path.position + Rotation.from_quat(path.quat_xyzw).apply(arms[-1]))
+        bodies.append(replace(body, position=place, path=path))
+    middle = framed(replace(scene, shapes=tuple(shapes), bodies=tuple(bodies)))[0]
+    for k, body in enumerate(bodies):
+        if is_infinite(shapes[body.shape]):  # drawn around its position, which may be any in it
+            normal = Rotation.from_quat(body.quat_xyzw).apply([0.0, 0.0, 1.0])
+            bodies[k] = replace(body, position=middle - (middle - body.position) @ normal * normal)
     held = [[np.zeros(3) if k < 0 else arms[k] for k in joint.bodies] for joint in scene.joints]
     joints = tuple(replace(joint, anchor=joint.anchor - arm) for joint, arm in zip(scene.joints, held, strict=True))
     far = [(shape.name, c) for shape, c in zip(scene.shapes, middles, strict=True) if c.any()]
-    notes = [f"{name} has its origin at {_numbers(c)} m of its own frame, in its middle" for name, c in far]
-    return replace(scene, shapes=shapes, bodies=bodies, joints=joints), notes
+    notes = [f"{name} is far from its origin: poses are those of its middle, at {_numbers(c)} m" for name, c in far]
+    return replace(scene, shapes=tuple(shapes), bodies=tuple(bodies), joints=joints), notes
 
 
 def plain_names(names: list[str], ascii: bool = False) -> list[str]:
