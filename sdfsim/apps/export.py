@@ -351,7 +351,8 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
     lines = {
         "the motion: the scene is exported as at the start": take.moving and not motion,
         "the paths of kinematic bodies: they stay at their start": led and not (take.moving and motion),
-        "textures": not textures and any(shape.skin is not None for shape in take.scene.shapes),
+        "textures and colours of single faces: colours of vertices, or one colour, are in their place": not textures
+        and any(shape.skin is not None for shape in take.scene.shapes),
     }
     return [line for line, missing in lines.items() if missing]
 

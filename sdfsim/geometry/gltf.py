@@ -154,7 +154,7 @@ def read_gltf(path: Path) -> FileMesh:
     damaged, or needs an extension that is not supported."""
     file = _GltfReader(path)
     parts = [part for _, part in file.parts()]
-    file.notes += [f"not shown: {', '.join(file.lost)}"] if file.lost else []
+    file.notes += [f"not shown: {what}" for what in file.lost]
     if not parts:
         return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), notes=tuple(file.notes))
     whole, colors = joined(parts), None
@@ -201,7 +201,7 @@ class _GltfReader:
         self.notes: list[str] = []  # what is lost
         self.lost: dict[str, None] = {}  # of the look of surfaces
         if self._list("animations"):
-            self.notes.append("its animations are left out: it stands as its nodes do")
+            self.notes.append("its animations are left out: it stands as it does before they begin")
 
     def _list(self, name: str) -> list[dict[str, Any]]:
         return self.header.get(name, [])

@@ -34,6 +34,7 @@ FLAT = 1e-9
 TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "TGA", "DDS", "GIF", "PPM")
 FACET = 50  # bytes of a triangle in a binary STL; the header has 84
 OBJ_ROWS = (b"v", b"vt", b"vn", b"f")
+OBJ_BUMPS = {"map_bump", "bump", "norm", "map_norm", "map_kn"}
 # Options of a texture in an MTL file, with the number of words that follow them; three of them have one to three
 # numbers.
 MAP_OPTIONS: dict[str, int] = {"-mm": 2, "-s": 3, "-o": 3, "-t": 3}
@@ -608,6 +609,9 @@ def _look(path: Path, rows: dict[str, str], notes: list[str]) -> tuple[np.ndarra
             color = np.round(255.0 * np.clip(np.broadcast_to(value, 3), 0.0, 1.0)).astype(np.uint8)
     except ValueError:
         notes.append(f"colour Kd {rows['kd'][:40]} is not three numbers: left out")
+    clear = rows.get("d", "1").strip("0.") == "1" and not rows.get("tr", "").strip("0.")
+    lost = {"normal maps": not OBJ_BUMPS.isdisjoint(rows), "transparency": "map_d" in rows or not clear}
+    notes += [f"not shown: {what}" for what, is_lost in lost.items() if is_lost]
     words, options = rows.get("map_kd", "").split(), {}
     while words and (key := words[0].lower()) in MAP_OPTIONS and len(words) > 1:
         count = MAP_OPTIONS[key]
