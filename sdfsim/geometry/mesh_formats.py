@@ -498,7 +498,7 @@ def obj_surface(path: Path, content: bytes) -> FileMesh:
     vertices = numbers([word for row in rows[b"v"] for word in row[:3]], text).reshape(-1, 3)
     shades = None
     if rows[b"v"] and all(len(row) >= 6 for row in rows[b"v"]):
-        shades = numbers([word for row in rows[b"v"] for word in row[-3:]], text).reshape(-1, 3)
+        shades = np.nan_to_num(numbers([word for row in rows[b"v"] for word in row[-3:]], text)).reshape(-1, 3)
         shades = np.clip(np.round(shades * (255.0 if shades.max() <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
     length, table = _obj_corners(rows, at, text)
     cuts = triangles(length, table[:, 0], vertices)
@@ -609,7 +609,8 @@ def _look(path: Path, rows: dict[str, str], notes: list[str]) -> tuple[np.ndarra
             color = np.round(255.0 * np.clip(np.broadcast_to(value, 3), 0.0, 1.0)).astype(np.uint8)
     except ValueError:
         notes.append(f"colour Kd {rows['kd'][:40]} is not three numbers: left out")
-    clear = rows.get("d", "1").strip("0.") == "1" and not rows.get("tr", "").strip("0.")
+    # Tr is 0 or 1 for what is not transparent: programs differ.
+    clear = rows.get("d", "1").strip("0.") == "1" and rows.get("tr", "1").strip("0.") in ("", "1")
     lost = {"normal maps": not OBJ_BUMPS.isdisjoint(rows), "transparency": "map_d" in rows or not clear}
     notes += [f"not shown: {what}" for what, is_lost in lost.items() if is_lost]
     words, options = rows.get("map_kd", "").split(), {}
@@ -647,9 +648,9 @@ def stl_surface(content: bytes) -> FileMesh:
     # The last triangle's last two bytes are an attribute, which some programs leave out.
     if len(content) < needed - 2:
         raise ValueError(f"cut short: {(len(content) - 84) // FACET} of {count} faces")
-    if not count:
+    if not count and len(content) > needed:
         raise ValueError(f"its header announces no faces, and {len(content) - 84} bytes follow")
     facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     corners = np.frombuffer(content[84:needed].ljust(needed - 84, b"\0"), facet)["corners"].astype(np.float64)
-    notes = ("colours of its faces are left out",) if b"COLOR=" in content[:80] else ()
+    notes = ("its colours are left out: STL is read without them",) if b"COLOR=" in content[:80] else ()
     return FileMesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), notes=notes)

@@ -280,7 +280,7 @@ def test_an_obj_finds_its_texture_however_it_is_named(
         ("mtllib die.mtl", "newmtl side 0\nKd spectral a.rfl\n", "colour Kd spectral a.rfl", None),
         ("mtllib die.mtl", "newmtl side 0\nmap_Bump a.png\n", "not shown: normal maps", None),
         ("mtllib die.mtl", "newmtl side 0\nKd 0 0.2 1\nTr 0.4\n", "not shown: transparency", (0, 51, 255)),
-        ("mtllib die.mtl", "newmtl side 0\nKd 0 0.2 1\nd 1.0\nTr 0\n", "", (0, 51, 255)),
+        ("mtllib die.mtl", "newmtl side 0\nKd 0 0.2 1\nd 1.0\nTr 1.0\n", "", (0, 51, 255)),
     ],
 )
 def test_looks_that_are_lost_are_named(tmp_path, library: str, text: str, message: str, color) -> None:
