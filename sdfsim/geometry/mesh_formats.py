@@ -508,17 +508,19 @@ def obj_surface(path: Path, content: bytes) -> FileMesh:
     notes: list[str] = []
     known = _libraries(path, libraries, notes)
     if not libraries and any(used.values()):
-        notes.append("it names materials, but no library of them (mtllib): left out")
+        notes.append("it names materials, but no file that describes them (mtllib): their looks are left out")
     starts, colors, plain = np.array(list(used)), np.full((len(faces), 3, 3), 255, np.uint8), np.ones(len(faces), bool)
-    material, colored, parts = np.searchsorted(starts, owner, side="right") - 1, shades is not None, []
+    numbered = {name: k for k, name in enumerate(dict.fromkeys(used.values()))}
+    material = np.array([numbered[name] for name in used.values()])[np.searchsorted(starts, owner, side="right") - 1]
+    colored, parts = shades is not None, []
     if shades is not None:
         colors[:] = shades[faces]
-    for name in dict.fromkeys(used.values()):
-        some = np.flatnonzero(np.isin(material, [k for k, other in enumerate(used.values()) if other == name]))
+    for name, k in numbered.items():
+        some = np.flatnonzero(material == k)
         if not name or not len(some) or not known:
             continue
         if name not in known:
-            notes.append(f"material {name} is in none of its libraries: left out")
+            notes.append(f"material {name} is not in {', '.join(libraries)}: its look is left out")
             continue
         color, image, laid = _look(path, known[name], notes)
         if image is not None and (table[cuts[some], 1] < 0).any():
