@@ -7,8 +7,8 @@ docs/export.md lists it for each format.
 import csv
 import io
 import logging
-import re
 import tempfile
+import unicodedata
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -30,13 +30,13 @@ from sdfsim.base.files import cached_arrays, check_writable, digest, user_cache,
 from sdfsim.base.lazy import optional
 from sdfsim.base.parallel import StageProgress, of_stage, silent_stages
 from sdfsim.geometry.gltf import GltfWriter, light
-from sdfsim.geometry.mesh import Mesh, convex_hull
+from sdfsim.geometry.mesh import Mesh, convex_hull, far_middle
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, wavefront
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.load import load_scene
-from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene import Body, Joint, Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 
@@ -57,6 +57,10 @@ STEP = 0.001  # s, the step of MuJoCo
 SOFT = 4.0  # steps, over 2 pi: the period of a MuJoCo contact
 MOST_PAIRS = 1000  # pairs of geoms whose coefficients are written one by one
 MOST_GROUPS = 31  # MuJoCo's bit masks
+# MuJoCo refuses moments of inertia below 1e-14 kg m^2, and convex pieces of hardly any volume. Below this moment,
+# kg m^2, or this size of a mesh, m, the unit of length is a thousandth.
+LEAST_MOMENT, LEAST_SIZE, FINER = 1e-13, 1e-3, 1000.0
+MOST_TOLD = 8  # names in a line of the report
 # Names that are taken: our own, MuJoCo's, and device names, which Windows does not allow for files.
 RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "joints", "con", "prn", "aux", "nul")
 RESERVED += tuple(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))
@@ -73,7 +77,7 @@ class Take:
     """The data to export: N bodies at T times."""
 
     scene: Scene  # the bodies as they are at the start
-    names: list[str]  # [N] unique names of ASCII letters, digits and underscores
+    names: list[str]  # [N] unique names of letters, digits and underscores
     shapes: list[str]  # names of the scene's shapes, in the same form
     colors: np.ndarray  # [N, 3] uint8 sRGB, for bodies whose mesh has no colours
     time: np.ndarray  # [T] s
@@ -81,6 +85,8 @@ class Take:
     quat_xyzw: np.ndarray  # [T, N, 4], with the sign that is nearer to the time before
     collide: Collide = "pieces"
     rate: float = RATE  # USD time codes per second
+    ascii: bool = False  # whether the names have no other letters than those of ASCII
+    notes: tuple[str, ...] = ()  # what differs from the source, one line each
 
     @property
     def moving(self) -> bool:
@@ -147,12 +153,12 @@ def export(
     if FORMATS[kind] is _usd:
         _pxr("Usd")  # checked before fitting shapes, which takes minutes
     check_writable(out.parent)
-    take = replace(_read(source, scene_file, allow_outside, on_progress), collide=collide)
+    take = replace(_read(source, scene_file, FORMATS[kind], allow_outside, on_progress), collide=collide)
     take = take if fps is None else take.at_rate(fps)
     out.parent.mkdir(parents=True, exist_ok=True)
     files, left_out = FORMATS[kind](take, out, on_progress)
     counts = {"bodies": len(take.names), "frames": len(take.time)}
-    notes = ["z up is turned to glTF's y up"] if kind == ".glb" else []
+    notes = [*take.notes, *(["z up is turned to glTF's y up"] if kind == ".glb" else [])]
     return {"format": kind[1:], **counts, "files": files, "left_out": left_out, "notes": notes}
 
 
@@ -169,7 +175,10 @@ def _path(what: str, given: Any, wanted: str) -> Path:
     return Path(given)
 
 
-def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
+def _read(
+    source: Path, scene_file: Path | None, write: Callable, allow_outside: bool, on_progress: StageProgress
+) -> Take:
+    """What to export, with names and shapes as the function `write` needs them."""
     progress = of_stage(on_progress, "shapes")
     run, source = None, source if source.exists() else find_scene(source, or_run=True)
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
@@ -188,27 +197,76 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
         hint = f"sdfsim fit {source} -o FOLDER makes a Shape folder of a mesh"
         message = f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder"
         raise SdfsimError(message, hint if source.suffix.lower() in MESH_SUFFIXES else "")
+    scene, notes = (scene, []) if write is _csv else _near(scene)
     if run is not None:
         time, turn = run.time, run.orientation.copy()
         turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
         com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
         offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
         place = run.position - offset.reshape(run.position.shape)
+        planes = [k for k, body in enumerate(scene.bodies) if is_infinite(scene.shapes[body.shape])]
+        place[:, planes] = np.reshape([scene.bodies[k].position for k in planes], (-1, 3))
     else:
         time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
         place = np.array([[body.position for body in scene.bodies]])
-    names, shapes = (plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
-    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, place, turn)
+    # ROS allows ASCII only, and programs that read URDF may not find files with other names.
+    ascii = write is _urdf
+    names, shapes = (plain_names([one.name for one in ones], ascii) for ones in (scene.bodies, scene.shapes))
+    pairs = zip((*scene.bodies, *scene.shapes), (*names, *shapes), strict=True)
+    renamed = list(dict.fromkeys(f"{one.name} is called {name}" for one, name in pairs if one.name != name))
+    if renamed and write is not _csv:
+        more = f", and {len(renamed) - MOST_TOLD} more" if len(renamed) > MOST_TOLD else ""
+        notes.append(", ".join(renamed[:MOST_TOLD]) + more)
+    colors = np.array(body_colors(scene), dtype=np.uint8)
+    return Take(scene, names, shapes, colors, time, place, turn, ascii=ascii, notes=tuple(notes))
 
 
-def plain_names(names: list[str]) -> list[str]:
-    """Unique names that every format accepts, in place of `names`."""
+def _near(scene: Scene) -> tuple[Scene, list[str]]:
+    """The same scene, but shapes far from their own origin (a map's coordinates) have it in their middle, because files
+    hold vertices in single precision; and a line for each. Distances from the surface stay as they are."""
+    middles = [np.zeros(3) if isinstance(s.sdf, ClosedForm) else far_middle(s.mesh.vertices) for s in scene.shapes]
+    if not np.any(middles):
+        return scene, []
+
+    def moved(mesh: Mesh, middle: np.ndarray) -> Mesh:
+        return replace(mesh, vertices=mesh.vertices - middle)
+
+    shapes, arms, bodies = [], [], []
+    for shape, c in zip(scene.shapes, middles, strict=True):
+        skin, pieces = shape.skin and moved(shape.skin, c), tuple(piece - c for piece in shape.pieces)
+        shape = replace(shape, mesh=moved(shape.mesh, c), skin=skin, pieces=pieces)
+        shapes.append(replace(shape, nodes=shape.nodes - c, com=shape.com - c))
+    for body in scene.bodies:
+        arms.append(body.scale * middles[body.shape])
+        path, place = body.path, body.position + Rotation.from_quat(body.quat_xyzw).apply(arms[-1])
+        if path is not None:
+            path = replace(path, position=path.position + Rotation.from_quat(path.quat_xyzw).apply(arms[-1]))
+        bodies.append(replace(body, position=place, path=path))
+    middle = framed(replace(scene, shapes=tuple(shapes), bodies=tuple(bodies)))[0]
+    for k, body in enumerate(bodies):
+        if is_infinite(shapes[body.shape]):  # drawn around its position, which may be any in it
+            normal = Rotation.from_quat(body.quat_xyzw).apply([0.0, 0.0, 1.0])
+            bodies[k] = replace(body, position=middle - (middle - body.position) @ normal * normal)
+    held = [[np.zeros(3) if k < 0 else arms[k] for k in joint.bodies] for joint in scene.joints]
+    joints = tuple(replace(joint, anchor=joint.anchor - arm) for joint, arm in zip(scene.joints, held, strict=True))
+    far = [(shape.name, c) for shape, c in zip(scene.shapes, middles, strict=True) if c.any()]
+    notes = [f"{name} is far from its origin: poses are those of its middle, at {_numbers(c)} m" for name, c in far]
+    return replace(scene, shapes=tuple(shapes), bodies=tuple(bodies), joints=joints), notes
+
+
+def plain_names(names: list[str], ascii: bool = False) -> list[str]:
+    """Unique names that formats accept, in place of `names`: letters of any script or only of ASCII, digits and
+    underscores."""
     used: set[str] = set(RESERVED)
     plain = []
     for name in names:
+        kept = (
+            c if f"_{c}".isidentifier() and (c.isascii() or not ascii) else " "
+            for c in unicodedata.normalize("NFC", name)
+        )
         # Trailing separators are dropped: `cup[3]` becomes `cup_3`.
-        stem = re.sub(r"\W", "_", re.sub(r"\W+$", "", name, flags=re.ASCII), flags=re.ASCII) or "_"
-        stem = f"_{stem}" if stem[0].isdigit() else stem
+        stem = "".join(kept).rstrip().replace(" ", "_") or "_"
+        stem = stem if stem.isidentifier() else f"_{stem}"
         # Names that differ only in case are the same file on some systems.
         choice = next(c for k in range(len(used) + 1) if (c := f"{stem}_{k}" if k else stem).lower() not in used)
         used.add(choice.lower())
@@ -222,7 +280,7 @@ def plain_names(names: list[str]) -> list[str]:
 def _joint_names(take: Take) -> dict[str, str]:
     """Names that every format accepts, in place of the names of the joints."""
     names = [joint.name for joint in take.scene.joints]
-    return dict(zip(names, plain_names(names), strict=True))
+    return dict(zip(names, plain_names(names, take.ascii), strict=True))
 
 
 def _inertia(body: Body, shape: Shape) -> np.ndarray:
@@ -286,7 +344,7 @@ def _write_assets(
 
 
 def _numbers(*values: Any) -> str:
-    return " ".join(f"{value + 0.0:.9g}" for value in np.concatenate([np.ravel(value) for value in values]))
+    return " ".join(f"{value + 0.0:.12g}" for value in np.concatenate([np.ravel(value) for value in values]))
 
 
 def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
@@ -309,7 +367,8 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
     lines = {
         "the motion: the scene is exported as at the start": take.moving and not motion,
         "the paths of kinematic bodies: they stay at their start": led and not (take.moving and motion),
-        "textures": not textures and any(shape.skin is not None for shape in take.scene.shapes),
+        "textures and colours of single faces: colours of vertices, or one colour, are in their place": not textures
+        and any(shape.skin is not None for shape in take.scene.shapes),
     }
     return [line for line, missing in lines.items() if missing]
 
@@ -318,7 +377,8 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
 
 
 def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
-    file = GltfWriter()
+    file, (middle, radius) = GltfWriter(), framed(take.scene)
+    file.origin = np.round(far_middle(middle + radius * np.array([[-1.0], [1.0]])))
     # Bodies of the same shape and colour share a mesh; those of the same shape share its arrays.
     numbers: dict[tuple[int, int], tuple[dict[str, int], int]] = {}
     drawn: dict[tuple[str, tuple[int, int]], int] = {}
@@ -341,7 +401,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
         if (key, form) not in drawn:
             material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8, lit=True)
             drawn[key, form] = file.mesh(key, *numbers[form], material)
-        place, turn = take.position[:, k], take.quat_xyzw[:, k]
+        place, turn = take.position[:, k] - file.origin, take.quat_xyzw[:, k]
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
         file.nodes.append({"name": name, "mesh": drawn[key, form], **node})
         if take.moving and body.motion != "static":
@@ -511,7 +571,8 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 
 
 def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
-    scene, left_out = take.scene, _missing(take)
+    take, left_out = _refined(take)
+    scene, left_out = take.scene, [*left_out, *_missing(take)]
     sampled = take.collide == "sdf"
     seen, cut = _write_assets(take, out, lambda body: not sampled, on_progress)
     root = XML("mujoco", model=plain_names([out.stem])[0])
@@ -619,6 +680,53 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         add(add(root, "keyframe"), "key", name="start", **start)
     _write_xml(out, root)
     return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
+
+
+def _refined(take: Take) -> tuple[Take, list[str]]:
+    """The data for MuJoCo, and a line if lengths are in a finer unit than metres. All lengths are `FINER` times as
+    large, and so is gravity, with the same densities and times; so the motion is the same."""
+    scene, k = take.scene, FINER
+    small = []
+    for body in scene.bodies:
+        shape = scene.shapes[body.shape]
+        moment = np.linalg.eigvalsh(_inertia(body, shape))[0] if body.motion == "dynamic" else np.inf
+        meshed = not isinstance(shape.sdf, ClosedForm)
+        size = body.scale * float(np.ptp(shape.mesh.vertices, axis=0).max()) if meshed else np.inf
+        small += [body.name] if moment < LEAST_MOMENT or size < LEAST_SIZE else []
+    if not small:
+        return take, []
+    bodies = tuple(
+        replace(
+            body, scale=k * body.scale, position=k * body.position, velocity=k * body.velocity, mass=k**3 * body.mass,
+            inertia=None if body.inertia is None else k**5 * body.inertia,
+        )
+        for body in scene.bodies
+    )  # fmt: skip
+    scene = replace(scene, bodies=bodies, joints=tuple(map(_refined_joint, scene.joints)), gravity=k * scene.gravity)
+    fall = _numbers(np.linalg.norm(scene.gravity))
+    line = (
+        f"metres and kilograms, as MuJoCo refuses bodies as small as {small[0]}: lengths are in mm, masses in 1e-9 kg"
+    )
+    return replace(take, scene=scene), [f"{line}, gravity is {fall} mm/s^2"]
+
+
+def _refined_joint(joint: Joint) -> Joint:
+    k, turns = FINER, joint.kind in ("hinge", "ball")
+    along = 1.0 if turns else k  # of what it measures: rad, or m
+    push = k**5 if turns else k**4  # of what acts along it: N m, or N
+    spring, motor, limits = joint.spring, joint.motor, joint.limits
+    if spring is not None:
+        spring = replace(spring, stiffness=spring.stiffness * push / along, rest=spring.rest * along)
+    if motor is not None:
+        speed, position = (None if goal is None else goal * along for goal in (motor.speed, motor.position))
+        gain = None if motor.gain is None else motor.gain * push / along
+        motor = replace(motor, most=motor.most * push, speed=speed, position=position, gain=gain)
+    return replace(
+        joint, anchor=k * joint.anchor, start=along * joint.start, limits=limits and (limits[0] * along, limits[1] * along),
+        length=None if joint.length is None else k * joint.length, damping=joint.damping * push / along,
+        friction=joint.friction * push, spring=spring, motor=motor,
+        breaks_force=k**4 * joint.breaks_force, breaks_torque=k**5 * joint.breaks_torque,
+    )  # fmt: skip
 
 
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:

@@ -17,24 +17,30 @@ from urllib.parse import unquote
 import numpy as np
 
 from sdfsim.geometry.mesh import joined
-from sdfsim.geometry.mesh_formats import FileMesh, looked_up, read_image, side_file, strip
-from sdfsim.geometry.skins import Painted
+from sdfsim.geometry.mesh_formats import TEXTURES, FileMesh, looked_up, read_image, side_file, strip
+from sdfsim.geometry.skins import Painted, plain_parts
 
-# From z up to glTF's y up: columns of a matrix [4, 4].
-_Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
+# From z up to glTF's y up: the first columns of a matrix [4, 4].
+_Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0]
 _COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123}
 _UNLIT = "KHR_materials_unlit"
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # the way back
 INSTANCES = "EXT_mesh_gpu_instancing"
 # Extensions that a file may require: those that are read here, and those for the look of surfaces, which do not change
 # geometry.
-HONOURED = {"KHR_mesh_quantization", INSTANCES, "KHR_texture_transform", "EXT_texture_webp"}
+VISIBILITY, GLOSS = "KHR_node_visibility", "KHR_materials_pbrSpecularGlossiness"
+# Where a texture names its image: extensions come first, as the image beside them is for programs without them.
+OF_IMAGES = ("EXT_texture_webp", "MSFT_texture_dds")
+HONOURED = {"KHR_mesh_quantization", INSTANCES, "KHR_texture_transform", VISIBILITY, *OF_IMAGES}
 OF_LOOKS = ("KHR_materials_", "EXT_materials_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
 MOST = 500_000_000  # vertices and corners
 WHITE = [1.0, 1.0, 1.0]
+# What is lost of a material, by the key that asks for it.
+LOST = {"normalTexture": "normal maps", "metallicRoughnessTexture": "roughness and metal maps"}
+LOST |= {"emissiveTexture": "glow maps"}
 SPARSE = 2**24  # most rows of an accessor that has sparse values only
 _OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
 
@@ -44,9 +50,11 @@ _VERTICES, _CORNERS = 34962, 34963  # what a buffer view is for, in glTF's numbe
 
 class GltfWriter:
     """A file to be written: nodes, meshes, materials and animations, with glTF's own keys. All nodes are below one that
-    turns z up to glTF's y up."""
+    turns z up to glTF's y up, and moves everything to `origin` [3] m. Arrays have single precision, so they should be
+    near it."""
 
     def __init__(self) -> None:
+        self.origin: np.ndarray = np.zeros(3)
         self.nodes: list[dict[str, Any]] = []
         self.meshes: list[dict[str, Any]] = []
         self.materials: list[dict[str, Any]] = []
@@ -107,7 +115,7 @@ class GltfWriter:
 
     def to_bytes(self) -> bytes:
         """The file."""
-        count = len(self.nodes)
+        count, (x, y, z) = len(self.nodes), self.origin.tolist()
         lists = {"meshes": self.meshes, "materials": self.materials, "images": self._images}
         lists |= {"accessors": self._accessors, "bufferViews": self._views, "animations": self.animations}
         lists |= {"textures": [{"source": k} for k in range(len(self._images))]}
@@ -116,7 +124,7 @@ class GltfWriter:
             "asset": {"version": "2.0", "generator": "sdfsim"},
             "scene": 0,
             "scenes": [{"nodes": [count]}],
-            "nodes": [*self.nodes, {"name": "root", "children": list(range(count)), "matrix": _Y_UP}],
+            "nodes": [*self.nodes, {"name": "root", "children": list(range(count)), "matrix": [*_Y_UP, x, z, -y, 1]}],
             "buffers": [{"byteLength": len(self._content)}],
             **{name: entries for name, entries in lists.items() if entries},
         }
@@ -142,18 +150,19 @@ def srgb(light: np.ndarray) -> np.ndarray:
 
 def read_gltf(path: Path) -> FileMesh:
     """All triangles of the scene that a .gltf or .glb file shows, turned from glTF's y up to z up: the meshes of all
-    nodes at the nodes' poses, with their colours. Raises ValueError if it is damaged, or needs an extension that is not
-    supported."""
+    nodes at the nodes' poses, or as the joints of their skins stand, with their colours. Raises ValueError if it is
+    damaged, or needs an extension that is not supported."""
     file = _GltfReader(path)
     parts = [part for _, part in file.parts()]
+    file.notes += [f"not shown: {what}" for what in file.lost]
     if not parts:
-        return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+        return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), notes=tuple(file.notes))
     whole, colors = joined(parts), None
     if any(part.colors is not None for part in parts):
         white = [np.full(part.vertices.shape, 255, np.uint8) if part.colors is None else part.colors for part in parts]
         colors = np.concatenate(white)
-    painted = tuple(part.painted[0] for part in parts) if file.textured else ()
-    return FileMesh(whole.vertices, whole.faces, colors, painted=painted)
+    painted = tuple(paint for part in parts for paint in part.painted) if file.textured else ()
+    return FileMesh(whole.vertices, whole.faces, colors, painted=painted, notes=tuple(file.notes))
 
 
 def read_painted(path: Path) -> dict[str, Painted]:
@@ -186,8 +195,13 @@ class _GltfReader:
         self.buffers = [self._bytes(entry, own if k == 0 else None) for k, entry in enumerate(self._list("buffers"))]
         self._arrays: dict[int, np.ndarray] = {}
         self._images: dict[int, np.ndarray | None] = {}
+        self._poses: dict[int, np.ndarray] = {}  # [4, 4] of nodes in the scene
         self._tinted: dict[tuple, np.ndarray] = {}  # images by their number (-1: plain colour) and colour factor
         self.textured = False  # whether any part has an image
+        self.notes: list[str] = []  # what is lost
+        self.lost: dict[str, None] = {}  # of the look of surfaces
+        if self._list("animations"):
+            self.notes.append("its animations are left out: it stands as it does before they begin")
 
     def _list(self, name: str) -> list[dict[str, Any]]:
         return self.header.get(name, [])
@@ -251,25 +265,63 @@ class _GltfReader:
             raise ValueError("an accessor does not fit its buffer")
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
-    def placed(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-        """Nodes with a mesh, and their poses [4, 4] in the scene."""
-        nodes = self._list("nodes")
+    def placed(self) -> list[tuple[dict[str, Any], np.ndarray]]:
+        """Nodes with a mesh that is seen, and their poses [4, 4] in the scene."""
+        nodes, found, hidden = self._list("nodes"), [], 0
         if scenes := self._list("scenes"):
             roots = scenes[_index(self.header.get("scene", 0))].get("nodes", [])
         else:
             roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
-        todo = [(_index(root), np.eye(4)) for root in reversed(roots)]
-        seen: set[int] = set()
+        todo = [(_index(root), np.eye(4), True) for root in reversed(roots)]
         while todo:
-            number, above = todo.pop()
-            if number in seen:
+            number, above, seen = todo.pop()
+            if number in self._poses:
                 raise ValueError(f"node {number} has two parents")
-            seen.add(number)
             node = nodes[number]
-            matrix = above @ _matrix(node)
-            todo += [(_index(child), matrix) for child in reversed(node.get("children", []))]
-            if "mesh" in node:
-                yield node, matrix
+            self._poses[number] = matrix = above @ _matrix(node)
+            seen = seen and node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
+            todo += [(_index(child), matrix, seen) for child in reversed(node.get("children", []))]
+            if "mesh" in node and seen:
+                found.append((node, matrix))
+            hidden += "mesh" in node and not seen
+        if hidden:
+            self.notes.append(f"{hidden} hidden node{'s are' if hidden > 1 else ' is'} left out")
+        return found
+
+    def bent(self, skin: dict[str, Any], attributes: dict[str, int], vertices: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Vertices [V, 3] of a skin's mesh as its joints stand, in the scene: the mean, by weights, of where its joints
+        carry a vertex from the pose in which it was bound. And whether they mirror it."""
+        joints = [_index(joint) for joint in skin["joints"]]
+        carried = np.array([self._pose(joint) for joint in joints])
+        if "inverseBindMatrices" in skin:
+            bound = self.array(skin["inverseBindMatrices"]).astype(np.float64)
+            if bound.shape != (len(joints), 16):
+                raise ValueError(f"a skin of {len(joints)} joints has {len(bound)} inverse bind matrices")
+            carried = carried @ bound.reshape(-1, 4, 4).transpose(0, 2, 1)  # columns come first in the file
+        sets = [k for k in range(len(attributes)) if f"JOINTS_{k}" in attributes and f"WEIGHTS_{k}" in attributes]
+        if not sets:
+            raise ValueError("a mesh with a skin has no joints or no weights (JOINTS_0, WEIGHTS_0)")
+        held = np.concatenate([self.array(attributes[f"JOINTS_{k}"]).astype(np.int64) for k in sets], axis=1)
+        weight = np.concatenate([self.array(attributes[f"WEIGHTS_{k}"]).astype(np.float64) for k in sets], axis=1)
+        held = np.where(weight > 0, held, 0)  # the others may name joints that do not exist
+        if held.shape != weight.shape or len(held) != len(vertices) or held.max() >= len(joints):
+            raise ValueError(f"the joints and weights of a skin of {len(joints)} joints do not fit its mesh")
+        weight[weight.sum(1) <= 0, 0] = 1.0
+        weight = np.maximum(weight, 0.0) / np.maximum(weight, 0.0).sum(1, keepdims=True)
+        points, moved = np.column_stack([vertices, np.ones(len(vertices))]), np.zeros_like(vertices)
+        for joint, share in zip(held.T, weight.T, strict=True):
+            moved += share[:, None] * np.einsum("vij,vj->vi", carried[joint, :3], points)
+        return moved, bool((np.linalg.det(carried[held[:, 0], :3, :3]) < 0).mean() > 0.5)
+
+    def _pose(self, number: int) -> np.ndarray:
+        """[4, 4] of a node, which need not be in the scene."""
+        if number not in self._poses:
+            above = next((k for k, node in enumerate(self._list("nodes")) if number in node.get("children", [])), None)
+            self._poses[number] = np.eye(4)  # in a circle of nodes
+            self._poses[number] = (np.eye(4) if above is None else self._pose(above)) @ _matrix(
+                self.header["nodes"][number]
+            )
+        return self._poses[number]
 
     def copies(self, node: dict[str, Any], matrix: np.ndarray) -> Iterator[np.ndarray]:
         """The pose [4, 4] of each instance of a node's mesh."""
@@ -289,25 +341,34 @@ class _GltfReader:
         """The triangles that the scene shows, z up, with the names of their nodes."""
         count = 0
         for node, matrix in self.placed():
-            for primitive in self.header["meshes"][node["mesh"]]["primitives"]:
-                if (part := self.part(primitive)) is None:
+            mesh = self.header["meshes"][_index(node["mesh"])]
+            skin = self.header["skins"][_index(node["skin"])] if "skin" in node else None
+            for primitive in mesh["primitives"]:
+                if (part := self.part(primitive, node.get("weights", mesh.get("weights", [])), skin)) is None:
                     continue
-                for place in self.copies(node, matrix):
+                # With a skin it is where its joints are, wherever the node is.
+                for place in self.copies(node, matrix) if skin is None else [np.eye(4)]:
                     count += len(part.vertices) + part.faces.size
                     if count > MOST:
                         raise ValueError(f"more than {MOST:,} vertices and corners, copies included")
-                    vertices = (part.vertices @ place[:3, :3].T + place[:3, 3]) @ Z_UP.T
-                    faces = part.faces[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else part.faces
-                    paint = part.painted[0] and part.painted[0]._replace(vertices=vertices, faces=faces)
-                    yield str(node.get("name")), part._replace(vertices=vertices, faces=faces, painted=(paint,))
+                    moved = _moved(part, place)
+                    painted = tuple(paint and _moved(paint, place) for paint in part.painted)
+                    yield str(node.get("name")), moved._replace(painted=painted)
 
-    def part(self, primitive: dict[str, Any]) -> FileMesh | None:
-        """The triangles of a primitive in its own frame; None for points and lines."""
+    def attribute(self, primitive: dict[str, Any], name: str, weights: list[float]) -> np.ndarray:
+        """Rows [V, K] float64 of an attribute of a primitive, with its morph targets by their weights."""
+        rows = self.array(primitive["attributes"][name]).astype(np.float64)
+        for weight, target in zip(weights, primitive.get("targets", []), strict=False):
+            if weight and name in target:
+                rows = rows + weight * self.array(target[name])
+        return rows
+
+    def part(self, primitive: dict[str, Any], weights: list[float], skin: dict[str, Any] | None) -> FileMesh | None:
+        """The triangles of a primitive in its own frame, or with a skin in the scene; None for points and lines."""
         mode = primitive.get("mode", TRIANGLES)
         if mode in (0, 1, 2, 3):
             return None
-        attributes = primitive["attributes"]
-        vertices = self.array(attributes["POSITION"]).astype(np.float64)
+        vertices = self.attribute(primitive, "POSITION", weights)
         if "indices" in primitive:
             corners = self.array(primitive["indices"])[:, 0].astype(np.int64)
             if corners.max() >= len(vertices):
@@ -324,31 +385,45 @@ class _GltfReader:
             faces = np.stack([np.broadcast_to(corners[:1], len(corners[2:])), corners[1:-1], corners[2:]], axis=1)
         else:
             raise ValueError(f"a primitive of mode {mode}, which glTF does not have")
-        colors, uv, image = self._surface(primitive, attributes, len(vertices))
-        paint = None if image is None else Painted(vertices, faces, uv, image)
-        return FileMesh(vertices, faces, colors, painted=(paint,))
+        if skin is not None:
+            vertices, mirrored = self.bent(skin, primitive["attributes"], vertices)
+            faces = faces[:, ::-1] if mirrored else faces
+        colors, uv, image = self._surface(primitive, weights, len(vertices))
+        if image is not None:
+            return FileMesh(vertices, faces, colors, painted=(Painted(vertices, faces, uv, image),))
+        own = None if colors is None else colors[faces]
+        return FileMesh(vertices, faces, colors, painted=(None,) if own is None else plain_parts(vertices, faces, own))
 
     def _surface(
-        self, primitive: dict[str, Any], attributes: dict[str, int], count: int
+        self, primitive: dict[str, Any], weights: list[float], count: int
     ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
         """The product, in linear light, of texture, material colour and vertex colours: at the vertices [V, 3] uint8;
         and as places [V, 2] in an image, None if the vertices' own colours differ."""
         factors, tint, uv, number = [], np.ones(3), np.zeros((count, 2)), -1
         if "material" in primitive:
-            surface = self.header["materials"][_index(primitive["material"])].get("pbrMetallicRoughness", {})
-            if surface.get("baseColorFactor", WHITE)[:3] != WHITE:
-                tint = np.array(surface["baseColorFactor"], dtype=np.float64)[:3]
+            material = self.header["materials"][_index(primitive["material"])]
+            surface = material.get("pbrMetallicRoughness", {})
+            self.lost |= {what: None for key, what in LOST.items() if key in material or key in surface}
+            self.lost |= {"transparency": None} if material.get("alphaMode", "OPAQUE") != "OPAQUE" else {}
+            gloss = material.get("extensions", {}).get(GLOSS)  # what programs without it show is behind it
+            base, layer = ("baseColor", surface) if gloss is None else ("diffuse", gloss)
+            tint = np.array(layer.get(f"{base}Factor", WHITE), dtype=np.float64)[:3]
+            if (tint != 1.0).any():
                 factors.append(np.tile(tint, (count, 1)))
-            texture = surface.get("baseColorTexture", {})
+            texture = layer.get(f"{base}Texture", {})
             moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
             places = f"TEXCOORD_{moved.get('texCoord', texture.get('texCoord', 0))}"
-            image = self._image(texture["index"]) if texture and not moved.get("rotation") else None
-            if image is not None and places in attributes:
-                uv = self.array(attributes[places]).astype(np.float64)[:, :2]
-                uv = uv * moved.get("scale", [1.0, 1.0]) + moved.get("offset", [0.0, 0.0])
+            image = self._image(texture["index"]) if texture else None
+            if image is not None and places not in primitive["attributes"]:
+                self.notes.append(f"a texture is left out: its mesh has no {places}")
+            elif image is not None:
+                uv = self.attribute(primitive, places, weights)[:, :2] * moved.get("scale", [1.0, 1.0])
+                turn = moved.get("rotation", 0.0)  # counter-clockwise, seen with v pointing down
+                across, down = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+                uv = np.stack([uv @ across, uv @ down], axis=1) + moved.get("offset", [0.0, 0.0])
                 factors.append(light(looked_up(image, uv)))
                 number, self.textured = texture["index"], True
-        own = self.array(attributes["COLOR_0"]).astype(np.float64)[:, :3] if "COLOR_0" in attributes else None
+        own = self.attribute(primitive, "COLOR_0", weights)[:, :3] if "COLOR_0" in primitive["attributes"] else None
         own = own if own is not None and own.shape == (count, 3) else None
         factors += [own] if own is not None else []
         factors = [factor for factor in factors if factor.shape == (count, 3)]
@@ -372,16 +447,36 @@ class _GltfReader:
         return self._tinted[key]
 
     def _image(self, texture: int) -> np.ndarray | None:
-        """[H, W, 3] uint8 of a texture, None if its format is not supported."""
+        """[H, W, 3] uint8 of a texture; None, and a note, if it is missing or its format is not supported."""
         entry = self.header["textures"][_index(texture)]
-        number = entry.get("extensions", {}).get("EXT_texture_webp", entry).get("source")
-        if number is None:
-            return None
-        if number not in self._images:
-            image = self.header["images"][_index(number)]
-            content = self._view(image["bufferView"]) if "bufferView" in image else self._bytes(image)
-            self._images[number] = None if content is None else read_image(content)
-        return self._images[number]
+        named = entry.get("extensions", {})
+        numbers = [named[name]["source"] for name in OF_IMAGES if "source" in named.get(name, {})]
+        numbers += [entry["source"]] if "source" in entry else []
+        if not numbers:
+            self.notes.append(f"a texture that only {', '.join(named) or 'nothing'} describes is left out")
+        for number in numbers:
+            if number not in self._images:
+                image, fault = self.header["images"][_index(number)], "has no data"
+                try:
+                    content = self._view(image["bufferView"]) if "bufferView" in image else self._bytes(image)
+                except ValueError as error:
+                    if "bufferView" in image:
+                        raise
+                    content, fault = None, str(error)
+                found = self._images[number] = None if content is None else read_image(content)
+                if found is None:
+                    called = image.get("name") or image.get("uri", "")[:40] or f"number {number}"
+                    fault = fault if content is None else f"{called} cannot be read (formats: {', '.join(TEXTURES)})"
+                    self.notes.append(f"texture {fault}: left out")
+            if (found := self._images[number]) is not None:
+                return found
+        return None
+
+
+def _moved(part: Any, place: np.ndarray) -> Any:
+    """A `FileMesh` or `Painted` at a pose [4, 4] of glTF, z up; a pose that mirrors it turns its faces over."""
+    faces = part.faces[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else part.faces
+    return part._replace(vertices=(part.vertices @ place[:3, :3].T + place[:3, 3]) @ Z_UP.T, faces=faces)
 
 
 def _index(number: int) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 
+FAR = 100.0  # sizes from the origin: beyond, single precision is coarser than a hundred thousandth of the size
 FARTHEST = 1e12  # m from the origin: beyond, double precision cannot separate the vertices of a room-sized mesh
 
 
@@ -66,6 +67,16 @@ def normal_frame(bounds: np.ndarray) -> Frame:
     if not np.isfinite(extent) or extent <= 0:
         raise SdfsimError("the shape has no extent", "all its vertices are at one point")
     return Frame(centre=bounds.mean(0), scale=extent)
+
+
+def far_middle(points: np.ndarray) -> np.ndarray:
+    """The middle [3] of the box around points [P, 3] if the origin is more than `FAR` times its size away; else
+    zeros."""
+    if not len(points):
+        return np.zeros(3)
+    low, high = points.min(0), points.max(0)
+    middle = (low + high) / 2
+    return middle if np.linalg.norm(middle) > FAR * np.linalg.norm(high - low) else np.zeros(3)
 
 
 def require_whole(mesh: Mesh) -> None:

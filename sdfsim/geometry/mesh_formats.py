@@ -1,19 +1,22 @@
-"""The contents of mesh files: PLY and OFF as arrays, and OBJ and STL in a form that trimesh reads correctly.
+"""The contents of mesh files: PLY, OFF, OBJ and STL as arrays.
 
 trimesh refuses a binary PLY whose faces differ in their number of corners, and an OFF with its counts on the first
-line; Open3D reads both, but rejects a whole file for one polygon with three corners in a line. So these two are read
-here. All readers raise ValueError for a file that is damaged or cut short.
+line; it misreads many ways to write OBJ and STL, and drops their materials without a word. Open3D rejects a whole file
+for one polygon with three corners in a line. So all four are read here. All readers raise ValueError for a file that is
+damaged or cut short.
 """
 
 import io
 import re
 import struct
+from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.geometry.skins import Painted
+from sdfsim.geometry.skins import Painted, plain_parts
 
 KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -27,8 +30,18 @@ PLACES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 TRIED = 64
 # A triangle of a fan may be turned over by at most this part of its polygon's area.
 FLAT = 1e-9
-TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # Pillow starts other programs for some of the other formats
+# Pillow starts other programs for some of the other formats.
+TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "TGA", "DDS", "GIF", "PPM")
 FACET = 50  # bytes of a triangle in a binary STL; the header has 84
+OBJ_ROWS = (b"v", b"vt", b"vn", b"f")
+OBJ_BUMPS = {"map_bump", "bump", "norm", "map_norm", "map_kn"}
+# Options of a texture in an MTL file, with the number of words that follow them; three of them have one to three
+# numbers.
+MAP_OPTIONS: dict[str, int] = {"-mm": 2, "-s": 3, "-o": 3, "-t": 3}
+MAP_OPTIONS |= dict.fromkeys(
+    ("-blendu", "-blendv", "-cc", "-clamp", "-boost", "-bm", "-imfchan", "-texres", "-type"), 1
+)
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 
 class Ragged(NamedTuple):
@@ -43,12 +56,47 @@ class FileMesh(NamedTuple):
 
     vertices: np.ndarray  # [V, 3] float64
     faces: np.ndarray  # [F, 3] int64
-    colors: np.ndarray | None = None  # [V, 3] uint8 RGB
+    colors: np.ndarray | None = None  # uint8 RGB of the vertices [V, 3], or of the corners of faces [F, 3, 3]
     # [F, 3, 2] texture coordinates of face corners, upper left (0, 0), and the name of the texture's file
     places: np.ndarray | None = None
     texture: str = ""
     # Parts, each with an image or a plain colour, None if a part has neither; empty if no part has an image
     painted: tuple[Painted | None, ...] = ()
+    notes: tuple[str, ...] = ()  # what is lost on reading, one line each
+
+    def vertex_colors(self) -> np.ndarray | None:
+        """[V, 3] uint8."""
+        if self.colors is None or self.colors.ndim == 2:
+            return self.colors
+        return averaged(self.colors, self.faces, len(self.vertices))
+
+    def corner_colors(self) -> np.ndarray | None:
+        """[F, 3, 3] uint8."""
+        return self.colors if self.colors is None or self.colors.ndim == 3 else self.colors[self.faces]
+
+
+def plain_text(content: bytes) -> bytes:
+    """A text with the line ends of Unix and without a byte order mark; UTF-16 becomes UTF-8."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        content = content.decode("utf-16", "replace").encode()
+    return content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def numbers(words: Sequence[bytes], text: bytes, kind: type = np.float64) -> np.ndarray:
+    """Words of a text as numbers [N]. Raises ValueError that names the line of the first word that is none."""
+    try:
+        return np.array(words, dtype="S").astype(kind)
+    except (ValueError, OverflowError) as error:
+        for word in words:
+            try:
+                np.array([word], dtype="S").astype(kind)
+            except (ValueError, OverflowError):
+                found = re.search(rb"(?<![\w.,+-])" + re.escape(word) + rb"(?![\w.,+-])", text)
+                line = text.count(b"\n", 0, found.start() if found else 0) + 1
+                comma = re.fullmatch(rb"[-+]?\d*,\d+([eE][-+]?\d+)?", word)
+                fault = "has a decimal comma: export it with decimal points" if comma else "is not a number"
+                raise ValueError(f"line {line}: {word.decode('latin-1')[:40]!r} {fault}") from error
+        raise
 
 
 Element = dict[str, Any]  # columns [N] by their names, or `Ragged`
@@ -58,8 +106,9 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
     """Elements of a PLY file by name, the NumPy types of their columns, and the name of a texture file if a comment
     gives it."""
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
-    line = re.escape(first[1]) if first else b""
-    end = re.search(line + rb"end_header[ \t]*(?:" + line + rb"|\Z)", content)
+    # Lines may end in several ways; but after CR alone, a line feed may be the first of the binary numbers.
+    line = rb"\r" if first and first[1] == b"\r" else rb"(?:\r\n|\n|\r)"
+    end = re.search(rb"[\r\n]end_header[ \t]*(?:" + line + rb"|\Z)", content)
     if first is None or end is None:
         raise ValueError("it has no complete PLY header")
     order, texture = "", ""
@@ -85,10 +134,7 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
         raise ValueError("its header has no PLY format")
     body, text = content[end.end() :], order == "ascii"
     if text:  # convert every number to eight bytes, and continue as with a binary file
-        try:
-            body = np.array(body.split(), dtype="S").astype("<f8").tobytes() if body.strip() else b""
-        except ValueError as error:
-            raise ValueError("its rows hold something that is not a number") from error
+        body = numbers(body.split(), plain_text(content)).astype("<f8").tobytes()
     found: dict[str, Element] = {}
     start = 0
     for name, rows in counts.items():
@@ -197,7 +243,7 @@ def ply_surface(content: bytes) -> FileMesh:
     colors = _colors(vertex, kinds.get("vertex", {}))
     if colors is None and len(faces) == len(cuts) and (by_face := _colors(face, kinds.get("face", {}))) is not None:
         owner = np.repeat(np.arange(len(polygons.length)), polygons.length)
-        colors = averaged(by_face[owner[cuts]], faces, len(vertices))
+        colors = by_face[owner[cuts]]
     places = None
     if texture and len(faces) == len(cuts):
         own, names = face.get("texcoord"), next((two for two in PLACES if vertex.keys() >= set(two)), None)
@@ -267,14 +313,39 @@ def read_image(content: bytes) -> np.ndarray | None:
 
 
 def side_file(path: Path, name: str) -> bytes:
-    """The content of a file that a mesh file names, from its folder. Raises ValueError if that is outside the folder or
-    missing."""
+    """The content of a file that a mesh file names, from its folder. Windows' separators, and names in another case,
+    are understood. Raises ValueError if that is outside the folder or missing."""
     from trimesh.resolvers import FilePathResolver
 
+    files, name = FilePathResolver(str(path)), name.strip().strip('"').replace("\\", "/")
+    cased, folder = [], path.parent
+    for part in name.split("/"):
+        inside = [file.name for file in folder.iterdir()] if folder.is_dir() and part not in ("", "..") else []
+        cased.append(next((other for other in inside if other.casefold() == part.casefold()), part))
+        folder = folder / cased[-1]
+    last = name.split("/")[-1].casefold()
+    beside = [file.name for file in path.parent.iterdir() if file.name.casefold() == last]
+    for choice in (name, "/".join(cased), *beside):
+        try:
+            return files.get(choice)
+        except OSError:
+            continue
+        except ValueError as error:
+            if not beside:
+                raise ValueError(f"{name} lies outside its folder") from error
+    raise ValueError(f"{name} is missing beside it")
+
+
+def image_beside(path: Path, name: str, notes: list[str]) -> np.ndarray | None:
+    """[H, W, 3] uint8 of an image that a mesh file names; None, and a note, if it cannot be read."""
     try:
-        return FilePathResolver(str(path)).get(name)
-    except OSError as error:
-        raise ValueError(f"{name} is missing beside it") from error
+        image = read_image(side_file(path, name))
+    except ValueError as error:
+        notes.append(f"texture {error}: left out")
+        return None
+    if image is None:
+        notes.append(f"texture {name} cannot be read: left out (formats: {', '.join(TEXTURES)})")
+    return image
 
 
 def whole(values: np.ndarray) -> np.ndarray:
@@ -368,8 +439,8 @@ def _ears(points: np.ndarray) -> np.ndarray:
 
 def off_surface(content: bytes) -> FileMesh:
     """The triangles of an OFF file (also COFF, NOFF, STOFF and their mixtures); polygons are cut into triangles."""
-    lines = re.sub(r"#[^\r\n]*", "", content.decode("latin-1").lstrip("\ufeff\xef\xbb\xbf")).splitlines()
-    rows = [words for line in lines if (words := line.split())]
+    text = plain_text(content)
+    rows = [words for line in re.sub(rb"#[^\n]*", b"", text).split(b"\n") if (words := line.decode("latin-1").split())]
     kind = re.fullmatch(r"(ST)?(C)?(N)?(4)?(n)?OFF", rows[0][0]) if rows else None
     if kind is None:
         raise ValueError("it does not begin with OFF")
@@ -390,7 +461,7 @@ def off_surface(content: bytes) -> FileMesh:
     taken = [row[:3] + row[shades : shades + 3] if has_shades else row[:3] for row in points]
     if any(len(row) < 3 for row in points):
         raise ValueError("a vertex has fewer than three coordinates")
-    table = np.array(taken, dtype=np.float64).reshape(count, -1) if count else np.zeros((0, 3))
+    table = numbers([word.encode() for row in taken for word in row], text).reshape(count, 6 if has_shades else 3)
     colors = None
     if has_shades:
         fractions = table[:, 3:].max() <= 1.0
@@ -398,102 +469,190 @@ def off_surface(content: bytes) -> FileMesh:
     length = np.array([int(row[0]) for row in rest], dtype=np.int64)
     if any(not 0 <= n < len(row) for n, row in zip(length.tolist(), rest, strict=True)):
         raise ValueError("cut short: a face has fewer corners than it announces")
-    corners = np.array(
-        [word for n, row in zip(length.tolist(), rest, strict=True) for word in row[1 : n + 1]], dtype="U"
-    )
-    corners = corners.astype(np.int64) if len(corners) else np.zeros(0, dtype=np.int64)
-    return FileMesh(table[:, :3], corners[triangles(length, corners, table[:, :3])], colors)
+    corners = [word.encode() for n, row in zip(length.tolist(), rest, strict=True) for word in row[1 : n + 1]]
+    corners = numbers(corners, text, np.int64)
+    shaded = colors is None and any(len(row) > n + 1 for n, row in zip(length.tolist(), rest, strict=True))
+    notes = ("colours of its faces are left out: OFF is read with those of vertices, PLY with both",) * shaded
+    return FileMesh(table[:, :3], corners[triangles(length, corners, table[:, :3])], colors, notes=notes)
 
 
-def plain_obj(content: bytes) -> bytes:
-    """An OBJ file without what trimesh misreads: comments behind faces, lines that begin with a blank, indices that
-    count back from the end of the rows so far, and polygons of five corners or more, which are cut into triangles
-    here."""
-    text = content.replace(b"\r\n", b"\n").replace(b"\\\n", b" ")
-    text = text if b"\n" in text else text.replace(b"\r", b"\n")
-    text = re.sub(rb"^[ \t]*((?:v|vt|vn|f)[ \t][^#\n]*)(?:#[^\n]*)?", rb"\1", text, flags=re.MULTILINE)
-    odd = re.compile(rb"^f[ \t](?:[^\n]*[ \t/])?(?:-\d+|0+)(?![\d.])|^f(?:[ \t]+[^ \t\n]+){5}", re.MULTILINE)
-    if odd.search(text) is None:
-        return text
-    kinds = (b"v", b"vt", b"vn")
-    counts = dict.fromkeys(kinds, 0)
-    vertices: list[list[bytes]] = []
-    polygons: dict[int, list[list[bytes]]] = {}
-    lines = text.split(b"\n")
-    for number, line in enumerate(lines):
-        key = line.split(None, 1)[0] if line.strip() else b""
-        if key in counts:
-            counts[key] += 1
-            if key == b"v":
-                vertices.append(line.split()[1:4])
-        elif key == b"f" and odd.match(line):
-            corners = [corner.split(b"/") for corner in line.split()[1:]]
+def obj_surface(path: Path, content: bytes) -> FileMesh:
+    """The triangles of an OBJ file, with the colours of its vertices and of its materials, whose images and libraries
+    are read from the folder of `path`."""
+    text = plain_text(content).replace(b"\\\n", b" ")
+    rows: dict[bytes, list[list[bytes]]] = {key: [] for key in OBJ_ROWS}
+    at: dict[bytes, list[int]] = {key: [] for key in OBJ_ROWS}  # their lines
+    libraries, used = [], {0: ""}  # the names of materials, by the first face
+    for number, line in enumerate(text.split(b"\n"), start=1):
+        key, *rest = line.split(None, 1) or [b""]
+        if key in rows:
+            rows[key].append(rest[0].partition(b"#")[0].split() if rest else [])
+            at[key].append(number)
+        elif key == b"usemtl":
+            used[len(rows[b"f"])] = _name(rest[0]) if rest else ""
+        elif key == b"mtllib" and rest:
+            libraries.append(_name(rest[0]))
+    for number, row in zip(at[b"v"], rows[b"v"], strict=True):
+        if len(row) < 3:
+            raise ValueError(f"line {number}: a vertex has fewer than three coordinates")
+    vertices = numbers([word for row in rows[b"v"] for word in row[:3]], text).reshape(-1, 3)
+    shades = None
+    if rows[b"v"] and all(len(row) >= 6 for row in rows[b"v"]):
+        shades = np.nan_to_num(numbers([word for row in rows[b"v"] for word in row[-3:]], text)).reshape(-1, 3)
+        shades = np.clip(np.round(shades * (255.0 if shades.max() <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
+    length, table = _obj_corners(rows, at, text)
+    cuts = triangles(length, table[:, 0], vertices)
+    faces, owner = table[cuts, 0], np.repeat(np.arange(len(length)), length)[cuts[:, 0]]
+    spots = numbers([word for row in rows[b"vt"] for word in (*row[:2], *[b"0"] * (2 - len(row)))], text).reshape(-1, 2)
+
+    notes: list[str] = []
+    known = _libraries(path, libraries, notes)
+    if not libraries and any(used.values()):
+        notes.append("it names materials, but no file that describes them (mtllib): their looks are left out")
+    starts, colors, plain = np.array(list(used)), np.full((len(faces), 3, 3), 255, np.uint8), np.ones(len(faces), bool)
+    numbered = {name: k for k, name in enumerate(dict.fromkeys(used.values()))}
+    material = np.array([numbered[name] for name in used.values()])[np.searchsorted(starts, owner, side="right") - 1]
+    colored, parts = shades is not None, []
+    if shades is not None:
+        colors[:] = shades[faces]
+    for name, k in numbered.items():
+        some = np.flatnonzero(material == k)
+        if not name or not len(some) or not known:
+            continue
+        if name not in known:
+            notes.append(f"material {name} is not in {', '.join(libraries)}: its look is left out")
+            continue
+        color, image, laid = _look(path, known[name], notes)
+        if image is not None and (table[cuts[some], 1] < 0).any():
+            notes.append(f"the texture of material {name} has no places (vt) on some faces: left out")
+            image = None
+        if image is not None:
+            uv = laid(spots[table[cuts[some], 1]]) * [1.0, -1.0] + [0.0, 1.0]  # OBJ counts from the lower edge
+            colors[some], plain[some], colored = looked_up(image, uv), False, True
+            # A vertex is doubled where the texture is cut.
+            pairs = table[cuts[some], 0] * (len(spots) + 1) + table[cuts[some], 1]
+            _, first, label = np.unique(pairs, return_index=True, return_inverse=True)
+            places, uv = vertices[faces[some]].reshape(-1, 3)[first], uv.reshape(-1, 2)[first]
+            parts.append(Painted(places, label.reshape(-1, 3), uv, image))
+        elif color is not None and shades is None:
+            colors[some], colored = color, True
+    painted = (*parts, *plain_parts(vertices, faces[plain], colors[plain])) if parts else ()
+    return FileMesh(vertices, faces, colors if colored else None, painted=painted, notes=tuple(notes))
+
+
+def _name(word: bytes) -> str:
+    try:
+        return word.decode().strip()
+    except UnicodeDecodeError:
+        return word.decode("latin-1").strip()
+
+
+def _obj_corners(
+    rows: dict[bytes, list[list[bytes]]], at: dict[bytes, list[int]], text: bytes
+) -> tuple[np.ndarray, np.ndarray]:
+    """Number of corners [P] of every polygon of an OBJ file, and rows [sum, 3] of the vertex, the place in the texture
+    and the normal of every corner, from 0; -1 for none."""
+    length = np.array([len(row) for row in rows[b"f"]], dtype=np.int64)
+    words = b" ".join(word + b"/0" * (2 - word.count(b"/")) for row in rows[b"f"] for word in row) + b" "
+    words = words.replace(b"//", b"/0/").replace(b"/ ", b"/0 ").replace(b"/", b" ").split()
+    given = numbers(words, text, np.int64)
+    if len(given) != 3 * length.sum():
+        raise ValueError("a corner of a face has more than three indices")
+    given = given.reshape(-1, 3)
+    line = np.repeat(np.array(at[b"f"], dtype=np.int64), length)
+    table = given - 1
+    for k, key in enumerate(OBJ_ROWS[:3]):
+        back = given[:, k] < 0  # counts back from where it stands, not from the end
+        before = np.searchsorted(at[key], line)
+        table[back, k] = before[back] + given[back, k]
+        wrong = (table[:, k] < 0) & (back | (k == 0))
+        if wrong.any():
+            j = int(wrong.argmax())
+            raise ValueError(f"line {line[j]}: a face has the index {given[j, k]}, {before[j]} rows come before it")
+        beyond = table[:, k] >= len(rows[key])
+        if k == 0 and beyond.any():
+            j = int(beyond.argmax())
+            raise ValueError(f"line {line[j]}: a face has the index {given[j, k]}, there are {len(rows[key])} vertices")
+        table[beyond, k] = -1
+    return length, table
+
+
+def _libraries(path: Path, names: list[str], notes: list[str]) -> dict[str, dict[str, str]]:
+    """The rows of the materials in MTL files, by their names and keys in lower case."""
+    known: dict[str, dict[str, str]] = {}
+    for line in names:
+        found, missing = [], ""
+        for choice in ([line], line.split() if " " in line else []):  # one name with blanks, or several
             try:
-                corners = [[_index(word, counts[kind]) for word, kind in zip(c, kinds, strict=False)] for c in corners]
+                found = [side_file(path, name) for name in choice]
             except ValueError as error:
-                raise ValueError(f"line {number + 1}: {error}") from error
-            lines[number] = _face_line(corners)
-            if len(corners) > 4:
-                polygons[number] = corners
-    if polygons:
-        length = np.array([len(corners) for corners in polygons.values()])
-        first = np.array([int(corner[0]) - 1 for corners in polygons.values() for corner in corners])
-        cuts = triangles(length, first, np.array(vertices, dtype=np.float64))
-        flat = [corner for corners in polygons.values() for corner in corners]
-        ends = np.cumsum(length - 2)
-        for (number, _), some in zip(polygons.items(), np.split(cuts, ends[:-1]), strict=True):
-            lines[number] = b"\n".join(_face_line([flat[k] for k in three]) for three in some.tolist())
-    return b"\n".join(lines)
+                missing = missing or str(error)
+            if found:
+                break
+        else:
+            notes.append(f"material library {missing}: its colours and textures are left out")
+        for content in found:
+            rows: dict[str, str] = {}
+            for row in plain_text(content).split(b"\n"):
+                key, _, rest = _name(row).replace("\t", " ").partition(" ")
+                if key.lower() == "newmtl":
+                    rows = known.setdefault(rest.strip(), {})
+                else:
+                    rows.setdefault(key.lower(), rest.strip())
+    return known
 
 
-def _face_line(corners: list[list[bytes]]) -> bytes:
-    return b"f " + b" ".join(b"/".join(corner) for corner in corners)
+def _look(path: Path, rows: dict[str, str], notes: list[str]) -> tuple[np.ndarray | None, np.ndarray | None, Any]:
+    """A material's colour [3] uint8 and image, None if it has none, and the function that lays places [..., 2] from the
+    lower left into the image."""
+    color = None
+    try:
+        if value := [float(word) for word in rows.get("kd", "").split()][:3]:
+            color = np.round(255.0 * np.clip(np.broadcast_to(value, 3), 0.0, 1.0)).astype(np.uint8)
+    except ValueError:
+        notes.append(f"colour Kd {rows['kd'][:40]} is not three numbers: left out")
+    # Tr is 0 or 1 for what is not transparent: programs differ.
+    clear = rows.get("d", "1").strip("0.") == "1" and rows.get("tr", "1").strip("0.") in ("", "1")
+    lost = {"normal maps": not OBJ_BUMPS.isdisjoint(rows), "transparency": "map_d" in rows or not clear}
+    notes += [f"not shown: {what}" for what, is_lost in lost.items() if is_lost]
+    words, options = rows.get("map_kd", "").split(), {}
+    while words and (key := words[0].lower()) in MAP_OPTIONS and len(words) > 1:
+        count = MAP_OPTIONS[key]
+        count = len(list(takewhile(NUMBER.fullmatch, words[1:4]))) if count == 3 else count
+        options[key], words = words[1 : 1 + count], words[1 + count :]
+    image = image_beside(path, " ".join(words), notes) if words else None
+
+    def laid(places: np.ndarray) -> np.ndarray:
+        for key, combine in (("-s", np.multiply), ("-o", np.add)):
+            given = [float(word) for word in options.get(key, [])][:2]
+            places = combine(places, [*given, *[1.0 if key == "-s" else 0.0] * (2 - len(given))])
+        return np.clip(places, 0.0, 1.0) if options.get("-clamp") == ["on"] else places
+
+    return color, image, laid
 
 
-def _index(word: bytes, count: int) -> bytes:
-    """An index that counts from 1, when there are `count` rows so far."""
-    if not word or int(word) > 0:
-        return word
-    if int(word) == 0 or -int(word) > count:
-        raise ValueError(f"a face has the index {int(word)}, {count} rows come before it")
-    return str(count + 1 + int(word)).encode()
-
-
-def plain_stl(content: bytes) -> bytes:
-    """An STL file without the bytes that follow the triangles of a binary one."""
+def stl_surface(content: bytes) -> FileMesh:
+    """The triangles of an STL file, text or binary."""
     count = int.from_bytes(content[80:84], "little") if len(content) >= 84 else 0
     needed = 84 + FACET * count
-    if len(content) == needed:
-        return content
-    if b"facet" in content and content.lstrip()[:5].lower() == b"solid" and b"\0" not in content[:512]:
-        if b"endsolid" not in content.lower():
+    head = plain_text(content[:512]).lower()
+    text = plain_text(content).lower() if head.lstrip()[:5] == b"solid" and b"\0" not in head else b""
+    if len(content) != needed and b"facet" in text:
+        if not re.search(rb"end[ \t]*solid", text):
             raise ValueError("cut short: it has no endsolid")
-        return content
+        words = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", text)
+        corners = numbers([word for row in words for word in row], text).reshape(-1, 3)
+        if len(corners) != 3 * (facets := len(re.findall(rb"\bfacet\s+normal\b", text))):
+            raise ValueError(f"damaged: {len(corners)} vertices for {facets} triangles")
+        return FileMesh(corners, np.arange(len(corners)).reshape(-1, 3))
     if len(content) < 84:
         raise ValueError("it is not an STL file, or cut short")
     # The last triangle's last two bytes are an attribute, which some programs leave out.
     if len(content) < needed - 2:
         raise ValueError(f"cut short: {(len(content) - 84) // FACET} of {count} faces")
-    if not count:
+    if not count and len(content) > needed:
         raise ValueError(f"its header announces no faces, and {len(content) - 84} bytes follow")
-    return content[:needed].ljust(needed, b"\0")
-
-
-def by_trimesh(path: Path, content: bytes) -> Any:
-    """A trimesh mesh of `content`; files that it names are read from the folder of `path` only."""
-    import trimesh
-
-    return trimesh.load(io.BytesIO(content), **_how(path), force="mesh")
-
-
-def scene_by_trimesh(path: Path, content: bytes) -> Any:
-    """Likewise a trimesh scene, with a mesh for each material."""
-    import trimesh
-
-    return trimesh.load_scene(io.BytesIO(content), **_how(path))
-
-
-def _how(path: Path) -> dict[str, Any]:
-    from trimesh.resolvers import FilePathResolver
-
-    return {"file_type": path.suffix.lower()[1:], "resolver": FilePathResolver(str(path)), "process": False}
+    facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    corners = np.frombuffer(content[84:needed].ljust(needed - 84, b"\0"), facet)["corners"].astype(np.float64)
+    notes = ("its colours are left out: STL is read without them",) if b"COLOR=" in content[:80] else ()
+    return FileMesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), notes=notes)

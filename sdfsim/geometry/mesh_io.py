@@ -1,35 +1,28 @@
 """Reading mesh files of all kinds, and the files that we write: PLY, glTF with textures, convex pieces as OBJ."""
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.files import visible
 from sdfsim.geometry.gltf import GltfWriter, read_gltf, read_painted
-from sdfsim.geometry.mesh import Mesh, clean, convex_hull, require_whole
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, far_middle, require_whole
 from sdfsim.geometry.mesh_formats import (
-    TEXTURES,
+    FileMesh,
     averaged,
-    by_trimesh,
+    image_beside,
     looked_up,
+    obj_surface,
     off_surface,
-    plain_obj,
-    plain_stl,
     ply_surface,
-    read_image,
     read_ply,
-    scene_by_trimesh,
-    side_file,
+    stl_surface,
 )
-from sdfsim.geometry.skins import Painted, one_skin
-
-# trimesh logs what it skips, sometimes with tracebacks. Callers may add a handler to see these lines.
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
+from sdfsim.geometry.skins import Painted, one_skin, plain_parts
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 GLTF = (".glb", ".gltf")
@@ -67,12 +60,14 @@ def load_textured(path: str | Path) -> Loaded:
         how = "export glb from Blender; " if kind else ""
         raise SdfsimError(f"{path}: {fault}", f"{how}use " + " ".join(MESH_SUFFIXES))
     try:
-        mesh, painted = _read(path, suffix)
-        mesh = clean(mesh, name=str(path))
-        if not painted:
-            return Loaded(mesh)
-        skin = None if None in painted else one_skin([part for part in painted if part is not None])
-        return Loaded(mesh, skin, () if skin is not None else ("its texture becomes colours of its vertices",))
+        found = _read(path, suffix)
+        notes = list(dict.fromkeys(found.notes))
+        colors, painted = _shown(found, notes)
+        mesh = clean(Mesh(found.vertices, found.faces, colors), name=str(path))
+        skin = one_skin([part for part in painted if part is not None]) if painted and None not in painted else None
+        if painted and skin is None:
+            notes.append("its texture becomes colours of its vertices")
+        return Loaded(mesh, skin, tuple(notes))
     except SdfsimError:
         raise
     except Exception as error:  # readers raise errors of many types
@@ -80,76 +75,42 @@ def load_textured(path: str | Path) -> Loaded:
         raise SdfsimError(f"{path}: not a readable mesh ({reason})") from error
 
 
-def _read(path: Path, suffix: str) -> tuple[Mesh, tuple[Painted | None, ...]]:
-    """The triangles of a file, and its parts with their images; no parts if there are no images."""
+def _read(path: Path, suffix: str) -> FileMesh:
+    """The triangles of a file."""
     if suffix in GLTF:
-        found = read_gltf(path)
-    elif suffix == ".ply":
-        found = ply_surface(path.read_bytes())
-    elif suffix == ".off":
-        found = off_surface(path.read_bytes())
-    else:
-        plain = (plain_obj if suffix == ".obj" else plain_stl)(path.read_bytes())
-        loaded = by_trimesh(path, plain)
-        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        mesh = Mesh(vertices, _faces(loaded), _vertex_colors(loaded, len(vertices)))
-        return mesh, _painted(path, plain) if suffix == ".obj" and b"mtllib" in plain else ()
-    colors, painted = found.colors, found.painted
-    if found.places is not None:
-        try:
-            image = read_image(side_file(path, found.texture))
-        except ValueError:
-            image = None
-        if image is not None:
-            colors = averaged(looked_up(image, found.places), found.faces, len(found.vertices))
-            corners = np.concatenate([found.vertices[found.faces], found.places], axis=2).reshape(-1, 5)
-            corners, label = np.unique(corners, axis=0, return_inverse=True)
-            painted = (Painted(corners[:, :3], label.reshape(-1, 3), corners[:, 3:], image),)
-    return Mesh(found.vertices, found.faces, colors), painted
+        return read_gltf(path)
+    content = path.read_bytes()
+    if suffix == ".obj":
+        return obj_surface(path, content)
+    if suffix != ".ply":
+        return (off_surface if suffix == ".off" else stl_surface)(content)
+    found, notes = ply_surface(content), []
+    image = image_beside(path, found.texture, notes) if found.texture else None
+    if image is None or found.places is None:
+        return found._replace(notes=(*found.notes, *notes))
+    corners = np.concatenate([found.vertices[found.faces], found.places], axis=2).reshape(-1, 5)
+    corners, label = np.unique(corners, axis=0, return_inverse=True)
+    painted = (Painted(corners[:, :3], label.reshape(-1, 3), corners[:, 3:], image),)
+    return found._replace(colors=looked_up(image, found.places), painted=painted)
 
 
-def _painted(path: Path, content: bytes) -> tuple[Painted, ...]:
-    """The parts of an OBJ file by their materials; none if no material has an image."""
-    parts, textured = [], False
-    for drawn in scene_by_trimesh(path, content).geometry.values():
-        faces = _faces(drawn)
-        if not len(faces):
-            continue
-        vertices, visual = np.array(drawn.vertices, dtype=np.float64), drawn.visual
-        uv, image = np.zeros((len(vertices), 2)), np.full((1, 1, 3), 255, np.uint8)
-        if getattr(visual, "kind", None) == "texture":
-            picture = _picture(visual)
-            if picture is not None:
-                # trimesh counts from the lower edge of a texture.
-                uv, image = np.asarray(visual.uv) * [1.0, -1.0] + [0.0, 1.0], np.asarray(picture.convert("RGB"))
-                textured = True
-            else:
-                image[:] = np.asarray(visual.material.main_color)[:3]
-        parts.append(Painted(vertices, faces, uv, image))
-    return tuple(parts) if textured else ()
-
-
-def _picture(visual: Any) -> Any:
-    """The image of a trimesh material, None if it has no readable one."""
-    image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
-    return None if image is None or image.format not in TEXTURES or visual.uv is None else image
-
-
-def _faces(loaded: Any) -> np.ndarray:
-    return np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
-
-
-def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
-    """[V, 3] uint8 if the file has colours; from a texture, its colour at each vertex."""
-    visual: Any = getattr(loaded, "visual", None)
-    if getattr(visual, "kind", None) == "texture":
-        if _picture(visual) is None:
-            return None
-        visual = visual.to_color()
-    elif getattr(visual, "kind", None) not in ("vertex", "face"):
-        return None
-    colors = np.asarray(visual.vertex_colors)
-    return colors[:, :3].astype(np.uint8) if colors.shape[:1] == (count,) else None
+def _shown(found: FileMesh, notes: list[str]) -> tuple[np.ndarray | None, tuple[Painted | None, ...]]:
+    """Colours of the vertices [V, 3], and the parts that are shown with images; no parts if colours of vertices are
+    enough. Where faces of several colours meet, as on a die, each colour becomes a part; or a note says that they
+    mix."""
+    colors = found.corner_colors()
+    if colors is None or not len(found.faces):
+        return None, found.painted
+    _, label = np.unique(found.vertices, axis=0, return_inverse=True)
+    corner, painted = label.reshape(-1)[found.faces], found.painted
+    if not painted:
+        pairs = np.unique((corner << 24) + colors @ np.array([1 << 16, 1 << 8, 1]))
+        if (np.diff(pairs >> 24) == 0).any():
+            painted = plain_parts(found.vertices, found.faces, colors)
+        if None in painted:
+            painted = ()
+            notes.append("where its colours meet, they are mixed at the vertices")
+    return averaged(colors, corner, len(found.vertices))[label.reshape(-1)], painted
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -157,7 +118,7 @@ def read_mesh(path: Path) -> Mesh:
     damaged."""
     with _reading(path):
         found = ply_surface(path.read_bytes())
-        mesh = Mesh(found.vertices, found.faces, found.colors)
+        mesh = Mesh(found.vertices, found.faces, found.vertex_colors())
         require_whole(mesh)
     return mesh
 
@@ -211,9 +172,10 @@ def write_glb(meshes: dict[str, Mesh]) -> bytes:
     light.
     """
     file = GltfWriter()
+    file.origin = far_middle(np.concatenate([mesh.vertices for mesh in meshes.values()]))
     for name, mesh in meshes.items():
         assert mesh.uv is not None and mesh.texture is not None
-        places = {"POSITION": file.array(mesh.vertices), "TEXCOORD_0": file.array(mesh.uv)}
+        places = {"POSITION": file.array(mesh.vertices - file.origin), "TEXCOORD_0": file.array(mesh.uv)}
         corners = file.array(mesh.faces.reshape(-1), "<u4")
         drawn = file.mesh(name, places, corners, file.material(name, np.ones(3), mesh.texture))
         file.nodes.append({"name": name, "mesh": drawn})

@@ -9,6 +9,7 @@ from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume
 
 LARGEST = 8192  # px, the longest side of the image that combines several images, or repetitions of one
 SWATCH = 8  # px, side of the patch of a plain colour beside images
+MOST_PLAIN = 1000  # colours that get such a patch each
 EDGE = 1e-4  # relative to an image: places outside it by no more than this count as on its border
 
 
@@ -21,6 +22,21 @@ class Painted(NamedTuple):
     image: np.ndarray  # [H, W, 3] uint8; one pixel for a plain colour
 
 
+def plain_parts(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> tuple[Painted | None, ...]:
+    """A part for each colour of faces [F, 3], from the colours [F, 3, 3] uint8 of their corners; (None,) if the corners
+    of a face differ, or if there are more than `MOST_PLAIN` colours."""
+    packed = colors @ np.array([1 << 16, 1 << 8, 1])
+    shades, label = np.unique(packed[:, 0], return_inverse=True)
+    if (packed != packed[:, :1]).any() or len(shades) > MOST_PLAIN:
+        return (None,)
+    parts = []
+    for k, shade in enumerate(shades.tolist()):
+        used, own = np.unique(faces[label.reshape(-1) == k], return_inverse=True)
+        image = np.array([[[shade >> 16, shade >> 8 & 255, shade & 255]]], dtype=np.uint8)
+        parts.append(Painted(vertices[used], own.reshape(-1, 3), np.full((len(used), 2), 0.5), image))
+    return tuple(parts)
+
+
 def one_skin(parts: Sequence[Painted]) -> Mesh | None:
     """The parts as one mesh, with their images side by side if there are several. None if an image repeats too often to
     be written out."""
@@ -28,7 +44,7 @@ def one_skin(parts: Sequence[Painted]) -> Mesh | None:
 
     places, tiles, images = [], {}, {}
     for part in parts:
-        uv = np.nan_to_num(part.uv)
+        uv = np.nan_to_num(part.uv) if part.image.shape[:2] != (1, 1) else np.full(part.uv.shape, 0.5)
         uv = uv - np.floor(uv.min(0) + EDGE)
         places.append(uv)
         key, often = id(part.image), np.maximum(np.ceil(uv.max(0) - EDGE), 1)

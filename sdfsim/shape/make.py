@@ -18,7 +18,7 @@ from sdfsim.base.files import user_cache
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, lattice
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, far_middle, is_closed, lattice
 from sdfsim.geometry.mesh_io import GLTF, Loaded, load_textured
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
@@ -173,14 +173,18 @@ def dressed(loaded: Loaded, *, thicken: float | None) -> tuple[Mesh | None, list
 
 
 def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
-    """Notes on a mesh file, one line each: that glTF was turned, and its size, if that is unusual in these `units`
-    (metres per unit). Many parts are drawn in millimetres, and few files state it."""
+    """Notes on a mesh file, one line each: that glTF was turned, its size, if that is unusual in these `units` (metres
+    per unit), and a distance from its origin that is large for its size. Many parts are drawn in millimetres, and few
+    files state it."""
     notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
     size = units * float(np.ptp(mesh.vertices, axis=0).max())
     if not given and size > LARGE:
         notes.append(f"it is {size:.3g} m wide in metres; if its unit is millimetres, give --units mm (units: mm)")
     elif not USUAL[0] <= size <= USUAL[1]:
         notes.append(f"it is {size:.3g} m wide; if that is wrong, give the file's unit with --units (units)")
+    if away := units * float(np.linalg.norm(far_middle(mesh.vertices))):
+        distance = f"{away / 1000:,.0f} km" if away >= 1e4 else f"{away:,.3g} m"
+        notes.append(f"it lies {distance} from its origin, which is the point that a body's position places")
     return notes
 
 

@@ -5,6 +5,7 @@ import json
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -557,3 +558,149 @@ def test_names_that_would_be_one_stay_apart(tmp_path):
     export(tmp_path / "scene.yaml", tmp_path / "scene.urdf")
     found = {path.name for path in tmp_path.glob("scene.*.urdf")}
     assert found == {f"scene.{name}.urdf" for name in ("a_b", "a_b_1", "A_b_2", "world_1", "_")}
+
+
+# --- shapes far from their origin, small ones, and names ---
+
+FAR = np.array([512345.27, 5401234.61, 331.0])  # no sums of a few powers of two
+
+
+@pytest.fixture
+def survey(tmp_path: Path) -> Path:
+    """A scene with an L of 8 x 8 x 3 m in the coordinates of a map, twice: one turned by 90 degrees about the vertical,
+    and moved back to where it was."""
+    outline = np.array([(0, 0), (8, 0), (8, 3), (3, 3), (3, 8), (0, 8)])
+    vertices = np.concatenate([np.column_stack([outline, np.full(6, z)]) for z in (0.0, 3.0)]) + FAR
+    flat = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)])
+    sides = [((k, (k + 1) % 6, k + 6), ((k + 1) % 6, (k + 1) % 6 + 6, k + 6)) for k in range(6)]
+    mesh = Mesh(vertices, np.concatenate([flat[:, ::-1], flat + 6, np.reshape(sides, (-1, 3))]))
+    (tmp_path / "house.ply").write_bytes(write_ply(mesh))
+    back = FAR - Rotation.from_euler("z", 90, degrees=True).apply(FAR) + [20.0, 0.0, 0.0]
+    scene = SceneBuilder().add("ground", plane={"offset": 330.5})
+    house = str(tmp_path / "house.ply")
+    scene.add("house", mesh=house, sdf="mesh", mass=1000)
+    scene.add("turned", mesh=house, sdf="mesh", mass=1000, position=back, euler_xyz_deg=(0, 0, 90))
+    return scene.save(tmp_path / "survey.yaml")
+
+
+# Boxes [2, 3] of the two houses relative to FAR, by hand.
+HOUSES = {"house": [[0, 0, 0], [8, 8, 3]], "turned": [[12, 0, 0], [20, 8, 3]]}
+
+
+def test_a_glb_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> None:
+    import trimesh
+
+    report = export(survey, survey.with_suffix(".glb"))
+    assert any("far from its origin" in note and "512349.27 5401238.61 332.5" in note for note in report["notes"])
+    found: dict[str, Any] = {}
+    scene = trimesh.load_scene(survey.with_suffix(".glb"), process=False)
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        places = trimesh.transform_points(scene.geometry[name].vertices, matrix)
+        found[node] = np.stack([places[:, 0], -places[:, 2], places[:, 1]], axis=1) - FAR
+    for name, box in HOUSES.items():
+        np.testing.assert_allclose([found[name].min(0), found[name].max(0)], box, atol=1e-4)
+    ground = found["ground"]  # without end, but drawn below the houses
+    assert ground[:, 0].min() < 0 and ground[:, 0].max() > 20 and np.allclose(ground[:, 2], -0.5)
+
+
+def test_a_usd_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> None:
+    from pxr import Usd, UsdGeom
+
+    export(survey, survey.with_suffix(".usda"))
+    stage = Usd.Stage.Open(str(survey.with_suffix(".usda")))
+    for name, box in HOUSES.items():
+        prim = UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}/geometry/solid"))
+        to_world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
+        points = np.array(prim.GetPointsAttr().Get(), dtype=float) @ to_world[:3, :3] + to_world[3, :3] - FAR
+        np.testing.assert_allclose([points.min(0), points.max(0)], box, atol=1e-4)
+
+
+def test_mujoco_loads_what_is_far_from_its_origin(survey: Path) -> None:
+    import mujoco
+
+    export(survey, survey.with_suffix(".xml"))
+    model = mujoco.MjModel.from_xml_path(str(survey.with_suffix(".xml")))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_step(model, data, 1000)
+    # Each has fallen by the half metre, and lies there. The centre of the L, by hand: 24 m^2 at (4, 1.5), 15 at
+    # (1.5, 5.5).
+    com = np.array([(24 * 4 + 15 * 1.5) / 39, (24 * 1.5 + 15 * 5.5) / 39, 1.0])
+    for name, place in (("house", com), ("turned", np.array([20 - com[1], com[0], 1.0]))):
+        np.testing.assert_allclose(data.body(name).xipos - FAR, place, atol=0.02)
+
+
+def test_a_csv_has_the_poses_of_the_origins_wherever_they_are(survey: Path) -> None:
+    export(survey, survey.with_suffix(".csv"))
+    rows = list(csv.DictReader(survey.with_suffix(".csv").open()))
+    assert [float(rows[1][axis]) for axis in "xyz"] == [0.0, 0.0, 0.0]
+    export(survey, survey.with_suffix(".urdf"))
+    rows = list(csv.DictReader(survey.with_suffix(".csv").open()))
+    np.testing.assert_allclose([float(rows[1][axis]) for axis in "xyz"], FAR + np.array([4, 4, 1.5]), atol=1e-6)
+
+
+def test_what_moves_far_from_the_origin_moves_evenly_in_a_glb(survey: Path) -> None:
+    scene = load_scene(survey)
+    time = np.linspace(0.0, 1.0, 11)
+    place = np.tile([body.position + body.scale * scene.shapes[body.shape].com for body in scene.bodies], (11, 1, 1))
+    place[:, 1, 0] += 0.001 * time  # single precision has steps of 0.03 m there
+    turn = np.tile([0.0, 0, 0, 1], (11, 3, 1))
+    still, none = np.zeros((11, 3, 3)), np.zeros((0, 3))
+    touching = {"contact_count": np.zeros(11, int), "contact_point": none, "contact_body": none[:, :2].astype(int)}
+    names = tuple(body.name for body in scene.bodies)
+    Rollout(time, place, turn, still, still, **touching, names=names).save(survey.with_name("run.npz"))
+    export(survey.with_name("run.npz"), survey.with_name("run.glb"), scene_file=survey)
+    tree, binary = chunks(survey.with_name("run.glb"))
+    node = [entry["name"] for entry in tree["nodes"]].index("house")
+    (channel,) = (c for c in tree["animations"][0]["channels"] if c["target"] == {"node": node, "path": "translation"})
+    sampler = tree["animations"][0]["samplers"][channel["sampler"]]
+    np.testing.assert_allclose(np.diff(values(tree, binary, sampler["output"])[:, 0]), 1e-4, atol=2e-6)
+
+
+def test_a_part_of_a_third_of_a_millimetre_loads_in_mujoco_and_falls(tmp_path: Path) -> None:
+    import mujoco
+
+    size, (low, high) = 3.6e-4, (0.0, 1.2e-3)
+    mesh_shape(primitives.box((size,) * 3), name="speck", kind="mesh").save(tmp_path / "speck")
+    scene = SceneBuilder().add("floor", plane={"offset": low})
+    scene.add("speck", asset=tmp_path / "speck", position=(0, 0, high), density=1000)
+    report = export(scene.save(tmp_path / "scene.yaml"), tmp_path / "scene.xml")
+    (line,) = (line for line in report["left_out"] if "MuJoCo refuses" in line)
+    assert "speck" in line and "mm" in line and "1e-9 kg" in line
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    assert model.body("speck").mass[0] * 1e-9 == pytest.approx(1000 * size**3, rel=1e-6)
+    mujoco.mj_step(model, data, 10)
+    assert (1000 * high - data.body("speck").xpos[2]) / 1000 == pytest.approx(9.81 * 0.01**2 / 2, rel=0.12)
+    mujoco.mj_step(model, data, 500)
+    assert data.body("speck").xpos[2] / 1000 == pytest.approx(size / 2, rel=0.05)
+
+
+def test_names_of_any_script_are_kept_where_the_format_can(tmp_path: Path) -> None:
+    import mujoco
+    import trimesh
+    from pxr import Usd
+
+    analytic_shape("box", size=(0.1, 0.1, 0.1)).save(tmp_path / "box")
+    mesh_shape(primitives.box((0.1, 0.1, 0.1)), name="木", kind="mesh").save(tmp_path / "木")
+    scene = SceneBuilder()
+    names = ["椅子", "कुर्सी", "стул", "Cafe\u0301 1", "chair"]
+    for k, name in enumerate(names):
+        scene.add(name, asset=tmp_path / ("木" if k == 0 else "box"), position=(k, 0, 0))
+    file = scene.save(tmp_path / "scene.yaml")
+    kept = ["椅子", "कुर्सी", "стул", "Café_1", "chair"]
+    report = export(file, tmp_path / "out.glb")
+    assert "Cafe\u0301 1 is called Café_1" in report["notes"]
+    assert set(kept) <= set(trimesh.load_scene(tmp_path / "out.glb").graph.nodes)
+    export(file, tmp_path / "out.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    assert all(stage.GetPrimAtPath(f"/World/{name}").IsValid() for name in kept)
+    export(file, tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert [model.body(k).name for k in range(1, 6)] == kept
+    report = export(file, tmp_path / "out.urdf")
+    (line,) = (note for note in report["notes"] if "is called" in note)
+    assert line.startswith("椅子 is called _, कुर्सी is called __1, стул is called __2, Cafe\u0301 1 is called Caf__1")
+    assert "chair is" not in line and all((tmp_path / f"out.{name}.urdf").is_file() for name in ("_", "__1", "__2"))

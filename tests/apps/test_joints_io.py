@@ -563,6 +563,24 @@ def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
     assert not any("elbow" in line for line in report["left_out"])
 
 
+def test_a_file_in_millimetres_moves_as_one_in_metres(tmp_path: Path) -> None:
+    moved, lines = [], []
+    for radius in (0.05, 0.0001):  # MuJoCo refuses the smaller one in metres
+        scene = jointed().add("bead", sphere={"radius": radius}, position=(5, 0, 2))
+        report = export(scene.save(tmp_path / "scene.yaml"), tmp_path / "out.xml")
+        lines.append([line for line in report["left_out"] if "in mm" in line])
+        model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        mujoco.mj_step(model, data, 100)  # before anything touches
+        names = [body.name for body in jointed().load().bodies] + ["bead"]
+        moved.append([(data.body(name).xpos.copy(), data.body(name).xmat.copy()) for name in names[1:]])
+    assert not lines[0] and len(lines[1]) == 1 and "bead" in lines[1][0] and "9810" in lines[1][0]
+    for (place, turn), (finer, turned) in zip(*moved, strict=True):
+        np.testing.assert_allclose(finer / 1000, place, atol=1e-9)
+        np.testing.assert_allclose(turned, turn, atol=1e-9)
+
+
 def same_joint(scene: Scene, other: Scene, name: str) -> None:
     """Both have a joint in the same place of the world, of the same kind, with the same numbers."""
 

@@ -16,7 +16,7 @@ from sdfsim.apps.export import export
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, clean, is_closed, signed_volume
-from sdfsim.geometry.mesh_io import load_mesh, write_glb
+from sdfsim.geometry.mesh_io import load_mesh, load_textured, write_glb
 from sdfsim.geometry.solidify import solidify
 from sdfsim.shape.make import mesh_shape
 
@@ -506,3 +506,154 @@ def test_our_own_glb_comes_back_as_it_was(tmp_path: Path) -> None:
     back = load_mesh(tmp_path / "shown.glb")
     np.testing.assert_allclose(back.vertices.max(0), mesh.vertices.max(0), atol=1e-6)
     assert signed_volume(back) == pytest.approx(signed_volume(mesh), rel=1e-5)
+
+
+def test_a_skin_stands_as_its_joints_do(tmp_path: Path) -> None:
+    # Bound in centimetres below an armature of 1/100, as Blender writes it: the upper side is carried by a joint that
+    # has turned by 90 degrees since, the lower one by its parent, and one vertex by both.
+    turn, hinge = Rotation.from_euler("y", 90, degrees=True), np.array([10.0, 20.0, 31.5])
+    in_y_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    pivot, turned = in_y_up @ hinge, Rotation.from_matrix(in_y_up @ turn.as_matrix() @ in_y_up.T)
+    upper = np.array([z > 30 for _, _, z in PLACES])
+    weights = [[0.0, 2.0] if up else [2.0, 0.0] for up in upper]
+    weights[0] = [0.25, 0.75]
+    nodes = [
+        {"mesh": 0, "skin": 0, "translation": [500.0, 3.0, 1.0], "scale": [7.0, 7.0, 7.0]},  # does not count
+        {"children": [2], "scale": [0.01] * 3},
+        {"children": [3]},
+        {"translation": (100 * pivot).tolist(), "rotation": turned.as_quat().tolist()},
+    ]
+    file = block(nodes=nodes, scenes=[{"nodes": [0, 1]}])
+    primitive = file.header["meshes"][0]["primitives"][0]
+    primitive["attributes"]["POSITION"] = file.accessor(100 * np.array(Y_UP), "<f4")
+    # The joints are listed the other way round; a second set is only padding, with a joint that does not exist.
+    for k, shares in enumerate((np.pad(weights, ((0, 0), (0, 2))), np.zeros((8, 4)))):
+        held = file.accessor(np.tile([1, 0, 9, 9], (8, 1)), "u1")
+        primitive["attributes"] |= {f"JOINTS_{k}": held, f"WEIGHTS_{k}": file.accessor(shares, "<f4")}
+    bound = np.tile(np.eye(4), (2, 1, 1))
+    bound[0, :3, 3] = -100 * pivot
+    file.header["skins"] = [{"joints": [3, 2], "inverseBindMatrices": 0}]
+    file.header["accessors"].append(
+        {"bufferView": file.view(bound.transpose(0, 2, 1).astype("<f4").tobytes()), "componentType": 5126, "count": 2,
+         "type": "MAT4"}
+    )  # fmt: skip
+    file.header["skins"][0]["inverseBindMatrices"] = len(file.header["accessors"]) - 1
+    mesh = load_mesh(file.write(tmp_path / "a.gltf"))
+    places = np.array(PLACES, float)
+    carried = turn.apply(places - hinge) + hinge
+    share = np.array([w[1] / sum(w) for w in weights])[:, None]
+    expected = share * carried + (1 - share) * places
+    assert len(mesh.vertices) == 8
+    order, other = (np.lexsort(np.round(rows, 3).T) for rows in (mesh.vertices, expected))
+    np.testing.assert_allclose(mesh.vertices[order], expected[other], atol=1e-5)
+    # Without inverse bind matrices the mesh is bound in the joints' own frames.
+    del file.header["skins"][0]["inverseBindMatrices"]
+    primitive["attributes"]["WEIGHTS_0"] = file.accessor(np.tile([1.0, 0, 0, 0], (8, 1)), "<f4")
+    check_block(load_mesh(file.write(tmp_path / "a.gltf")))
+    file.header["skins"][0]["joints"] = [3]
+    with pytest.raises(SdfsimError, match="skin of 1 joints"):
+        load_mesh(file.write(tmp_path / "a.gltf"))
+
+
+def test_morph_targets_count_by_their_weights(tmp_path: Path) -> None:
+    # The upper side is lifted by 8 m and pulled by 6 m along x; a node's weights come before those of the mesh.
+    file = block()
+    up = np.array([z > 30 for _, _, z in PLACES])[:, None]
+    targets = [{"POSITION": file.accessor(up * np.array([[0.0, 8, 0]]), "<f4")}]
+    targets += [{"POSITION": file.accessor(up * np.array([[6.0, 0, 0]]), "<f4")}, {"NORMAL": 0}]
+    file.header["meshes"][0]["primitives"][0]["targets"] = targets
+    for of_mesh, of_node, (x, z) in (
+        (None, None, (0, 0)), ([0.25, 0.5, 1], None, (3, 2)), ([1, 1, 1], [0.5, 0, 0], (0, 4)), ([0, 1], None, (6, 0)),
+    ):  # fmt: skip
+        for entry, weights in ((file.header["meshes"][0], of_mesh), (file.header["nodes"][0], of_node)):
+            entry |= {"weights": weights} if weights else {}
+        high = load_mesh(file.write(tmp_path / "a.gltf")).vertices
+        low, high = high[high[:, 2] < 30.5], high[high[:, 2] > 30.5]
+        np.testing.assert_allclose(low.min(0), [10, 20, 30], atol=1e-5)
+        np.testing.assert_allclose(high.min(0), [10 + x, 20, 33 + z], atol=1e-5)
+        file.header["nodes"][0].pop("weights", None)
+
+
+def test_hidden_nodes_are_left_out_and_counted(tmp_path: Path) -> None:
+    def seen(visible: bool) -> dict:
+        return {"extensions": {"KHR_node_visibility": {"visible": visible}}}
+
+    nodes = [{"mesh": 0, "children": [1], **seen(True)}, {"children": [2], **seen(False)}]
+    nodes += [{"mesh": 0, "translation": [50, 0, 0], **seen(True)}]
+    file = block(nodes=nodes, extensionsRequired=["KHR_node_visibility"])
+    loaded = load_textured(file.write(tmp_path / "a.gltf"))
+    check_block(loaded.mesh)
+    assert loaded.notes == ("1 hidden node is left out",)
+    file.header["animations"] = [{"channels": [], "samplers": []}]
+    assert any("animations" in note for note in load_textured(file.write(tmp_path / "a.gltf")).notes)
+
+
+# --- text as other programs write it ---
+
+
+def stl_text() -> str:
+    rows = ["solid part"]
+    for face in TRIANGLES:
+        rows += ["facet normal 0 0 0", " outer loop", *("  vertex {} {} {}".format(*PLACES[k]) for k in face)]
+        rows += [" endloop", "endfacet"]
+    return "\n".join([*rows, "endsolid part\n"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        str.upper,
+        lambda text: text.replace("endsolid", "end solid"),
+        lambda text: text.replace("\n", "\r"),
+        lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+        lambda text: text.replace("\n ", " "),
+        lambda text: text.upper().replace("ENDSOLID", "End Solid").replace("\n", "\r"),
+    ],
+)
+def test_a_text_stl_is_read_however_it_is_written(tmp_path: Path, change: Callable[[str], str]) -> None:
+    (tmp_path / "a.stl").write_bytes(change(stl_text()).encode())
+    check_block(load_mesh(tmp_path / "a.stl"))
+    (tmp_path / "a.stl").write_bytes(change(stl_text()).encode("utf-16"))
+    check_block(load_mesh(tmp_path / "a.stl"))
+
+
+@pytest.mark.parametrize("ends", [("\r\n", "\n"), ("\n", "\r\n"), ("\r", "\r"), ("\r\n", "\r\n")])
+def test_lines_of_a_ply_header_may_end_in_several_ways(tmp_path: Path, ends: tuple[str, str]) -> None:
+    for content in (binary_ply("<"), text_ply("3 0 1 2\n", 1).encode()):
+        head, tail = content.split(b"end_header\n")
+        head = head.replace(b"\n", ends[0].encode()) + b"end_header" + ends[1].encode()
+        (tmp_path / "a.ply").write_bytes(head + tail)
+        mesh = load_mesh(tmp_path / "a.ply")
+        assert len(mesh.faces) == (12 if content[:20].count(b"binary") else 1)
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "off", "stl"])
+def test_a_decimal_comma_is_named_with_its_line(tmp_path: Path, kind: str) -> None:
+    text = {
+        "obj": obj(lambda c: f"f {' '.join(str(k + 1) for k in c)}\n"),
+        "ply": text_ply("".join(f"{len(c)} {' '.join(map(str, c))}\n" for c in MIXED), len(MIXED)),
+        "off": off_text("OFF\n8 7 0"),
+        "stl": stl_text(),
+    }[kind]
+    (tmp_path / f"a.{kind}").write_text(text)
+    check_block(load_mesh(tmp_path / f"a.{kind}"))
+    lines = text.split("\n")
+    row = next(k for k, line in enumerate(lines) if "11 22 33" in line)
+    lines[row] = lines[row].replace("11 22 33", "11,25 22 33")
+    (tmp_path / f"a.{kind}").write_text("\n".join(lines))
+    with pytest.raises(SdfsimError, match=rf"line {row + 1}: '11,25' has a decimal comma") as error:
+        load_mesh(tmp_path / f"a.{kind}")
+    assert "\n" not in error.value.message
+
+
+@pytest.mark.parametrize(
+    ("face", "message"),
+    [
+        ("f 1 2 9\n", "line 9: a face has the index 9, there are 8 vertices"),
+        ("f 1 2 x\n", "line 9: 'x' is not a number"),
+    ],
+)
+def test_a_face_that_is_wrong_is_named_with_its_line(tmp_path: Path, face: str, message: str) -> None:
+    (tmp_path / "a.obj").write_text("".join("v {} {} {}\n".format(*place) for place in PLACES) + face)
+    with pytest.raises(SdfsimError, match=message):
+        load_mesh(tmp_path / "a.obj")
