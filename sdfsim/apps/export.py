@@ -722,7 +722,8 @@ def _refined_joint(joint: Joint) -> Joint:
         gain = None if motor.gain is None else motor.gain * push / along
         motor = replace(motor, most=motor.most * push, speed=speed, position=position, gain=gain)
     return replace(
-        joint, anchor=k * joint.anchor, start=along * joint.start, limits=limits and (limits[0] * along, limits[1] * along),
+        joint, anchor=k * joint.anchor, start=along * joint.start,
+        limits=limits and (limits[0] * along, limits[1] * along),
         length=None if joint.length is None else k * joint.length, damping=joint.damping * push / along,
         friction=joint.friction * push, spring=spring, motor=motor,
         breaks_force=k**4 * joint.breaks_force, breaks_torque=k**5 * joint.breaks_torque,
