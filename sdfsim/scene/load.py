@@ -107,6 +107,9 @@ def _load_shapes(
     for key in dict.fromkeys(body.shape for body in table.bodies):
         same[key] = key and first.setdefault(table.shapes[key].model_dump_json(exclude_unset=True), key)
     shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
+    scales: dict[str | None, list[float]] = {}
+    for body in table.bodies:
+        scales.setdefault(same[body.shape], []).append(body.scale)
     slow = {key: s.kind in FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
     for now in (False, True):
         todo = [key for key in first.values() if slow[key] is now]
@@ -116,7 +119,8 @@ def _load_shapes(
                 on_progress((i + fraction) / count, message)
 
             try:
-                shapes[key] = _load_shape(key, table.shapes[key], silent if on_progress is silent else report)
+                told = silent if on_progress is silent else report
+                shapes[key] = _load_shape(key, table.shapes[key], scales[key], told)
             except SdfsimError as error:
                 hint = f" ({error.hint})" if error.hint else ""
                 document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
@@ -124,7 +128,7 @@ def _load_shapes(
     return same, shapes
 
 
-def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
+def _load_shape(name: str, entry: ShapeTable, scales: list[float], on_progress: Progress) -> Shape:
     kind: Any = entry.kind
     made: Any = {"sdf": entry.sdf or "mlp", "resolution": entry.resolution, "on_progress": on_progress, "name": name}
     if entry.asset:
@@ -132,7 +136,7 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
         shape = with_sdf(shape, entry.sdf, resolution=entry.resolution) if entry.sdf else shape
     elif entry.mesh:
         units = UNITS[entry.units] if "units" in entry.model_fields_set else None
-        made |= {"units": units, "cap": entry.cap == "on", "thicken": entry.thicken}
+        made |= {"units": units, "scales": scales, "cap": entry.cap == "on", "thicken": entry.thicken}
         shape = shape_from_mesh(entry.mesh, **made)
     elif entry.primitive:
         shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)
