@@ -16,7 +16,7 @@ from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_textured
 from sdfsim.scene.schema import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall
 from sdfsim.sdf.fit import FIT_VERSION, Recipe
-from sdfsim.shape.make import dressed, fit_mesh, remarks
+from sdfsim.shape.make import dressed, far_origin, fit_mesh, remarks
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
 
 ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "sign_errors")
@@ -87,7 +87,8 @@ def fit_file(mesh_file: Path, out: Path, options: Options, *, device: str, on_pr
     # A mesh file may name others, so its own bytes are not enough.
     skin, lost = dressed(loaded, thicken=options.thicken)
     skin = skin and replace(skin, vertices=skin.vertices * metres)
-    remarked = [*lost, *remarked]
+    far = far_origin(mesh)
+    remarked = [*lost, *remarked, *([far] if far else [])]
     described = mesh.digest() + ("" if skin is None else skin.digest())
     request = hashlib.sha256(f"{described}|{options}|{FIT_VERSION}".encode()).hexdigest()
     check_writable(out)

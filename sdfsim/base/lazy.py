@@ -18,15 +18,21 @@ torch = _Torch()
 
 
 class NotInstalled(SdfsimError):
-    """A package of an extra is not installed."""
+    """A package of an extra is not installed, or does not load."""
 
 
 def optional(module: str, title: str, extra: str) -> Any:
-    """A module of a package that belongs to an extra. Raises NotInstalled if it is missing."""
+    """A module of a package that belongs to an extra. Raises NotInstalled if it is missing, or with its own error if it
+    does not load."""
     try:
         return importlib.import_module(module)
-    except ImportError as error:
-        raise NotInstalled(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
+    except Exception as error:  # a package that is broken may raise anything
+        missing = error.name or "" if isinstance(error, ModuleNotFoundError) else None
+        if missing is not None and f"{module}.".startswith(f"{missing}."):
+            raise NotInstalled(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        hint = f"mend what it names, or pip install --force-reinstall {module.partition('.')[0]}"
+        raise NotInstalled(f"{title} is installed, but does not load ({why})", hint) from error
 
 
 def pyplot() -> Any:

@@ -17,10 +17,8 @@ from sdfsim.scene.document import Document
 from sdfsim.scene.joints import joints_of
 from sdfsim.scene.scene import Body, Effects, Motion, Scene, Waypoints
 from sdfsim.scene.schema import FITTED, UNITS, BodyTable, SceneTable, ShapeTable
-from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.make import analytic_shape, far_origin, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.shape import Shape, centred, load_shape, with_nodes, with_sdf, with_wall
-
-FAR_OFF = 10.0  # sizes of a shape: a note tells of an origin that is farther away
 
 
 def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
@@ -70,12 +68,8 @@ def load_scene(
     loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
     notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", []))
-    away = [(float(np.linalg.norm(s.com)), s) for of, s in loaded if of.mesh or of.asset]
-    notes += tuple(
-        f"{s.name}: its origin is {far:.3g} m from its centre of mass; centre: on moves it there"
-        for far, s in away
-        if far > FAR_OFF * np.ptp(s.mesh.vertices, axis=0).max()
-    )
+    away = [(s.name, far_origin(s.mesh)) for of, s in loaded if of.mesh or of.asset]
+    notes += tuple(f"{name}: {line}; centre: on moves it to the centre of mass" for name, line in away if line)
     if on_progress is silent:
         for note in notes:
             warn_once(note)
@@ -107,6 +101,9 @@ def _load_shapes(
     for key in dict.fromkeys(body.shape for body in table.bodies):
         same[key] = key and first.setdefault(table.shapes[key].model_dump_json(exclude_unset=True), key)
     shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
+    scales: dict[str | None, list[float]] = {}
+    for body in table.bodies:
+        scales.setdefault(same[body.shape], []).append(body.scale)
     slow = {key: s.kind in FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
     for now in (False, True):
         todo = [key for key in first.values() if slow[key] is now]
@@ -116,7 +113,8 @@ def _load_shapes(
                 on_progress((i + fraction) / count, message)
 
             try:
-                shapes[key] = _load_shape(key, table.shapes[key], silent if on_progress is silent else report)
+                told = silent if on_progress is silent else report
+                shapes[key] = _load_shape(key, table.shapes[key], scales[key], told)
             except SdfsimError as error:
                 hint = f" ({error.hint})" if error.hint else ""
                 document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
@@ -124,7 +122,7 @@ def _load_shapes(
     return same, shapes
 
 
-def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
+def _load_shape(name: str, entry: ShapeTable, scales: list[float], on_progress: Progress) -> Shape:
     kind: Any = entry.kind
     made: Any = {"sdf": entry.sdf or "mlp", "resolution": entry.resolution, "on_progress": on_progress, "name": name}
     if entry.asset:
@@ -132,7 +130,7 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
         shape = with_sdf(shape, entry.sdf, resolution=entry.resolution) if entry.sdf else shape
     elif entry.mesh:
         units = UNITS[entry.units] if "units" in entry.model_fields_set else None
-        made |= {"units": units, "cap": entry.cap == "on", "thicken": entry.thicken}
+        made |= {"units": units, "scales": scales, "cap": entry.cap == "on", "thicken": entry.thicken}
         shape = shape_from_mesh(entry.mesh, **made)
     elif entry.primitive:
         shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)

@@ -26,7 +26,7 @@ from sdfsim.base.errors import nearest
 from sdfsim.geometry.primitives import PRIMITIVES
 from sdfsim.scene.document import NOTHING, Loc, Numeral
 from sdfsim.scene.scene import WORLD, JointKind, Motion, Switch
-from sdfsim.shape.shape import DEFAULT_RESOLUTION, MESH_FILE, RECORD_FILE, SKIN_FILE, WEIGHTS_FILE, SdfKind
+from sdfsim.shape.shape import DEFAULT_RESOLUTION, FINEST_GRID, MESH_FILE, RECORD_FILE, SKIN_FILE, WEIGHTS_FILE, SdfKind
 
 VERSION = 1
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -94,6 +94,8 @@ def _message(error: Any, table: "type[Table]") -> str:
         return "is required"
     key = error["loc"][0]
     if kind == "extra_forbidden":
+        if place := table.elsewhere(str(key)):
+            return place
         return f"unknown key{meant(key, known) or '; known here: ' + (', '.join(known) or 'none')}"
     extra, limits = known[key].json_schema_extra, error.get("ctx", {})
     unit = extra.get("unit", "") if isinstance(extra, dict) else ""
@@ -219,6 +221,11 @@ class Table(BaseModel):
         return made
 
     @classmethod
+    def elsewhere(cls, key: str) -> str:
+        """Where a key that this table does not know belongs, for a message; empty if nowhere."""
+        return ""
+
+    @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         """Faults in the combination of keys; checked even if values are wrong."""
         yield from ()
@@ -305,7 +312,9 @@ class ShapeTable(Table):
         "an asset keeps its own and others are fitted",
         None,
     )
-    resolution: Whole = key("samples along the longest side, with `sdf: grid`", DEFAULT_RESOLUTION, ge=8, le=512)
+    resolution: Whole = key(
+        "samples along the longest side, with `sdf: grid`", DEFAULT_RESOLUTION, ge=8, le=FINEST_GRID
+    )
     nodes: Whole | None = key(
         "N of the N^3 grid whose points become surface nodes; by default a shape keeps its own", None, ge=3, le=128
     )
@@ -435,6 +444,12 @@ class BodyTable(Turned):
     arrange: Arrange | None = key("places of the copies", None)
 
     @classmethod
+    def elsewhere(cls, key: str) -> str:
+        if key in cls.model_fields or key not in ShapeTable.model_fields:
+            return ""
+        return f"belongs to a shape: give `shapes: {{NAME: {{{key}: ...}}}}` beside `bodies`, and here `shape: NAME`"
+
+    @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         for key in _NOT_WITH_PLANE if "plane" in data else ():
             if key in data:
@@ -442,7 +457,8 @@ class BodyTable(Turned):
         if "plane" in data and data.get("motion", "static") != "static":
             yield ("motion",), "a plane must be static"
         if "plane" not in data:
-            yield from _one_of(data, ("shape", "plane"), required=True)
+            misplaced = any(map(cls.elsewhere, map(str, data)))  # those faults say where it belongs
+            yield from _one_of(data, ("shape", "plane"), required=not misplaced)
             yield from super().check_keys(data)
             yield from _one_of(data, ("mass", "density"))
         if data.get("motion") == "kinematic":

@@ -18,7 +18,7 @@ from sdfsim.base.files import user_cache
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import Mesh, clean, convex_hull, far_middle, is_closed, lattice
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, lattice, signed_volume
 from sdfsim.geometry.mesh_io import GLTF, Loaded, load_textured
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
@@ -27,7 +27,16 @@ from sdfsim.sdf.fit.certificate import certify_grid
 from sdfsim.sdf.grid import sample_grid
 from sdfsim.sdf.reference import MeshDistance, PiecesDistance
 from sdfsim.sdf.sdf import Sdf
-from sdfsim.shape.shape import DEFAULT_RESOLUTION, FORMAT_VERSION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
+from sdfsim.shape.shape import (
+    DEFAULT_RESOLUTION,
+    FINEST_GRID,
+    FORMAT_VERSION,
+    SdfKind,
+    Shape,
+    load_shape,
+    scaled,
+    sdf_of_mesh,
+)
 from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 
 if TYPE_CHECKING:
@@ -36,6 +45,7 @@ if TYPE_CHECKING:
 # m, sizes of meshes that need no remark. If the units are not given the upper limit is lower, as few moving things are
 # larger.
 USUAL, LARGE = (1e-3, 100.0), 5.0
+FAR_OFF = 10.0  # sizes of a mesh: a note tells of an origin that is farther away
 # For convex pieces: largest share of nodes that are vertices, and largest share that are vertices or points on edges.
 OWN_SHARE, EDGE_SHARE = 0.6, 0.85
 # Distance of points on the edges of convex pieces, relative to the size of the whole shape.
@@ -134,21 +144,22 @@ def shape_from_primitive(
     unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
     # Rounded, since sines and cosines differ in their last digit from machine to machine.
     key = Mesh(unit.vertices.round(9), unit.faces).digest()
-    shape = _cached(unit, key, kind, sdf, resolution, cache_dir, on_progress=on_progress)
+    shape = _cached(unit, key, name or kind, sdf, resolution, cache_dir, on_progress=on_progress)
     return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
 
 
 def shape_from_mesh(
     path: str | Path, cache_dir: str | Path | None = None, *, name: str | None = None, units: float | None = None,
     cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
-    on_progress: Progress = silent,
+    on_progress: Progress = silent, scales: Sequence[float] = (1.0,),
 ) -> Shape:  # fmt: skip
     """The shape of a mesh file. It is made on first use, then taken from a cache (by default `sdfsim/shapes` in the
     user's cache folder), whose key is the content of the mesh.
 
     `units` are metres per unit of the file (None: unknown, taken as metres), `thicken` m is a thickness for an open
     sheet. With `sdf` "mlp" the network is fitted; "grid" and "mesh" need no fit (see `mesh_shape`). `source["notes"]`
-    lists what was done to the mesh, and `remarks`. Raises SdfsimError if the mesh cannot be used.
+    lists what was done to the mesh, and `remarks` on its size, by which `scales` its bodies have. Raises SdfsimError if
+    the mesh cannot be used.
     """
     path = Path(path)
     loaded = load_textured(path)
@@ -157,9 +168,10 @@ def shape_from_mesh(
     key = mesh.digest()
     metres = 1.0 if units is None else units
     how = {"cap": cap, "thicken": None if thicken is None else thicken / metres, "on_progress": on_progress}
-    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, file=str(path), **how)
+    shape = _cached(mesh, key, name or path.stem, sdf, resolution, cache_dir, file=str(path), **how)
     skin, lost = dressed(loaded, thicken=thicken)
-    notes = [*shape.source.get("notes", []), *lost, *remarks(path, mesh, metres, given=units is not None)]
+    remarked = remarks(path, mesh, metres, given=units is not None, scales=scales)
+    notes = [*shape.source.get("notes", []), *lost, *remarked]
     source = {**shape.source, "file": path.name, "sha256": key} | ({"notes": notes} if notes else {})
     return scaled(replace(shape, name=name or path.stem, source=source, skin=skin), metres)
 
@@ -172,20 +184,29 @@ def dressed(loaded: Loaded, *, thicken: float | None) -> tuple[Mesh | None, list
     return None, ["its texture becomes colours of its vertices, as thicken gives it other surfaces"]
 
 
-def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
-    """Notes on a mesh file, one line each: that glTF was turned, its size, if that is unusual in these `units` (metres
-    per unit), and a distance from its origin that is large for its size. Many parts are drawn in millimetres, and few
-    files state it."""
+def remarks(path: Path, mesh: Mesh, units: float, *, given: bool, scales: Sequence[float] = (1.0,)) -> list[str]:
+    """Notes on a mesh file, one line each: that glTF was turned, and its size, if that is unusual in these `units`
+    (metres per unit) for a body of one of these `scales`. Many parts are drawn in millimetres, and few files state
+    it."""
     notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
-    size = units * float(np.ptp(mesh.vertices, axis=0).max())
-    if not given and size > LARGE:
+    most = USUAL[1] if given else LARGE
+    sizes = [scale * units * float(np.ptp(mesh.vertices, axis=0).max()) for scale in scales]
+    size = next((size for size in sizes if not USUAL[0] <= size <= most), None)
+    if size is not None and not given and size > LARGE:
         notes.append(f"it is {size:.3g} m wide in metres; if its unit is millimetres, give --units mm (units: mm)")
-    elif not USUAL[0] <= size <= USUAL[1]:
+    elif size is not None:
         notes.append(f"it is {size:.3g} m wide; if that is wrong, give the file's unit with --units (units)")
-    if away := units * float(np.linalg.norm(far_middle(mesh.vertices))):
-        distance = f"{away / 1000:,.0f} km" if away >= 1e4 else f"{away:,.3g} m"
-        notes.append(f"it lies {distance} from its origin, which is the point that a body's position places")
     return notes
+
+
+def far_origin(mesh: Mesh, units: float = 1.0) -> str:
+    """A line on a mesh whose origin is far away for its size; else an empty one. `units` are metres per unit."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    away = units * float(np.linalg.norm(low + high)) / 2
+    if away <= FAR_OFF * units * float((high - low).max()):
+        return ""
+    distance = f"{away / 1000:,.0f} km" if away >= 1e4 else f"{away:.3g} m"
+    return f"it lies {distance} from its origin, which is the point that a body's position places"
 
 
 def mesh_shape(
@@ -196,9 +217,24 @@ def mesh_shape(
     mass as for a fit. Raises SdfsimError, which calls the mesh `file` (or else `name`), if the mesh cannot be used."""
     solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
     sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress, coarse)
-    nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+    try:
+        nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+    except SdfsimError as error:
+        if kind != "grid":
+            raise
+        extent, wall = float(np.ptp(solid.surface.vertices, axis=0).max()), _wall(solid.surface)
+        enough = int(np.ceil(2.0 * extent / wall)) + 1  # two samples in the wall
+        fault = f"no surface nodes: walls of about {wall:.2g} m lie between the samples of a grid of {resolution}"
+        hint = f"give resolution: {enough}, or sdf: mesh" if enough <= FINEST_GRID else "give sdf: mesh, which has none"
+        raise SdfsimError(f"{file or name}: {fault}", hint) from error
     source = {"kind": "mesh"} | note | ({"notes": list(solid.notes)} if solid.notes else {})
     return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), certificate, source)
+
+
+def _wall(mesh: Mesh) -> float:
+    """The mean thickness of a closed sheet, m: its volume over half its area."""
+    sides = np.diff(mesh.vertices[mesh.faces], axis=1)
+    return 4.0 * abs(signed_volume(mesh)) / float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
 
 
 def _cached(

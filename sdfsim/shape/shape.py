@@ -36,6 +36,7 @@ SdfKind = Literal["mlp", "grid", "mesh"]
 FORMAT_VERSION = 1
 # Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
 DEFAULT_RESOLUTION = 64
+FINEST_GRID = 512  # samples along the longest side, at most
 WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
 SKIN_FILE = "textured.glb"  # only for shapes with a texture
 

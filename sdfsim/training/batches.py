@@ -1,9 +1,10 @@
 """The batches of a training run, in the order of its steps: drawn on demand, or in advance by worker processes."""
 
+import contextlib
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -43,9 +44,9 @@ class Draws(Dataset):
         return Drawn(batch, mirrored, time.process_time() - started)
 
 
-def batches(draws: Draws, first: int, workers: int = 0) -> Iterator[Drawn]:
+def batches(draws: Draws, first: int, workers: int = 0) -> Generator[Drawn, None, None]:
     """The batches of the steps from `first` on, the same for any number of `workers`, processes that draw in advance.
-    Raises SdfsimError if one of them ended."""
+    They have ended once the generator is closed. Raises SdfsimError if one of them ended."""
     steps = range(first, sys.maxsize)
     if not workers:
         yield from map(draws.__getitem__, steps)
@@ -55,12 +56,18 @@ def batches(draws: Draws, first: int, workers: int = 0) -> Iterator[Drawn]:
         draws, batch_size=None, sampler=steps, collate_fn=_as_it_is, num_workers=workers, prefetch_factor=AHEAD,
         worker_init_fn=_deaf, multiprocessing_context="spawn",
     )  # fmt: skip
+    drawing: Any = iter(loader)
     try:
-        yield from loader
+        yield from drawing
     except RuntimeError as error:
         if "DataLoader worker" not in str(error).partition("\n")[0]:
             raise
         raise SdfsimError("a process that draws batches has ended", "fewer --workers use less memory") from error
+    finally:
+        # Joined here, not when the loader is collected: a worker may crash on its way out, after its last batch, and
+        # torch would print the error that it raises for this.
+        with contextlib.suppress(RuntimeError):
+            drawing._shutdown_workers()
 
 
 def moved(value: Any, device: torch.device) -> Any:

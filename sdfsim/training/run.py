@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Generator
 from copy import deepcopy
 from dataclasses import asdict
 from functools import cached_property
@@ -93,12 +93,13 @@ class Run:
         follow([self.average[name] for name in self.weights], list(self.weights.values()), self.step)
 
     @cached_property
-    def drawn(self) -> Iterator[Drawn]:
+    def drawn(self) -> Generator[Drawn, None, None]:
         return batches(Draws(self.task, self.plan.batch, self.seed, self.team), self.step, self.workers)
 
     def close(self) -> None:
         """End the workers; a further step would start new ones."""
-        self.__dict__.pop("drawn", None)
+        if drawn := self.__dict__.pop("drawn", None):
+            drawn.close()
 
     def share(self) -> float:
         """Factor on the peak learning rates: a warm-up over 2 % of all steps, at most 1000, then a cosine down to a

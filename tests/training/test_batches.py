@@ -1,8 +1,12 @@
 """Batches that other processes draw ahead are those that a run draws itself, in the order of its steps."""
 
+import atexit
+import gc
 import itertools
+import multiprocessing
 import os
 import signal
+import sys
 from dataclasses import fields
 
 import numpy as np
@@ -43,6 +47,26 @@ class Fatal:
 
     def draw(self, rng, count, team):
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Crashing:
+    """A task whose process draws as it should, and aborts when it ends."""
+
+    def draw(self, rng, count, team):
+        atexit.register(os.abort)
+        return {}
+
+
+def test_workers_that_crash_on_their_way_out_are_joined_in_silence(monkeypatch):
+    told: list = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    drawn = batches(Draws(Crashing(), 1, 0, ALONE), 0, 2)
+    assert next(drawn).batch == {} and len(multiprocessing.active_children()) == 2
+    drawn.close()
+    assert not multiprocessing.active_children()
+    del drawn
+    gc.collect()
+    assert not told
 
 
 @pytest.mark.parametrize("kind", ["impulse", "sdf-sim"])
