@@ -151,7 +151,7 @@ def test_a_target_beyond_the_limits_is_told():
         (lambda j: setattr(j, "target", (1, 2)), "target: must be a finite number"),
         (lambda j: setattr(j, "effort", np.nan), "effort: must be a finite number"),
         (lambda j: setattr(j, "most", -1), "most: must be a finite number of at least 0"),
-        (lambda j: setattr(j, "time", 0), "time: must be above 0"),
+        (lambda j: setattr(j, "time", -1), "time: must be a finite number of at least 0"),
         (lambda j: setattr(j, "friction", True), "friction: must be a finite number of at least 0"),
         (lambda j: setattr(j, "torque", 2.0), "torque is read-only\nhint: set `effort`"),
         (lambda j: setattr(j, "force", 2.0), "force is read-only\nhint: set `effort`"),

@@ -1492,7 +1492,8 @@ def begin_step(world, work, motion, rules, held):
 
 @njit(**FAST)
 def _find_first(world, work, motion, rules, held):
-    """Find the unknown impulses of joints, as if there were no contact."""
+    """Find the unknown impulses of joints that no contact acts on. Where contacts act, velocities are not converted,
+    so that none are needed."""
     graph, each = held.graph, held.each
     from_contacts = System(
         np.empty((0, 4), np.int64), np.empty((0, 3, WIDTH)), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 4)),
@@ -1504,7 +1505,7 @@ def _find_first(world, work, motion, rules, held):
         fresh = False
         for k in range(graph.comp[c], graph.comp[c + 1]):
             fresh = fresh or (graph.node[k] < 0 and each.state[-1 - graph.node[k], FRESH] > 0.0)
-        if not fresh or asleep(motion.island, graph, c):
+        if not fresh or asleep(motion.island, graph, c) or _resting(motion.touching, graph, c):
             continue
         one[0] = c
         _solve_island(
