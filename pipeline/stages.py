@@ -74,13 +74,15 @@ def do_photos(project: Project, work: Path) -> dict:
 
 def do_poses(project: Project, work: Path) -> dict:
     from pipeline.inputs.photos import load_photos
-    from pipeline.mesh.placement import check_bodies, check_distance
+    from pipeline.mesh.placement import check_bodies, check_distance, check_up
     from pipeline.sfm.poses import solve
 
     folder = project.place("photos")
     photos = load_photos(folder)
     if project.options.distance is not None:  # before minutes of poses and training
         check_distance(project.options.distance, photos)
+    if project.options.up is not None:
+        check_up(project.options.up, photos)
     check_bodies(project.options.body, photos)
     return solve(photos, folder, work, seed=project.options.seed, on_progress=project.progress_of("poses"))
 

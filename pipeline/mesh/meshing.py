@@ -12,13 +12,13 @@ from PIL import Image, ImageDraw, ImageFont
 from pipeline.cameras import View, load_poses, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
-from pipeline.inputs.photos import load_photos, open_photo
+from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, open_photo
 from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.hollows import hollow
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held
-from pipeline.mesh.placement import GRAVITY, Placement, Up, located_bodies, measured_scale, place
+from pipeline.mesh.placement import GRAVITY, Placement, Up, given_up, located_bodies, measured_scale, place
 from pipeline.mesh.supports import complete, on_any
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
@@ -68,6 +68,11 @@ def make_meshes(
     held = load_held(photos / JOINT)
     if held is not None and scale is None and options.size is None:
         scale = held.metres / to_unit.scale, held.size_from
+    if options.up is not None:
+        axes = to_unit.rotation if (photos / KNOWN_CAMERAS).exists() else (
+            place(surface.visible, posed.views, up=up).to_metres.rotation.T
+        )  # fmt: skip
+        up = given_up(options.up, axes, posed.views, load_photos(photos), surface.visible)
     placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
     if held is not None:
         if placement.size_from == held.size_from:

@@ -6,14 +6,14 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.cameras import View, focus, spread_angle, view_of, view_span
+from pipeline.cameras import View, focus, view_of, view_span
 from pipeline.inputs.photos import Photo
 from pipeline.sfm.agreement import ENOUGH, contradicting, excess, excess_of_photos
 
 # Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
 FOV_RANGE = (18.0, 110.0)
 MAX_MEAN_ERROR = 2.0  # px
-MIN_TRIANGULATION = 1.5  # degrees
+MIN_TRIANGULATION = 2.0  # degrees, of the median point; mapping leaves out points below 1.5
 FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, ENOUGH, 30, 6
 FOCAL_OFF = 1.5  # times the focal length of EXIF: beyond this the lens is a different one
 # Of the matches. Right poses have up to 0.1, with looser matches 0.2; those of repeating textures two thirds and more.
@@ -82,7 +82,9 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
     needed = max(3, -(-together // 2), -(-len(photos) // 3))
     left_out = [{"photo": p.source, **left_out_reason(p, result, found)} for p in photos if p.name not in posed]
     against = result.get("agreement", [])
-    angle, around = (spread_angle(views), view_span(views)) if views else (0.0, 0.0)
+    angle, around = (result["angle"], view_span(views, np.array(result["middle"]))) if views else (0.0, 0.0)
+    if angle >= MIN_TRIANGULATION and len(posed) >= needed:  # A step along something flat looks like a turn, but gives depth.
+        found = replace(found, turn_only=0.0)
     failures, warnings = [], []
     if len(posed) < needed:
         failures.append(f"only {len(posed)} of {len(photos)} photos could be posed ({needed} are needed)")
@@ -93,7 +95,8 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         check_focal(views, photos, bool(astray), failures, warnings)
         check_errors(result, astray, failures, warnings)
         if angle < MIN_TRIANGULATION:
-            failures.append(f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)")
+            failures.append(f"the cameras stand too close together (half of the points are seen from directions that "
+                            f"are at most {angle:.1f} degrees apart)")  # fmt: skip
         elif around < ONE_SIDE:
             warnings.append(f"the photos show the scene from one side ({around:.0f} degrees around it): what they do "
                             "not show is guessed, so the result is not closed: walk further around")  # fmt: skip
@@ -101,6 +104,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         "photos": len(photos), "posed": len(posed), "left_out": left_out,
         "mean_error": round(result.get("mean_error", 0.0), 4), "points": result.get("points", 0),
         "field_of_view": sorted({round(view.fov, 2) for view in views}), "span_degrees": round(around, 1),
+        "triangulation_degrees": round(angle, 2),
         "cameras": [len(names) for names in result.get("cameras", [])],
         "contradictions": round(contradicting(against), 4), "excess": round(excess(against), 3),
         "components": [len(c) for c in found.components],
@@ -137,11 +141,11 @@ def photos_astray(result: dict) -> list[str]:
     return astray if len(astray) > FEW_ASTRAY * len(photos) else []
 
 
-def why_astray(views: list[View], astray: list[str]) -> str:
+def why_astray(views: list[View], astray: list[str], middle: np.ndarray) -> str:
     """Possible causes of such matches, the likelier first: too few photos or too large steps, or several zooms. Neither
     is certain."""
     zooms = "photos of several zooms, or cropped ones: give those of one zoom, or as the camera stored them, with EXIF"
-    rays = focus(views)[1]
+    rays = focus(views, middle)[1]
     angles = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
     np.fill_diagonal(angles, np.inf)
     step = float(np.median(angles.min(1)))
@@ -221,7 +225,7 @@ def diagnose(result: dict, views: list[View], found: Findings, failures: list[st
         causes.append("a texture that repeats makes different places look the same: cover it, or lay something unlike "
                       "on it")  # fmt: skip
     elif views and (astray := photos_astray(result)):
-        causes.append(why_astray(views, astray))
+        causes.append(why_astray(views, astray, np.array(result["middle"])))
     elif len(linked) < len(result["counts"]) / 2:
         causes.append("most photos overlap too little with the others")
     return causes

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipeline.cameras import Sparse, triangulation_angle, view_of
 from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
 from sdfsim.base.files import write_arrays, write_json
 
@@ -363,8 +364,8 @@ def views_in(reconstruction) -> list[dict]:
     return views
 
 
-def save_points(reconstruction, path: Path) -> None:
-    """Writes the points of a reconstruction (`sparse.npz`), with photos numbered as in `views_in`."""
+def save_points(reconstruction, path: Path) -> Sparse:
+    """Writes and returns the points of a reconstruction (`sparse.npz`), with photos numbered as in `views_in`."""
     index_of = {image.image_id: index for index, image in enumerate(posed_in(reconstruction))}
     points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
     seen = [
@@ -380,6 +381,7 @@ def save_points(reconstruction, path: Path) -> None:
         "view_of": observations[:, 1],
     }
     write_arrays(path, arrays, compressed=False)
+    return Sparse(**arrays)
 
 
 def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str, str, np.ndarray, np.ndarray]]]:
@@ -418,7 +420,7 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = S
     explains to a median of `least` px: with the right focal length, the one that explains most pairs, one rotation maps
     the rays of all matches."""
     best = 0.0
-    for ratio in np.geomspace(0.4, 4.0, 24):
+    for ratio in np.geomspace(0.4, 3.0, 20):  # a longer lens is not usable, and any step along a wall would fit it
         explained = 0
         for size, first, second in pairs:
             focal = ratio * max(size["width"], size["height"])
@@ -466,7 +468,9 @@ def main(job_path: str) -> None:
         result["judged"] = agreement(judges, result["views"])  # by the matches of the first attempt
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
-        save_points(best, out / "sparse.npz")
+        sparse = save_points(best, out / "sparse.npz")
+        result["middle"] = np.median(sparse.xyz, axis=0).tolist() if len(sparse.xyz) else [0.0, 0.0, 0.0]
+        result["angle"] = triangulation_angle([view_of({**view, "source": ""}) for view in result["views"]], sparse)
     write_json(out / "result.json", result)
 
 

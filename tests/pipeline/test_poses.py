@@ -180,7 +180,7 @@ def test_cameras_on_one_side_are_no_closed_object():
 
 @pytest.mark.parametrize(("span", "expected"), [(90.0, 81.0), (200.0, 180.0), (360.0, 324.0)])
 def test_span_is_the_arc_less_the_largest_gap(span, expected):
-    assert view_span(views_of(result(10, 10, span=span), PHOTOS)) == pytest.approx(expected, abs=0.01)
+    assert view_span(views_of(result(10, 10, span=span), PHOTOS), np.zeros(3)) == pytest.approx(expected, abs=0.01)
 
 
 def test_cameras_too_close_together_fail():
