@@ -13,6 +13,8 @@ from sdfsim.base.files import read_arrays, read_json, write_json
 
 # People hold cameras level to about this; if all look one way, straight down or at a wall, nothing is known.
 CAREFUL, UNKNOWN = 2.0, 90.0  # degrees
+# Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
+FOV_RANGE = (18.0, 110.0)
 
 
 @dataclass(frozen=True)

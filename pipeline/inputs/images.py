@@ -23,6 +23,7 @@ BACKDROP = 0.5
 BLURRED = 0.1
 BLOCKS = 12  # per side, fewer for small photos
 DARK = 0.1  # of white: a hundredth of a photo has to reach this
+WHITE = 250  # of 255: brighter pixels show nothing
 
 
 @dataclass(frozen=True)
@@ -195,6 +196,13 @@ def brightness(picture: ReadPhoto) -> float:
     grey = picture.pixels.astype(np.float32).mean(-1) / 255
     inside = grey if picture.mask is None else grey[picture.mask >= 128]
     return float(np.quantile(inside, 0.99)) if inside.size else 1.0
+
+
+def whiteness(picture: ReadPhoto) -> float:
+    """Share of a photo, or of its object if it has a mask, that is white."""
+    white = picture.pixels.min(-1) >= WHITE
+    inside = white if picture.mask is None else white[picture.mask >= 128]
+    return float(inside.mean()) if inside.size else 0.0
 
 
 def block_means(values: np.ndarray, blocks: int) -> np.ndarray:

@@ -1,17 +1,16 @@
 """Checks whether poses can be trusted, and diagnoses problems of the photos."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.cameras import View, focus, view_of, view_span
+from pipeline.cameras import FOV_RANGE, View, focus, view_of, view_span
 from pipeline.inputs.photos import Photo
 from pipeline.sfm.agreement import ENOUGH, contradicting, excess, excess_of_photos
 
-# Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
-FOV_RANGE = (18.0, 110.0)
 MAX_MEAN_ERROR = 2.0  # px
 MIN_TRIANGULATION = 2.0  # degrees, of the median point; mapping leaves out points below 1.5
 FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, ENOUGH, 30, 6
@@ -23,6 +22,7 @@ MANY_CONTRADICTIONS = 0.35
 MOST_EXCESS, FEW_ASTRAY = 2.0, 0.1
 # Fewer photos, or neighbours that stand farther apart (degrees, as seen from the scene), are doubtful.
 GOOD_PHOTOS, WIDE_STEP = 20, 18.0
+HALF = 0.5  # share of a photo that is white: from here on it may be what is wrong with it
 STILL = 0.5  # of a pair's matches not moving: the background is static
 ONE_SIDE = 150.0  # degrees of viewpoints around the scene: below this it is seen from one side only
 COMPONENT_NAMED = 3
@@ -83,14 +83,24 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
     left_out = [{"photo": p.source, **left_out_reason(p, result, found)} for p in photos if p.name not in posed]
     against = result.get("agreement", [])
     angle, around = (result["angle"], view_span(views, np.array(result["middle"]))) if views else (0.0, 0.0)
-    if angle >= MIN_TRIANGULATION and len(posed) >= needed:  # A step along something flat looks like a turn, but gives depth.
+    # A step along something flat looks like a turn, but gives depth.
+    if angle >= MIN_TRIANGULATION and len(posed) >= needed:
         found = replace(found, turn_only=0.0)
     failures, warnings = [], []
+    if drawn := result.get("overlay"):
+        left, top, right, bottom = drawn
+        warnings.append(f"what is drawn over the photos (a logo, a date), from {left:.0%} to {right:.0%} of their width "
+                        f"and {top:.0%} to {bottom:.0%} of their height, is not matched: it does not move with the "
+                        "scene")  # fmt: skip
     if len(posed) < needed:
         failures.append(f"only {len(posed)} of {len(photos)} photos could be posed ({needed} are needed)")
     else:
         if left_out:
             warnings.append(f"{len(left_out)} of {len(photos)} photos were left out")
+        if result.get("held"):
+            warnings.append("the photos all look exactly the same way, from which no focal length follows: it is "
+                            f"{'that of EXIF' if any(p.focal for p in photos) else 'a guess'}, and depths are only "
+                            "as right as that: tilt the camera in some photos")  # fmt: skip
         astray = [] if known else photos_astray(result)
         check_focal(views, photos, bool(astray), failures, warnings)
         check_errors(result, astray, failures, warnings)
@@ -109,7 +119,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         "contradictions": round(contradicting(against), 4), "excess": round(excess(against), 3),
         "components": [len(c) for c in found.components],
         "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
-        "causes": diagnose(result, views, found, failures), "failures": failures, "warnings": warnings,
+        "causes": diagnose(result, photos, views, found, failures), "failures": failures, "warnings": warnings,
     }  # fmt: skip
 
 
@@ -188,19 +198,21 @@ def left_out_reason(photo: Photo, result: dict, found: Findings) -> dict:
     entry = result["counts"].get(photo.name, {})
     count, best = entry.get("features", 0), entry.get("best_matches", 0)
     if count < FEW_FEATURES:
-        return reason("features", f"too few features ({count}): {photo.fault or 'blurred, dark or without texture'}")
+        white = f"{photo.white:.0%} of it is white, blown out or blank" if photo.white > HALF else ""
+        why = photo.fault or white or "blurred, dark, blown out or without texture"
+        return reason("features", f"too few features ({count}): {why}")
+    if photo.fault:
+        return reason("fault", f"{photo.fault} (best pair: {best} matches)")
     group = next((c for c in found.components if photo.name in c), [])
     if len(group) >= COMPONENT_NAMED and group is not found.components[0]:
         others = f"it matches {len(group) - 1} other photos, none of them in the larger set"
         return reason("unrelated", f"shows something else: {others}")
-    if photo.fault:
-        return reason("fault", f"{photo.fault} (best pair: {best} matches)")
     if best < FEW_MATCHES:
         return reason("overlap", f"too few matches with other photos (best pair: {best}): not enough overlap")
     return reason("disagrees", f"its {best} matches do not agree with the rest of the reconstruction")
 
 
-def diagnose(result: dict, views: list[View], found: Findings, failures: list[str]) -> list[str]:
+def diagnose(result: dict, photos: list[Photo], views: list[View], found: Findings, failures: list[str]) -> list[str]:
     """Problems of the photos as a set, likeliest first; empty if the poses are good."""
     causes = []
     if found.still > 0.5:
@@ -216,7 +228,10 @@ def diagnose(result: dict, views: list[View], found: Findings, failures: list[st
     posed = {view["name"] for view in result["views"]}
     unposed = len(linked) >= 6 and len(posed & set(linked)) < len(linked) / 2  # of photos that match others well
     if found.textureless > 0.5:
-        causes.append("there is too little to see: blurred, dark, or without texture, like a blank wall")
+        faults = Counter(p.fault or ("mostly white, blown out or blank" if p.white > HALF else "") for p in photos)
+        fault, times = faults.most_common(1)[0]
+        why = "blurred, dark, blown out, or without texture, like a blank wall"
+        causes.append(f"there is too little to see: {f'{times} photos are {fault}' if fault else why}")
     elif len(result["counts"]) < FEW_PHOTOS:
         causes.append(f"{len(result['counts'])} photos are too few to be certain of anything")
     elif found.turn_only > 0.5 and found.still <= 0.5:
@@ -248,5 +263,9 @@ def failure_hint(checks: dict) -> str:
         return "check which photo belongs to which camera, and its axes; or give the folder of photos alone"
     kinds = [entry["kind"] for entry in checks["left_out"]]
     if kinds.count("features") > kinds.count("overlap"):
+        blown = sum("blown out" in entry["why"] and entry["kind"] == "features" for entry in checks["left_out"])
+        bare = sum("without texture" in entry["why"] for entry in checks["left_out"])
+        if blown - bare > len(checks["left_out"]) / 2:
+            return "take them again with less light or exposure: what is white shows nothing"
         return "take sharper photos in better light, or put something textured under the object"
     return "take 20 to 60 photos in small steps around the object, each overlapping the one before by two thirds"

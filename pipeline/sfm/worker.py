@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.cameras import Sparse, triangulation_angle, view_of
+from pipeline.cameras import FOV_RANGE, Sparse, triangulation_angle, view_of
 from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
 from sdfsim.base.files import write_arrays, write_json
 
@@ -35,11 +35,16 @@ HOPELESS = 0.5  # of all matches contradicting the poses: no focal length fixes 
 # Ratio of a focal length to the next shorter one above which they are two zooms; among photos of one zoom, each posed
 # with its own focal length, it was up to 1.05.
 ZOOM = 1.12
+# Degrees up to which axes are parallel, exactly and nearly: focal length and depth can then be traded for each other.
+PARALLEL, NEARLY = 0.3, 5.0
 ABOUT = 1.03  # ratio of two models' unexplained matches up to which the one with fewer cameras is chosen
 # Number of a photo's largest features for finding similar photos; how much nearer than the next a match has to be; and
 # the matches above which photos may show the same.
 LARGEST, DISTINCT, COMMON = 400, 0.8, 2
 STILL = 2.0  # px between the pixels of a match in two photos: below this it did not move
+# What does not move in this share of the pairs, in a cell of so many along a picture's width, is a logo or a date, if
+# such cells are a small share of the picture; more is a background. On a street no cell had 0.06.
+CELLS, OFTEN, SMALL = 48, 0.15, 0.2
 TURNS = 200  # largest number of pairs of photos that are checked for turns on the spot
 
 
@@ -171,8 +176,9 @@ def from_known(pycolmap, job: dict, database: Path, out: Path):
     return pycolmap.triangulate_points(known, database, job["images"], place, options=options)
 
 
-def mapped(pycolmap, job: dict, database: Path, out: Path):
-    """The reconstruction with the most photos that incremental mapping finds, or None."""
+def mapped(pycolmap, job: dict, database: Path, out: Path, *, hold: bool = False):
+    """The reconstruction with the most photos that incremental mapping finds, or None; `hold`: focal lengths stay as
+    given or assumed."""
     done = 0
 
     def count() -> None:
@@ -182,7 +188,7 @@ def mapped(pycolmap, job: dict, database: Path, out: Path):
 
     print("placed 0", flush=True)
     found = pycolmap.incremental_mapping(
-        database, job["images"], fresh(out / "colmap"), options=incremental_options(pycolmap, job),
+        database, job["images"], fresh(out / "colmap"), options=incremental_options(pycolmap, job, hold),
         next_image_callback=count,
     )  # fmt: skip
     return max(found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
@@ -203,6 +209,9 @@ def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
     """
     shared = [group["names"] for group in job["groups"]]
     tried = [(mapped(pycolmap, job, database, out), shared)]
+    job["held"] = undetermined(views_in(tried[0][0]))
+    if job["held"]:
+        return mapped(pycolmap, job, database, out, hold=True), shared
     first = agreement(pairs, views_in(tried[0][0]))
     costs = [unexplained(first)]
     copy, names = out / "zooms.db", [name for group in shared for name in group]
@@ -217,6 +226,18 @@ def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
     copy.unlink(missing_ok=True)
     # The fewest cameras that are about as good as any.
     return next(one for one, cost in zip(tried, costs, strict=True) if cost <= ABOUT * min(costs) + (ABOUT - 1) / 10)
+
+
+def undetermined(views: list[dict]) -> bool:
+    """Whether the focal length says nothing because all cameras look one way: a longer lens and depths longer by as
+    much give the same pictures."""
+    if not views:
+        return False
+    axes = np.array([view["rotation"][2] for view in views])
+    mean = axes.mean(0) / np.linalg.norm(axes.mean(0))
+    apart = float(np.degrees(np.arccos(np.clip(axes @ mean, -1, 1))).max())
+    fov = [view_of({**view, "source": ""}).fov for view in views]
+    return apart < PARALLEL or (apart < NEARLY and not FOV_RANGE[0] < min(fov) <= max(fov) < FOV_RANGE[1])
 
 
 def doubtful(entries: list[dict]) -> bool:
@@ -265,16 +286,17 @@ def with_cameras(pycolmap, database: Path, copy: Path, groups: list[list[str]], 
                 opened.update_image(image)
 
 
-def incremental_options(pycolmap, job: dict):
+def incremental_options(pycolmap, job: dict, hold: bool = False):
     """Settings of incremental mapping: on one thread, because several threads sum in an order that differs between
-    runs."""
+    runs. `hold`: without refining the lens."""
     mapper = {
         "num_threads": 1, "random_seed": job["seed"], "init_min_num_inliers": job["init_inliers"],
         "init_min_tri_angle": job["init_angle"], "abs_pose_min_num_inliers": job["pose_inliers"],
     }  # fmt: skip
     return pycolmap.IncrementalPipelineOptions(
         min_model_size=3, max_num_models=4, num_threads=1, random_seed=job["seed"], min_num_matches=job["min_inliers"],
-        mapper=mapper, triangulation={"random_seed": job["seed"]},
+        mapper=mapper, triangulation={"random_seed": job["seed"]}, ba_refine_focal_length=not hold,
+        ba_refine_extra_params=not hold,
     )  # fmt: skip
 
 
@@ -398,6 +420,28 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
     return {name: len(points[key]) for key, name in images.items()}, pairs
 
 
+def overlay(pycolmap, job: dict, database: Path) -> list[float]:
+    """The box (left, top, right, bottom, in shares of the picture) around what is drawn over the photos, such as a logo
+    or a date: its features match in the same place of all pictures, however these move. Empty if there is none."""
+    widths = {name: group["width"] for group in job["groups"] for name in group["names"]}
+    count, pairs = np.zeros((CELLS, 4 * CELLS), int), 0
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image.name for image in opened.read_all_images()}
+        points = {key: opened.read_keypoints(key)[:, :2] / widths[name] for key, name in images.items()}
+        for pair, matched in zip(*opened.read_all_matches(), strict=True):
+            (a, b), (first, second) = pycolmap.pair_id_to_image_pair(pair), np.asarray(matched, int).reshape(-1, 2).T
+            if len(first) >= ENOUGH:
+                still = np.linalg.norm(points[a][first] - points[b][second], axis=1) < STILL / widths[images[a]]
+                at = (CELLS * points[a][first[still]]).astype(int).clip(0, [CELLS - 1, 4 * CELLS - 1])
+                count[tuple(np.unique(at, axis=0).T)] += 1
+                pairs += 1
+    often = np.argwhere(count > OFTEN * max(pairs, 1))
+    tall = max((group["height"] / group["width"] for group in job["groups"]), default=1.0)
+    if not len(often) or pairs < ENOUGH or len(often) > SMALL * CELLS**2 * tall:
+        return []
+    return [float(x) for x in np.append(often.min(0), often.max(0) + 1) / CELLS / [1, tall, 1, tall]]
+
+
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
     """Facts from the matches without poses: `counts` of each photo, `pairs` (with the share of matches that did not
     move between the photos), and the share of `turn_only` pairs."""
@@ -446,6 +490,13 @@ def main(job_path: str) -> None:
     features(pycolmap, job, database)
     print("phase matches", flush=True)
     matches(pycolmap, job, database)
+    drawn = [] if job["moving_only"] else overlay(pycolmap, job, database)
+    if drawn:
+        job["moving_only"] = True
+        with closing(sqlite3.connect(database)) as opened:
+            opened.execute("DELETE FROM two_view_geometries")
+            opened.commit()
+        matches(pycolmap, job, database)
     print("phase mapping", flush=True)
     counts, pairs = read_pairs(pycolmap, database)
     if job["known_cameras"]:
@@ -459,7 +510,8 @@ def main(job_path: str) -> None:
             print("phase mapping", flush=True)
             counts, pairs = read_pairs(pycolmap, database)
             best, cameras = best_mapping(pycolmap, job, database, pairs, out)
-    result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
+    held = job.get("held", False)
+    result: dict[str, Any] = {"views": [], "overlay": drawn, "held": held, **findings(job, counts, pairs)}
     if best:
         result["views"] = views_in(best)
         result["cameras"] = cameras

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find,
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import write_arrays, write_json
-from tests.helpers.photos import photo, result
+from tests.helpers.photos import photo, result, turned
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TABLE_VASE = ROOT / "samples" / "photos" / "table_vase"
@@ -562,6 +563,7 @@ def test_what_looks_least_alike_is_matched_too_where_photos_are_left_out(posed, 
     monkeypatch.setattr(worker, "watch_parent", lambda: None)
     monkeypatch.setattr(worker, "features", lambda *args: None)
     monkeypatch.setattr(worker, "matches", lambda pycolmap, job, database: limits.append(job["exhaustive_up_to"]))
+    monkeypatch.setattr(worker, "overlay", lambda *args: [])
     monkeypatch.setattr(worker, "read_pairs", lambda *args: ({}, []))
     monkeypatch.setattr(worker, "findings", lambda *args: {})
     monkeypatch.setattr(worker, "best_mapping", lambda *args: (None, []))
@@ -582,3 +584,62 @@ def test_poses_of_the_rendered_set(tmp_path):
     assert report["posed"] == 48
     assert report["center_error_worst_percent"] < 0.5
     assert report["focal_error_percent"] < 0.5
+
+
+@pytest.mark.parametrize(("still", "found"), [(12, [0.0625, 0.0833, 0.2083, 0.1667]), (0, []), (400, [])])
+def test_what_is_drawn_over_the_photos_is_found_by_what_stands_still(tmp_path, still, found):
+    """A logo of 12 features in 9 of the 48 x 36 cells of the picture; no logo; and a background that stands still."""
+    import pycolmap
+
+    rng, size = np.random.default_rng(0), np.array([480, 360])
+    inside = (np.array([31.0, 31]), np.array([99.0, 59])) if still < 100 else (np.zeros(2), size)
+    logo = rng.uniform(*inside, (still, 2))
+    logo[:2] = np.array([[31.0, 31], [99, 59]])[:still]
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        camera = opened.write_camera(
+            pycolmap.Camera(model="SIMPLE_RADIAL", width=480, height=360, params=[500, 240, 180, 0])
+        )
+        images = [opened.write_image(pycolmap.Image(name=f"{k}.jpg", camera_id=camera)) for k in range(12)]
+        for image in images:
+            places = np.concatenate([logo + rng.normal(0, 0.2, logo.shape), rng.uniform(0, 1, (60, 2)) * size])
+            shape = np.tile([2.0, 0, 0, 2], (len(places), 1))
+            opened.write_keypoints(image, np.column_stack([places, shape]).astype(np.float32))
+        every = np.arange(still + 60, dtype=np.uint32)
+        for k, a in enumerate(images):
+            for b in images[k + 1 :]:
+                opened.write_matches(a, b, np.stack([every, every], 1))
+    job = {"groups": [{"width": 480, "height": 360, "names": [f"{k}.jpg" for k in range(12)]}]}
+    assert worker.overlay(pycolmap, job, tmp_path / "database.db") == pytest.approx(found, abs=1e-3)
+
+
+def test_what_is_drawn_over_the_photos_is_reported():
+    verdict = check({**result(10, 10), "overlay": [0.05, 0.1, 0.2, 0.15]}, PHOTOS)
+    assert "a logo, a date" in verdict["warnings"][0] and "from 5% to 20% of their width" in verdict["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("tilt", "focal", "held"), [(0.0, 600.0, True), (2.0, 600.0, False), (2.0, 3000.0, True), (20.0, 3000.0, False)]
+)
+def test_cameras_that_look_exactly_one_way_have_no_focal_length_of_their_own(tilt, focal, held):
+    views = result(10, 10, focal=focal, span=0.0)["views"]
+    for number, view in enumerate(views):
+        view["rotation"] = turned(np.radians(tilt) * (number % 2 - 0.5)).tolist()
+    assert worker.undetermined(views) == held
+    verdict = check({**result(10, 10), "held": held}, PHOTOS)
+    assert any("no focal length follows: it is a guess" in line for line in verdict["warnings"]) == held
+
+
+def test_progress_never_counts_more_photos_than_there_are(tmp_path):
+    (tmp_path / "progress.log").write_text("phase mapping\nplaced 29\nplaced 30\n")
+    assert poses.estimate(tmp_path, tmp_path / "progress.log", {"count": 29}) == (1.0, "placing cameras, 29 of 29")
+
+
+def test_blown_out_photos_are_neither_blurred_nor_of_something_else():
+    """Seven of 18 match each other alone, as white photos do; one of them counts as sound."""
+    photos = [photo(k, fault="blown out" if k > 11 else "") for k in range(18)]
+    verdict = check(two_things(), photos)
+    assert [entry["why"].split(" (")[0] for entry in verdict["left_out"][1:]] == ["blown out"] * 6
+    white = [replace(photo(k), white=0.8) for k in range(10)]
+    verdict = check(result(10, 0, features=30, matches=0), white)
+    assert "10 photos are mostly white" in verdict["causes"][0] and "less light" in failure_hint(verdict)
+    assert "80% of it is white" in verdict["left_out"][0]["why"]

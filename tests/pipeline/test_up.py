@@ -44,7 +44,7 @@ def downwards(yaws: np.ndarray, seed: int = 0) -> list[View]:
     views = []
     for number, yaw in enumerate(yaws):
         eye = np.array([0.2 * (number % 6) - 0.5, 0.15 * (number // 6) - 0.3, 1.6]) + rng.normal(0, 0.01, 3)
-        target = eye + [*rng.normal(0, 0.02, 2), -1]
+        target = eye + np.array([*rng.normal(0, 0.02, 2), -1])
         views.append(look_at(eye, target, up=(np.sin(yaw), np.cos(yaw), 0)))
     return views
 
@@ -53,7 +53,7 @@ def rail(eye_height: float = 0.0, pitch: float = 0.0) -> list[View]:
     """A dozen cameras along a rail of 2 m before the wall, all of them looking straight ahead or down by degrees."""
     down = np.tan(np.radians(pitch))
     places = [np.array([x, -1.5, eye_height]) for x in np.linspace(-1, 1, 12)]
-    return [look_at(place, place + [0, 1, -down]) for place in places]
+    return [look_at(place, place + np.array([0, 1, -down])) for place in places]
 
 
 def in_some_world(mesh: Mesh, views: list[View]) -> tuple[Mesh, list[View], np.ndarray]:
