@@ -132,7 +132,7 @@ def read_cameras(path: Path) -> list[KnownCamera]:
         return sorted(read(path), key=lambda camera: camera.name)
     except KeyError as error:
         raise SdfsimError(f"{path}: cannot be read as cameras: it has no {error}", FORMS) from error
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+    except (OSError, ValueError, IndexError, TypeError, AttributeError, struct.error) as error:
         raise SdfsimError(f"{path}: cannot be read as cameras: {error!r}", "write it again") from error
 
 

@@ -25,7 +25,8 @@ HELPERS = {
 }  # fmt: skip
 ABOVE = 3  # levels above a COLMAP model in which its photos may lie: the model may be colmap/sparse/0
 NAMED = 3  # folders with photos that an error names
-VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}
+VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}  # these are videos even if they cannot be decoded
+ASKED = 20  # files of a folder without photos that are tried as videos
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,10 @@ def find_source(given: Path, *, unpacked: bool = False) -> Source:
     given = Path(given)
     if not given.exists():
         raise SdfsimError(f"{given}: no such folder", "give the folder that holds the photos, or a video")
-    if given.is_file() and given.suffix.lower() in VIDEOS:
-        return Source(video=given)
     if given.is_file() and given.suffix.lower() in ARCHIVES:
         return Source(archive=given)
+    if _is_video(given):
+        return Source(video=given)
     if len(models := _models(given)) > 1:
         sizes = {model: len(read_cameras(model)) for model in models}
         given = max(models, key=lambda model: sizes[model])
@@ -129,7 +130,7 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
             raise SdfsimError(f"{message}; below it are {some}{more}", "give the folder that holds the photos")
         if models := [place for level in levels(folder) for place in level if is_model(place)]:
             raise SdfsimError(f"{message}; {models[0]} holds cameras", "give that folder")
-        if films := [path for path in _files(folder) if path.suffix.lower() in VIDEOS]:
+        if films := [path for path in _files(folder)[:ASKED] if _is_video(path)]:
             told = f"{message}; it holds the video {films[0].name}"
             raise SdfsimError(told, f"give the video: sdfsim reconstruct {quote(str(films[0]))} -o ROOM")
         raise SdfsimError(message, notes[0] if notes else "take photos all around, each overlapping the one before")
@@ -179,6 +180,15 @@ def masks_beside(photos: list[Path]) -> dict[Path, Path]:
     """The masks that lie among the photos, by photo."""
     found = [helpers(folder) for folder in dict.fromkeys(photo.parent for photo in photos)]
     return {photo: path for each in found for path, (kind, photo) in each.items() if kind == "masks"}
+
+
+def _is_video(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    if not path.is_file() or suffix in SUFFIXES or suffix == ".json":
+        return False
+    from pipeline.inputs.video import is_film
+
+    return suffix in VIDEOS or is_film(path)
 
 
 def _files(folder: Path) -> list[Path]:

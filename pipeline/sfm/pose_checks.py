@@ -89,9 +89,9 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
     failures, warnings = [], []
     if drawn := result.get("overlay"):
         left, top, right, bottom = drawn
-        warnings.append(f"what is drawn over the photos (a logo, a date), from {left:.0%} to {right:.0%} of their width "
-                        f"and {top:.0%} to {bottom:.0%} of their height, is not matched: it does not move with the "
-                        "scene")  # fmt: skip
+        warnings.append("what is drawn over the photos (a logo, a date) does not move with the scene and is not "
+                        f"matched: from {left:.0%} to {right:.0%} of their width, {top:.0%} to {bottom:.0%} of their "
+                        "height")  # fmt: skip
     if len(posed) < needed:
         failures.append(f"only {len(posed)} of {len(photos)} photos could be posed ({needed} are needed)")
     else:
