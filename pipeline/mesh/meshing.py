@@ -79,7 +79,12 @@ def make_meshes(
             placement = replace(placement, size_assumed=held.size_assumed)
         held.moved(placement.to_metres.after(to_unit)).save(out / JOINT)
     level, known, completed = placement.to_metres.rotation[2], None, []
-    if not alone:
+    if alone:
+        # What nobody sees below the lowest place in sight is as level as what carried it; a field makes a dome of it.
+        bottom = ground(placement)
+        volume, limit = volume.limited(bottom), lambda p: np.maximum(ball(p), bottom(p))
+        surface = surface_of(volume, field, posed, photos, ball, on_progress=share_of(on_progress, 0.45, 0.05))
+    else:
         on_progress(0.45, "looking for level surfaces without texture")
         completed = complete(surface, level, field.finest, posed, photos)
     if completed:
@@ -89,7 +94,7 @@ def make_meshes(
         surface = surface_of(volume, field, posed, photos, limit, known=known,
                              on_progress=share_of(on_progress, 0.45, 0.05))  # fmt: skip
     if options.crop is not None:
-        limit = box_of(placement, np.reshape(options.crop, (2, 3)))
+        limit = box_of(placement, np.reshape(options.crop, (2, 3)), limit)
         volume = volume.limited(limit)
         if not (volume.values < 0).any():
             raise SdfsimError(
@@ -150,13 +155,18 @@ def trust(
     }  # fmt: skip
 
 
-def box_of(placement: Placement, corners: np.ndarray) -> Distance:
-    """Distance from the space left after cropping: the trained ball within a box with corners [2, 3] m."""
+def ground(placement: Placement) -> Distance:
+    """Distance from the space above z = 0 m."""
+    return lambda points: -placement.to_metres.points(points)[:, 2] / placement.to_metres.scale
+
+
+def box_of(placement: Placement, corners: np.ndarray, space: Distance) -> Distance:
+    """Distance from the space left after cropping: a `space` within a box with corners [2, 3] m."""
     middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
 
     def distance(points: np.ndarray) -> np.ndarray:
         beyond = np.abs(placement.to_metres.points(points) - middle) - half
-        return np.maximum(ball(points), beyond.max(1) / placement.to_metres.scale)
+        return np.maximum(space(points), beyond.max(1) / placement.to_metres.scale)
 
     return distance
 

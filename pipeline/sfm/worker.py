@@ -36,7 +36,7 @@ HOPELESS = 0.5  # of all matches contradicting the poses: no focal length fixes 
 # with its own focal length, it was up to 1.05.
 ZOOM = 1.12
 # Degrees up to which axes are parallel, exactly and nearly: focal length and depth can then be traded for each other.
-PARALLEL, NEARLY = 0.3, 5.0
+PARALLEL, NEARLY = 1.0, 5.0
 ABOUT = 1.03  # ratio of two models' unexplained matches up to which the one with fewer cameras is chosen
 # Number of a photo's largest features for finding similar photos; how much nearer than the next a match has to be; and
 # the matches above which photos may show the same.

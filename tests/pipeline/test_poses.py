@@ -618,7 +618,7 @@ def test_what_is_drawn_over_the_photos_is_reported():
 
 
 @pytest.mark.parametrize(
-    ("tilt", "focal", "held"), [(0.0, 600.0, True), (2.0, 600.0, False), (2.0, 3000.0, True), (20.0, 3000.0, False)]
+    ("tilt", "focal", "held"), [(0.9, 600.0, True), (4.0, 600.0, False), (4.0, 3000.0, True), (20.0, 3000.0, False)]
 )
 def test_cameras_that_look_exactly_one_way_have_no_focal_length_of_their_own(tilt, focal, held):
     views = result(10, 10, focal=focal, span=0.0)["views"]
