@@ -152,12 +152,12 @@ class Stage:
 
 
 STAGES = {
-    "photos": Stage(do_photos, "photos", version=4),
-    "poses": Stage(do_poses, "poses", version=7),
+    "photos": Stage(do_photos, "photos", version=5),
+    "poses": Stage(do_poses, "poses", version=8),
     "distill": Stage(do_distill, "distill", version=13),
-    "mesh": Stage(do_mesh, "mesh", version=15),
+    "mesh": Stage(do_mesh, "mesh", version=16),
     "fit": Stage(do_fit, "assets", version=3),
-    "scene": Stage(do_scene, "scene", version=6),
+    "scene": Stage(do_scene, "scene", version=7),
 }
 
 

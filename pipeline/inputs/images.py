@@ -198,6 +198,24 @@ def brightness(picture: ReadPhoto) -> float:
     return float(np.quantile(inside, 0.99)) if inside.size else 1.0
 
 
+def is_panorama(path: Path) -> bool:
+    """Whether a photo shows all directions in one picture of 2:1: it says so, or its sides join and its top and bottom,
+    each a single direction, have one colour."""
+    try:
+        width, height = stored_size(path)
+        if abs(width / height - 2) > 0.01:
+            return False
+        with open(path, "rb") as file:
+            if b"equirectangular" in file.read(1 << 16):  # in its XMP
+                return True
+        small = np.asarray(decoded(path, 512)[0].convert("RGB").resize((512, 256), Image.Resampling.BOX), float)
+    except (OSError, SdfsimError, Image.DecompressionBombError):  # what is wrong with it is named when it is read
+        return False
+    joins = np.abs(small[:, 0] - small[:, -1]).mean() < 0.35 * np.abs(small - np.roll(small, 128, 1)).mean()
+    top, middle, bottom = (small[row].std(0).mean() for row in (0, 128, -1))
+    return bool(joins and max(top, bottom) < 0.35 * middle)
+
+
 def whiteness(picture: ReadPhoto) -> float:
     """Share of a photo, or of its object if it has a mask, that is white."""
     white = picture.pixels.min(-1) >= WHITE

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from pipeline.cameras import View, save_views
 from pipeline.inputs.bit_depth import common_white
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
-from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, read_photo, sharpness, whiteness
+from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, is_panorama, read_photo, sharpness, whiteness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
@@ -25,6 +25,10 @@ LONG_SIDE = 1600  # px; later steps reduce the photos to the size that they need
 KNOWN_CAMERAS = "known_cameras.json"  # cameras that came with the photos
 BLOWN = (0.5, 0.3, 0.9)  # share of a photo that is white, and by how much more than in the median photo; or in any case
 NAMED = 8  # photos named one by one in a note
+PANORAMAS = (
+    "these are not read: cut each into flat views of 60 to 90 degrees (as `ffmpeg -vf v360=e:flat` does), all with the "
+    "same width, and give those; or take ordinary photos"
+)
 # What makes a photo useless, and what helps.
 FAULTS = {
     "too dark": "take them again with more light", "blown out": "take them again with less light or exposure",
@@ -68,6 +72,10 @@ def prepare_photos(
     """
     out = Path(out)
     with opened(given, out / ".capture") as source:
+        round_about = [path for path in source.photos if is_panorama(path)] if not source.frames else []
+        if len(round_about) > len(source.photos) / 2:
+            message = f"{given}: {len(round_about)} photos are panoramas of 360 degrees (first: {round_about[0].name})"
+            raise SdfsimError(message, PANORAMAS)
         (out / "images").mkdir(parents=True, exist_ok=True)
         photos: list[Photo] = []
         views: list[View] = []

@@ -24,6 +24,8 @@ MOST_EXCESS, FEW_ASTRAY = 2.0, 0.1
 GOOD_PHOTOS, WIDE_STEP = 20, 18.0
 HALF = 0.5  # share of a photo that is white: from here on it may be what is wrong with it
 STILL = 0.5  # of a pair's matches not moving: the background is static
+# Px by which all photos are off alike at one place of the picture, and its share of all error: a lens of another kind.
+OTHER_LENS = (0.3, 0.3)
 ONE_SIDE = 150.0  # degrees of viewpoints around the scene: below this it is seen from one side only
 COMPONENT_NAMED = 3
 
@@ -99,8 +101,8 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
             warnings.append(f"{len(left_out)} of {len(photos)} photos were left out")
         if result.get("held"):
             warnings.append("the photos all look exactly the same way, from which no focal length follows: it is "
-                            f"{'that of EXIF' if any(p.focal for p in photos) else 'a guess'}, and depths are only "
-                            "as right as that: tilt the camera in some photos")  # fmt: skip
+                            f"{'that of EXIF' if any(p.focal for p in photos) else 'a guess'}, and depths are "
+                            "only as right as that: tilt the camera in some photos")  # fmt: skip
         astray = [] if known else photos_astray(result)
         check_focal(views, photos, bool(astray), failures, warnings)
         check_errors(result, astray, failures, warnings)
@@ -118,7 +120,7 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         "cameras": [len(names) for names in result.get("cameras", [])],
         "contradictions": round(contradicting(against), 4), "excess": round(excess(against), 3),
         "components": [len(c) for c in found.components],
-        "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
+        "other_lens": other_lens(result), "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
         "causes": diagnose(result, photos, views, found, failures), "failures": failures, "warnings": warnings,
     }  # fmt: skip
 
@@ -138,6 +140,12 @@ def check_focal(
         wrong = "poses" if doubtful else "EXIF"
         message = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
         (failures if doubtful else warnings).append(message)
+
+
+def other_lens(result: dict) -> bool:
+    """Whether the residuals say that the lens is of another kind than the one that was fitted."""
+    off, share = result.get("lens", (0.0, 0.0))
+    return off > OTHER_LENS[0] and share > OTHER_LENS[1]
 
 
 def photos_astray(result: dict) -> list[str]:
@@ -174,6 +182,8 @@ def check_errors(result: dict, astray: list[str], failures: list[str], warnings:
     against, posed = contradicting(agreement), len(result["views"])
     if error > MAX_MEAN_ERROR:
         failures.append(f"mean reprojection error of {error:.1f} px (at most {MAX_MEAN_ERROR})")
+    if other_lens(result):
+        failures.append(f"at the same place of the picture all photos are off by the same {result['lens'][0]:.1f} px")
     if points < FEW_POINTS:
         failures.append(f"only {points} points in common")
     if against > MANY_CONTRADICTIONS:
@@ -227,7 +237,11 @@ def diagnose(result: dict, photos: list[Photo], views: list[View], found: Findin
     linked = found.components[0] if found.components else []
     posed = {view["name"] for view in result["views"]}
     unposed = len(linked) >= 6 and len(posed & set(linked)) < len(linked) / 2  # of photos that match others well
-    if found.textureless > 0.5:
+    if other_lens(result):
+        causes.append("the lens is a fisheye or bends in another way that is not found from photos alone: give its "
+                      "calibration, as a transforms.json with camera_model OPENCV_FISHEYE or OPENCV or as a COLMAP "
+                      "model, or photos that are straightened")  # fmt: skip
+    elif found.textureless > 0.5:
         faults = Counter(p.fault or ("mostly white, blown out or blank" if p.white > HALF else "") for p in photos)
         fault, times = faults.most_common(1)[0]
         why = "blurred, dark, blown out, or without texture, like a blank wall"
@@ -261,6 +275,8 @@ def failure_hint(checks: dict) -> str:
     """Advice, from the most common reason."""
     if checks.get("known_cameras"):
         return "check which photo belongs to which camera, and its axes; or give the folder of photos alone"
+    if checks["other_lens"]:
+        return "switch to the main camera of the phone (not the wide one), or calibrate the lens"
     kinds = [entry["kind"] for entry in checks["left_out"]]
     if kinds.count("features") > kinds.count("overlap"):
         blown = sum("blown out" in entry["why"] and entry["kind"] == "features" for entry in checks["left_out"])

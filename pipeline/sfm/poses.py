@@ -52,7 +52,9 @@ WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose ph
 
 def hopeful(settings: dict, first: dict) -> bool:
     """Whether an attempt is worth its time after the first one's failed checks. More features do not help for photos
-    from one spot, or with a static background."""
+    from one spot, with a static background, or of another lens."""
+    if first["other_lens"]:
+        return False
     still = first["still_pairs"] > 0.5
     return still if settings["moving_only"] else first["turn_only_pairs"] <= 0.9 and not still
 

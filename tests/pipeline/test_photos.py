@@ -463,3 +463,29 @@ def test_a_white_background_is_no_fault(tmp_path):
     photos, notes = prepare_photos(tmp_path / "in", tmp_path)
     assert [photo.fault for photo in photos] == [""] * 3 and notes == []
     assert photos[0].white == pytest.approx(2 / 3, abs=1e-3)
+
+
+def round_about(width: int = 800) -> np.ndarray:
+    """A picture of all directions, of 2:1: waves over the sphere."""
+    row, column = np.mgrid[0 : width // 2, 0:width] + 0.5
+    turn, up = 2 * np.pi * column / width, np.pi * (0.5 - row / (width // 2))
+    x, y, z = np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)
+    waves = [np.sin(7 * x + 3 * z) + np.cos(6 * y), np.sin(9 * y - 4 * x), np.cos(8 * x * y + 5 * z)]
+    return (127 + 60 * np.stack(waves, -1)).clip(0, 255).astype(np.uint8)
+
+
+def test_panoramas_are_refused_at_once(tmp_path):
+    for k in range(4):
+        Image.fromarray(np.roll(round_about(), 100 * k, 1)).save(tmp_path / f"{k}.jpg")
+    with pytest.raises(SdfsimError, match=r"4 photos are panoramas of 360 degrees \(first: 0\.jpg\)") as caught:
+        prepare_photos(tmp_path, tmp_path / "out")
+    assert "flat views" in caught.value.hint and not (tmp_path / "out").exists()
+
+
+def test_wide_photos_are_no_panoramas(tmp_path):
+    """Of 2:1, but their sides do not join; one has a sky and a floor of one colour each."""
+    photos = [np.roll(round_about(), 100 * k, 1)[:, 200 - k : 600] for k in range(3)]
+    for k, pixels in enumerate(photos):
+        tall = pixels[100:300] if k else np.concatenate([np.full((100, 400, 3), 200, np.uint8), pixels[150:250, :400]])
+        Image.fromarray(tall[:200, :400]).save(tmp_path / f"{k}.png")
+    assert len(prepare_photos(tmp_path, tmp_path / "out")[0]) == 3

@@ -643,3 +643,31 @@ def test_blown_out_photos_are_neither_blurred_nor_of_something_else():
     verdict = check(result(10, 0, features=30, matches=0), white)
     assert "10 photos are mostly white" in verdict["causes"][0] and "less light" in failure_hint(verdict)
     assert "80% of it is white" in verdict["left_out"][0]["why"]
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.8])
+def test_what_the_lens_leaves_is_what_all_photos_have_alike(bend):
+    """Points are off by 0.8 sin(2 pi x / width) px at each place, 0.8 / sqrt(2) RMS, over noise of 0.5 px in x and y."""
+    import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 12, 900
+    pycolmap.set_random_seed(0)
+    model, rng = pycolmap.synthesize_dataset(options), np.random.default_rng(0)
+    for image in model.images.values():
+        width = model.cameras[image.camera_id].width
+        for point in image.points2D:
+            point.xy = point.xy + rng.normal(0, 0.5, 2) + [bend * np.sin(2 * np.pi * point.xy[0] / width), 0]
+    off, share = worker.lens_left(model)
+    assert off == pytest.approx(bend / 2**0.5, abs=0.08)
+    assert share == pytest.approx(off / np.hypot(off, 0.5 * 2**0.5), abs=0.05)
+
+
+def test_a_lens_of_another_kind_is_refused_and_named(monkeypatch, tmp_path):
+    """All photos have a pose, the error is below 2 px, and no pair contradicts: yet all are off alike."""
+    fisheye = {**result(10, 10, error=1.3), "lens": [0.55, 0.42]}
+    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": fisheye})
+    assert tried == ["ordinary"]
+    assert "all photos are off by the same 0.6 px" in checks["error"] and "the lens is a fisheye" in checks["error"]
+    for usual in ([0.55, 0.2], [0.2, 0.5]):
+        assert check({**result(10, 10), "lens": usual}, PHOTOS)["failures"] == []
