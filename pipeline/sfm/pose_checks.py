@@ -100,9 +100,9 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         if left_out:
             warnings.append(f"{len(left_out)} of {len(photos)} photos were left out")
         if result.get("held"):
+            source = "that of EXIF" if any(p.focal for p in photos) else "a guess"
             warnings.append("the photos all look exactly the same way, from which no focal length follows: it is "
-                            f"{'that of EXIF' if any(p.focal for p in photos) else 'a guess'}, and depths are "
-                            "only as right as that: tilt the camera in some photos")  # fmt: skip
+                            f"{source}, and depths are only as right as that: tilt the camera in some")  # fmt: skip
         astray = [] if known else photos_astray(result)
         check_focal(views, photos, bool(astray), failures, warnings)
         check_errors(result, astray, failures, warnings)
@@ -120,7 +120,8 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, kn
         "cameras": [len(names) for names in result.get("cameras", [])],
         "contradictions": round(contradicting(against), 4), "excess": round(excess(against), 3),
         "components": [len(c) for c in found.components],
-        "other_lens": other_lens(result), "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
+        "other_lens": other_lens(result),
+        "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
         "causes": diagnose(result, photos, views, found, failures), "failures": failures, "warnings": warnings,
     }  # fmt: skip
 

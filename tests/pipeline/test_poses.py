@@ -647,7 +647,7 @@ def test_blown_out_photos_are_neither_blurred_nor_of_something_else():
 
 @pytest.mark.parametrize("bend", [0.0, 0.8])
 def test_what_the_lens_leaves_is_what_all_photos_have_alike(bend):
-    """Points are off by 0.8 sin(2 pi x / width) px at each place, 0.8 / sqrt(2) RMS, over noise of 0.5 px in x and y."""
+    """Points are off by 0.8 sin(2 pi x / width) px at each place, 0.8 / sqrt(2) RMS; noise is 0.5 px in x and y."""
     import pycolmap
 
     options = pycolmap.SyntheticDatasetOptions()
