@@ -11,8 +11,10 @@ from sdfsim.base.console import plain
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, read_json, write_json
 
-# People hold cameras level to about this; if photos are turned, or all from one place, almost nothing is known.
-CAREFUL, UNKNOWN = 2.0, 30.0  # degrees
+# People hold cameras level to about this; if all look one way, straight down or at a wall, nothing is known.
+CAREFUL, UNKNOWN = 2.0, 90.0  # degrees
+# Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
+FOV_RANGE = (18.0, 110.0)
 
 
 @dataclass(frozen=True)
@@ -196,33 +198,45 @@ def camera_up(views: Sequence[View]) -> Up:
     """Up from the cameras alone: people hold cameras level, so it is the direction with the least spread of their right
     axes; if these do not span a plane, the mean image up."""
     right = np.array([v.rotation[0] for v in views])
-    mean = -np.mean([v.rotation[1] for v in views], axis=0)
-    mean /= np.linalg.norm(mean) + 1e-12
+    mean, view = -np.mean([v.rotation[1] for v in views], axis=0), np.mean([v.rotation[2] for v in views], axis=0)
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
-    up = vectors[:, 0] * np.sign(vectors[:, 0] @ mean or 1.0)
-    if values[1] < 0.05 or values[0] > 0.3 * values[1] or up @ mean < 0.5:
-        return Up(mean, "cameras", UNKNOWN)
+    # Cameras that look straight down have no image up, and those that look ahead no view down.
+    side = vectors[:, 0] @ (mean - view)
+    if np.linalg.norm(mean) < 0.5 and np.linalg.norm(view) > 0.9:  # nobody turns a camera about before a wall
+        return Up(-view / np.linalg.norm(view), "cameras", 3 * CAREFUL)
+    if values[1] < 0.05 or values[0] > 0.3 * values[1] or abs(side) < 0.3:
+        return Up(mean / (np.linalg.norm(mean) + 1e-12), "cameras", UNKNOWN)
+    up = vectors[:, 0] * np.sign(side)
     # The less the right axes fan out, the more a roll of each camera tilts the result.
     return Up(up, "cameras", float(np.hypot(CAREFUL, np.degrees(np.sqrt(max(values[0], 0) / values[1])))))
 
 
-def focus(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Point [3] that the cameras look at, and unit directions [N, 3] from them to it."""
+def focus(views: Sequence[View], middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Point [3] that the cameras look at, and unit directions [N, 3] from them to it. Where their axes are parallel
+    they cross nowhere: then the `middle` [3] of what they see decides."""
     centers = np.array([v.center for v in views])
-    point = nearest_to_axes(centers, np.array([v.rotation[2] for v in views]))
+    point = nearest_to_axes(centers, np.array([v.rotation[2] for v in views]), middle)
     rays = point - centers
     return point, rays / (np.linalg.norm(rays, axis=1, keepdims=True) + 1e-12)
 
 
-def spread_angle(views: list[View]) -> float:
-    """Largest angle (degrees) between viewing rays to the centre of what the cameras look at."""
-    rays = focus(views)[1]
-    return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+def triangulation_angle(views: Sequence[View], sparse: Sparse) -> float:
+    """Median over the points of the largest angle (degrees) between two lines on which photos see a point; 0 without
+    points."""
+    if not len(sparse.point_of):
+        return 0.0
+    rays = np.array([view.center for view in views])[sparse.view_of] - sparse.xyz[sparse.point_of]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True) + 1e-12
+    order = np.argsort(sparse.point_of, kind="stable")
+    groups = np.split(rays[order], np.flatnonzero(np.diff(sparse.point_of[order])) + 1)
+    least = np.median([(group @ group.T).min() for group in groups])
+    return float(np.degrees(np.arccos(np.clip(least, -1, 1))))
 
 
-def view_span(views: list[View]) -> float:
-    """Degrees around the scene's upright axis that the cameras cover: 360 minus the largest gap."""
-    rays, up = focus(views)[1], camera_up(views).direction
+def view_span(views: list[View], middle: np.ndarray) -> float:
+    """Degrees around the scene's upright axis that the cameras cover: 360 minus the largest gap. The `middle` [3] is
+    that of what they see."""
+    rays, up = focus(views, middle)[1], camera_up(views).direction
     flat = rays - np.outer(rays @ up, up)
     level = np.linalg.norm(flat, axis=1) > 0.1  # a photo from straight above has no side
     if level.sum() < 2:

@@ -49,7 +49,7 @@ def options(*names: str, kept: bool = False) -> Callable[[Callable[..., None]], 
 
 
 @command
-@options("preset", "size", "distance", "crop", "body", "drop", "material", "sdf")
+@options("preset", "size", "distance", "up", "crop", "body", "drop", "material", "sdf")
 def reconstruct(
     session: Session,
     photos: Photos,
@@ -147,7 +147,7 @@ def distill(
 
 
 @command
-@options("preset", "size", "distance", "crop", "body", kept=True)
+@options("preset", "size", "distance", "up", "crop", "body", kept=True)
 def mesh(
     session: Session,
     folder: Annotated[Path, typer.Argument(help="Folder that distill has written.", show_default=False)],

@@ -63,6 +63,12 @@ class Options(BaseModel):
         None, ["mesh"], "Corners of the box to keep, metres, the lower one first.",
         kind=tuple[str, str] | None, metavar="X,Y,Z X,Y,Z",
     )  # fmt: skip
+    up: str | None = option(
+        None, ["mesh"],
+        "What is up: PHOTO:X,Y on a level face; an axis, such as z or -y, of the cameras that were given or else of "
+        "mesh.ply; or view, if all photos look straight down.",
+        metavar="PLACE|AXIS|view",
+    )  # fmt: skip
     # by body, places PHOTO:X,Y that show it
     body: dict[str, list[str]] = option(
         dict, ["mesh"],
@@ -176,6 +182,7 @@ class OptionKeys(TypedDict, total=False):
     sdf: Literal["grid", "mlp"] | None
     distance: tuple[str, str, float] | None
     crop: Sequence[float] | None
+    up: str | None
     body: Mapping[str, Sequence[str]]
     drop: Literal["box", "ball", "none"]
     material: Mapping[str, str]

@@ -158,12 +158,6 @@ def write_scene(
         solid, shown = meshes_of(mesh_folder, SCENERY)
         everything = {SCENERY: solid} | solids
     notes: list[str] = []
-    slab = None
-    if drop != "none":
-        whole = joined(list(everything.values()))
-        slab = choose_slab(whole if shown is None else shown, whole)
-        if slab.slope > LEVEL:
-            notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
     origins = {name: origin_of(mesh) for name, mesh in solids.items()}
     closed = {name: replace(mesh, vertices=mesh.vertices - origins.get(name, 0)) for name, mesh in everything.items()}
     materials = materials or {}
@@ -175,13 +169,24 @@ def write_scene(
             message = "joint: the part that moves could not be cut off the rest as a body of its own"
             raise SdfsimError(f"{message}; {held.line()}", "photograph it from more sides", exit_code=EXIT_QUALITY)
         holder = holder_of(solids[PART], {name: mesh for name, mesh in everything.items() if name != PART})
-    text_of = partial(scene_text, placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials,
+    text_of = partial(scene_text, placement, origins, scenery=parts["scenery"], drop=drop, materials=materials,
                       seed=seed, floor=floor, held=held, holder=holder)  # fmt: skip
-    text = text_of()
+    text, slab = text_of(None), None
     scene = load_scene(scene_file, text=text, allow_outside=True)
     if moved := cleared(scene, closed):
-        text = text_of(moved=moved)
-        notes += [moved_line(name, one, LAYER * parts["cell"]) for name, one in moved.items()]
+        text = text_of(None, moved=moved)
+    if drop != "none":  # onto bodies where they start
+        shifts = {name: one.shift for name, one in moved.items()}
+        whole = joined([replace(m, vertices=m.vertices + shifts.get(name, 0)) for name, m in everything.items()])
+        slab = choose_slab(whole if shown is None else shown, whole)
+        if slab.slope > LEVEL:
+            notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
+        text = text_of(slab, moved=moved)
+        scene = load_scene(scene_file, text=text, allow_outside=True)
+        if (dropped := cleared(scene, closed).get(drop)) is not None:
+            moved[drop] = dropped
+            text = text_of(slab, moved=moved)
+    notes += [moved_line(name, one, LAYER * parts["cell"]) for name, one in moved.items()]
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:

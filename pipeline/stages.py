@@ -75,13 +75,15 @@ def do_photos(project: Project, work: Path) -> dict:
 
 def do_poses(project: Project, work: Path) -> dict:
     from pipeline.inputs.photos import load_photos
-    from pipeline.mesh.placement import check_bodies, check_distance
+    from pipeline.mesh.placement import check_bodies, check_distance, check_up
     from pipeline.sfm.poses import solve
 
     folder = project.place("photos")
     photos = load_photos(folder)
     if project.options.distance is not None:  # before minutes of poses and training
         check_distance(project.options.distance, photos)
+    if project.options.up is not None:
+        check_up(project.options.up, photos)
     check_bodies(project.options.body, photos)
     return solve(photos, folder, work, seed=project.options.seed, on_progress=project.progress_of("poses"))
 
@@ -151,12 +153,12 @@ class Stage:
 
 
 STAGES = {
-    "photos": Stage(do_photos, "photos", version=4),
-    "poses": Stage(do_poses, "poses", version=7),
+    "photos": Stage(do_photos, "photos", version=5),
+    "poses": Stage(do_poses, "poses", version=8),
     "distill": Stage(do_distill, "distill", version=13),
-    "mesh": Stage(do_mesh, "mesh", version=15),
+    "mesh": Stage(do_mesh, "mesh", version=16),
     "fit": Stage(do_fit, "assets", version=3),
-    "scene": Stage(do_scene, "scene", version=6),
+    "scene": Stage(do_scene, "scene", version=7),
 }
 
 

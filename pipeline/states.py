@@ -39,7 +39,7 @@ from sdfsim.base.files import write_json
 from sdfsim.base.parallel import StageProgress
 
 FIRST, SECOND = "first", "second"
-WITHOUT = ("crop", "body")  # options that refer to one state's meshes
+WITHOUT = ("crop", "body", "up")  # options that refer to one state's meshes
 
 
 def reconstruct(

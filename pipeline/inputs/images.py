@@ -23,6 +23,7 @@ BACKDROP = 0.5
 BLURRED = 0.1
 BLOCKS = 12  # per side, fewer for small photos
 DARK = 0.1  # of white: a hundredth of a photo has to reach this
+WHITE = 250  # of 255: brighter pixels show nothing
 
 
 @dataclass(frozen=True)
@@ -195,6 +196,31 @@ def brightness(picture: ReadPhoto) -> float:
     grey = picture.pixels.astype(np.float32).mean(-1) / 255
     inside = grey if picture.mask is None else grey[picture.mask >= 128]
     return float(np.quantile(inside, 0.99)) if inside.size else 1.0
+
+
+def is_panorama(path: Path) -> bool:
+    """Whether a photo shows all directions in one picture of 2:1: it says so, or its sides join and its top and bottom,
+    each a single direction, have one colour."""
+    try:
+        width, height = stored_size(path)
+        if abs(width / height - 2) > 0.01:
+            return False
+        with open(path, "rb") as file:
+            if b"equirectangular" in file.read(1 << 16):  # in its XMP
+                return True
+        small = np.asarray(decoded(path, 512)[0].convert("RGB").resize((512, 256), Image.Resampling.BOX), float)
+    except (OSError, SdfsimError, Image.DecompressionBombError):  # what is wrong with it is named when it is read
+        return False
+    joins = np.abs(small[:, 0] - small[:, -1]).mean() < 0.35 * np.abs(small - np.roll(small, 128, 1)).mean()
+    top, middle, bottom = (small[row].std(0).mean() for row in (0, 128, -1))
+    return bool(joins and max(top, bottom) < 0.35 * middle)
+
+
+def whiteness(picture: ReadPhoto) -> float:
+    """Share of a photo, or of its object if it has a mask, that is white."""
+    white = picture.pixels.min(-1) >= WHITE
+    inside = white if picture.mask is None else white[picture.mask >= 128]
+    return float(inside.mean()) if inside.size else 0.0
 
 
 def block_means(values: np.ndarray, blocks: int) -> np.ndarray:

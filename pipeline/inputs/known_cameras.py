@@ -29,6 +29,18 @@ MODELS = {
 }  # fmt: skip
 PARAMETERS = {name: parameters.split() for name, parameters in MODELS.values() if parameters}
 STRAIGHTEN = f"allowed: {', '.join(PARAMETERS)}; `colmap image_undistorter` makes photos of any other straight"
+FORMS = "cameras are a transforms.json (NeRF, nerfstudio) or a COLMAP model; or give the folder of the photos alone"
+# What files of other programs have as keys, and in their first entry; and what to give instead.
+PROGRAMS: tuple[tuple[str, set[str], set[str], str], ...] = (
+    ("OpenMVG", {"sfm_data_version"}, set(), "write its model with openMVG_main_openMVG2Colmap"),
+    ("Meshroom (AliceVision)", {"views", "intrinsics"}, set(), "export its cameras to COLMAP"),
+    ("OpenSfM", set(), {"shots"}, "write its model with `opensfm export_colmap`"),
+    ("OpenSfM", set(), {"projection_type"}, "it has lenses but no poses: `opensfm export_colmap` writes both"),
+    ("3D Gaussian splatting", set(), {"img_name"}, "give the COLMAP model (sparse/0) that it was trained from"),
+    ("nerfstudio without cameras", {"transform", "scale"}, set(), "give the transforms.json of its input"),
+    ("Polycam", {"t_00"}, set(), "give the folder or the zip of the capture"),
+    ("sdfsim", {"views", "convention"}, set(), "give what it was made from"),
+)
 SQUARE = 1e-3  # pixels within this share of a square count as square
 # OpenCV counts pixel centres from 0.
 CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -118,13 +130,17 @@ def read_cameras(path: Path) -> list[KnownCamera]:
     read = read_model if path.is_dir() else read_transforms
     try:
         return sorted(read(path), key=lambda camera: camera.name)
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+    except KeyError as error:
+        raise SdfsimError(f"{path}: cannot be read as cameras: it has no {error}", FORMS) from error
+    except (OSError, ValueError, IndexError, TypeError, AttributeError, struct.error) as error:
         raise SdfsimError(f"{path}: cannot be read as cameras: {error!r}", "write it again") from error
 
 
 def read_transforms(path: Path) -> list[KnownCamera]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
     about = json.loads(path.read_bytes())  # Bytes: json handles a byte order mark.
+    if not isinstance(about, dict) or "frames" not in about:
+        raise _foreign(path, about)
     found = []
     for frame in about["frames"]:
         values = {**about, **frame}
@@ -153,6 +169,17 @@ def read_transforms(path: Path) -> list[KnownCamera]:
         depth = DepthFile(below(path.parent, name), unit and float(unit)) if name else None
         found.append(posed(str(frame["file_path"]), (width, height), lens, pose, frame.get("mask_path"), depth))
     return found
+
+
+def _foreign(path: Path, about: Any) -> SdfsimError:
+    """The error for a JSON file of another kind: names the program that writes such files, and what to give."""
+    first = next(iter(about.values() if isinstance(about, dict) else about), None) if about else None
+    keys, inner = (set(some) if isinstance(some, dict) else set() for some in (about, first))
+    for program, there, below, instead in PROGRAMS:
+        if there <= keys and below <= inner:
+            return SdfsimError(f"{path}: is a file of {program}, which is not read", f"{instead}; {FORMS}")
+    names = ", ".join(sorted(keys or inner)[:5])
+    return SdfsimError(f"{path}: not a transforms.json: it has no `frames`, but {names or 'nothing'}", FORMS)
 
 
 def _pose(matrix: Any, where: str) -> np.ndarray:

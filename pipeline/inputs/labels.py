@@ -13,6 +13,7 @@ from sdfsim.base.files import read_json, visible
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FOLDER, NAMES = "labels", "names.json"  # written by the photos stage
+MASKS = ("masks", "mask")  # folders
 UNKNOWN = 255  # a pixel without information
 
 
@@ -59,8 +60,10 @@ def find_masks(photos: list[Path]) -> dict[Path, Path]:
     """The mask file of each photo that has one in a folder `masks` in or next to the photo's folder; white is the
     object."""
     masks: dict[Path, Path] = {}
-    for root in _roots(photos):
-        masks = {**_of_photos(root, root / "masks", photos)[0], **masks}
+    own = {photo.parent for photo in photos}
+    for folder in (root / name for root in _roots(photos) for name in MASKS):
+        if folder not in own:
+            masks = {**_of_photos(folder.parent, folder, photos)[0], **masks}
     return masks
 
 
@@ -72,7 +75,7 @@ def find_labels(photos: list[Path]) -> Labels:
     images: dict[Path, Path] = {}
     notes: list[str] = []
     for root in _roots(photos):
-        inside = visible(root / "masks") if (root / "masks").is_dir() else []
+        inside = [path for name in MASKS if (root / name).is_dir() for path in visible(root / name)]
         for folder in sorted(path for path in (root / FOLDER, *inside) if path.is_dir()):
             if folder in [photo.parent for photo in photos]:
                 continue

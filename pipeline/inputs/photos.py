@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from pipeline.cameras import View, save_views
 from pipeline.inputs.bit_depth import common_white
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
-from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, read_photo, sharpness
+from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, is_panorama, read_photo, sharpness, whiteness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
@@ -23,7 +23,17 @@ from sdfsim.base.parallel import Progress, silent
 
 LONG_SIDE = 1600  # px; later steps reduce the photos to the size that they need
 KNOWN_CAMERAS = "known_cameras.json"  # cameras that came with the photos
+BLOWN = (0.5, 0.3, 0.9)  # share of a photo that is white, and by how much more than in the median photo; or in any case
 NAMED = 8  # photos named one by one in a note
+PANORAMAS = (
+    "these are not read: cut each into flat views of 60 to 90 degrees (as `ffmpeg -vf v360=e:flat` does), all with the "
+    "same width, and give those; or take ordinary photos"
+)
+# What makes a photo useless, and what helps.
+FAULTS = {
+    "too dark": "take them again with more light", "blown out": "take them again with less light or exposure",
+    "blurred": "take them again",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -41,8 +51,9 @@ class Photo:
     camera: str  # make and model from EXIF, empty where unknown
     mask: bool  # whether a mask came with it, as alpha or as a file
     sharpness: float  # see `sharpness`; 0.2 to 0.6 for photos in focus
-    fault: str = ""  # "too dark", "blurred" or nothing
+    fault: str = ""  # "too dark", "blown out", "blurred" or nothing
     depth: bool = False  # whether depth came with it
+    white: float = 0.0  # share of it that is white
 
     def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
         """Pixels [P, 2] of the prepared photo, with camera `view`, from those of the user's photo."""
@@ -61,6 +72,10 @@ def prepare_photos(
     """
     out = Path(out)
     with opened(given, out / ".capture") as source:
+        round_about = [path for path in source.photos if is_panorama(path)] if not source.frames else []
+        if len(round_about) > len(source.photos) / 2:
+            message = f"{given}: {len(round_about)} photos are panoramas of 360 degrees (first: {round_about[0].name})"
+            raise SdfsimError(message, PANORAMAS)
         (out / "images").mkdir(parents=True, exist_ok=True)
         photos: list[Photo] = []
         views: list[View] = []
@@ -85,12 +100,16 @@ def prepare_photos(
             photos.append(
                 Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
                       picture.mask is not None, sharp, "too dark" if brightness(picture) < DARK else "",
-                      bool(known and known.depth))
+                      bool(known and known.depth), round(whiteness(picture), 4))
             )  # fmt: skip
             on_progress(fraction, f"{len(photos)} photos")
         # Relative to the set's typical value: if all photos are blurred alike, the scene may be the cause.
         least = max(BLURRED, 0.35 * float(np.quantile([p.sharpness for p in photos], 0.75)))
-        photos = [replace(p, fault=p.fault or ("blurred" if p.sharpness < least else "")) for p in photos]
+        usual = float(np.median([p.white for p in photos]))  # as before a white background
+        for k, p in enumerate(photos):
+            blown = p.white > BLOWN[2] or p.white > max(BLOWN[0], usual + BLOWN[1])
+            fault = p.fault or ("blown out" if blown else "blurred" if p.sharpness < least else "")
+            photos[k] = replace(p, fault=fault)
         if views:
             save_views(views, out / KNOWN_CAMERAS)
         if source.capture:
@@ -159,7 +178,7 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
     if masked < len(photos) and (masked or mask_files):
         notes.append(f"masks are used only if every photo has one: {mask_files} mask files are ignored, and what is "
                      f"transparent in {masked} photos is grey")  # fmt: skip
-    for fault, again in (("too dark", "take them again with more light"), ("blurred", "take them again")):
+    for fault, again in FAULTS.items():
         names = [p.source for p in photos if p.fault == fault]
         if names:
             named = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")

@@ -1,7 +1,8 @@
 """The user's input: a folder of photos, a video, or photos with known cameras."""
 
 import os
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 
@@ -14,9 +15,18 @@ from sdfsim.base.files import visible
 MIN_PHOTOS = 3
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".hif", ".avif"}
 READABLE = "photos are JPEG, PNG, TIFF, HEIC, AVIF, WebP or BMP; give a video itself to use it"
+INSIDE = ("images", "image", "rgb", "color")  # folders of photos below the one that is given
+# Words in the names of pictures that are no photos but belong to some, and what they show.
+HELPERS = {
+    "depth": "depth", "disparity": "depth", "disp": "depth", "conf": "confidence", "confidence": "confidence",
+    "mask": "masks", "masks": "masks", "matte": "masks", "normal": "normals", "normals": "normals", "label": "labels",
+    "labels": "labels", "seg": "labels", "semantic": "labels", "segmentation": "labels", "thumb": "previews",
+    "thumbnail": "previews", "preview": "previews",
+}  # fmt: skip
 ABOVE = 3  # levels above a COLMAP model in which its photos may lie: the model may be colmap/sparse/0
 NAMED = 3  # folders with photos that an error names
-VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}
+VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}  # these are videos even if they cannot be decoded
+ASKED = 20  # files of a folder without photos that are tried as videos
 
 
 @dataclass(frozen=True)
@@ -65,10 +75,19 @@ def find_source(given: Path, *, unpacked: bool = False) -> Source:
     given = Path(given)
     if not given.exists():
         raise SdfsimError(f"{given}: no such folder", "give the folder that holds the photos, or a video")
-    if given.is_file() and given.suffix.lower() in VIDEOS:
-        return Source(video=given)
     if given.is_file() and given.suffix.lower() in ARCHIVES:
         return Source(archive=given)
+    if _is_video(given):
+        return Source(video=given)
+    if len(models := _models(given)) > 1:
+        sizes = {model: len(read_cameras(model)) for model in models}
+        given = max(models, key=lambda model: sizes[model])
+        each = ", ".join(f"{count} photos in {model.name}" for model, count in sizes.items())
+        note = f"{given.parent} holds {len(models)} models ({each}): the largest, {given.name}, is used"
+        source = _with_cameras(given, read_cameras(given))
+        return replace(source, notes=(note, *source.notes))
+    if models:
+        (given,) = models
     if given.suffix.lower() == ".json" or is_model(given):
         return _with_cameras(given, read_cameras(given))
     if given.is_file():
@@ -82,7 +101,8 @@ def find_source(given: Path, *, unpacked: bool = False) -> Source:
         (given,) = inside
     photos, notes = find_photos(given)
     labels = find_labels(photos)
-    return Source(tuple(photos), find_masks(photos), labels, notes=(*notes, *labels.notes))
+    masks = {**masks_beside(photos), **find_masks(photos)}
+    return Source(tuple(photos), masks, labels, notes=(*notes, *labels.notes))
 
 
 def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
@@ -93,7 +113,12 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
     notes = []
     if place != folder and (beside := _images(folder)):
         notes.append(f"{len(beside)} photos beside the folder {place.name} are not used (first: {beside[0].name})")
-    other = [p.name for p in _files(place) if p not in found and p.suffix != ".json"]
+    others = helpers(place)
+    for kind in sorted({what for what, _ in others.values()}):
+        some = [path for path, (what, _) in others.items() if what == kind]
+        used = "are used as such" if kind == "masks" else "are not used"
+        notes.append(f"{len(some)} pictures are {kind} of photos, by their names (first: {some[0].name}): they {used}")
+    other = [p.name for p in _files(place) if p not in found and p not in others and p.suffix != ".json"]
     if other:
         notes.append(f"{len(other)} files are not used (first: {other[0]}): {READABLE}")
     if len(found) < MIN_PHOTOS:
@@ -105,7 +130,7 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
             raise SdfsimError(f"{message}; below it are {some}{more}", "give the folder that holds the photos")
         if models := [place for level in levels(folder) for place in level if is_model(place)]:
             raise SdfsimError(f"{message}; {models[0]} holds cameras", "give that folder")
-        if films := [path for path in _files(folder) if path.suffix.lower() in VIDEOS]:
+        if films := [path for path in _files(folder)[:ASKED] if _is_video(path)]:
             told = f"{message}; it holds the video {films[0].name}"
             raise SdfsimError(told, f"give the video: sdfsim reconstruct {quote(str(films[0]))} -o ROOM")
         raise SdfsimError(message, notes[0] if notes else "take photos all around, each overlapping the one before")
@@ -113,10 +138,10 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def photos_in(folder: Path) -> list[Path]:
-    """The photo files of a folder in name order, or those of its subfolder `images`, next to which a few previews may
-    lie. Raises SdfsimError if the folder cannot be read."""
+    """The photo files of a folder in name order, or those of its subfolder `images` (see `INSIDE`), next to which a few
+    previews may lie. Raises SdfsimError if the folder cannot be read."""
     own = _images(folder)
-    inner = _images(folder / "images") if (folder / "images").is_dir() else []
+    inner = next((found for name in INSIDE if (folder / name).is_dir() and (found := _images(folder / name))), [])
 
     def size(photos: list[Path]) -> int:
         return sum(photo.stat().st_size for photo in photos)
@@ -127,7 +152,43 @@ def photos_in(folder: Path) -> list[Path]:
 
 
 def _images(folder: Path) -> list[Path]:
+    others = helpers(folder)
+    return [path for path in _pictures(folder) if path not in others]
+
+
+def _pictures(folder: Path) -> list[Path]:
     return [path for path in _files(folder) if path.suffix.lower() in SUFFIXES]
+
+
+def helpers(folder: Path) -> dict[Path, tuple[str, Path]]:
+    """The pictures of a folder that are no photos but belong to one, by their names: what they show, and the photo.
+    `depth_00007.png` belongs to `frame_00007.jpg`, `left_mask.png` to `left.png`."""
+    photos, others = {}, {}
+    for path in _pictures(folder):
+        words = re.findall(r"[^\W\d_]+|\d+", path.stem.lower())
+        kind = next((HELPERS[word] for word in words if word in HELPERS), None)
+        numbers = tuple(int(word) for word in words if word.isdecimal())
+        key = numbers or tuple(word for word in words if word not in HELPERS)
+        if kind is None:
+            photos[key] = path
+        else:
+            others[path] = kind, key
+    return {path: (kind, photos[key]) for path, (kind, key) in others.items() if key in photos}
+
+
+def masks_beside(photos: list[Path]) -> dict[Path, Path]:
+    """The masks that lie among the photos, by photo."""
+    found = [helpers(folder) for folder in dict.fromkeys(photo.parent for photo in photos)]
+    return {photo: path for each in found for path, (kind, photo) in each.items() if kind == "masks"}
+
+
+def _is_video(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    if not path.is_file() or suffix in SUFFIXES or suffix == ".json":
+        return False
+    from pipeline.inputs.video import is_film
+
+    return suffix in VIDEOS or is_film(path)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -144,6 +205,13 @@ def _with_photos(folder: Path) -> list[Path]:
         if found:
             return found
     return []
+
+
+def _models(given: Path) -> list[Path]:
+    """The numbered COLMAP models in a folder, or beside one, as COLMAP's mapper leaves them: one is of most photos."""
+    folder = given.parent if is_model(given) and given.name.isdecimal() else given
+    found = [place for place in folder.glob("[0-9]*") if place.name.isdecimal() and is_model(place)]
+    return [] if found and folder == given and photos_in(given) else sorted(found, key=lambda place: int(place.name))
 
 
 def is_model(folder: Path) -> bool:

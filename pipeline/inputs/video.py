@@ -1,7 +1,9 @@
 """A video -> its sharpest frames, spread evenly over the motion of the camera."""
 
+import itertools
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,26 +14,57 @@ from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 SMALL, MIDDLE = 256, 960  # px, longer side of the frames for measuring motion and sharpness
 STEP = 0.07  # of the picture's width: motion from one chosen frame to the next
 FEWEST, MOST = 24, 100
+STILLS = {"image2", "tty"}  # formats of the decoder
 LEAST_MOTION = 0.5  # picture widths in total: less is not a walk around an object
 # Without this the decoder prints messages about damaged files, past Python.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
-    """The frames of a video, upright RGB [H, W, 3] uint8, and their number per second. Raises SdfsimError if it is
-    unreadable."""
+    """The frames of a video, upright RGB [H, W, 3] uint8, and their number per second, from the first decoder that has
+    any: OpenCV's is faster, PyAV's knows more, such as AV1. Raises SdfsimError if the video is unreadable."""
+    for decoder in (_by_opencv, _by_pyav):
+        frames, rate = decoder(path)
+        if (first := next(frames, None)) is not None:
+            return itertools.chain([first], frames), rate
+    raise SdfsimError(f"{path}: cannot be decoded as a video", "convert it to MP4 (H.264)")
+
+
+def _by_opencv(path: Path) -> tuple[Iterator[np.ndarray], float]:
     import cv2
 
     video = cv2.VideoCapture(str(path))
-    if not video.isOpened():
-        raise SdfsimError(f"{path}: cannot be decoded as a video", "convert it to MP4 (H.264)")
-    rate = float(video.get(cv2.CAP_PROP_FPS)) or 30.0
 
     def read() -> Iterator[np.ndarray]:
         while (found := video.read())[0]:
             yield found[1][..., ::-1]
 
-    return read(), rate
+    return read(), float(video.get(cv2.CAP_PROP_FPS)) or 30.0
+
+
+def _by_pyav(path: Path) -> tuple[Iterator[np.ndarray], float]:
+    import av
+
+    def read() -> Iterator[np.ndarray]:
+        with suppress(av.FFmpegError), av.open(str(path)) as film:  # a damaged end ends the film
+            for frame in film.decode(video=0):
+                yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
+
+    with suppress(av.FFmpegError, IndexError), av.open(str(path)) as film:
+        return read(), float(film.streams.video[0].average_rate or 30.0)
+    return iter(()), 30.0
+
+
+def is_film(path: Path) -> bool:
+    """Whether a file holds moving pictures, whatever its name; text and single pictures, which the decoder would show
+    as well, do not count."""
+    import av
+
+    with suppress(av.FFmpegError), av.open(str(path)) as film:
+        still = av.stream.Disposition.attached_pic  # of a sound file
+        moving = [stream for stream in film.streams.video if not stream.disposition & still]
+        return bool(moving) and film.format.name not in STILLS and not film.format.name.endswith("_pipe")
+    return False
 
 
 def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:

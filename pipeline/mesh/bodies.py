@@ -55,6 +55,7 @@ SMALLEST_PLANE = 0.005  # of the visible surface: less is a flat place on someth
 LARGEST_FOOT = 0.5  # largest share of its plane that a body covers; more is relief
 CARRIED = 0.3  # share of a level plane with a component's samples below it: from here on it carries the plane
 SEEN_SHARE = 0.2  # of a body's surface, that photos have to show
+FEW, SEEN_BY_FEW = 3, 0.05  # photos that have to show a body, and how much of its surface
 STANDS = 0.3  # least share of a body's lowest layer that has the solid of the plane right below it
 CRUMB = 0.05  # of a body's samples: a smaller piece next to it was separated by noise, and belongs to it
 FLAKE = 0.02  # of the area of a body's largest piece: smaller pieces are left out
@@ -385,6 +386,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     touching: list[tuple[FoundBody, FoundBody, str]] = []
     for body in whole:
         found, by, name = _parted(surface, body, votes, smallest, clicked, scene)
+        found = _merged(surface, body, found)
         parts = [_piece(body, part, names[part.number - 1] if part.number else "") for part in found]
         touching += [(parts[k], parts[n], by) for k, part in enumerate(found) for n in part.neighbours if n > k]
         pieces += parts or [replace(body, name=name)]
@@ -396,7 +398,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     largest = {body.name: body.size for body in sorted(pieces, key=lambda body: body.size)}
     pieces = [body for body in pieces if not body.name or body.size > SCRAP * largest[body.name]]
     sampled: dict[FoundBody, Mesh] = {}
-    for body in pieces:
+    for body in (body for body in pieces if _is_seen(surface, body)):
         mesh = body_mesh(body, distance, min(max(FINER * finest, body.size / ENOUGH), surface.volume.cell))
         if mesh is not None:
             sampled[body] = mesh
@@ -441,6 +443,32 @@ def _parted(surface: FieldSurface, body: FoundBody, votes: Votes | None, smalles
     if np.isfinite(body.level.height):
         return parts_by_shape(solid, surface.raw.colors[solid.index], smallest), "shape", ""
     return [], "", ""
+
+
+def _is_seen(surface: FieldSurface, body: FoundBody) -> bool:
+    """Whether `FEW` photos show any of a body: what none of them shows is made up by the training."""
+    place = Volume(_within(surface, body).astype(np.float32), body.low, body.cell)
+    if body.seam is not None:
+        own = body.seam.at(place.points().reshape(-1, 3)).reshape(place.values.shape) < 0
+        place = replace(place, values=place.values * own)
+    shown = surface.raw.vertices[surface.views >= FEW]
+    return _share_seen(place, surface.raw.vertices, shown) > SEEN_BY_FEW
+
+
+def _merged(surface: FieldSurface, body: FoundBody, parts: list[Part]) -> list[Part]:
+    """The parts of a body; those that no photos show, such as one inside of another, go to a neighbour. Empty if one is
+    left."""
+    shown = [_is_seen(surface, _piece(body, part, "")) for part in parts]
+    goes = {k: next((n for n in part.neighbours if shown[n]), k) for k, part in enumerate(parts) if not shown[k]}
+    stays = [k for k in range(len(parts)) if goes.get(k, k) == k]
+    merged = []
+    for k in stays:
+        group = [k, *(n for n, to in goes.items() if to == k != n)]
+        values = np.min([parts[n].seam.values for n in group], axis=0)
+        beside = {goes.get(n, n) for one in group for n in parts[one].neighbours} - {k}
+        merged.append(replace(parts[k], seam=replace(parts[k].seam, values=values),
+                              neighbours=sorted(stays.index(n) for n in beside)))  # fmt: skip
+    return merged if len(merged) > 1 else []
 
 
 def _solid(surface: FieldSurface, body: FoundBody) -> ConnectedSolid:
@@ -533,10 +561,13 @@ def _names(bodies: list[FoundBody]) -> dict[FoundBody, str]:
 
 
 def whole_bodies(surface: FieldSurface) -> dict[str, Mesh]:
-    """Every connected component of the solid as a body, the largest first."""
+    """Every connected component of the solid that is seen as a body, the largest first; one in any case."""
     solid = surface.solid
-    label = components(solid)
-    order = np.argsort(-np.bincount(label, face_normals(solid)[1]))
+    label, area = components(solid), face_normals(solid)[1]
+    shown = (surface.views >= FEW)[surface.raw.faces[surface.kept]].any(1)
+    total = np.bincount(label, area)
+    seen = np.bincount(label, area * shown) > SEEN_BY_FEW * total
+    order = [k for k in np.argsort(-total) if seen[k]] or [int(total.argmax())]
     return {f"object{n}": keep_faces(solid, label == k) for n, k in enumerate(order, start=1)}
 
 

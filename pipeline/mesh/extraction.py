@@ -124,6 +124,7 @@ class FieldSurface:
     kept: np.ndarray  # [F] bool, faces of it to keep
     shown: np.ndarray  # [F] bool, faces to keep that photos show
     left_out: list[float]  # longest sides of pieces left out, the largest first
+    views: np.ndarray  # [V] int, photos that show each vertex of it
 
     @property
     def visible(self) -> Mesh:
@@ -186,7 +187,7 @@ def surface_of(
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
     if (unseen := completed & (found.weight == 0)).any():
         rgb[unseen] = spread_colors(raw.vertices[unseen], raw.vertices[seen & ~unseen], rgb[seen & ~unseen])
-    return FieldSurface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
+    return FieldSurface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out, found.count)
 
 
 @torch.no_grad()

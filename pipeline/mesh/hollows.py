@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from pipeline.mesh.trust import FEW, Evidence
 from pipeline.mesh.visibility import heights
@@ -13,6 +14,7 @@ PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; tha
 # The matter below a hollow is its floor if it is thinner than this share of the hollow's depth.
 FLOOR = 0.3
 UPRIGHT = 0.5  # largest upward component of the normal of a wall
+LEAK = 0.2  # share of a hollow's bottom: smaller holes in it are where its thin floor was not found; a ring has larger
 KNOWN = 0.5  # share of a wall that photos have to see from both sides for a known thickness
 
 
@@ -25,6 +27,7 @@ class Hollow:
     seen: int  # photos that see its bottom: the median over it, by rays
     wall: float | None  # m, the median thickness of the wall around it; None if there is none
     wall_seen: float  # share of the wall, by vertices, of which photos see both sides
+    holes: float = 0.0  # share of its bottom that is missing
 
     def to_dict(self) -> dict:
         """Plain values for the report, lengths to a hundredth of a millimetre in a body of a metre."""
@@ -44,16 +47,27 @@ def hollow(mesh: Mesh, least: float, evidence: Evidence | None = None) -> Hollow
     height = heights(mesh, places)
     through = np.isnan(height)
     height = np.where(through, low[2], height)
-    water = reconstruction(np.where(through, height, height.max()), height, method="erosion")
-    depth = water - height
-    deep = depth > 0.5 * depth.max()
+    around = np.asarray(ndimage.label(through)[0])  # type: ignore[index]
+    outside, holes = around == around[0, 0], through & (around != around[0, 0])
+
+    def filled(open_: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The water level, the depth of the water, and the deep places, if it flows out where `open_`."""
+        water = reconstruction(np.where(open_, height, height.max()), height, method="erosion")
+        depth = water - height
+        return water, depth, depth > 0.5 * depth.max()
+
+    water, depth, deep = filled(outside)
+    if holes[deep].sum() > LEAK * deep.sum():
+        holes[:] = False
+        water, depth, deep = filled(through)
     found = float(np.median(depth[deep])) if depth.max() > 0 else 0.0
     if found < least or deep.sum() < FEWEST:
         return None
+    missing, deep = float(holes[deep].mean()), deep & ~holes
     bottom = np.concatenate([places[deep], height[deep][:, None]], 1)
     seen = 0 if evidence is None else int(np.median(evidence.nearest(bottom).views))
     wall, wall_seen = _wall(mesh, float(np.median(water[deep])), bottom, evidence)
-    return Hollow(found, float(np.median(height[deep]) - low[2]), seen, wall, wall_seen)
+    return Hollow(found, float(np.median(height[deep]) - low[2]), seen, wall, wall_seen, missing)
 
 
 def _wall(mesh: Mesh, rim: float, bottom: np.ndarray, evidence: Evidence | None) -> tuple[float | None, float]:
@@ -91,6 +105,8 @@ def hollow_line(name: str, found: dict) -> str:
         line = f"{name}: hollow to {depth:.2g} m below its rim or deeper; {photos}, the {below:.2g} m below are a guess"
     else:
         line = f"{name}: hollow to {depth:.2g} m below its rim; {photos}, and the {below:.2g} m below that are solid"
+    if found.get("holes"):
+        line += f"; {found['holes']:.0%} of its floor was not found and is a hole"
     if found["wall"] is None:
         return line
     if found["wall_seen"] < KNOWN:

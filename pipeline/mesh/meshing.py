@@ -12,13 +12,13 @@ from PIL import Image, ImageDraw, ImageFont
 from pipeline.cameras import View, load_poses, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
-from pipeline.inputs.photos import load_photos, open_photo
+from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, open_photo
 from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.hollows import hollow
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held
-from pipeline.mesh.placement import GRAVITY, Placement, Up, located_bodies, measured_scale, place
+from pipeline.mesh.placement import GRAVITY, Placement, Up, given_up, located_bodies, measured_scale, place
 from pipeline.mesh.supports import complete, on_any
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
@@ -68,13 +68,23 @@ def make_meshes(
     held = load_held(photos / JOINT)
     if held is not None and scale is None and options.size is None:
         scale = held.metres / to_unit.scale, held.size_from
+    if options.up is not None:
+        axes = to_unit.rotation if (photos / KNOWN_CAMERAS).exists() else (
+            place(surface.visible, posed.views, up=up).to_metres.rotation.T
+        )  # fmt: skip
+        up = given_up(options.up, axes, posed.views, load_photos(photos), surface.visible)
     placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
     if held is not None:
         if placement.size_from == held.size_from:
             placement = replace(placement, size_assumed=held.size_assumed)
         held.moved(placement.to_metres.after(to_unit)).save(out / JOINT)
     level, known, completed = placement.to_metres.rotation[2], None, []
-    if not alone:
+    if alone:
+        # What nobody sees below the lowest place in sight is as level as what carried it; a field makes a dome of it.
+        bottom = ground(placement)
+        volume, limit = volume.limited(bottom), lambda p: np.maximum(ball(p), bottom(p))
+        surface = surface_of(volume, field, posed, photos, ball, on_progress=share_of(on_progress, 0.45, 0.05))
+    else:
         on_progress(0.45, "looking for level surfaces without texture")
         completed = complete(surface, level, field.finest, posed, photos)
     if completed:
@@ -84,7 +94,7 @@ def make_meshes(
         surface = surface_of(volume, field, posed, photos, limit, known=known,
                              on_progress=share_of(on_progress, 0.45, 0.05))  # fmt: skip
     if options.crop is not None:
-        limit = box_of(placement, np.reshape(options.crop, (2, 3)))
+        limit = box_of(placement, np.reshape(options.crop, (2, 3)), limit)
         volume = volume.limited(limit)
         if not (volume.values < 0).any():
             raise SdfsimError(
@@ -145,13 +155,18 @@ def trust(
     }  # fmt: skip
 
 
-def box_of(placement: Placement, corners: np.ndarray) -> Distance:
-    """Distance from the space left after cropping: the trained ball within a box with corners [2, 3] m."""
+def ground(placement: Placement) -> Distance:
+    """Distance from the space above z = 0 m."""
+    return lambda points: -placement.to_metres.points(points)[:, 2] / placement.to_metres.scale
+
+
+def box_of(placement: Placement, corners: np.ndarray, space: Distance) -> Distance:
+    """Distance from the space left after cropping: a `space` within a box with corners [2, 3] m."""
     middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
 
     def distance(points: np.ndarray) -> np.ndarray:
         beyond = np.abs(placement.to_metres.points(points) - middle) - half
-        return np.maximum(ball(points), beyond.max(1) / placement.to_metres.scale)
+        return np.maximum(space(points), beyond.max(1) / placement.to_metres.scale)
 
     return distance
 

@@ -4,10 +4,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.cameras import Similarity, Up, View, camera_up, frame_of
+from pipeline.cameras import CAREFUL, UNKNOWN, Similarity, Up, View, camera_up, frame_of
 from pipeline.inputs.photos import Photo
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.files import read_json, write_json
@@ -21,12 +22,25 @@ FLOORS = 0.5  # degrees, tilt of real floors and tables
 # For the plane that gives up: largest angle (degrees) between its normal and the cameras' up, and least share of the
 # area.
 MAX_ANGLE, MIN_SHARE = 25.0, 0.08
+# If all cameras look one way, which says nothing of how far down: these angles (degrees) from their image up towards
+# them are tried for a floor; walls of things on a table face all ways alike, so this share of them faces the other.
+PITCHES, BOTH_WAYS = (0.0, 25.0, 50.0), 0.5
+# What they look at is below them, rather than a wall, if two of four hold: one plane across the view has this share;
+# cameras move upwards in the picture by this share of how they move sideways; by more than sideways; and they move
+# towards the plane by less than this share of the smaller of both. With three, up is known within some degrees.
+ACROSS, UPWARDS, LEVELLED, PROBABLY = 0.25, 0.3, 0.2, 20.0
 DRAWN, TRIALS = 2000, 200  # of the search for that plane: points, and planes that are tried
 LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a level face: 18 degrees
 MIN_FLOOR = 0.05  # share of the area that a floor has
 # A pixel may miss its target by these shares of the width; a point farther away by the factor is behind the target.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
-FORMS = {"distance": "PHOTO:X,Y or PHOTO", "body": "NAME=PHOTO:X,Y"}  # of a place, by the option that takes it
+# Of a place, by the option that takes it.
+FORMS = {
+    "distance": "PHOTO:X,Y or PHOTO", "body": "NAME=PHOTO:X,Y",
+    "up": "PHOTO:X,Y on a level face, an axis such as z or -y, or view",
+}  # fmt: skip
+AXES = {f"{sign}{name}": float(f"{sign}1") * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "+", "-")}
+BESIDE = 0.05  # normalised units: the face that is clicked is the surface within this
 
 
 @dataclass(frozen=True)
@@ -66,23 +80,101 @@ def load_placement(mesh_folder: Path) -> Placement:
 def find_up(shown: Mesh, views: Sequence[View]) -> Up:
     """Up from the largest nearly level plane, else from the cameras; their disagreement adds to the uncertainty."""
     cameras = camera_up(views)
-    normals, areas = face_normals(shown)
-    centers = shown.vertices[shown.faces].mean(1)
-    plane = plane_up(centers, normals, areas, cameras.direction, tolerance=0.02)
+    if cameras.within >= UNKNOWN:
+        return _up_one_way(shown, views, cameras)
+    plane = plane_up(*samples_of(shown), cameras.direction, tolerance=0.02)
     if plane is None:
         return cameras
-    normal, slope = plane
-    within = float(np.hypot(FLOORS, slope))
-    apart = float(np.degrees(np.arccos(np.clip(normal @ cameras.direction, -1, 1))))
-    return Up(normal, "plane", within if apart < 3 * cameras.within else max(within, apart))
+    apart = float(np.degrees(np.arccos(np.clip(plane.normal @ cameras.direction, -1, 1))))
+    return Up(plane.normal, "plane", plane.within if apart < 3 * cameras.within else max(plane.within, apart))
+
+
+def samples_of(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middles [F, 3], unit normals [F, 3] and areas [F] of a mesh's faces."""
+    return mesh.vertices[mesh.faces].mean(1), *face_normals(mesh)
+
+
+def _up_one_way(shown: Mesh, views: Sequence[View], cameras: Up) -> Up:
+    """Up if all cameras look one way: level, they are, but how far down they look is unknown. A floor that they see at
+    an angle says it; else what they look at is a table top below them or a wall in front, as they moved."""
+    right, down, view = (np.mean([v.rotation[k] for v in views], axis=0) for k in range(3))
+    if min(np.linalg.norm(right), np.linalg.norm(view)) < 0.5:
+        return cameras
+    towards = -view / np.linalg.norm(view)
+    upright = -down + (down @ towards) * towards
+    upright /= np.linalg.norm(upright)
+    points, normals, areas = samples_of(shown)
+    floors = []
+    for pitch in np.radians(PITCHES):
+        guess = np.cos(pitch) * upright + np.sin(pitch) * towards
+        if (plane := plane_up(points, normals, areas, guess, tolerance=0.02)) is not None:
+            there, mirrored = (
+                areas[normals @ way > np.cos(np.radians(MAX_ANGLE))].sum()
+                for way in (plane.normal, 2 * (plane.normal @ towards) * towards - plane.normal)
+            )
+            if plane.normal @ towards < 0.9 and mirrored < BOTH_WAYS * there:
+                floors.append(plane)
+    if floors:
+        floor = max(floors, key=lambda plane: plane.share)
+        rolled = float(np.degrees(np.arcsin(min(abs(floor.normal @ right) / np.linalg.norm(right), 1.0))))
+        return Up(floor.normal, "plane", floor.within if rolled < 3 * CAREFUL else max(floor.within, rolled))
+    front = plane_up(points, normals, areas, towards, tolerance=0.02)
+    if front is None:
+        return cameras
+    frame = np.stack([right, -down, front.normal]) / np.linalg.norm([right, down, front.normal], axis=1)[:, None]
+    aside, up, ahead = np.std([v.center for v in views] @ frame.T, axis=0)
+    votes = sum((front.share > ACROSS, up > UPWARDS * aside, up > aside, ahead < LEVELLED * min(aside, up)))
+    if votes >= 2:
+        return Up(front.normal, "plane", UNKNOWN if votes == 2 else max(front.within, PROBABLY))
+    upright -= (upright @ front.normal) * front.normal
+    return Up(upright / np.linalg.norm(upright), "cameras", UNKNOWN)
+
+
+def given_up(text: str, axes: np.ndarray, views: Sequence[View], photos: list[Photo], visible: Mesh) -> Up:
+    """Up as an option says it (see `Options`): an axis, of the columns of `axes` [3, 3]; `view`, against the cameras'
+    mean view; or the normal of the visible surface at a place. Raises the SdfsimErrors of `_locate`."""
+    if text in AXES:
+        return Up(axes @ AXES[text], f"axis {text} that was given", FLOORS)
+    if text == "view":
+        view = np.mean([v.rotation[2] for v in views], axis=0)
+        # Cameras that look down are held so to some degrees each.
+        return Up(-view / np.linalg.norm(view), "view of the cameras, as given", 3 * CAREFUL / np.sqrt(len(views)))
+    place = _locate(text, views, photos, Caster(visible), "up")
+    points, normals, areas = samples_of(visible)
+    near = np.linalg.norm(points - place, axis=1) < BESIDE
+    normal = (areas[near, None] * normals[near]).sum(0)
+    normal /= np.linalg.norm(normal)
+    flat = np.abs((points - place) @ normal) < BESIDE
+    plane = plane_up(points[flat], normals[flat], areas[flat], normal, tolerance=0.02)
+    found = (normal, CONFIDENT["medium"]) if plane is None else (plane.normal, plane.within)
+    return Up(found[0], f"face at {text}, as given", found[1])
+
+
+def check_up(text: str, photos: list[Photo]) -> None:
+    """Checks the option `up` as far as possible without poses. Raises the SdfsimErrors of `_end`, and one for a photo
+    without a pixel."""
+    if text not in AXES and text != "view" and _end(text, photos, "up")[1] is None:
+        raise SdfsimError(f"up: {text} has no pixel", f"write {FORMS['up']}")
+
+
+class LevelUp(NamedTuple):
+    """A plane that gives up."""
+
+    normal: np.ndarray  # [3] unit, upwards
+    slope: float  # degrees that its unevenness amounts to
+    share: float  # of the surface's area
+
+    @property
+    def within(self) -> float:
+        """Uncertainty of its normal as up, degrees."""
+        return float(np.hypot(FLOORS, self.slope))
 
 
 def plane_up(
     points: np.ndarray, normals: np.ndarray, weights: np.ndarray, guess: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, float] | None:
+) -> LevelUp | None:
     """The largest plane (RANSAC) among surface samples [P, 3] with unit normals [P, 3] and areas [P], whose normal is
-    within `MAX_ANGLE` of a unit guess [3] and whose samples lie within `tolerance`: its unit normal [3] and the slope
-    in degrees that its unevenness amounts to; None if none is large enough."""
+    within `MAX_ANGLE` of a unit guess [3] and whose samples lie within `tolerance`; None if none is large enough."""
     near = normals @ guess > np.cos(np.radians(MAX_ANGLE))
     if near.sum() <= 10:
         return None
@@ -107,7 +199,8 @@ def plane_up(
             return None
     if normal @ guess < np.cos(np.radians(MAX_ANGLE)):
         return None
-    return normal, float(np.degrees(np.arctan(np.sqrt(max(spread[0], 0) / max(spread[1], 1e-30)))))
+    slope = float(np.degrees(np.arctan(np.sqrt(max(spread[0], 0) / max(spread[1], 1e-30)))))
+    return LevelUp(normal, slope, float(w[inside].sum() / weights.sum()))
 
 
 def resting_height(mesh: Mesh) -> float:
@@ -221,7 +314,7 @@ def _locate(
         raise SdfsimError(
             f"{option}: {text} shows nothing of the surface", "choose a pixel on the reconstructed surface"
         )
-    if option == "body":  # Users point at the middle of a body.
+    if option != "distance":  # Users point at the middle of a body, or of a face.
         hit = int(np.isfinite(away).argmax())
         return view.center + away[hit] * rays[hit]
     # Users point at corners. A reconstructed corner is a little rounded, and a pixel just next to it shows a surface

@@ -175,7 +175,7 @@ def next_photos(
     now, sight = evidence.at(index), sight.at(index)
     sure = now.uncertainty[np.isfinite(now.uncertainty)]
     limit = UNSURE * float(np.median(sure)) if len(sure) else 0.0
-    middle, towards = focus(list(views))
+    middle, towards = focus(views, np.median(evidence.vertices[counted], axis=0))
     places = _places(views, middle, towards, solid)
     around = [sight.of_place(place, np.ones(SAMPLES, bool)) for place in places]
     around = [seen[cosine > FAIR] for seen, cosine in around]

@@ -52,7 +52,9 @@ WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose ph
 
 def hopeful(settings: dict, first: dict) -> bool:
     """Whether an attempt is worth its time after the first one's failed checks. More features do not help for photos
-    from one spot, or with a static background."""
+    from one spot, with a static background, or of another lens."""
+    if first["other_lens"]:
+        return False
     still = first["still_pairs"] > 0.5
     return still if settings["moving_only"] else first["turn_only_pairs"] <= 0.9 and not still
 
@@ -98,7 +100,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 5,  # of the child's files, which a resumed run reads
+        "version": 6,  # of the child's files, which a resumed run reads
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
@@ -203,7 +205,7 @@ def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
     if phase == "mapping":
         placed = [int(number) for word, number in said if word == "placed"] or [0]
         # Each further focal length starts again with no camera, but the progress must not go back.
-        return 0.75 + 0.25 * min(1.0, max(placed) / count), f"placing cameras, {placed[-1]} of {count}"
+        return 0.75 + 0.25 * min(1.0, max(placed) / count), f"placing cameras, {min(placed[-1], count)} of {count}"
     table, total = "keypoints", count
     if phase == "matches":
         pairs = count * (count - 1) // 2

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipeline.cameras import FOV_RANGE, Sparse, triangulation_angle, view_of
 from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
 from sdfsim.base.files import write_arrays, write_json
 
@@ -34,11 +35,17 @@ HOPELESS = 0.5  # of all matches contradicting the poses: no focal length fixes 
 # Ratio of a focal length to the next shorter one above which they are two zooms; among photos of one zoom, each posed
 # with its own focal length, it was up to 1.05.
 ZOOM = 1.12
+# Degrees up to which axes are parallel, exactly and nearly: focal length and depth can then be traded for each other.
+PARALLEL, NEARLY = 1.0, 5.0
 ABOUT = 1.03  # ratio of two models' unexplained matches up to which the one with fewer cameras is chosen
 # Number of a photo's largest features for finding similar photos; how much nearer than the next a match has to be; and
 # the matches above which photos may show the same.
 LARGEST, DISTINCT, COMMON = 400, 0.8, 2
+PLACES = 8  # along each side of a picture, at which the residuals of all photos are compared
 STILL = 2.0  # px between the pixels of a match in two photos: below this it did not move
+# What does not move in this share of the pairs, in a cell of so many along a picture's width, is a logo or a date, if
+# such cells are a small share of the picture; more is a background. On a street no cell had 0.06.
+CELLS, OFTEN, SMALL = 48, 0.15, 0.2
 TURNS = 200  # largest number of pairs of photos that are checked for turns on the spot
 
 
@@ -170,8 +177,9 @@ def from_known(pycolmap, job: dict, database: Path, out: Path):
     return pycolmap.triangulate_points(known, database, job["images"], place, options=options)
 
 
-def mapped(pycolmap, job: dict, database: Path, out: Path):
-    """The reconstruction with the most photos that incremental mapping finds, or None."""
+def mapped(pycolmap, job: dict, database: Path, out: Path, *, hold: bool = False):
+    """The reconstruction with the most photos that incremental mapping finds, or None; `hold`: focal lengths stay as
+    given or assumed."""
     done = 0
 
     def count() -> None:
@@ -181,7 +189,7 @@ def mapped(pycolmap, job: dict, database: Path, out: Path):
 
     print("placed 0", flush=True)
     found = pycolmap.incremental_mapping(
-        database, job["images"], fresh(out / "colmap"), options=incremental_options(pycolmap, job),
+        database, job["images"], fresh(out / "colmap"), options=incremental_options(pycolmap, job, hold),
         next_image_callback=count,
     )  # fmt: skip
     return max(found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
@@ -202,6 +210,9 @@ def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
     """
     shared = [group["names"] for group in job["groups"]]
     tried = [(mapped(pycolmap, job, database, out), shared)]
+    job["held"] = undetermined(views_in(tried[0][0]))
+    if job["held"]:
+        return mapped(pycolmap, job, database, out, hold=True), shared
     first = agreement(pairs, views_in(tried[0][0]))
     costs = [unexplained(first)]
     copy, names = out / "zooms.db", [name for group in shared for name in group]
@@ -216,6 +227,18 @@ def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
     copy.unlink(missing_ok=True)
     # The fewest cameras that are about as good as any.
     return next(one for one, cost in zip(tried, costs, strict=True) if cost <= ABOUT * min(costs) + (ABOUT - 1) / 10)
+
+
+def undetermined(views: list[dict]) -> bool:
+    """Whether the focal length says nothing because all cameras look one way: a longer lens and depths longer by as
+    much give the same pictures."""
+    if not views:
+        return False
+    axes = np.array([view["rotation"][2] for view in views])
+    mean = axes.mean(0) / np.linalg.norm(axes.mean(0))
+    apart = float(np.degrees(np.arccos(np.clip(axes @ mean, -1, 1))).max())
+    fov = [view_of({**view, "source": ""}).fov for view in views]
+    return apart < PARALLEL or (apart < NEARLY and not FOV_RANGE[0] < min(fov) <= max(fov) < FOV_RANGE[1])
 
 
 def doubtful(entries: list[dict]) -> bool:
@@ -264,16 +287,17 @@ def with_cameras(pycolmap, database: Path, copy: Path, groups: list[list[str]], 
                 opened.update_image(image)
 
 
-def incremental_options(pycolmap, job: dict):
+def incremental_options(pycolmap, job: dict, hold: bool = False):
     """Settings of incremental mapping: on one thread, because several threads sum in an order that differs between
-    runs."""
+    runs. `hold`: without refining the lens."""
     mapper = {
         "num_threads": 1, "random_seed": job["seed"], "init_min_num_inliers": job["init_inliers"],
         "init_min_tri_angle": job["init_angle"], "abs_pose_min_num_inliers": job["pose_inliers"],
     }  # fmt: skip
     return pycolmap.IncrementalPipelineOptions(
         min_model_size=3, max_num_models=4, num_threads=1, random_seed=job["seed"], min_num_matches=job["min_inliers"],
-        mapper=mapper, triangulation={"random_seed": job["seed"]},
+        mapper=mapper, triangulation={"random_seed": job["seed"]}, ba_refine_focal_length=not hold,
+        ba_refine_extra_params=not hold,
     )  # fmt: skip
 
 
@@ -363,8 +387,8 @@ def views_in(reconstruction) -> list[dict]:
     return views
 
 
-def save_points(reconstruction, path: Path) -> None:
-    """Writes the points of a reconstruction (`sparse.npz`), with photos numbered as in `views_in`."""
+def save_points(reconstruction, path: Path) -> Sparse:
+    """Writes and returns the points of a reconstruction (`sparse.npz`), with photos numbered as in `views_in`."""
     index_of = {image.image_id: index for index, image in enumerate(posed_in(reconstruction))}
     points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
     seen = [
@@ -380,6 +404,32 @@ def save_points(reconstruction, path: Path) -> None:
         "view_of": observations[:, 1],
     }
     write_arrays(path, arrays, compressed=False)
+    return Sparse(**arrays)
+
+
+def lens_left(model) -> tuple[float, float]:
+    """What the lens model leaves: how far (px, RMS) points are off in the same way at the same place of the picture in
+    all photos, and that as a share of how far they are off in all. Noise is no such thing, and is taken away."""
+    at, off = [], []
+    for image in posed_in(model):
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world()
+        seen = [point for point in image.points2D if point.has_point3D()]
+        pixels = np.array([point.xy for point in seen]).reshape(-1, 2)
+        xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen]).reshape(-1, 3)
+        local = xyz @ pose.rotation.matrix().T + pose.translation
+        at.append(PLACES * pixels / [camera.width, camera.height])
+        off.append(pixels - np.asarray(camera.img_from_cam(local), float))
+    place, off = np.concatenate(at).astype(int).clip(0, PLACES - 1) @ [PLACES, 1], np.concatenate(off)
+    good = np.isfinite(off).all(1)
+    place, off = place[good], off[good]
+    count = np.bincount(place, minlength=PLACES**2)
+    there = count >= ENOUGH
+    if not there.any():
+        return 0.0, 0.0
+    mean = np.stack([np.bincount(place, part, PLACES**2)[there] for part in off.T]) / count[there]
+    total = float((off**2).sum(1).mean())
+    same = float((mean**2).sum(0) @ count[there] - total * there.sum()) / float(count[there].sum())
+    return float(np.sqrt(max(same, 0.0))), float(np.sqrt(max(same, 0.0) / max(total, 1e-12)))
 
 
 def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str, str, np.ndarray, np.ndarray]]]:
@@ -394,6 +444,28 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
                 a, b = pycolmap.pair_id_to_image_pair(pair)
                 pairs.append((images[a], images[b], points[a][matched[:, 0]], points[b][matched[:, 1]]))
     return {name: len(points[key]) for key, name in images.items()}, pairs
+
+
+def overlay(pycolmap, job: dict, database: Path) -> list[float]:
+    """The box (left, top, right, bottom, in shares of the picture) around what is drawn over the photos, such as a logo
+    or a date: its features match in the same place of all pictures, however these move. Empty if there is none."""
+    widths = {name: group["width"] for group in job["groups"] for name in group["names"]}
+    count, pairs = np.zeros((CELLS, 4 * CELLS), int), 0
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image.name for image in opened.read_all_images()}
+        points = {key: opened.read_keypoints(key)[:, :2] / widths[name] for key, name in images.items()}
+        for pair, matched in zip(*opened.read_all_matches(), strict=True):
+            (a, b), (first, second) = pycolmap.pair_id_to_image_pair(pair), np.asarray(matched, int).reshape(-1, 2).T
+            if len(first) >= ENOUGH:
+                still = np.linalg.norm(points[a][first] - points[b][second], axis=1) < STILL / widths[images[a]]
+                at = (CELLS * points[a][first[still]]).astype(int).clip(0, [CELLS - 1, 4 * CELLS - 1])
+                count[tuple(np.unique(at, axis=0).T)] += 1
+                pairs += 1
+    often = np.argwhere(count > OFTEN * max(pairs, 1))
+    tall = max((group["height"] / group["width"] for group in job["groups"]), default=1.0)
+    if not len(often) or pairs < ENOUGH or len(often) > SMALL * CELLS**2 * tall:
+        return []
+    return [float(x) for x in np.append(often.min(0), often.max(0) + 1) / CELLS / [1, tall, 1, tall]]
 
 
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
@@ -418,7 +490,7 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = S
     explains to a median of `least` px: with the right focal length, the one that explains most pairs, one rotation maps
     the rays of all matches."""
     best = 0.0
-    for ratio in np.geomspace(0.4, 4.0, 24):
+    for ratio in np.geomspace(0.4, 3.0, 20):  # a longer lens is not usable, and any step along a wall would fit it
         explained = 0
         for size, first, second in pairs:
             focal = ratio * max(size["width"], size["height"])
@@ -444,6 +516,13 @@ def main(job_path: str) -> None:
     features(pycolmap, job, database)
     print("phase matches", flush=True)
     matches(pycolmap, job, database)
+    drawn = [] if job["moving_only"] else overlay(pycolmap, job, database)
+    if drawn:
+        job["moving_only"] = True
+        with closing(sqlite3.connect(database)) as opened:
+            opened.execute("DELETE FROM two_view_geometries")
+            opened.commit()
+        matches(pycolmap, job, database)
     print("phase mapping", flush=True)
     counts, pairs = read_pairs(pycolmap, database)
     if job["known_cameras"]:
@@ -457,7 +536,8 @@ def main(job_path: str) -> None:
             print("phase mapping", flush=True)
             counts, pairs = read_pairs(pycolmap, database)
             best, cameras = best_mapping(pycolmap, job, database, pairs, out)
-    result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
+    held = job.get("held", False)
+    result: dict[str, Any] = {"views": [], "overlay": drawn, "held": held, **findings(job, counts, pairs)}
     if best:
         result["views"] = views_in(best)
         result["cameras"] = cameras
@@ -466,7 +546,10 @@ def main(job_path: str) -> None:
         result["judged"] = agreement(judges, result["views"])  # by the matches of the first attempt
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
-        save_points(best, out / "sparse.npz")
+        result["lens"] = lens_left(best)
+        sparse = save_points(best, out / "sparse.npz")
+        result["middle"] = np.median(sparse.xyz, axis=0).tolist() if len(sparse.xyz) else [0.0, 0.0, 0.0]
+        result["angle"] = triangulation_angle([view_of({**view, "source": ""}) for view in result["views"]], sparse)
     write_json(out / "result.json", result)
 
 

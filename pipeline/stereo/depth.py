@@ -194,7 +194,7 @@ def neighbours(poses: PosedPhotos) -> list[list[int]]:
     """For each view the others that match it best, the best first: they show the same sparse points from an angle that
     is neither too narrow nor too wide, and the first few are on different sides."""
     views, sparse = poses.views, poses.sparse
-    middle = focus(views)[0]
+    middle = focus(views, np.median(sparse.xyz, axis=0))[0]
     centers = np.array([view.center for view in views])
     rng = np.random.default_rng(0)
     found = []

@@ -46,7 +46,9 @@ def result(count: int, posed: int, *, focal: float = 600.0, error: float = 0.5, 
     agreed = [{"a": pair["a"], "b": pair["b"], "matches": matches, "error": 0.3 if k < posed - 1 else None,
                "own": 0.25, "cost": 0.1} for k, pair in enumerate(pairs)]  # fmt: skip
     return {"views": views, "counts": counts, "pairs": pairs, "agreement": agreed, "mean_error": error,
-            "points": 900, "turn_only": 0.0, "cameras": [names], "judged": [dict(pair) for pair in agreed]}  # fmt: skip
+            "points": 900,
+            "lens": [0.1, 0.2], "middle": [0.0, 0.0, 0.0], "angle": min(span * (1 - 1 / max(posed, 2)), 180.0),
+            "turn_only": 0.0, "cameras": [names], "judged": [dict(pair) for pair in agreed]}  # fmt: skip
 
 
 def turned(angle: float) -> np.ndarray:

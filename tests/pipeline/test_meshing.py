@@ -23,7 +23,7 @@ from pipeline.options import options_of
 from pipeline.report import mesh_notes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, is_closed
+from sdfsim.geometry.mesh import Mesh, face_normals, is_closed
 from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
 from tests.helpers.surfaces import TABLE, TOP, both, box, look_at
 
@@ -59,17 +59,15 @@ def cameras() -> list[View]:
     return [replace(view, name=f"{k:04d}.jpg", source=f"{k}.jpg") for k, view in enumerate(views)]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    """Folders as the stages before leave them."""
-    folder = tmp_path_factory.mktemp("run")
+def folders(folder: Path, surface: Callable[[np.ndarray], np.ndarray]) -> Path:
+    """Folders as the stages before leave them, with points on the surface of a distance."""
     for name in ("poses", "photos/images"):
         (folder / name).mkdir(parents=True)
     views = cameras()
     save_views(views, folder / "poses" / "cameras.json")
     rng = np.random.default_rng(0)
     xyz = rng.uniform([-0.6, -0.6, -0.5], [0.6, 0.6, 0.5], (4000, 3))
-    xyz = xyz[np.abs(both(xyz)) < 0.05]
+    xyz = xyz[np.abs(surface(xyz)) < 0.05]
     count = len(xyz)
     sparse = Sparse(xyz, np.zeros((count, 3), np.uint8), np.full(count, 0.3), np.arange(count), np.zeros(count, int))
     np.savez(folder / "poses" / "sparse.npz", **vars(sparse))
@@ -80,6 +78,11 @@ def run(tmp_path_factory) -> Path:
     for view in views:
         Image.new("RGB", (view.width, view.height), (180, 90, 40)).save(folder / "photos" / "images" / view.name)
     return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    return folders(tmp_path_factory.mktemp("run"), both)
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +151,33 @@ def test_cropping_leaves_the_frame_and_what_is_within(mesh):
     assert (vertices > corners[0] - 0.02).all() and (vertices < corners[1] + 0.02).all()
     with pytest.raises(SdfsimError, match="crop: "):
         mesh(crop=(5.0, 5, 5, 6, 6, 6))
+
+
+class Disc(Drawn):
+    """A disc of 0.4 about the axis, 0.12 high; as no photo sees it from below, the field has a cone there."""
+
+    def sdf(self, points: torch.Tensor) -> torch.Tensor:
+        p = points.double().numpy()
+        r = np.hypot(p[:, 0], p[:, 1])
+        return torch.from_numpy(np.maximum(np.maximum(r - 0.4, p[:, 2] - 0.12), 0.125 * (r - 0.4) - p[:, 2])).float()
+
+
+def test_what_no_photo_sees_below_a_body_without_scenery_is_level(tmp_path, monkeypatch):
+    """The cone is 0.05 deep, and its sides are in no sight: what carried the disc was level with its edge."""
+    trained = Trained(Disc(), 0.01, Similarity(1.0, np.eye(3), np.zeros(3)), {"masked": True})  # type: ignore[arg-type]
+    monkeypatch.setattr(meshing, "load_field", lambda folder: trained)
+    monkeypatch.setitem(meshing.RESOLUTION, "quick", 97)
+    run = folders(tmp_path, lambda p: trained.field.sdf(torch.from_numpy(p)).numpy())
+    (tmp_path / "out").mkdir()
+    options = options_of(preset="quick", size=0.8)
+    report = make_meshes(run / "distill", run / "poses", run / "photos", run / "out", options)
+    disc = load_mesh(run / "out" / "objects" / "object1.ply")
+    assert report["objects"] == ["object1"] and is_closed(disc)
+    height, cell = disc.vertices[:, 2], 2.04 / 96
+    normals, areas = face_normals(disc)
+    assert height.min() == pytest.approx(0.0, abs=1e-6) and np.ptp(height) == pytest.approx(0.12, abs=cell)
+    level = (disc.vertices[disc.faces][..., 2] < 1e-6).all(1) & (normals[:, 2] < -0.999)
+    assert areas[level].sum() > 0.8 * np.pi * 0.4**2  # marching cubes round its edge
 
 
 def test_lengths_are_reported_to_six_digits_of_the_largest():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import PosedPhotos
+from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, find_level_planes, split
-from pipeline.mesh.extraction import EXTENT, FieldSurface, ball, sample_volume
+from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
+from pipeline.mesh.seams import Part
 from sdfsim.geometry.bvh import Winding
 from sdfsim.geometry.mass import mass_properties
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
@@ -31,7 +34,7 @@ def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarra
     there = raw.vertices @ turn
     shown = (ball(raw.vertices) < -0.03) & (np.ones(len(there), bool) if seen is None else seen(there))
     faces = shown[raw.faces].all(1)
-    return FieldSurface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, [])
+    return FieldSurface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, [], 3 * shown)
 
 
 def parts_of(
@@ -191,6 +194,39 @@ def test_without_scenery_every_component_is_a_body():
     assert parts.solid is None and parts.shown is None
     volumes = [signed_volume(mesh) for mesh in parts.bodies.values()]
     np.testing.assert_allclose(volumes, [0.6 * 0.4 * 0.4, 0.2 * 0.4 * 0.2], rtol=0.05)
+
+
+def test_what_seams_split_off_inside_of_a_body_is_no_body(monkeypatch):
+    """A block on a table, which seams divide in two halves and a core that no photo sees: two bodies, no core left."""
+    low, half = np.array([0.1, -0.05, TOP + 0.15]), 0.15
+    scene = lambda p: np.minimum(table(p), box(p, low, (half, half, half)))  # noqa: E731
+    core = lambda p: np.linalg.norm(p - low, axis=-1) - 0.08  # noqa: E731
+
+    def parted(surface, body, *rest) -> tuple[list[Part], str, str]:
+        points = Volume(np.zeros(body.own.shape), body.low, body.cell).points()
+        left, inner = points[..., 0] - low[0], core(points)
+        values = [np.maximum(left, -inner), np.maximum(-left, -inner), inner]
+        seams = [Volume(value.astype(np.float32), body.low, body.cell) for value in values]
+        return [Part(0, seam, [n for n in range(3) if n != k]) for k, seam in enumerate(seams)], "shape", ""
+
+    monkeypatch.setattr(bodies, "_parted", parted)
+    parts = parts_of(scene)
+    assert list(parts.bodies) == ["object1", "object2"] and parts.touching == [("object1", "object2", "shape")]
+    total = sum(signed_volume(mesh) for mesh in parts.bodies.values())
+    assert total == pytest.approx((2 * half) ** 3, rel=0.05)  # The core is 8 % of it.
+
+
+def test_a_body_that_two_photos_see_is_none():
+    assert list(parts_of(both).bodies) == ["object1"]
+    few = surface_of(both)
+    few = replace(few, views=np.where(few.raw.vertices[:, 2] > TOP + 0.05, 2, few.views))
+    up, field = np.array([0.0, 0, 1]), lambda p: both(p).astype(np.float32)
+    assert split(few, field, FINEST, NOTHING, Path(), up, alone=False).bodies == {}
+    pair = lambda p: np.minimum(box(p, (0.3, 0, 0), (0.1, 0.2, 0.1)), box(p, (-0.4, 0, 0), (0.3, 0.2, 0.2)))  # noqa: E731
+    alone = surface_of(pair)
+    alone = replace(alone, views=np.where(alone.raw.vertices[:, 0] > 0.1, 2, alone.views))
+    (left,) = split(alone, pair, FINEST, NOTHING, Path(), up, alone=True).bodies.values()
+    assert signed_volume(left) == pytest.approx(0.6 * 0.4 * 0.4, rel=0.05)
 
 
 def test_level_planes_are_found_at_their_heights():

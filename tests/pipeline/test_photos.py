@@ -432,3 +432,60 @@ def test_files_of_other_kinds_that_were_cut_are_one_clear_line(tmp_path, kind):
     with pytest.raises(SdfsimError, match=rf"a\.{kind}: .*(cut short|cannot be decoded)") as caught:
         read_photo(tmp_path / f"a.{kind}", 120)
     assert "\n" not in caught.value.message
+
+
+def lit(folder: Path, gains: list[float]) -> Path:
+    """Photos of one texture, each with so many times the light, cut off at white."""
+    folder.mkdir()
+    texture = np.kron(np.random.default_rng(0).integers(20, 120, (30, 40, 3)), np.ones((4, 4, 1)))
+    for number, gain in enumerate(gains):
+        Image.fromarray((gain * texture).clip(0, 255).astype(np.uint8)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.mark.parametrize(("gains", "blown"), [([1, 1, 1, 9], [3]), ([20, 20, 20], [0, 1, 2]), ([1, 1, 2], [])])
+def test_photos_that_are_white_are_blown_out_not_blurred_or_dark(tmp_path, gains, blown):
+    photos, notes = prepare_photos(lit(tmp_path / "in", gains), tmp_path)
+    assert [k for k, photo in enumerate(photos) if photo.fault == "blown out"] == blown
+    if blown:
+        (note,) = notes
+        assert note.startswith(f"{len(blown)} of {len(gains)} photos are blown out, take them again with less light")
+
+
+def test_a_white_background_is_no_fault(tmp_path):
+    """Two thirds of each photo are white, the rest is sharp."""
+    lit(tmp_path / "in", [1, 1, 1])
+    for path in (tmp_path / "in").iterdir():
+        with Image.open(path) as image:
+            pixels = np.array(image)
+        pixels[:80] = 255
+        Image.fromarray(pixels).save(path)
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path)
+    assert [photo.fault for photo in photos] == [""] * 3 and notes == []
+    assert photos[0].white == pytest.approx(2 / 3, abs=1e-3)
+
+
+def round_about(width: int = 800) -> np.ndarray:
+    """A picture of all directions, of 2:1: waves over the sphere."""
+    row, column = np.mgrid[0 : width // 2, 0:width] + 0.5
+    turn, up = 2 * np.pi * column / width, np.pi * (0.5 - row / (width // 2))
+    x, y, z = np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)
+    waves = [np.sin(7 * x + 3 * z) + np.cos(6 * y), np.sin(9 * y - 4 * x), np.cos(8 * x * y + 5 * z)]
+    return (127 + 60 * np.stack(waves, -1)).clip(0, 255).astype(np.uint8)
+
+
+def test_panoramas_are_refused_at_once(tmp_path):
+    for k in range(4):
+        Image.fromarray(np.roll(round_about(), 100 * k, 1)).save(tmp_path / f"{k}.jpg")
+    with pytest.raises(SdfsimError, match=r"4 photos are panoramas of 360 degrees \(first: 0\.jpg\)") as caught:
+        prepare_photos(tmp_path, tmp_path / "out")
+    assert "flat views" in caught.value.hint and not (tmp_path / "out").exists()
+
+
+def test_wide_photos_are_no_panoramas(tmp_path):
+    """Of 2:1, but their sides do not join; one has a sky and a floor of one colour each."""
+    photos = [np.roll(round_about(), 100 * k, 1)[:, 200 - k : 600] for k in range(3)]
+    for k, pixels in enumerate(photos):
+        tall = pixels[100:300] if k else np.concatenate([np.full((100, 400, 3), 200, np.uint8), pixels[150:250, :400]])
+        Image.fromarray(tall[:200, :400]).save(tmp_path / f"{k}.png")
+    assert len(prepare_photos(tmp_path, tmp_path / "out")[0]) == 3

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find,
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import write_arrays, write_json
-from tests.helpers.photos import photo, result
+from tests.helpers.photos import photo, result, turned
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TABLE_VASE = ROOT / "samples" / "photos" / "table_vase"
@@ -180,7 +181,7 @@ def test_cameras_on_one_side_are_no_closed_object():
 
 @pytest.mark.parametrize(("span", "expected"), [(90.0, 81.0), (200.0, 180.0), (360.0, 324.0)])
 def test_span_is_the_arc_less_the_largest_gap(span, expected):
-    assert view_span(views_of(result(10, 10, span=span), PHOTOS)) == pytest.approx(expected, abs=0.01)
+    assert view_span(views_of(result(10, 10, span=span), PHOTOS), np.zeros(3)) == pytest.approx(expected, abs=0.01)
 
 
 def test_cameras_too_close_together_fail():
@@ -562,6 +563,7 @@ def test_what_looks_least_alike_is_matched_too_where_photos_are_left_out(posed, 
     monkeypatch.setattr(worker, "watch_parent", lambda: None)
     monkeypatch.setattr(worker, "features", lambda *args: None)
     monkeypatch.setattr(worker, "matches", lambda pycolmap, job, database: limits.append(job["exhaustive_up_to"]))
+    monkeypatch.setattr(worker, "overlay", lambda *args: [])
     monkeypatch.setattr(worker, "read_pairs", lambda *args: ({}, []))
     monkeypatch.setattr(worker, "findings", lambda *args: {})
     monkeypatch.setattr(worker, "best_mapping", lambda *args: (None, []))
@@ -582,3 +584,90 @@ def test_poses_of_the_rendered_set(tmp_path):
     assert report["posed"] == 48
     assert report["center_error_worst_percent"] < 0.5
     assert report["focal_error_percent"] < 0.5
+
+
+@pytest.mark.parametrize(("still", "found"), [(12, [0.0625, 0.0833, 0.2083, 0.1667]), (0, []), (400, [])])
+def test_what_is_drawn_over_the_photos_is_found_by_what_stands_still(tmp_path, still, found):
+    """A logo of 12 features in 9 of the 48 x 36 cells of the picture; no logo; and a background that stands still."""
+    import pycolmap
+
+    rng, size = np.random.default_rng(0), np.array([480, 360])
+    inside = (np.array([31.0, 31]), np.array([99.0, 59])) if still < 100 else (np.zeros(2), size)
+    logo = rng.uniform(*inside, (still, 2))
+    logo[:2] = np.array([[31.0, 31], [99, 59]])[:still]
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        camera = opened.write_camera(
+            pycolmap.Camera(model="SIMPLE_RADIAL", width=480, height=360, params=[500, 240, 180, 0])
+        )
+        images = [opened.write_image(pycolmap.Image(name=f"{k}.jpg", camera_id=camera)) for k in range(12)]
+        for image in images:
+            places = np.concatenate([logo + rng.normal(0, 0.2, logo.shape), rng.uniform(0, 1, (60, 2)) * size])
+            shape = np.tile([2.0, 0, 0, 2], (len(places), 1))
+            opened.write_keypoints(image, np.column_stack([places, shape]).astype(np.float32))
+        every = np.arange(still + 60, dtype=np.uint32)
+        for k, a in enumerate(images):
+            for b in images[k + 1 :]:
+                opened.write_matches(a, b, np.stack([every, every], 1))
+    job = {"groups": [{"width": 480, "height": 360, "names": [f"{k}.jpg" for k in range(12)]}]}
+    assert worker.overlay(pycolmap, job, tmp_path / "database.db") == pytest.approx(found, abs=1e-3)
+
+
+def test_what_is_drawn_over_the_photos_is_reported():
+    verdict = check({**result(10, 10), "overlay": [0.05, 0.1, 0.2, 0.15]}, PHOTOS)
+    assert "a logo, a date" in verdict["warnings"][0] and "from 5% to 20% of their width" in verdict["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("tilt", "focal", "held"), [(0.9, 600.0, True), (4.0, 600.0, False), (4.0, 3000.0, True), (20.0, 3000.0, False)]
+)
+def test_cameras_that_look_exactly_one_way_have_no_focal_length_of_their_own(tilt, focal, held):
+    views = result(10, 10, focal=focal, span=0.0)["views"]
+    for number, view in enumerate(views):
+        view["rotation"] = turned(np.radians(tilt) * (number % 2 - 0.5)).tolist()
+    assert worker.undetermined(views) == held
+    verdict = check({**result(10, 10), "held": held}, PHOTOS)
+    assert any("no focal length follows: it is a guess" in line for line in verdict["warnings"]) == held
+
+
+def test_progress_never_counts_more_photos_than_there_are(tmp_path):
+    (tmp_path / "progress.log").write_text("phase mapping\nplaced 29\nplaced 30\n")
+    assert poses.estimate(tmp_path, tmp_path / "progress.log", {"count": 29}) == (1.0, "placing cameras, 29 of 29")
+
+
+def test_blown_out_photos_are_neither_blurred_nor_of_something_else():
+    """Seven of 18 match each other alone, as white photos do; one of them counts as sound."""
+    photos = [photo(k, fault="blown out" if k > 11 else "") for k in range(18)]
+    verdict = check(two_things(), photos)
+    assert [entry["why"].split(" (")[0] for entry in verdict["left_out"][1:]] == ["blown out"] * 6
+    white = [replace(photo(k), white=0.8) for k in range(10)]
+    verdict = check(result(10, 0, features=30, matches=0), white)
+    assert "10 photos are mostly white" in verdict["causes"][0] and "less light" in failure_hint(verdict)
+    assert "80% of it is white" in verdict["left_out"][0]["why"]
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.8])
+def test_what_the_lens_leaves_is_what_all_photos_have_alike(bend):
+    """Points are off by 0.8 sin(2 pi x / width) px at each place, 0.8 / sqrt(2) RMS; noise is 0.5 px in x and y."""
+    import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 12, 900
+    pycolmap.set_random_seed(0)
+    model, rng = pycolmap.synthesize_dataset(options), np.random.default_rng(0)
+    for image in model.images.values():
+        width = model.cameras[image.camera_id].width
+        for point in image.points2D:
+            point.xy = point.xy + rng.normal(0, 0.5, 2) + [bend * np.sin(2 * np.pi * point.xy[0] / width), 0]
+    off, share = worker.lens_left(model)
+    assert off == pytest.approx(bend / 2**0.5, abs=0.08)
+    assert share == pytest.approx(off / np.hypot(off, 0.5 * 2**0.5), abs=0.05)
+
+
+def test_a_lens_of_another_kind_is_refused_and_named(monkeypatch, tmp_path):
+    """All photos have a pose, the error is below 2 px, and no pair contradicts: yet all are off alike."""
+    fisheye = {**result(10, 10, error=1.3), "lens": [0.55, 0.42]}
+    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": fisheye})
+    assert tried == ["ordinary"]
+    assert "all photos are off by the same 0.6 px" in checks["error"] and "the lens is a fisheye" in checks["error"]
+    for usual in ([0.55, 0.2], [0.2, 0.5]):
+        assert check({**result(10, 10), "lens": usual}, PHOTOS)["failures"] == []

@@ -170,6 +170,20 @@ def test_a_body_that_photos_put_into_the_floor_starts_on_it(fitted, deep, told):
     assert f"  # moved up by {deep:.2g} m, out of " in text
 
 
+def test_the_box_falls_onto_a_body_where_it_starts_not_where_it_was_found(fitted):
+    """A cube without scenery that reaches 0.15 m below the floor: it is moved up first."""
+    parts = {"version": 1, "scenery": False, "cell": 0.02, "objects": [{"name": "object1"}]}
+    write_json(fitted / "parts.json", parts)
+    (fitted / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (0, 0, -0.05))))
+    report = write_scene(fitted, fitted / "scene.yaml")
+    assert list(report["moved"]) == ["object1"]
+    assert report["moved"]["object1"]["by"] == pytest.approx([0, 0, 0.15], abs=1e-3)
+    at = {body["name"]: body["position"] for body in yaml.safe_load((fitted / "scene.yaml").read_text())["bodies"][1:]}
+    assert at["object1"][2] == pytest.approx(0.0, abs=1e-4)
+    under = at["box"][2] - 0.5 * report["drop"]["thickness"]
+    assert 0.2 < under < 0.2 + 0.5 * report["drop"]["side"]
+
+
 def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_path, monkeypatch):
     fits = []
 

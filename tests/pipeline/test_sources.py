@@ -465,3 +465,94 @@ def test_each_lens_is_colmaps_in_every_format(tmp_path, model, kind, projected):
     points = (LOCAL - view.translation) @ view.rotation
     found = prepared[0].prepared(np.array(projected[model]), view)
     np.testing.assert_allclose(found, view.project(points)[0], atol=1e-6)
+
+
+def scanned(folder: Path, *others: str) -> Path:
+    """Photos as a phone's scanner writes them, and pictures of the same numbers with other names."""
+    noise(folder, [f"frame_{k:05d}.jpg" for k in range(4)])
+    return noise(folder, [f"{name}_{k:05d}.png" for name in others for k in range(4)])
+
+
+def test_depth_and_confidence_among_the_photos_are_named_and_not_used(tmp_path):
+    source = find_source(scanned(tmp_path, "depth", "conf"))
+    assert [path.name for path in source.photos] == [f"frame_{k:05d}.jpg" for k in range(4)] and not source.masks
+    assert source.notes == (
+        "4 pictures are confidence of photos, by their names (first: conf_00000.png): they are not used",
+        "4 pictures are depth of photos, by their names (first: depth_00000.png): they are not used",
+    )
+
+
+@pytest.mark.parametrize("name", ["{}_mask.png", "{}.mask.png", "Mask-{}.png"])
+def test_masks_among_the_photos_are_masks(tmp_path, name):
+    noise(tmp_path / "in", [f"{k:03d}.png" for k in range(3)])
+    half = np.zeros((90, 120), np.uint8)
+    half[:, :60] = 255
+    for k in range(3):
+        Image.fromarray(half).save(tmp_path / "in" / name.format(f"{k:03d}"))
+    photos, notes = prepare_photos(tmp_path / "in", fresh(tmp_path / "out"))
+    assert [photo.source for photo in photos] == ["000.png", "001.png", "002.png"] and all(p.mask for p in photos)
+    with Image.open(tmp_path / "out" / "masks" / "0000.jpg.png") as mask:
+        assert (np.asarray(mask) == half).all()
+    assert len(notes) == 1 and "3 pictures are masks of photos" in notes[0]
+
+
+def test_folders_called_image_and_mask_are_photos_and_masks(tmp_path):
+    noise(tmp_path / "image", ["a.png", "b.png", "c.png"])
+    noise(tmp_path / "mask", ["a.png", "b.png", "c.png"])
+    source = find_source(tmp_path)
+    assert [path.parent.name for path in source.photos] == ["image"] * 3
+    assert {photo.name: mask for photo, mask in source.masks.items()} == {
+        f"{name}.png": tmp_path / "mask" / f"{name}.png" for name in "abc"
+    }
+
+
+@pytest.mark.parametrize("names", [["mask_1.png", "mask_2.png", "mask_3.png"], ["a.png", "b.png", "my mask.png"]])
+def test_photos_of_masks_are_photos(tmp_path, names):
+    """There is no other picture of the same number or name."""
+    source = find_source(noise(tmp_path, names))
+    assert sorted(path.name for path in source.photos) == sorted(names) and source.notes == ()
+
+
+@pytest.mark.parametrize("given", ["sparse", "sparse/0", "sparse/1"])
+def test_of_several_models_the_largest_is_used_and_all_are_named(tmp_path, given):
+    """COLMAP leaves one for each set of photos that it cannot join; 0 is not always the larger."""
+    noise(tmp_path / "images", NAMES)
+    write_text_model(tmp_path / "sparse" / "1")
+    write_text_model(tmp_path / "sparse" / "0")
+    lines = (tmp_path / "sparse" / "0" / "images.txt").read_text().splitlines()
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:3]) + "\n")  # of one photo
+    source = find_source(tmp_path / given)
+    assert len(source.photos) == 3 and source.cameras == tmp_path / "sparse" / "1"
+    assert source.notes[0].endswith("holds 2 models (1 photos in 0, 3 photos in 1): the largest, 1, is used")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "program", "instead"),
+    [
+        ("sfm_data.json", {"sfm_data_version": "0.3", "views": [], "extrinsics": []}, "OpenMVG", "openMVG2Colmap"),
+        ("reconstruction.json", [{"cameras": {}, "shots": {"a.jpg": {}}}], "OpenSfM", "export_colmap"),
+        ("camera_models.json", {"v2 x": {"projection_type": "perspective", "width": 1}}, "OpenSfM", "export_colmap"),
+        ("cameras.json", [{"id": 0, "img_name": "a", "position": [0, 0, 0]}], "3D Gaussian splatting", "sparse/0"),
+        ("sfm.json", {"version": ["1", "2"], "views": [], "intrinsics": []}, "Meshroom", "COLMAP"),
+    ],
+)  # fmt: skip
+def test_cameras_of_other_programs_are_named_with_what_to_give(tmp_path, name, content, program, instead):
+    (tmp_path / name).write_text(json.dumps(content))
+    with pytest.raises(SdfsimError, match=f"{name}: is a file of {program}") as caught:
+        find_source(tmp_path / name)
+    assert instead in caught.value.hint and "transforms.json" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({"points": [], "colors": []}, "it has no `frames`, but colors, points"),
+        ([], "it has no `frames`, but nothing"),
+        ({"fl_x": 1, "w": 1, "h": 1, "frames": [{"file_path": "a"}]}, "it has no 'transform_matrix'"),
+    ],
+)
+def test_other_json_files_are_told_what_they_lack(tmp_path, content, says):
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(SdfsimError, match=says) as caught:
+        find_source(tmp_path / "c.json")
+    assert "transforms.json" in caught.value.hint and "KeyError" not in str(caught.value)

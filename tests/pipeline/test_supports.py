@@ -91,7 +91,7 @@ def photographed(tmp_path_factory) -> tuple[FieldSurface, PosedPhotos, Path]:
     known = (np.abs(raw.vertices[:, :2]) < MAT + 0.03).all(1) & (np.abs(raw.vertices[:, 2] - TOP) < 0.5 * CELL)
     known |= np.abs(raw.vertices[:, 2] - FLOOR) < 0.5 * CELL
     shown = known[raw.faces].all(1)
-    surface = FieldSurface(volume, raw, known, np.ones(len(raw.faces), bool), shown, [])
+    surface = FieldSurface(volume, raw, known, np.ones(len(raw.faces), bool), shown, [], 3 * known)
     return surface, PosedPhotos(tuple(views), sparse), folder
 
 
@@ -128,7 +128,14 @@ def test_nothing_is_completed_where_all_of_it_is_seen_or_patterned(photographed)
     assert complete(replace(surface, shown=surface.shown & low), UP, CELL, poses, folder) == []
     flat = Volume(np.minimum(box_distance(surface.volume.points()), 1).astype(np.float32), surface.volume.low, CELL)
     raw = flat.mesh()
-    whole = FieldSurface(flat, raw, np.ones(len(raw.vertices), bool), *[np.ones(len(raw.faces), bool)] * 2, [])
+    whole = FieldSurface(
+        flat,
+        raw,
+        np.ones(len(raw.vertices), bool),
+        *[np.ones(len(raw.faces), bool)] * 2,
+        [],
+        np.full(len(raw.vertices), 3),
+    )
     assert complete(whole, UP, CELL, poses, folder) == []
 
 
@@ -150,7 +157,14 @@ def test_flat_spots_of_a_round_thing_are_no_tables(photographed):
     volume = replace(surface.volume, values=(ball + bumps).astype(np.float32))
     raw = volume.mesh()
     raw = replace(raw, colors=np.full(raw.vertices.shape, 128, np.uint8))
-    whole = FieldSurface(volume, raw, np.ones(len(raw.vertices), bool), *[np.ones(len(raw.faces), bool)] * 2, [])
+    whole = FieldSurface(
+        volume,
+        raw,
+        np.ones(len(raw.vertices), bool),
+        *[np.ones(len(raw.faces), bool)] * 2,
+        [],
+        np.full(len(raw.vertices), 3),
+    )
     plain = folder.parent / "plain"
     (plain / "images").mkdir(parents=True, exist_ok=True)
     for view in poses.views:

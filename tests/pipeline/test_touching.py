@@ -124,7 +124,9 @@ class Scene:
         ]
         raw = Mesh(raw.vertices, raw.faces, (255 * np.array(mean)[nearest] ** (1 / 1.6)).astype(np.uint8))
         shown = ball(raw.vertices) < -0.03
-        self.surface = FieldSurface(volume, raw, shown, np.ones(len(raw.faces), bool), shown[raw.faces].all(1), [])
+        self.surface = FieldSurface(
+            volume, raw, shown, np.ones(len(raw.faces), bool), shown[raw.faces].all(1), [], 3 * shown
+        )
         # What the field is between its samples is that of the samples: exact distances take minutes.
         self.distance = lambda points: volume.at(points).astype(np.float32)
 

@@ -4,8 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from pipeline.inputs import video
 from pipeline.inputs.photos import prepare_photos
+from pipeline.inputs.sources import find_source
 from pipeline.inputs.video import FEWEST, choose_frames, follow, frames_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from tests.pipeline.photo_sets import TABLE_VASE
@@ -79,3 +82,60 @@ def test_what_is_no_video_is_named(tmp_path, capfd):
     with pytest.raises(SdfsimError, match=r"a\.mp4: "):
         prepare_photos(tmp_path / "a.mp4", tmp_path)
     assert capfd.readouterr().err == ""
+
+
+def encode(path: Path, codec: str, container: str, frames: int = 40, turned: float = 0) -> None:
+    """A film of a window that slides over a photo, by PyAV."""
+    import av
+
+    with Image.open(TABLE_VASE / "images" / "000.jpg") as image:
+        strip = np.asarray(image.resize((WIDTH + 8 * frames, HEIGHT)))
+    with av.open(str(path), "w", format=container) as film:
+        stream = film.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        if turned:
+            stream.set_display_rotation(turned)
+        for number in range(frames):
+            pixels = np.ascontiguousarray(strip[:, 8 * number : 8 * number + WIDTH])
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        film.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "container"),
+    [
+        ("walk.mp4", "libsvtav1", "mp4"), ("WALK.MTS", "libx264", "mpegts"), ("walk.3gp", "mpeg4", "3gp"),
+        ("walk.mpg", "mpeg2video", "mpeg"), ("walk.wmv", "wmv2", "asf"), ("walk", "libx264", "matroska"),
+    ],
+)  # fmt: skip
+def test_what_can_be_decoded_is_a_film(tmp_path, name, codec, container):
+    encode(tmp_path / name, codec, container)
+    source = find_source(tmp_path / name)
+    assert source.video == tmp_path / name
+    moved, _ = follow(source.video)
+    assert 38 <= len(moved) <= 40
+    assert moved[-1] / (len(moved) - 1) == pytest.approx(8 / WIDTH, rel=0.1)
+
+
+@pytest.mark.parametrize("turned", [0, 90, 180, -90])
+def test_pyav_shows_what_opencv_shows(tmp_path, turned):
+    """Upright as well: phones store films as the sensor lies."""
+    encode(tmp_path / "a.mp4", "libx264", "mp4", turned=turned)
+    (one, rate), (other, same) = (decoder(tmp_path / "a.mp4") for decoder in (video._by_opencv, video._by_pyav))
+    pairs = list(zip(one, other, strict=True))
+    assert len(pairs) == 40 and rate == same == 25
+    assert max(np.abs(a.astype(int) - b).mean() for a, b in pairs) < 3
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "song.mp3", "lens.xml"])
+def test_text_and_sound_are_no_films(tmp_path, name):
+    (tmp_path / name).write_bytes(b"a line of text\n" * 2000)
+    with pytest.raises(SdfsimError, match="not a folder, a video"):
+        find_source(tmp_path / name)
+
+
+def test_a_folder_with_a_film_of_any_kind_names_the_command(tmp_path):
+    encode(tmp_path / "00012.MTS", "libx264", "mpegts")
+    with pytest.raises(SdfsimError, match=r"it holds the video 00012\.MTS") as caught:
+        find_source(tmp_path)
+    assert "sdfsim reconstruct" in caught.value.hint
