@@ -115,7 +115,8 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
     counts: dict[str, int] = {}
     columns: dict[str, list[tuple[str, str, str]]] = {}  # name, type of the list's length or nothing, type
     for row in content[first.end() : end.start()].decode("latin-1").splitlines():
-        match (row.lower() if row.split(None, 1)[:1] and row.split(None, 1)[0].isupper() else row).split():
+        words = row.split()
+        match [word.lower() for word in words] if words and words[0].isupper() else words:
             case ["format", way, *_] if way in ORDERS:
                 order = way
             case ["element", name, count] if count.isdecimal() and name not in counts:
