@@ -684,7 +684,8 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
 
 def _refined(take: Take) -> tuple[Take, list[str]]:
     """The data for MuJoCo, and a line if lengths are in a finer unit than metres. All lengths are `FINER` times as
-    large, and so is gravity, with the same densities and times; so the motion is the same."""
+    large, and so is gravity, with the same densities and times; so the motion is the same, up to the softness of
+    contacts."""
     scene, k = take.scene, FINER
     small = []
     for body in scene.bodies:

@@ -359,7 +359,8 @@ class _GltfReader:
         """Rows [V, K] float64 of an attribute of a primitive, with its morph targets by their weights."""
         rows = self.array(primitive["attributes"][name]).astype(np.float64)
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
-            if weight and name in target:
+            # A target without data moves nothing.
+            if weight and name in target and {"bufferView", "sparse"} & self.header["accessors"][target[name]].keys():
                 rows = rows + weight * self.array(target[name])
         return rows
 

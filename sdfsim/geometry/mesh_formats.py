@@ -105,17 +105,18 @@ Element = dict[str, Any]  # columns [N] by their names, or `Ragged`
 def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, str]], str]:
     """Elements of a PLY file by name, the NumPy types of their columns, and the name of a texture file if a comment
     gives it."""
-    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
+    first = re.match(rb"(?i:ply)[ \t]*(\r\n|\n|\r)", content)
     # Lines may end in several ways; but after CR alone, a line feed may be the first of the binary numbers.
     line = rb"\r" if first and first[1] == b"\r" else rb"(?:\r\n|\n|\r)"
-    end = re.search(rb"[\r\n]end_header[ \t]*(?:" + line + rb"|\Z)", content)
+    end = re.search(rb"[\r\n](?i:end_header)[ \t]*(?:" + line + rb"|\Z)", content)
     if first is None or end is None:
         raise ValueError("it has no complete PLY header")
     order, texture = "", ""
     counts: dict[str, int] = {}
     columns: dict[str, list[tuple[str, str, str]]] = {}  # name, type of the list's length or nothing, type
     for row in content[first.end() : end.start()].decode("latin-1").splitlines():
-        match row.split():
+        words = row.split()
+        match [word.lower() for word in words] if words and words[0].isupper() else words:
             case ["format", way, *_] if way in ORDERS:
                 order = way
             case ["element", name, count] if count.isdecimal() and name not in counts:
@@ -441,7 +442,8 @@ def off_surface(content: bytes) -> FileMesh:
     """The triangles of an OFF file (also COFF, NOFF, STOFF and their mixtures); polygons are cut into triangles."""
     text = plain_text(content)
     rows = [words for line in re.sub(rb"#[^\n]*", b"", text).split(b"\n") if (words := line.decode("latin-1").split())]
-    kind = re.fullmatch(r"(ST)?(C)?(N)?(4)?(n)?OFF", rows[0][0]) if rows else None
+    first = rows[0][0] if rows else ""
+    kind = re.fullmatch(r"(ST)?(C)?(N)?(4)?(n)?OFF", first.upper() if first.islower() else first)
     if kind is None:
         raise ValueError("it does not begin with OFF")
     if kind[4] or kind[5]:
@@ -485,6 +487,7 @@ def obj_surface(path: Path, content: bytes) -> FileMesh:
     libraries, used = [], {0: ""}  # the names of materials, by the first face
     for number, line in enumerate(text.split(b"\n"), start=1):
         key, *rest = line.split(None, 1) or [b""]
+        key = key.lower()
         if key in rows:
             rows[key].append(rest[0].partition(b"#")[0].split() if rest else [])
             at[key].append(number)
@@ -642,7 +645,7 @@ def stl_surface(content: bytes) -> FileMesh:
             raise ValueError("cut short: it has no endsolid")
         words = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", text)
         corners = numbers([word for row in words for word in row], text).reshape(-1, 3)
-        if len(corners) != 3 * (facets := len(re.findall(rb"\bfacet\s+normal\b", text))):
+        if len(corners) != 3 * (facets := len(re.findall(rb"\bouter\s+loop\b", text))):
             raise ValueError(f"damaged: {len(corners)} vertices for {facets} triangles")
         return FileMesh(corners, np.arange(len(corners)).reshape(-1, 3))
     if len(content) < 84:

@@ -164,6 +164,7 @@ def off_text(first: str, vertex: str = "{} {} {}", faces: list[tuple[int, ...]] 
     [
         (off_text("OFF\n8 7 0"), None),
         (off_text("OFF 8 7 14"), None),
+        (off_text("off\n8 7 0"), None),
         (off_text("OFF\n# made by hand\n\n8 7   # no edges", tail="  0.5 0.5 0.5"), None),
         (off_text("\ufeffOFF\r\n8 7 0", tail=" # a face"), None),
         (off_text("OFF\n8 5 0", faces=[*QUADS, (2, 0, 4, 6)]).replace("8 5 0", "8 6 0"), None),
@@ -222,6 +223,7 @@ def obj(face: Callable[[tuple[int, ...]], str]) -> str:
         obj(lambda c: f"f {' '.join(f'{k - 8}/-1/-1' for k in c)}\n"),
         obj(lambda c: f"f {' '.join(f'{k + 1}//-1' for k in c)}\n"),
         obj(lambda c: f"f {' '.join(str(k + 1) for k in c)} # group 0\n"),
+        obj(lambda c: f"f {' '.join(str(k + 1) for k in c)}\n").upper(),
         obj(lambda c: f"  f {' '.join(str(k + 1) for k in c)}\t# 0 of -1\r\n"),
         # Indices count back from where they stand, not from the end.
         "".join(
@@ -560,7 +562,11 @@ def test_morph_targets_count_by_their_weights(tmp_path: Path) -> None:
     file = block()
     up = np.array([z > 30 for _, _, z in PLACES])[:, None]
     targets = [{"POSITION": file.accessor(up * np.array([[0.0, 8, 0]]), "<f4")}]
-    targets += [{"POSITION": file.accessor(up * np.array([[6.0, 0, 0]]), "<f4")}, {"NORMAL": 0}]
+    targets += [
+        {"POSITION": file.accessor(up * np.array([[6.0, 0, 0]]), "<f4")},
+        {"POSITION": len(file.header["accessors"])},
+    ]
+    file.header["accessors"].append({"componentType": 5126, "count": 8, "type": "VEC3"})  # without data: zeros
     file.header["meshes"][0]["primitives"][0]["targets"] = targets
     for of_mesh, of_node, (x, z) in (
         (None, None, (0, 0)), ([0.25, 0.5, 1], None, (3, 2)), ([1, 1, 1], [0.5, 0, 0], (0, 4)), ([0, 1], None, (6, 0)),
@@ -607,6 +613,7 @@ def stl_text() -> str:
         lambda text: text.replace("\n", "\r"),
         lambda text: "\ufeff" + text.replace("\n", "\r\n"),
         lambda text: text.replace("\n ", " "),
+        lambda text: text.replace("facet normal 0 0 0", "facet").replace("endfacet", "end facet"),
         lambda text: text.upper().replace("ENDSOLID", "End Solid").replace("\n", "\r"),
     ],
 )
@@ -619,7 +626,8 @@ def test_a_text_stl_is_read_however_it_is_written(tmp_path: Path, change: Callab
 
 @pytest.mark.parametrize("ends", [("\r\n", "\n"), ("\n", "\r\n"), ("\r", "\r"), ("\r\n", "\r\n")])
 def test_lines_of_a_ply_header_may_end_in_several_ways(tmp_path: Path, ends: tuple[str, str]) -> None:
-    for content in (binary_ply("<"), text_ply("3 0 1 2\n", 1).encode()):
+    for content in (binary_ply("<"), text_ply("3 0 1 2\n", 1).encode(), text_ply("3 0 1 2\n", 1).upper().encode()):
+        content = content.replace(b"END_HEADER", b"end_header")
         head, tail = content.split(b"end_header\n")
         head = head.replace(b"\n", ends[0].encode()) + b"end_header" + ends[1].encode()
         (tmp_path / "a.ply").write_bytes(head + tail)
