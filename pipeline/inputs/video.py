@@ -44,13 +44,14 @@ def _by_opencv(path: Path) -> tuple[Iterator[np.ndarray], float]:
 
 def _by_pyav(path: Path) -> tuple[Iterator[np.ndarray], float]:
     import av
+    from av.error import FFmpegError
 
     def read() -> Iterator[np.ndarray]:
-        with suppress(av.FFmpegError), av.open(str(path)) as film:  # a damaged end ends the film
+        with suppress(FFmpegError), av.open(str(path)) as film:  # a damaged end ends the film
             for frame in film.decode(video=0):
                 yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
 
-    with suppress(av.FFmpegError, IndexError), av.open(str(path)) as film:
+    with suppress(FFmpegError, IndexError), av.open(str(path)) as film:
         return read(), float(film.streams.video[0].average_rate or 30.0)
     return iter(()), 30.0
 
@@ -59,9 +60,11 @@ def is_film(path: Path) -> bool:
     """Whether a file holds moving pictures, whatever its name; text and single pictures, which the decoder would show
     as well, do not count."""
     import av
+    from av.error import FFmpegError
+    from av.stream import Disposition
 
-    with suppress(av.FFmpegError), av.open(str(path)) as film:
-        still = av.stream.Disposition.attached_pic  # of a sound file
+    with suppress(FFmpegError), av.open(str(path)) as film:
+        still = Disposition.attached_pic  # of a sound file
         moving = [stream for stream in film.streams.video if not stream.disposition & still]
         return bool(moving) and film.format.name not in STILLS and not film.format.name.endswith("_pipe")
     return False
