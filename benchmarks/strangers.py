@@ -9,7 +9,8 @@ the commands that a user would run: `reconstruct` for photos and `simulate` for 
 if it is refused as open), which is then scaled to 20 cm and dropped from half its size onto a floor, with `sdf: grid`
 if the fit misses its certificate; `identify` for recordings. Commands run in separate processes, none for longer than
 `--longest` seconds, so that one input cannot stop the others. Writes DIR/table.md and DIR/table.json, failures first,
-and with `--page` the table of docs/notes/strangers.md. Times are for an empty DIR.
+and with `--page` the tables of docs/notes/strangers.md, one for each kind that was found. A second run with the same
+DIR continues: inputs that are in its table.json are not repeated.
 """
 
 import json
@@ -198,11 +199,16 @@ def of_recordings(found: Found, row: Row, place: Path, run: Callable[..., dict[s
         row.wrong.append("the identified numbers are farther off than those of the scene")
 
 
+def named(found: Found, folder: Path) -> str:
+    """The name of an input in the table."""
+    name = found.files[0].relative_to(folder).as_posix()
+    return name if len(found.files) == 1 else f"{name} and {len(found.files) - 1} more"
+
+
 def judged(found: Found, folder: Path, out: Path, preset: str, longest: float) -> Row:
     """The row of an input, including any failure."""
-    name = found.files[0].relative_to(folder).as_posix()
-    row = Row(name if len(found.files) == 1 else f"{name} and {len(found.files) - 1} more", found.kind)
-    place = out / name
+    row = Row(named(found, folder), found.kind)
+    place = out / found.files[0].relative_to(folder)
     began = time.monotonic()
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -244,11 +250,15 @@ def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 180
     inputs = list(found_in(folder))
     if not inputs:
         raise SdfsimError(f"{folder}: no photos, meshes or recordings in it or below it")
-    rows = []
+    done = out / "table.json"
+    rows = [Row(**row) for row in json.loads(done.read_text(encoding="utf-8"))] if done.exists() else []
     for found in inputs:
+        if named(found, folder) in {row.name for row in rows}:
+            continue
         rows.append(judged(found, folder, out, preset, longest))
         print(" | ".join(filter(None, rows[-1].cells())), flush=True)
-        write_json(out / "table.json", [asdict(row) for row in rows])  # the rows so far
+        write_json(done, [asdict(row) for row in rows])  # the rows so far
     write_text(out / "table.md", table(rows))
-    if page:
-        write_section("strangers", "python -m benchmarks strangers FOLDER -o DIR --page", table(rows), PAGE)
+    for kind in sorted({row.kind for row in rows}) if page else ():
+        of_kind = table([row for row in rows if row.kind == kind])
+        write_section(f"strangers {kind}", "python -m benchmarks strangers FOLDER -o DIR --page", of_kind, PAGE)
