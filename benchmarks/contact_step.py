@@ -139,7 +139,7 @@ def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable
     few, many = FAR
     both("static boxes far away", (str(few), with_far(few)), (str(many), with_far(many)), 500)
     found["64 boxes at rest"] = ("awake", "asleep", lambda: asleep(apart(64)))
-    for model in ("solver", "small"):
+    for model in ("solver", "gnn"):
         few, many = map(str, FAR)
         found[f"the same with all of `Simulator`, {model}"] = (few, many, partial(user_steps, model))
     return found

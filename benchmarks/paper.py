@@ -26,11 +26,12 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
+from benchmarks import baselines  # noqa: F401, adds its networks
 from benchmarks.results import progress
 from samples.large import write_scene
 from sdfsim.base.files import write_text
 from sdfsim.data.batching import batches, first_frames, roll_out
-from sdfsim.data.dataset import conditions_of, engine_substep, read_info
+from sdfsim.data.dataset import conditions_of, read_info
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import errors
@@ -44,7 +45,6 @@ from sdfsim.sdf.grid import sample_grid
 from sdfsim.shape.make import fit_pieces
 from sdfsim.shape.shape import Shape, load_shape
 from sdfsim.simulate.simulator import Simulator
-from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
@@ -230,13 +230,9 @@ def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
     recorded = [first_frames(t, int(FRAME) + 1) for t in recorded]
     if width is not None:
         shapes = {name: refitted(shape, width, home / name) for name, shape in shapes.items()}
-    inner = inner_steps(recorded[0].dt, engine_substep(data))
-    solver, motions, conditions = load_model(SOLVER), [], conditions_of(data)
+    solver, motions, floor = load_model(SOLVER), [], conditions_of(data).floor
     for group in batches(recorded):
-        motions += roll_out(
-            solver, group, shapes, int(FRAME), substeps=inner, floor=conditions.floor,
-            as_teacher=conditions.by_teacher,
-        )  # fmt: skip
+        motions += roll_out(solver, group, shapes, int(FRAME), floor=floor)
     return errors(motions, recorded)[FRAME]
 
 

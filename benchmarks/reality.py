@@ -4,24 +4,20 @@
 
 TOSSES holds `cube.npz`: tosses of an acrylic cube onto a table, tracked at 148 Hz (ContactNets; Pfrommer, Halm and Posa
 2020). Starts are fitted to the flight before the first impact. `sdfsim identify` finds our parameters on 60 tosses; for
-other engines a search finds the same number of parameters on the same tosses, with the same number of tries. Networks
-on our solve with these parameters are trained on 8 to 256 tosses, three seeds of each, and chosen by the errors of
-whole motions on further tosses. Errors are measured on 100 others, over the first 75 frames, from the same starts.
-Drake takes part if it is installed. It takes five minutes, about forty more for the networks, and ten more with Drake.
+other engines a search finds the same number of parameters on the same tosses, with the same number of tries. Errors are
+measured on 100 others, over the first 75 frames, from the same starts. Drake takes part if it is installed. It takes
+five minutes, and ten more with Drake.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from time import process_time
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-import torch
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -59,26 +55,16 @@ from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json, write_text
 from sdfsim.base.lazy import NotInstalled, optional
-from sdfsim.data.batching import roll_out
-from sdfsim.data.dataset import Trajectory
 from sdfsim.data.public_tosses import CUBE
-from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, one_thread
+from sdfsim.evaluation.harness import Line, Panel, draw, markdown, number, one_thread
 from sdfsim.evaluation.metrics import interval
-from sdfsim.learned.impulse import ImpulseNetwork
-from sdfsim.learned.model import SURFACE, Model, load_model
 from sdfsim.scene.load import load_scene
-from sdfsim.scene.scene import Body, Scene
-from sdfsim.training.motion_task import MotionTask, Starts
-from sdfsim.training.presets import PRESETS, Preset
-from sdfsim.training.run import Run
-from sdfsim.training.surface_task import SurfaceTask
+from sdfsim.scene.scene import Scene
 
 SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as published
 THING = Thing(np.full(3, SIDE), MASS, np.full(3, INERTIA))
 GRAVITY = 9.81  # m/s^2
 FEW = 16  # first tosses, for a second fit of ours
-TRAINED, SEEDS = (8, 16, 64, 256), 3  # training tosses of networks, and seeds of each
-STEPS, LOOKS = 240, 4  # of a training, and its states among which the choosing tosses decide
 
 
 @dataclass(frozen=True)
@@ -228,197 +214,6 @@ def drake(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[
     return Motion(place, turns)
 
 
-# --- networks ---
-
-
-def rolled(network: ImpulseNetwork, task: MotionTask, starts: Sequence[Start]) -> Motion:
-    worlds = task.worlds(len(starts))
-    position, turn, speed, spin = (
-        np.array([getattr(start, name) for start in starts])
-        for name in ("position", "quat_xyzw", "velocity", "angular_velocity")
-    )
-    first = Starts(position, turn, speed, spin, np.zeros((0, 0, 7)))
-    steps = worlds.roll(network, first, FRAMES)
-    place, turn = (np.stack([getattr(step, name) for step in steps], 1) for name in ("position", "orientation"))
-    return Motion(place * worlds.units.length, turn)
-
-
-def trained(how: Trained, seed: int, rows: Sequence[int], lesson: Lesson) -> tuple[Judged, float, float]:
-    """The state of a training on the recordings `rows` with the least error on the choosing tosses: a function that
-    moves tosses with it, this error, and the seconds of processor time in total."""
-    began = process_time()
-    with TemporaryDirectory() as folder:
-        plan, known = how.plan(), [lesson.known[k] for k in rows]
-        if plan.kind in SURFACE:
-            task: Any = SurfaceTask(dataset_of(known, lesson, Path(folder)), "train", plan, noisy=True)
-        else:
-            task = MotionTask(known or lesson.known[:1], lesson.scene, noisy=True)
-
-        def judged(run: Run) -> Judged:
-            if plan.kind in SURFACE:
-                return partial(on_surfaces, run.export(plan.kind, []), lesson)
-            return partial(rolled, cast("ImpulseNetwork", run.averaged()), task)
-
-        start = load_model(TEACHERS[seed]) if how.teacher else None
-        run = Run(plan, task, how.steps, seed, torch.device("cpu"), first=start)
-        states = [] if how.steps else [judged(run)]
-        while run.step < how.steps:
-            run.advance()
-            if run.step % (how.steps // LOOKS) == 0:
-                states.append(judged(run))
-        run.close()
-    starts, truth = lesson.chooses
-    off = [summed(state(starts), truth) for state in states]
-    best = int(np.argmin(off))
-    return states[best], off[best], process_time() - began
-
-
-def summed(found: Motion, truth: Motion) -> float:
-    """The criterion for choosing a state of a training: the sum of mean errors, % and degrees."""
-    return float(sum(error.mean() for error in errors(found, truth)))
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """Data for a network: training, choosing and test tosses."""
-
-    known: list[Recording]  # for training
-    scene: Scene  # as identified
-    # starts with the recorded motion: of the choosing tosses, and of the test tosses
-    chooses: tuple[Sequence[Start], Motion]
-    judges: tuple[Sequence[Start], Motion]
-
-
-@dataclass(frozen=True)
-class Trained:
-    """One row of the table of networks."""
-
-    preset: str
-    tosses: int
-    steps: int = STEPS
-    teacher: bool = False  # whether it begins with the weights of `TEACHERS`, trained on an engine's recordings
-
-    def plan(self) -> Preset:
-        """Its training plan: networks on surface nodes have the size of `sdf-sim-small`, with the lengths of their
-        presets scaled from MOVi-B's bodies to this cube."""
-        plan = PRESETS[self.preset]
-        if plan.kind not in SURFACE:
-            return plan
-        small, share = PRESETS["sdf-sim-small"], SIDE / BODIES
-        return replace(
-            plan, config=small.config, batch=small.batch, nodes=NODES, reach=share * plan.reach,
-            noise=share * (plan.noise or 0.0),
-        )  # fmt: skip
-
-
-Judged = Callable[[Sequence[Start]], Motion]
-BODIES = 1.87  # m, the middle of the sizes of MOVi-B's bodies
-NODES = 32  # of a cube, at most
-SURFACE_STEPS = 800  # for networks on surface nodes, which have one seed
-HERE = Path(__file__).with_name("models")
-TEACHERS = [
-    HERE / "alone-0.safetensors",
-    "gnn",
-    HERE / "alone-2.safetensors",
-]  # each of 2,000 trajectories (docs/gpu.md)
-NETWORKS = {f"on the solve, {count} tosses": Trained("impacts", count) for count in TRAINED}
-NETWORKS |= {
-    "on the solve, 1,000 steps, 256 tosses": Trained("impacts", 256, PRESETS["impacts"].steps),
-    "alone, 256 tosses": Trained("alone", 256),
-    "alone, after the engine, no tosses": Trained("alone", 0, 0, teacher=True),
-    "alone, after the engine, 256 tosses": Trained("alone", 256, teacher=True),
-    **{f"{kind}, 256 tosses": Trained(kind, 256, SURFACE_STEPS) for kind in SURFACE},
-}
-
-
-def learnt(how: Trained, seed: int, lesson: Lesson) -> dict[str, Any]:
-    """One network: errors [2, TEST] on the test tosses, and its error on the choosing tosses."""
-    rows = np.random.default_rng([seed, how.tosses]).choice(len(lesson.known), how.tosses, replace=False)
-    state, off, taken = trained(how, seed, rows.tolist(), lesson)
-    starts, truth = lesson.judges
-    return {"test": np.array(errors(state(starts), truth)).tolist(), "chosen": off, "seconds": taken}
-
-
-def _table(scene: Scene) -> tuple[Rotation, np.ndarray, Body]:
-    """Rotation and position of a scene's table, and the cube."""
-    table, cube = scene.bodies
-    return Rotation.from_quat(table.quat_xyzw), np.asarray(table.position), cube
-
-
-def dataset_of(recordings: Sequence[Recording], lesson: Lesson, folder: Path) -> Path:
-    """Recordings as a dataset, with the table as its floor at z = 0."""
-    (folder / "train").mkdir()
-    shape = lesson.scene.shapes[_table(lesson.scene)[2].shape]
-    shape.save(folder / "shapes" / "cube")
-    for k, r in enumerate(recordings):
-        place, turn, speed, spin = r.position[:, 0], r.orientation[:, 0], r.velocity[:, 0], r.angular_velocity[:, 0]
-        trajectory_of(place, turn, speed, spin, r.dt, lesson.scene).save(folder / "train" / f"{k:03}.npz")
-    return folder
-
-
-def trajectory_of(
-    position: np.ndarray, turn: np.ndarray, velocity: np.ndarray, spin: np.ndarray, dt: float, scene: Scene
-) -> Trajectory:
-    """Poses and velocities [T, *] of the cube of a scene as seen from its table."""
-    lies, at, cube = _table(scene)
-    still, inertia = lies.inv(), cube.inertia if cube.inertia is not None else np.eye(3) * EVEN
-    return Trajectory(
-        position=still.apply(position - at)[:, None], orientation=(still * Rotation.from_quat(turn)).as_quat()[:, None],
-        velocity=still.apply(velocity)[:, None], angular_velocity=still.apply(spin)[:, None], shape=np.array(["cube"]),
-        scale=np.array([cube.scale]), mass=np.array([cube.mass]), inertia=np.diag(inertia)[None],
-        friction=np.array([cube.friction]), restitution=np.array([cube.restitution]), static=np.zeros(1, bool), dt=dt,
-        gravity=still.apply(scene.gravity),
-    )  # fmt: skip
-
-
-def on_surfaces(model: Model, lesson: Lesson, starts: Sequence[Start]) -> Motion:
-    """The motion of a network on surface nodes from these starts; bodies without contact fly exactly."""
-    lies, at, cube = _table(lesson.scene)
-    table, dt = lesson.scene.bodies[0], lesson.known[0].dt
-
-    def begun(start: Start) -> Trajectory:
-        place, turn, speed, spin = (
-            getattr(start, name)[None] for name in ("position", "quat_xyzw", "velocity", "angular_velocity")
-        )
-        return trajectory_of(place, turn, speed, spin, dt, lesson.scene)
-
-    shapes, floor = {"cube": lesson.scene.shapes[cube.shape]}, (table.friction, table.restitution)
-    moved = roll_out(model, list(map(begun, starts)), shapes, FRAMES, floor=floor)
-    place = np.stack([lies.apply(t.position[1:, 0]) + at for t in moved])
-    turn = np.stack([(lies * Rotation.from_quat(t.orientation[1:, 0])).as_quat() for t in moved])
-    return Motion(place, turn)
-
-
-def networks(groups: tuple[list[Toss], list[Toss], list[Toss]], scene: Path, gravity: float, out: Path) -> Results:
-    """Every network of `NETWORKS` with every seed by (seed, name), each kept in a file in `out`; and the solve without
-    a network. The tosses of the parameter fit are used for training too."""
-    fit, test, rest = groups
-    pool = [*fit, *rest]
-    free, held = pool[: max(TRAINED)], pool[max(TRAINED) :]
-    known = load_scene(scene)
-    chooses, judges = (([fitted_start(toss, gravity) for toss in some], recorded(some)) for some in (held, test))
-    lesson = Lesson(recordings_of(free, known), known, chooses, judges)
-    told = [scene.read_text(encoding="utf-8"), gravity, free, held, test]
-    jobs = [
-        Job(f"seed {seed}", name, [how, how.plan(), LOOKS, seed, *told], learnt, (how, seed, lesson))
-        for seed in range(SEEDS)
-        for name, how in NETWORKS.items()
-        if seed == 0 or how.preset not in SURFACE
-    ]
-    return measure([Job("-", SOLVE, told, solved, (lesson, known)), *jobs], out, on_progress=progress)
-
-
-SOLVE = "the solve alone"
-
-
-def solved(lesson: Lesson, scene: Scene) -> dict[str, Any]:
-    """The same for the solve without a network."""
-    found = [ours(starts, lesson.known[0].dt, scene) for starts, _ in (lesson.chooses, lesson.judges)]
-    return {
-        "test": np.array(errors(found[1], lesson.judges[1])).tolist(), "chosen": summed(found[0], lesson.chooses[1])
-    }  # fmt: skip
-
-
 ENGINES: dict[str, tuple[Engine, Bounds]] = {
     "MuJoCo, elliptic cone": (partial(mujoco, THING), SOFT),
     "MuJoCo, pyramidal cone": (partial(mujoco, THING, elliptic=False), SOFT),
@@ -432,14 +227,11 @@ ENGINES: dict[str, tuple[Engine, Bounds]] = {
 
 
 @one_thread()
-def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bool = False) -> None:
+def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     """Fit and test every engine; write the section of the page, `reality.json` with every toss's errors, the identified
-    scene, and pictures. Then the networks; use `networks_only` if DIR already holds that scene."""
+    scene, and pictures."""
     known = load_tosses(tosses)
     groups = split(known)
-    if networks_only:
-        write_networks(groups, out, gravity)
-        return
     (fit, fit_truth), (test, test_truth) = (
         ([fitted_start(toss, gravity) for toss in group], recorded(group)) for group in groups[:2]
     )
@@ -488,7 +280,6 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY, networks_only: bo
         f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
     )
     write_section("reality", COMMAND, text)
-    write_networks(groups, out, gravity)
 
 
 OURS, FEWER = "sdfsim", f"sdfsim, found on {FEW} tosses"
@@ -552,43 +343,6 @@ def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
         own = " / ".join(number(error.mean()) for error in one["fit"])
         rows.append((name, *map(_told, one["test"]), less, own, found))
     return rows
-
-
-def write_networks(groups: tuple[list[Toss], list[Toss], list[Toss]], out: Path, gravity: float) -> None:
-    """Train and test all networks in the identified scene; write their section of the page."""
-    found = networks(groups, out / "identified.yaml", gravity, out / "networks")
-    chosen = len(groups[0]) + len(groups[2]) - max(TRAINED)
-    text = (
-        f"These are networks in the identified scene. A training has {STEPS} steps unless its row says otherwise "
-        f"({SURFACE_STEPS} for networks on surface nodes). {chosen} tosses choose the best of its {LOOKS} states, "
-        f"which is measured once on {TEST} others. Means are over the listed seeds, with 95 % intervals over tosses. "
-        "Differences to the solve are paired by toss. Times are seconds of one core for one training.\n\n"
-        f"{markdown(network_table(found))}"
-    )
-    write_section("reality networks", f"{COMMAND} --networks-only", text)
-
-
-def network_table(found: Results) -> list[tuple[str, ...]]:
-    """Means over seeds, and their difference to the solve alone, paired by toss; the worst comes first."""
-    solve = found["-", SOLVE]
-    own = np.array(solve["test"])
-    head = ("network", "position, %", "rotation, degrees", "minus the solve", "position, % / degrees of each seed")
-    rows = []
-    for name in dict.fromkeys(method for _, method in found if method != SOLVE):
-        seeds = [one for (_, method), one in found.items() if method == name]
-        if why := next((one["failed"] for one in seeds if "failed" in one), ""):
-            rows.append((np.inf, (name, why, *[""] * (len(head) - 1))))
-            continue
-        test = np.array([one["test"] for one in seeds])
-        mean = test.mean(0)
-        less = " / ".join(_told(change) for change in mean - own)
-        each = "; ".join(" / ".join(map(number, of)) for of in test.mean(2).tolist())
-        on = " / ".join(number(one["chosen"]) for one in seeds)
-        taken = number(float(np.mean([one["seconds"] for one in seeds])))
-        rows.append((float((mean - own).sum(0).mean()), (name, *map(_told, mean), less, each, on, taken)))
-    rows.sort(key=lambda row: -row[0])
-    on = f"sum of both errors on the tosses that choose (solve: {number(solve['chosen'])})"
-    return [(*head, on, "s"), *(row for _, row in rows), (SOLVE, *map(_told, own), "", "", "", "")]
 
 
 def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> None:

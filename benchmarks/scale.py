@@ -130,12 +130,12 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
     jobs = []
     for count in (n for n in BOWLS if n <= largest):
         case = f"{count} spheres in a bowl"
-        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), *(((64, sdf_sim),) if sdf_sim else ())):
+        for nodes, model in ((64, "solver"), (512, "solver"), (64, "gnn"), *(((64, sdf_sim),) if sdf_sim else ())):
             steps, method = 200 if model != sdf_sim else 10, f"{Path(model).stem}, {nodes} nodes"
             jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
         for name, run in (("PyBullet", bullet), ("MuJoCo", mujoco)):
             jobs.append(Job(case, name, [200], engine, (run, scene("bowl", count, 64), 200)))
-    for model in ("solver", "small"):
+    for model in ("solver", "gnn"):
         jobs += [Job(f"{n} boxes far apart", model, [30], ours, (n, 30, model)) for n in APART if n <= 4 * largest]
         for parts in PARTS:
             knots = (scene("knots", 64, 2844), 100, model, 1 / parts)

@@ -63,12 +63,12 @@ def simulate(
         *run.beside_lines(report),
         *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
         f"wrote {out}",
-        *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"usable, not exact: {line}" for line in report["caveats"]),
     ]
     print_failed(session, report)
     if "recording" in report:
         lines.append(f"watch it: sdfsim view {out}   (or: rerun {report['recording']})")
+    lines += [f"outside the model's training: {line}" for line in report["outside_training"]]
     lines.append(f"laws: surfaces measured in {report['frames_measured']} of {report['frames']} frames, energy in all")
     lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
     session.report(report, lines)
@@ -318,22 +318,13 @@ def train(
     session: Session,
     data: Annotated[
         list[Path],
-        typer.Option(
-            help="Dataset folder, or several to train on together. With --scene: recordings of it, as `identify` reads "
-            "them.",
-            show_default=False,
-        ),
+        typer.Option(help="Dataset folder, or several to train on together.", show_default=False),
     ],
     out: Out,
-    scene: Annotated[
-        Path | None, typer.Option(help="The scene of recordings, best as `identify -o` wrote it.", show_default=False)
-    ] = None,
     preset: Annotated[
-        Literal[
-            "small", "alone", "impacts", "sdf-sim", "sdf-sim-small", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"
-        ],
+        Literal["gnn", "sdf-sim", "sdf-sim-small"],
         typer.Option(help="Kind and size of the model."),
-    ] = "small",
+    ] = "gnn",
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in the folder.")] = False,
     first: Annotated[
         str | None,
@@ -347,7 +338,7 @@ def train(
     ] = 0,
     device: str = "auto",
 ) -> None:
-    """Train a model on datasets, or on recordings of real motions."""
+    """Train a model on datasets."""
     from sdfsim.training.train import train as run_training
 
     session.report(run_training(**session.given(), on_progress=session.progress))

@@ -10,7 +10,6 @@ import numpy as np
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.parallel import threads
 from sdfsim.data.dataset import FLOOR, Trajectory
-from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.learned.model import SOLVER, Model
 from sdfsim.physics.bodies import Bodies, State, Units
 from sdfsim.physics.motion import MOTION, Motion
@@ -110,26 +109,20 @@ def roll_out(
     *,
     contact: bool = True,
     substeps: int = SUBSTEPS,
-    as_teacher: bool = False,
     floor: tuple[float, float] = FLOOR,
 ) -> list[Trajectory]:
     """Simulate a batch of trajectories with the same step and gravity from their first frames. Returns the predicted
     motions, of steps + 1 frames.
 
-    The solve makes `substeps` inner steps in a recorded one. With `as_teacher` it does three things as PyBullet does:
-    bodies are larger by `MARGIN` than their shapes, the push out of an overlap adds to the speed of a rebound, and
-    friction is bounded along two axes. "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit
-    code 3) for a state that is not finite.
+    The solve makes `substeps` inner steps in a recorded one. "learned" free flight is for networks on surface nodes.
+    Raises SdfsimError (exit code 3) for a state that is not finite.
     """
     from sdfsim.physics.solver.prepare import SharedShapes  # numba is slow to load
 
     stepper = stepper_of(model, contact=contact, free_flight=free_flight)
     units = model_units(stepper, group[0])
     gravity = np.asarray(group[0].gravity, dtype=np.float64) / units.acceleration
-    options = Options(
-        gravity, group[0].dt / units.time, model.inner or substeps, adds=as_teacher, cone=not as_teacher,
-        margin=MARGIN / units.length if as_teacher else 0.0,
-    )  # fmt: skip
+    options = Options(gravity, group[0].dt / units.time, model.inner or substeps)
     known, plane = {name: stepper.surface(shape) for name, shape in shapes.items()}, stepper.surface(PLANE)
     # The solve is fastest with one trajectory at a time, on all cores; a network with all of them in one graph.
     alone = model.kind == SOLVER

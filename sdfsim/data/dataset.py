@@ -16,7 +16,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, read_json, write_arrays
-from sdfsim.data.pybullet_sim import TEACHER_VERSION, set_as_teacher
+from sdfsim.data.pybullet_sim import TEACHER_VERSION
 from sdfsim.physics.motion import Motion
 
 if TYPE_CHECKING:
@@ -169,7 +169,6 @@ class Conditions:
 
     floor: tuple[float, float]  # the floor's friction and restitution
     floor_given: bool  # whether a dataset.json gives these; else they are those of the recipes' floor
-    by_teacher: bool  # whether a dataset.json names PyBullet with the teacher's settings
 
 
 def conditions_of(data: Path) -> Conditions:
@@ -178,7 +177,7 @@ def conditions_of(data: Path) -> Conditions:
     home = home_of(data)
     info = read_info(home) if home else {}
     floor = floor_of(info, home or data)
-    return Conditions(floor, floor_given=info.get("floor") is not None, by_teacher=set_as_teacher(info))
+    return Conditions(floor, floor_given=info.get("floor") is not None)
 
 
 def floor_of(info: dict, folder: Path = Path()) -> tuple[float, float]:

@@ -69,15 +69,6 @@ def engine_settings(step: float, substeps: int) -> dict:
     return ENGINE_SETTINGS | BODY_SETTINGS | MAXIMAL | {"timeStep": step / substeps}
 
 
-def set_as_teacher(info: dict) -> bool:
-    """Whether a `dataset.json` names this engine with the teacher's settings, with any inner step. In its recordings,
-    bodies are then larger by `MARGIN`, and pushes out of overlaps add to rebounds."""
-    settings, ours = info.get("engine_settings"), engine_settings(DT, SUBSTEPS)
-    if info.get("engine") != "pybullet" or not isinstance(settings, dict):
-        return False
-    return all(settings.get(name) == value for name, value in ours.items() if name != "timeStep")
-
-
 def substeps_of(step: float) -> int:
     """Inner steps in a recorded step of `step` s. Raises SdfsimError if the teacher does not record at this rate."""
     for fps, substeps in RATES.items():

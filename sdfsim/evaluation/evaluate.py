@@ -23,7 +23,7 @@ from sdfsim.data.dataset import (
     read_info,
     trajectory_files,
 )
-from sdfsim.data.pybullet_sim import MARGIN, engine_settings, import_pybullet, substeps_of
+from sdfsim.data.pybullet_sim import engine_settings, import_pybullet, substeps_of
 from sdfsim.evaluation import metrics
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.evaluation.metrics import Motions, energy_gain, errors
@@ -34,7 +34,6 @@ from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.steppers import FreeFlight, stepper_of
-from sdfsim.training.contact_cache import inner_steps
 
 SURVIVED = "0.25"  # m, the limit for which the median survival time is shown
 NOTHING = "-"
@@ -65,8 +64,7 @@ def evaluate(
         model: bundled name, path or `Model`.
         steps: length of the rollouts; errors are reported at the horizons of `HORIZONS` up to it, and at it.
         free_flight: "exact" or (networks on surface nodes) "learned".
-        substeps: inner steps of the solve in a step; None: those of the model, else those of the recording engine if
-            that is the teacher (PyBullet with its settings), else those of `users_inner`.
+        substeps: inner steps of the solve in a step; None: those of the model, else those of `users_inner`.
         chaos_floor: also run PyBullet again from starts that differ slightly (see `PERTURBATIONS`).
         errors_only: leave out penetration, energy gain and resting speed.
 
@@ -78,9 +76,7 @@ def evaluate(
         "median_survival_s": for all of them, by limit in m: time until half of the bodies are farther from the
         recording. "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the recording.
         "engine_substep": s, the recording engine's inner step; 0 if no dataset.json gives it. "floor": its "friction"
-        and "restitution"; "told" is whether a dataset.json gives them. "as_teacher": whether the solve imitates
-        PyBullet (see `roll_out`): only for recordings of PyBullet with the teacher's settings, by their dataset.json.
-        All others are compared with the solve as `Simulator` runs it, on their floor. "inner_steps": number of inner
+        and "restitution"; "told" is whether a dataset.json gives them. "inner_steps": number of inner
         steps of the solve in a step. Further counts, and "ms_per_step_per_trajectory".
 
     Raises:
@@ -102,21 +98,14 @@ def evaluate(
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
     scenes, seconds = [scene_of([t], [0], shapes, conditions.floor)[0] for t in recorded], 0.0
-    if substeps is not None:
-        inner = substeps
-    elif conditions.by_teacher:
-        inner = inner_steps(recorded[0].dt, substep)
-    else:
-        inner = SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes)
+    inner = substeps or (SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes))
     used = replace(used, inner=substeps or used.inner)
     stepper = replace(stepper, model=used)
     for k, group in enumerate(groups):
         on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         common = (used, group, shapes, longest)
         started = time.perf_counter()
-        contenders["model"] += roll_out(
-            *common, free_flight, substeps=inner, as_teacher=conditions.by_teacher, floor=conditions.floor
-        )
+        contenders["model"] += roll_out(*common, free_flight, substeps=inner, floor=conditions.floor)
         seconds += time.perf_counter() - started
         contenders["ballistic"] += roll_out(*common, contact=False)
     report = {
@@ -131,7 +120,6 @@ def evaluate(
         "steps_asked": steps,
         "engine_substep": substep,
         "floor": {"friction": friction, "restitution": restitution, "told": conditions.floor_given},
-        "as_teacher": conditions.by_teacher,
         "inner_steps": used.inner or inner,
         "outside_training": stepper.unknown(scenes, model_units(stepper, recorded[0])),
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
@@ -287,14 +275,9 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 def notes(report: dict[str, Any]) -> list[str]:
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
     ground, source = report["floor"], "from dataset.json" if report["floor"]["told"] else "that of our recipes"
-    how = f"The solve imitates PyBullet: bodies larger by {MARGIN:g} m, pushes that add to rebounds."
-    if not report["as_teacher"]:
-        how = (
-            f"The solve is as users run it, in {report['inner_steps']} inner steps: no dataset.json names the teacher."
-        )
     lines = [
         f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {source}.",
-        how,
+        f"The solve makes {report['inner_steps']} inner steps in a recorded one, as in a user's run.",
         f"Penetration: the deepest node in every {depth['every']}th frame with contact.",
         "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
         f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.",

@@ -20,7 +20,7 @@ from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_setti
 from sdfsim.evaluation.engines import Engine, Ran, TooSlow, bullet, by_engine, by_model, shape_urdf, still
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
-from sdfsim.learned.model import Model, load_model, sound_models
+from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
@@ -85,7 +85,7 @@ def stress(
             fetched, another run in the folder, or a folder that cannot be written.
     """
     device = str(pick_device(device))
-    tested = [load_model(name) for name in models or sound_models()]
+    tested = [load_model(name) for name in models or [SOLVER]]
     names, others = [model.name for model in tested], list(engines)
     if twice := {name for name in names if names.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")

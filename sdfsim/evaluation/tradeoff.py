@@ -27,7 +27,7 @@ from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import energy_gain, errors
 from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
-from sdfsim.learned.model import SOLVER, Model, load_model, sound_models
+from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -79,7 +79,6 @@ class Cases:
     solids: dict[str, ExactSolid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
-    by_teacher: bool = True  # whether the recordings have the teacher's settings; the solve then imitates PyBullet
     length: float = 1.0  # m of the scene in one unit of these; 1 for recordings
     time: float = 1.0  # s
 
@@ -115,7 +114,6 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
         urdfs=urdfs,
         solids=exact_solids(data, shapes),
         floor=conditions.floor,
-        by_teacher=conditions.by_teacher,
     )
 
 
@@ -242,8 +240,7 @@ def measure_ours(variant: Variant, cases: Cases) -> dict[str, Any]:
         prepared = time.perf_counter() - began
         starts, steps = [every(t, variant.stride) for t in cases.starts], cases.steps // variant.stride
         motions = roll_out(
-            model, starts, shapes, steps, contact=variant.contact, floor=cases.floor, substeps=variant.substeps,
-            as_teacher=variant.contact and cases.by_teacher,
+            model, starts, shapes, steps, contact=variant.contact, floor=cases.floor, substeps=variant.substeps
         )  # fmt: skip
     result = _judged(motions, cases, variant.stride) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
     if result["exploded"]:
@@ -347,7 +344,7 @@ def tradeoff(
     """
     if source and not source.exists():
         raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
-    names = list(models) or sound_models()
+    names = list(models) or [SOLVER]
     with locked(out), one_thread():
         on_progress("scenes", 0.0, "reading scenes and shapes")
         if source and source.is_dir():

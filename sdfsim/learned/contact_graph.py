@@ -4,24 +4,25 @@ Everything a network sees is a scalar in an edge's frame, made dimensionless by 
 the prediction turns with the scene and does not depend on the choice of units.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 REST_SPEED = 0.2  # model units: the speed that gravity adds in one training step; slower counts as resting
-EDGE_FEATURES = 30
+EDGE_FEATURES = 26
+NEVER = 2.0  # steps: the time of touch that is told of surfaces that would not touch within this
 # The tensors of a graph with one row per edge, except its ends, and those with one row per body.
-OF_EDGES = ("normal", "arm_first", "arm_second", "impulse", "gap", "when", "friction", "restitution")
+OF_EDGES = ("normal", "arm_first", "arm_second", "gap", "friction", "restitution")
 OF_BODIES = (
-    "inverse_mass", "inverse_inertia", "velocity", "angular", "free_velocity", "free_angular", "solved_velocity",
-    "solved_angular", "mean_velocity", "mean_angular",
+    "inverse_mass", "inverse_inertia", "velocity", "angular", "free_velocity", "free_angular", "mean_velocity",
+    "mean_angular",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ContactGraph:
-    """N bodies and E places where they met or nearly met in the contact solve, in single precision."""
+    """N bodies and E points at which two of them are near each other at the start of a step, or come near in it."""
 
     inverse_mass: Tensor  # [N], 0 for bodies that are not dynamic
     inverse_inertia: Tensor  # [N, 3, 3], world axes, 0 for bodies that are not dynamic
@@ -31,10 +32,7 @@ class ContactGraph:
     # free_velocity, free_angular: [N, 3] at its end in free flight
     free_velocity: Tensor
     free_angular: Tensor
-    # solved_velocity, solved_angular: [N, 3] at its end, by the solve
-    solved_velocity: Tensor
-    solved_angular: Tensor
-    # mean_velocity, mean_angular: [N, 3] mean over the step, by the solve
+    # mean_velocity, mean_angular: [N, 3] mean over the step in free flight
     mean_velocity: Tensor
     mean_angular: Tensor
     # first, second: [E] int64
@@ -46,18 +44,11 @@ class ContactGraph:
     # arm_first, arm_second: [E, 3] from the centres of mass
     arm_first: Tensor
     arm_second: Tensor
-    impulse: Tensor  # [E, 3] impulse of the solve on `first`; `second` gets the opposite
-    gap: Tensor  # [E] signed distance when the place was first found
-    when: Tensor  # [E] the part of the step that had passed by then
+    gap: Tensor  # [E] signed distance at the start of the step
     # friction, restitution: [E] products of the two bodies' coefficients
     friction: Tensor
     restitution: Tensor
     dt: float  # the step
-
-
-def in_single(graph: ContactGraph) -> ContactGraph:
-    tensors = {n: v for n, v in vars(graph).items() if isinstance(v, Tensor) and v.is_floating_point()}
-    return replace(graph, **{name: value.float() for name, value in tensors.items()})
 
 
 @dataclass(frozen=True)
@@ -74,8 +65,9 @@ class EdgeFrames:
     # second body, by the opposite
     response_first: Tensor
     response_second: Tensor
-    solved: Tensor  # [E, 3] impulse of the solve along each axis
-    slip: Tensor  # [E, 3] relative velocity at the start of the step along each axis
+    # [E, 3, 4] relative velocities along each axis: at the start of the step, what gravity and free spin add over the
+    # step, what the turn of the arms adds, and the one that closes the gap within the step
+    told: Tensor
     start: Tensor  # [E, EDGE_FEATURES] input features
 
 
@@ -114,18 +106,16 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
         [push_first * mass[:, :1], push_second * mass[:, :1], twist_first[:, 0, 0, None] * mass[:, :1]], -1
     )
     count = torch.zeros(g.pairs, dtype=g.gap.dtype, device=g.gap.device).index_add_(0, g.pair, torch.ones_like(g.gap))
-    solved = (axes @ g.impulse[..., None])[..., 0]
     in_frame = axes @ torch.stack([slip, lift, _centripetal(g)], -1)  # [E, axis, quantity]
     scaled = (in_frame / speed[..., None]).flatten(1)
-    given = solved / (mass * speed)
     gap = g.gap[:, None] / (speed * g.dt)
+    closing = torch.nn.functional.pad(g.gap[:, None] / g.dt, (0, 2))[..., None]
     fixed = torch.stack([(push_first == 0)[:, 0], (push_second == 0)[:, 0]], -1).to(gap.dtype)
     start = torch.cat(
         [
             torch.asinh(gap),
             g.gap[:, None] * 10.0,
             scaled,
-            torch.asinh(given),
             torch.log(speed / REST_SPEED),
             torch.log(mass[:, 1:] / mass[:, :1]),
             coupling,
@@ -134,8 +124,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
             g.restitution[:, None],
             torch.log(count[g.pair])[:, None] * 0.5,
             fixed,
-            g.when[:, None],
-            (given[:, :1] > 0).to(gap.dtype),
+            _touch(g.gap, in_frame[:, 0], g.dt)[:, None],
         ],
         -1,
     )
@@ -146,8 +135,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
         jacobian_second=torch.cat([axes, moment_second], -1),
         response_first=torch.cat([axes * push_first[..., None], turn_first], -1).mT,
         response_second=torch.cat([axes * push_second[..., None], turn_second], -1).mT.neg(),
-        solved=solved,
-        slip=in_frame[..., 0],
+        told=torch.cat([in_frame, closing], -1),
         start=start,
     )
 
@@ -217,3 +205,15 @@ def _centripetal(g: ContactGraph) -> Tensor:
         return torch.linalg.cross(w, torch.linalg.cross(w, arm)) * g.dt
 
     return part(g.first, g.arm_first) - part(g.second, g.arm_second)
+
+
+def _touch(gap: Tensor, along: Tensor, dt: float) -> Tensor:
+    """[E] when surfaces would touch in free motion, in steps from the start, at most `NEVER`; 0 if they do already.
+    `along` [E, quantity] are relative velocities along the normal, as in `EdgeFrames.told`."""
+    speed, pull = along[:, 0], along[:, 1:].sum(-1)
+    away = gap / dt
+    # away + speed t + pull t^2 / 2 = 0, t in steps, in the form that is exact for small pulls
+    root = (speed.square() - 2.0 * pull * away).clamp_min(0.0).sqrt()
+    when = 2.0 * away / (root - speed).clamp_min(1e-9)
+    meets = (speed.square() >= 2.0 * pull * away) & (root > speed)
+    return torch.where(gap <= 0.0, 0.0, torch.where(meets, when, NEVER).clamp(0.0, NEVER))

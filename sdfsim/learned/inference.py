@@ -1,4 +1,4 @@
-"""The *impulse* network in a simulation: the graph of a solved step, and the step with the network's corrections."""
+"""The *impulse* network in a simulation: the graph of a step, and the step with the network's impulses."""
 
 from copy import deepcopy
 
@@ -10,10 +10,10 @@ from sdfsim.learned.contact_graph import ContactGraph, number_pairs
 from sdfsim.learned.impulse import ImpulseNetwork, Velocities
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
-from sdfsim.physics.free_flight import torque_free
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
-from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, Edges
+
+Edges = tuple[np.ndarray, np.ndarray]  # as `physics.solver.prepare.points_near` gives them
 
 
 def doubled(network: ImpulseNetwork) -> ImpulseNetwork:
@@ -21,96 +21,82 @@ def doubled(network: ImpulseNetwork) -> ImpulseNetwork:
     return deepcopy(network).cpu().double()
 
 
+def velocities(before: State, after: State, rows: np.ndarray, dt: float, known: float) -> Velocities:
+    """How the bodies `rows` [A] int64 move in a step `dt` from one state to another, in units in which it lasts
+    `known`."""
+    time = dt / known
+    start, end = ([state.rows_of(name, rows) for name in MOTION] for state in (before, after))
+    turned = pose.to_rotvec(pose.multiply(end[1], pose.conjugate(start[1])))
+    found = end[2] / time, end[3] * time, (end[0] - start[0]) / (dt * time), turned * (time / dt)
+    return Velocities(*map(_tensor, found))
+
+
 def step_graph(
-    bodies: Bodies, before: State, solved: State, edges: Edges, options: Options, known: float,
-    rows: np.ndarray | None = None,
-) -> tuple[np.ndarray, ContactGraph]:  # fmt: skip
-    """The bodies `rows` [A] int64 (None: those that met another in a solved step with these `edges`), and their graph
-    in double precision. Units are such that the step is `known`, the only step that the network was trained with, and
-    gravity keeps its value; masses are relative to the heaviest."""
-    rows = np.unique(edges.pair) if rows is None else rows
-    inside = np.searchsorted(rows, edges.pair)
+    bodies: Bodies, before: State, free: State, edges: Edges, options: Options, known: float, rows: np.ndarray
+) -> ContactGraph:
+    """The graph of the bodies `rows` [A] int64, among them all of these `edges`, in double precision, with the state
+    that free flight leads to. Units are such that the step is `known`, the only step that the network was trained with,
+    and gravity keeps its value; masses are relative to the heaviest."""
+    pair, value = edges
+    inside = np.searchsorted(rows, pair)
     time = options.dt / known
     length, moves = time * time, bodies.moves[rows]
     heaviest = float(bodies.mass[rows].max()) or 1.0
-    (place, start, speed, spin), (later, turned, solved_speed, solved_spin) = (
-        [state.rows_of(name, rows) for name in MOTION] for state in (before, solved)
-    )
-    turn, still = pose.to_matrix(start), ~moves[:, None]
-    inertia = bodies.inertia[rows]
-    inverse = turn @ np.linalg.inv(inertia) @ turn.swapaxes(-1, -2) * (moves & options.rotation)[:, None, None]
-    free = np.where(still, spin, torque_free(start, spin, inertia, options.dt)[1]) if options.rotation else spin
-    fall = options.dt * np.asarray(options.gravity) * moves[:, None]
-    turned = pose.to_rotvec(pose.multiply(turned, pose.conjugate(start)))
-
-    def tensor(values: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values))
-
-    def edge(column: int) -> Tensor:
-        return tensor(edges.value[:, column : column + 3])
-
-    def product(own: np.ndarray, there: bool) -> Tensor:
-        return tensor(own[edges.pair].prod(1) * there)
-
+    turn = pose.to_matrix(before.rows_of("orientation", rows))
+    inverse = turn @ np.linalg.inv(bodies.inertia[rows]) @ turn.swapaxes(-1, -2)
+    inverse = inverse * (moves & options.rotation)[:, None, None]
+    flown = velocities(before, free, rows, options.dt, known)
     first, second = torch.from_numpy(np.ascontiguousarray(inside.T))
-    pair, pairs = number_pairs(first, second, len(rows))
-    return rows, ContactGraph(
-        inverse_mass=tensor(bodies.inverse_mass[rows] * heaviest),
-        inverse_inertia=tensor(inverse * (heaviest * length**2)),
-        velocity=tensor(speed / time),
-        angular=tensor(spin * time),
-        free_velocity=tensor((speed + fall) / time),
-        free_angular=tensor(free * time),
-        solved_velocity=tensor(solved_speed / time),
-        solved_angular=tensor(solved_spin * time),
-        mean_velocity=tensor((later - place) / (options.dt * time)),
-        mean_angular=tensor(turned * (time / options.dt)),
+    of_pair, pairs = number_pairs(first, second, len(rows))
+    return ContactGraph(
+        inverse_mass=_tensor(bodies.inverse_mass[rows] * heaviest),
+        inverse_inertia=_tensor(inverse * (heaviest * length**2)),
+        velocity=_tensor(before.rows_of("velocity", rows) / time),
+        angular=_tensor(before.rows_of("angular_velocity", rows) * time),
+        free_velocity=flown.velocity,
+        free_angular=flown.angular,
+        mean_velocity=flown.mean_velocity,
+        mean_angular=flown.mean_angular,
         first=first,
         second=second,
-        pair=pair,
+        pair=of_pair,
         pairs=pairs,
-        normal=edge(AXIS),
-        arm_first=edge(ARM) / length,
-        arm_second=edge(OTHER) / length,
-        impulse=edge(GIVEN) / (heaviest * time),
-        gap=tensor(edges.value[:, APART] / length),
-        when=tensor(edges.value[:, WHEN]),
-        friction=product(bodies.friction, options.friction),
-        restitution=product(bodies.restitution, options.restitution),
+        arm_first=_tensor(value[:, :3] / length),
+        arm_second=_tensor(value[:, 3:6] / length),
+        normal=_tensor(value[:, 6:9]),
+        gap=_tensor(value[:, 9] / length),
+        friction=_tensor(bodies.friction[pair].prod(1) * options.friction),
+        restitution=_tensor(bodies.restitution[pair].prod(1) * options.restitution),
         dt=known,
     )
 
 
-def corrected(
-    network: ImpulseNetwork, bodies: Bodies, before: State, solved: State, edges: Edges, options: Options,
-    known: float, trust: float = 1.0,
-) -> State:  # fmt: skip
-    """The state after a step of the solve with these `edges` (at least one), corrected by a network that was trained on
-    steps of `known`; `trust` (0 to 1) scales the correction."""
-    rows, graph = step_graph(bodies, before, solved, edges, options, known)
-    with torch.no_grad():
-        made = network(graph, friction=options.friction, trust=trust)
-    return changed(bodies, solved, rows, graph, made, options)
-
-
-def changed(
-    bodies: Bodies, solved: State, rows: np.ndarray, graph: ContactGraph, made: Velocities, options: Options
+def stepped(
+    network: ImpulseNetwork, bodies: Bodies, before: State, free: State, edges: Edges, options: Options, known: float
 ) -> State:
-    """The solved step with the velocities `made` by a network for the bodies `rows`."""
-    time, moves = options.dt / graph.dt, bodies.moves[rows]
+    """The state after a step: free flight, and the impulses of a network that was trained on steps of `known` at these
+    `edges` (at least one)."""
+    rows = np.unique(edges[0])
+    graph = step_graph(bodies, before, free, edges, options, known, rows)
+    with torch.no_grad():
+        made = network(graph, friction=options.friction)
+    time, moves = options.dt / known, bodies.moves[rows]
     rows = rows[moves]
-    change = {
-        name: (getattr(made, name) - getattr(graph, of)).numpy()[moves].astype(np.float64)
-        for name, of in (
-            ("velocity", "solved_velocity"), ("angular", "solved_angular"),
-            ("mean_velocity", "mean_velocity"), ("mean_angular", "mean_angular"),
-        )
-    }  # fmt: skip
-    moved = {name: solved.rows_of(name, rows) for name in MOTION}
-    moved["position"] += change["mean_velocity"] * time * options.dt
-    moved["velocity"] += change["velocity"] * time
+    end, spin, mean, turn = (
+        getattr(made, name).numpy()[moves] for name in ("velocity", "angular", "mean_velocity", "mean_angular")
+    )
+    orientation = before.rows_of("orientation", rows)
+    moved = {
+        "position": before.rows_of("position", rows) + mean * (time * options.dt),
+        "orientation": orientation,
+        "velocity": end * time,
+        "angular_velocity": np.zeros_like(spin),
+    }
     if options.rotation:
-        turn = pose.from_rotvec(change["mean_angular"] * graph.dt)
-        moved["orientation"] = pose.normalise(pose.multiply(turn, moved["orientation"]))
-        moved["angular_velocity"] += change["angular"] / time
-    return solved.with_rows(rows, moved)
+        turned = pose.multiply(pose.from_rotvec(turn * known), orientation)
+        moved |= {"orientation": pose.normalise(turned), "angular_velocity": spin / time}
+    return free.with_rows(rows, moved)
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values))

@@ -18,10 +18,9 @@ if TYPE_CHECKING:  # slow to load
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # largest value of any size of a network
-MODEL_VERSION = 3  # 2: networks without the contact solve; 1: trained on data of an earlier version of the teacher
+MODEL_VERSION = 4  # of what networks read; files of earlier versions have to be trained again
 SOLVER = "solver"
-LEARNED = ("gnn", "sdf-sim")  # bundled networks that use learning alone, without the solve
-SURFACE = ("sdf-sim", "fignet", "fignet-star", "mgn", "dpi")  # networks whose messages run between surface nodes
+IMPULSE = "impulse"  # the network on bodies; messages of all others run between surface nodes
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Model:
     """Weights with everything needed to use them."""
 
     name: str  # bundled name or file stem
-    kind: str  # "solver", "impulse" or one of `SURFACE`
+    kind: str  # "solver", "impulse" or a name in `learned.families`
     network: Any  # an `nn.Module` in evaluation mode; None for the solver, or if loaded without weights
     dt: float  # s, the step of the training data, or of the solver for bodies of `length` at `gravity`
     gravity: float  # m/s^2, its magnitude in the training data
@@ -72,8 +71,8 @@ class Model:
 
 
 def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
-    """An untrained network of `kind` ("impulse" or one of `SURFACE`). Raises KeyError for another kind."""
-    if kind == "impulse":
+    """An untrained network of `kind` ("impulse" or a name in `learned.families`). Raises KeyError for another kind."""
+    if kind == IMPULSE:
         from sdfsim.learned.impulse import ImpulseConfig, ImpulseNetwork
 
         return ImpulseNetwork(ImpulseConfig(**config))
@@ -91,11 +90,6 @@ def bundled_models() -> list[str]:
 def model_names() -> list[str]:
     """Names of bundled models: the solver and the networks."""
     return [SOLVER, *bundled_models()]
-
-
-def sound_models() -> list[str]:
-    """The solver, and the bundled networks on top of it: the default of hard cases and studies."""
-    return [name for name in model_names() if name not in LEARNED]
 
 
 def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:

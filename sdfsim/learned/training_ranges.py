@@ -32,8 +32,6 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
     found = [_values(scene, units) for scene in scenes]
     si = {"size": units.length, "speed": units.velocity}
     lines = []
-    if any(b.motion == "kinematic" for scene in scenes for b in scene.bodies):
-        lines.append(f"bodies on a path: {model.name} was not trained with any")
     for name, label in LABELS.items():
         values = [value for some in found for value in some.get(name, [])]
         if not values or name not in model.ranges:

@@ -12,8 +12,7 @@ SUBSTEPS = 5  # inner steps in one step of PyBullet in the training data; some r
 # inner steps shorter than the usual 4 ms, which scenes of slender bodies have: SLOP_A_TIME times the inner step.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
 SLOW = 2.0  # inner steps: an approach no faster than what gravity gives in this time ends without a rebound
-ROUNDS, PYBULLET_ROUNDS = 100, 50  # largest number of sweeps of sequential impulses in an inner step; PyBullet's number
-COARSE = 0.01  # model times: in longer inner steps, points that bodies hit during the step are recorded too
+ROUNDS = 100  # largest number of sweeps of sequential impulses in an inner step
 
 
 class Options(NamedTuple):
@@ -26,9 +25,3 @@ class Options(NamedTuple):
     restitution: bool = True  # False gives every contact restitution 0
     rotation: bool = True  # False lets bodies translate only
     sleep: bool = False  # whether the solve freezes bodies at rest
-    record: bool = False  # whether the solve records what contacts did during a step
-    # margin: by how much the solve enlarges all bodies but planes; adds: whether the speed that resolves penetration
-    # adds to the speed of a rebound. PyBullet does both; they serve comparisons with it.
-    margin: float = 0.0
-    adds: bool = False
-    cone: bool = True  # whether a cone bounds friction; PyBullet bounds it along two axes separately

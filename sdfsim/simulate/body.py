@@ -196,9 +196,7 @@ class BodyHandle:
         self._must_move("be pulled")
         sim = self._simulator
         if not sim.stepper.forces:
-            raise SdfsimError(
-                "networks on surface nodes do not support forces", "use the solver, or a network on top of it"
-            )
+            raise SdfsimError("networks have no inputs for forces", "use the solver")
         given, moment = _vector("force", force), _vector("torque", torque)
         if at is not None:
             moment = moment + np.cross(_vector("at", at) - self.centre, given)

@@ -131,10 +131,8 @@ class Simulator(LiveScene):
         model = model if isinstance(model, Model) else load_model(model, weights=asked)
         self._asked = {"dt": dt, "free_flight": free_flight}
         stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight)
-        if jointed and not stepper.forces:
-            raise SdfsimError(
-                "networks on surface nodes do not support joints", "use the solver, or set effects.joints: off"
-            )
+        if not stepper.forces:
+            _check_inputs(scene, model.name, joints=jointed)
         self.device = str(pick_device(device)) if stepper.on_surfaces else "cpu"
         self.model = model.to(self.device)
         self.seed = scene.seed if seed is None else seed
@@ -153,7 +151,6 @@ class Simulator(LiveScene):
         check_sizes(self.bodies, self._names, self.units.length)
         if effects.contact.on and self.model.ranges:
             self.outside_training += deep_starts(self.bodies, state, self._names, self.units.length)
-        stepper = stepper.distrusted() if self.outside_training else stepper
         self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
@@ -279,11 +276,9 @@ class Simulator(LiveScene):
 
     def contact_points(self) -> list[ContactPoint]:
         """The points where bodies touch in the present state, as the last step of the contact solve left them. Raises
-        SdfsimError for networks on surface nodes, which have no impulses."""
+        SdfsimError for networks, which report no impulses."""
         if not self.stepper.forces:
-            raise SdfsimError(
-                "networks on surface nodes report no impulses", "use the solver, or a network on top of it"
-            )
+            raise SdfsimError("networks report no impulses of contacts", "use the solver")
         from sdfsim.physics.solver.prepare import contact_points
 
         found, u = contact_points(self.state), self.units
@@ -447,6 +442,17 @@ class Simulator(LiveScene):
             joint_position=frames.joint[:, :, 0] * self._joint_unit if frames.joint.shape[1] else frames.joint[:, :, 0],
             joint_force=frames.joint[:, :, 1:4] * u.mass * u.acceleration,
             joint_torque=frames.joint[:, :, 4:7] * u.energy,
+        )
+
+
+def _check_inputs(scene: Scene, model: str, *, joints: bool) -> None:
+    """Raise SdfsimError if a scene has parts for which networks have no inputs."""
+    paths = [b.name for b in scene.bodies if b.motion == "kinematic"]
+    if joints:
+        raise SdfsimError(f"{model}: a network has no inputs for joints", f"use {SOLVER}, or set effects.joints: off")
+    if paths:
+        raise SdfsimError(
+            f"{model}: a network has no inputs for bodies on a path ({paths[0]!r})", f"use {SOLVER}, or make it static"
         )
 
 

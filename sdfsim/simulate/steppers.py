@@ -18,7 +18,7 @@ import numpy as np
 
 from sdfsim.base.compiling import running
 from sdfsim.base.errors import SdfsimError
-from sdfsim.learned.model import SOLVER, SURFACE, Model
+from sdfsim.learned.model import IMPULSE, SOLVER, Model
 from sdfsim.learned.training_ranges import outside_training
 from sdfsim.physics.bodies import Bodies, State, Units, awake
 from sdfsim.physics.free_flight import driven, fly, with_history
@@ -36,10 +36,9 @@ if TYPE_CHECKING:  # numba and torch are slow to load
 
     from sdfsim.learned.families import Family
     from sdfsim.learned.impulse import ImpulseNetwork
-    from sdfsim.learned.near import Contacts, Pairs
+    from sdfsim.learned.near import Contacts
     from sdfsim.learned.tensors import BodyTensors
     from sdfsim.physics.solver.prepare import Compiled, SharedShapes, Steps
-    from sdfsim.physics.solver.record import Edges
 
 FreeFlight = Literal["exact", "learned"]
 LONGEST = 0.01  # s, the longest inner step of the contact solve that its laws were checked with
@@ -82,12 +81,12 @@ class Carry:
     given: float = 0.0  # work of pulls in these steps, model units
     frames: Frames | None = None  # frames of these steps, if they were asked for
     scene: Compiled | None = None  # the bodies for compiled code, if the stepper uses any
-    # weights: a network on the solve, in double precision; tensors: the bodies, for a network on surface nodes. Both
-    # also depend on the options.
+    # weights: a network on bodies, in double precision; tensors: the bodies, for a network on surface nodes. Both also
+    # depend on the options.
     weights: ImpulseNetwork | None = None
     tensors: BodyTensors | None = None
-    edges: Edges | None = None  # what contacts did in the latest step, if `options.record`
-    near: Contacts | Pairs | None = None  # where a network on surface nodes found bodies near each other
+    near: Contacts | None = None  # where a network on surface nodes found bodies near each other
+    touched: tuple[np.ndarray, np.ndarray, float] | None = None  # where one on bodies did, as `touching` returns it
 
     @contextmanager
     def timed(self, phase: str) -> Iterator[None]:
@@ -105,7 +104,8 @@ class Stepper:
     mean: bool = False  # whether model units follow the mean size of the bodies that move, not the smallest
 
     on_surfaces: ClassVar[bool] = False  # whether it works on surface nodes: on CUDA too, in steps of its own length
-    forces: ClassVar[bool] = True  # whether bodies can be pulled, and contacts report impulses
+    # whether bodies can be pulled, held by joints and moved along paths, and contacts report impulses
+    forces: ClassVar[bool] = True
     sleeps: ClassVar[bool] = False  # whether it freezes bodies at rest
     network: ClassVar[bool] = False  # whether a network takes part
     solids: ClassVar[bool] = False  # whether shapes with convex pieces collide as these
@@ -127,10 +127,6 @@ class Stepper:
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
         """A line for each way in which scenes are beyond what the stepper was trained or checked on."""
         return outside_training(scenes, self.model, units)
-
-    def distrusted(self) -> Stepper:
-        """The stepper for scenes that are beyond its training."""
-        return self
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
         """A start state, completed with everything that the first step needs."""
@@ -161,14 +157,14 @@ class Stepper:
         bodies, dt, rows, frames = carry.bodies, carry.options.dt, carry.bodies.movers, []
         carry.done, carry.fault, carry.given, carry.frames = 0, None, 0.0, None
         for _ in range(n):
-            known = carry.counts, carry.near
+            known = carry.counts, carry.near, carry.touched
             carry.counts = dict.fromkeys(carry.counts, 0.0)
             after = self._step(driven(bodies, state, dt), carry)
             asleep = np.zeros(len(rows), bool) if after.touch is None else after.touch.rows_of("island", rows) >= 0
             if carry.checked:
                 carry.fault = first_fault(after, dt, rows[~asleep], state)
                 if carry.fault is not None:
-                    carry.counts, carry.near = known
+                    carry.counts, carry.near, carry.touched = known
                     break
             carry.counts |= {"asleep": asleep.sum(), "free": len(rows) - asleep.sum() - carry.counts["active"]}
             given = _given(state, after, rows, dt)
@@ -237,7 +233,6 @@ class Solver(Stepper):
 
     def _steps(self, state: State, carry: Carry, n: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         made = cast("Compiled", carry.scene).advance(state, carry.options, n, most, keep=keep)
-        carry.edges = made.edges
         if made.done:
             carry.counts |= dict(zip(("pairs", "contacts", "active"), made.counts[:3], strict=True))
         return made
@@ -247,33 +242,36 @@ class Solver(Stepper):
             return self._steps(state, carry, 1, NO_LIMITS).state  # `Stepper.advance` checks the result
 
 
-@dataclass(frozen=True)
-class OnSolver(Solver):
-    """The *impulse* network, which corrects the step of the contact solve."""
+class OnBodies(Stepper):
+    """The *impulse* network: free flight, and its impulses at the points where bodies are near each other."""
 
-    trust: float = 1.0  # factor on what the network adds to the solve; 0 if a scene is beyond its training
+    network = solids = True
+    distances = True  # type: ignore[assignment]
+    forces = False
 
-    network = True
-    unknown, advance = Stepper.unknown, Stepper.advance
-
-    def distrusted(self) -> Stepper:
-        return replace(self, trust=0.0)
+    def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
+        """The points were found at the start of the step."""
+        return super().touching(state, carry) if carry is None or carry.touched is None else carry.touched
 
     def _step(self, state: State, carry: Carry) -> State:
-        # No network was trained with forces or joints.
-        asked = self.trust > 0.0 and state.load is None and state.joints is None
-        carry.options = carry.options._replace(record=asked)
-        solved, edges = super()._step(state, carry), cast("Edges", carry.edges)
-        if not (asked and len(edges.pair)):
-            return solved
-        from sdfsim.learned.inference import corrected, doubled
+        from sdfsim.learned.inference import doubled, stepped
+        from sdfsim.physics.solver.prepare import TOUCHING, points_near
 
+        bodies, options, free = carry.bodies, carry.options, super()._step(state, carry)
+        with carry.timed("contact_ms"):
+            pair, value = points_near(cast("Compiled", carry.scene), state, options.gravity, options.dt)
+        touch = value[:, 9] <= TOUCHING
+        point = state.position[pair[touch, 0]] + value[touch, :3]
+        carry.touched = point, pair[touch], float((-value[:, 9]).max(initial=0.0))
+        if not len(pair):
+            return free
         with carry.timed("network_ms"):
             if carry.weights is None:
                 carry.weights = doubled(self.model.network)
-            known = self.model.dt, self.trust
-            after = corrected(carry.weights, carry.bodies, state, solved, edges, carry.options, *known)
-        carry.counts |= {"nodes": len(np.unique(edges.pair)), "edges": len(edges.pair)}
+            after = stepped(carry.weights, bodies, state, free, (pair, value), options, self.model.dt)
+        rows = np.unique(pair)
+        carry.counts |= {"active": int(bodies.moves[rows].sum()), "contacts": int(touch.sum())}
+        carry.counts |= {"nodes": len(rows), "edges": len(pair)}
         return after
 
 
@@ -426,7 +424,7 @@ def joint_frame(state: State) -> np.ndarray:
 def stepper_of(model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact") -> Stepper:
     """The stepper of a model, for scenes with `contact` or without. Only networks on surface nodes have "learned" free
     flight; raises SdfsimError for it with any other model."""
-    learned, on_surfaces = free_flight == "learned", model.kind in SURFACE
+    learned, on_surfaces = free_flight == "learned", model.kind not in (SOLVER, IMPULSE)
     if learned and not on_surfaces:
         raise SdfsimError("only networks on surface nodes have free_flight 'learned'", "give a model of that kind")
     if not contact and not learned:
@@ -435,4 +433,4 @@ def stepper_of(model: Model, *, contact: bool = True, free_flight: FreeFlight = 
         from sdfsim.learned.families import FAMILIES
 
         return OnSurfaces(model, True, family=FAMILIES[model.kind], contact=contact, learned=learned)
-    return Solver(model) if model.kind == SOLVER else OnSolver(model)
+    return Solver(model) if model.kind == SOLVER else OnBodies(model)

@@ -13,7 +13,6 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.training.distributed import Team
 
 AHEAD = 4  # batches that each worker draws in advance
 
@@ -34,13 +33,12 @@ class Draws(Dataset):
     task: Any
     count: int  # frames in a batch
     seed: int
-    team: Team
 
     def __getitem__(self, step: int) -> Drawn:
         started = time.process_time()
         rng = np.random.default_rng([self.seed, 0, step])
         mirrored = bool(rng.integers(2))
-        batch = self.task.draw(rng, self.count, self.team)
+        batch = self.task.draw(rng, self.count)
         return Drawn(batch, mirrored, time.process_time() - started)
 
 

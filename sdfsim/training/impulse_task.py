@@ -9,8 +9,7 @@ from torch import Tensor
 from sdfsim.data.dataset import ranges_of
 from sdfsim.learned.contact_graph import OF_BODIES, OF_EDGES, ContactGraph, number_pairs
 from sdfsim.learned.impulse import ImpulseNetwork, Velocities
-from sdfsim.training.contact_cache import ENDS, STEP, ContactFrames
-from sdfsim.training.distributed import ALONE, Team
+from sdfsim.training.contact_frames import ENDS, STEP, ContactFrames
 
 HUBER = 0.01  # m/s: smaller errors count squared, larger ones linearly; bodies at rest may creep more slowly than this
 CALM_SHARE = 0.2  # how often frames without a hit are drawn, relative to those with the hardest hits
@@ -49,10 +48,10 @@ class ImpulseTask:
         ratios = (heaviest / lightest)[heaviest > 0]
         return ranges_of(f.size[moving], speed, ratios, f.friction, f.restitution, f.floor)
 
-    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> ContactBatch:
-        """A batch of `count` frames, or this process's part of it."""
+    def draw(self, rng: np.random.Generator, count: int) -> ContactBatch:
+        """A batch of `count` frames."""
         picked = np.sort(rng.choice(len(self.frames), size=count, p=self.weight))
-        return self.batch(picked[team.share(count)])
+        return self.batch(picked)
 
     def batch(self, picked: np.ndarray) -> ContactBatch:
         """The frames `picked` [K] as one graph whose last body is the floor."""
@@ -91,10 +90,6 @@ class ImpulseTask:
             _size((predicted.mean_angular - batch.truth.mean_angular) * lever),
         ]
         return torch.stack(terms).mean(0)[batch.counts].sum() / max(1, int(batch.counts.sum()))
-
-    def weight_of(self, batch: ContactBatch) -> int:
-        """The number of bodies over which a batch's loss is averaged."""
-        return int(batch.counts.sum())
 
 
 def _size(error: Tensor) -> Tensor:

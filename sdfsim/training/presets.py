@@ -18,27 +18,10 @@ class Preset:
     matrix_rate: float | None = None
 
 
-LITTLE = {"width": 32, "rounds": 4}
-PUBLISHED = {"width": 128, "steps": 10}  # sizes of SDF-Sim's network
-# The papers do not give the radii of MeshGraphNets and DPI. With these, graphs of MOVi-B have about as many edges
-# between bodies as SDF-Sim's paper counts (docs/paper.md).
-RADII = {"sdf-sim": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-large": 0.38, "dpi": 0.3}
-
 PRESETS = {
-    "small": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
-    "alone": Preset("impulse", LITTLE | {"alone": 1}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
-    # A network on the solve, for recordings of real motions.
-    "impacts": Preset(
-        "impulse", {"width": 32, "rounds": 2, "impacts": 1}, steps=1_000, batch=32, rate=2e-3, matrix_rate=0.01
-    ),
+    "gnn": Preset("impulse", {"width": 32, "rounds": 4}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    # SDF-Sim as published
+    "sdf-sim": Preset("sdf-sim", {"width": 128, "steps": 10}, 1_000_000, batch=8, rate=1e-3, nodes=64, noise=0.003),
     # SDF-Sim's graph with a network that is small enough for a CPU
-    "sdf-sim-small": Preset(
-        "sdf-sim", {"width": 64, "steps": 5}, 20_000, batch=32, rate=1e-3, reach=RADII["sdf-sim"], nodes=64, noise=0.003
-    ),
-    **{
-        name: Preset(
-            name.removesuffix("-large"), PUBLISHED, 1_000_000, batch=8, rate=1e-3, reach=reach, nodes=64, noise=0.003
-        )
-        for name, reach in RADII.items()
-    },
+    "sdf-sim-small": Preset("sdf-sim", {"width": 64, "steps": 5}, 20_000, batch=32, rate=1e-3, nodes=64, noise=0.003),
 }

@@ -19,7 +19,6 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import digest, read_arrays, write_arrays
 from sdfsim.training.batches import Drawn, Draws, batches, moved
-from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 
 if TYPE_CHECKING:
@@ -34,19 +33,19 @@ SMALLEST = 16  # rows and columns of a matrix that counts as hidden; smaller one
 class Run:
     """Everything that changes during training, and how to save it.
 
-    The task is an `ImpulseTask`, a `SurfaceTask` or a `MotionTask`. The learning rate depends on `total`, the
-    optimiser's steps of the whole run; a `team` shares the work, and `workers` draw batches ahead. It begins with the
+    The task is an `ImpulseTask` or a `SurfaceTask`. The learning rate depends on `total`, the
+    optimiser's steps of the whole run; `workers` draw batches ahead. It begins with the
     weights of `first`, if given. Raises SdfsimError if that is another network than the plan's.
     """
 
     def __init__(
-        self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE,
+        self, plan: Preset, task: Any, total: int, seed: int, device: torch.device,
         workers: int = 0, first: Model | None = None,
     ) -> None:  # fmt: skip
         from sdfsim.learned.model import new_network
 
         torch.manual_seed(seed)
-        self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
+        self.plan, self.task, self.total, self.seed, self.device = plan, task, total, seed, device
         self.workers = workers
         self.origin = {"plan": json.loads(json.dumps(asdict(plan))), "seed": seed, "data": task.digest()}
         self.network: nn.Module = new_network(plan.kind, plan.config)
@@ -72,11 +71,8 @@ class Run:
             self.seconds += drawn.seconds
         batch = moved(drawn.batch, self.device)
         loss = self.task.loss(self.network, batch, mirrored=drawn.mirrored)
-        weight = self.task.weight_of(batch)
-        loss = loss * (weight / max(1.0, self.team.total(weight, self.device)))
         self.optimiser.zero_grad()
         loss.backward()
-        self.team.add_gradients(self.network.parameters())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
         if bool(norm.isfinite()):
             self.optimiser.step(self.share())
@@ -86,7 +82,7 @@ class Run:
             if self.skipped >= BAD_BATCHES:
                 raise SdfsimError(f"training diverged at step {self.step}: no finite gradient in {BAD_BATCHES} batches")
         self.step += 1
-        value = self.team.total(float(loss.detach()), self.device)
+        value = float(loss.detach())
         self.loss = value if math.isnan(self.loss) else 0.99 * self.loss + 0.01 * value
         decay = min(EMA_DECAY, (1.0 + self.step) / (10.0 + self.step))
         follow = get_ema_multi_avg_fn(decay)
@@ -94,7 +90,7 @@ class Run:
 
     @cached_property
     def drawn(self) -> Generator[Drawn, None, None]:
-        return batches(Draws(self.task, self.plan.batch, self.seed, self.team), self.step, self.workers)
+        return batches(Draws(self.task, self.plan.batch, self.seed), self.step, self.workers)
 
     def close(self) -> None:
         """End the workers; a further step would start new ones."""
@@ -156,7 +152,6 @@ class Run:
             "seed": self.seed,
             "optimiser_steps": self.step,
             "seconds": round(self.seconds),
-            "processes": self.team.size,
             "threads": torch.get_num_threads(),
             "device": str(self.device),
             "preset_name": name,
@@ -168,8 +163,7 @@ class Run:
             network=self.averaged(),
             dt=self.task.dt,
             gravity=self.task.gravity,
-            length=getattr(self.task, "length", float(np.mean(ranges["size"]))),
-            inner=getattr(self.task, "inner", 0),
+            length=float(np.mean(ranges["size"])),
             reach=self.plan.reach,
             nodes=self.plan.nodes,
             ranges=ranges,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,14 +13,12 @@ from sdfsim.data.batching import PLANE, centred, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
 from sdfsim.learned.families import FAMILIES
 from sdfsim.learned.message_passing import GraphNetwork, MultiGraph, flipped
-from sdfsim.learned.near import Contacts, Pairs
 from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
 from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.physics.solver.prepare import Compiled, SharedShapes
 from sdfsim.training.batches import moved
-from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 
 CPU = torch.device("cpu")
@@ -73,9 +72,9 @@ class SurfaceTask:
             network.observe(batch.graph)
             network.target.observe(batch.target[batch.moves])
 
-    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
+    def draw(self, rng: np.random.Generator, count: int) -> Batch:
         """`count` recorded steps as one graph, or this process's part of them."""
-        bodies, state, after = self.scenes(rng, count, team)
+        bodies, state, after = self.scenes(rng, count)
         scene = Compiled(bodies, state, self.shared) if self.family.distances else None
         bodies, state = body_tensors(bodies, CPU), state_tensors(state, CPU)
         # The target leads from the disturbed poses to the recorded one, so that the network learns to undo errors.
@@ -83,20 +82,17 @@ class SurfaceTask:
         graph = self.family.graph(bodies, state, self.near(bodies, state, scene))
         return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 
-    def near(self, bodies: BodyTensors, state: StateTensors, scene: Compiled | None) -> Contacts | Pairs:
+    def near(self, bodies: BodyTensors, state: StateTensors, scene: Compiled | None) -> Any:
         """The near parts of bodies; see `Family.near`."""
         gravity = np.asarray(self.trajectories[0].gravity, dtype=np.float64)
         return self.family.near(bodies, state, gravity, self.reach, self.dt, scene)
 
-    def scenes(
-        self, rng: np.random.Generator, count: int, team: Team = ALONE
-    ) -> tuple[Bodies, State, tuple[np.ndarray, np.ndarray]]:
+    def scenes(self, rng: np.random.Generator, count: int) -> tuple[Bodies, State, tuple[np.ndarray, np.ndarray]]:
         """Bodies of `count` recorded steps side by side, their motion before, and their poses [N, *] after."""
         picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
         frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
         yaw = pose.from_rotvec(np.array([0.0, 0.0, rng.uniform(0, 2 * np.pi)]))
-        noise = self._noise(picked, rng, team)
-        picked, frames = picked[team.share(count)], frames[team.share(count)]
+        noise = self._noise(picked, rng)
         units = Units(1.0, 1.0, 1.0)
         bodies, state = merged(picked, frames, self.shapes, units, self.floor, self.plane)
         recorded = [state_at(picked, [k + offset for k in frames], state) for offset in (-2, -1, 0, 1)]
@@ -121,10 +117,6 @@ class SurfaceTask:
         error = network(graph) - network.target(target)
         return error[batch.moves].square().mean()
 
-    def weight_of(self, batch: Batch) -> int:
-        """The number of nodes over which a batch's loss is averaged."""
-        return int(batch.moves.sum())
-
     def ranges(self) -> dict[str, list[float]]:
         """The ranges of the trajectories; see `ranges_of`."""
         extent = {name: largest_extent(shape) for name, shape in self.shapes.items()}
@@ -138,18 +130,14 @@ class SurfaceTask:
             np.array([self.floor]),
         )
 
-    def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> np.ndarray | None:
+    def _noise(self, picked: list[Trajectory], rng: np.random.Generator) -> np.ndarray | None:
         """Noise [3, 2, N + 1, 3] m for each input pose: shifts, and turns measured at the surface, for bodies and the
-        floor. It is drawn for the whole batch, so that it does not depend on the team's size; this process takes its
-        part."""
+        floor."""
         if self.noise is None:
             return None
-        ends = np.cumsum([0] + [t.position.shape[1] for t in picked])
         # Steps of size 1 / sqrt(3), so that the last pose of the walk deviates by `noise`.
-        steps = rng.normal(scale=self.noise / np.sqrt(3), size=(3, 2, ends[-1] + 1, 3))
-        mine = team.share(len(picked))
-        rows = [*range(ends[mine.start], ends[mine.stop]), ends[-1]]
-        return steps[:, :, rows]
+        count = 1 + sum(t.position.shape[1] for t in picked)
+        return rng.normal(scale=self.noise / np.sqrt(3), size=(3, 2, count, 3))
 
 
 def _disturbed(poses: list[tuple[np.ndarray, np.ndarray]], bodies: Bodies, noise: np.ndarray):

@@ -17,7 +17,6 @@ from sdfsim.physics.solver.joints import (
     solve_with_joints,
 )
 from sdfsim.physics.solver.narrow_phase import find_near, narrow_phase
-from sdfsim.physics.solver.record import gathered, no_edges, noted
 from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.sleep import put_to_sleep, woken
 from sdfsim.physics.solver.time_of_impact import time_of_impact
@@ -39,15 +38,15 @@ from sdfsim.physics.solver.vectors import (
 
 
 @njit(**FAST, inline="always")
-def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, step):
+def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, script, step):
     """Advance `motion`, and the state of joints in `held`, by one step of a script, in place. The time depends on the
     bodies that are awake, however many others there are.
 
     All structures except `manifolds` and `held` are references. `run_steps` says which arguments may be None.
 
     Returns:
-        The manifolds at the end of the step; what contacts did, if it is to be recorded; and counts: pairs tested,
-        contacts of the last inner step, bodies that contacts moved.
+        The manifolds at the end of the step; and counts: pairs tested, contacts of the last inner step, bodies that
+        contacts moved.
     """
     joints = reference(held)
     matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
@@ -64,7 +63,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
         if stirred:
             manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
-    contacts, edges = 0, no_edges()
+    contacts = 0
     _shifted(world, work, motion, rules, -0.5)
     if held is not None:
         begin_step(world, work, motion, rules, joints)
@@ -100,8 +99,6 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
         else:
             system = solve_contacts(world, work, motion, rules, points, threads)
         contacts = len(system.where)
-        if note is not None:
-            edges = noted(motion, matrix, points, system, k / rules.options.substeps, edges)
         time_of_impact(shapes, world, work, motion, rules, points, parts, work.scratch, surfaces)
         if held is not None:
             kept_together(joints, work.part)
@@ -113,16 +110,6 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
                     if joints.calm[b]:  # for bodies that only joints hold
                         motion.touching[b] = False
                 work.met[b] = work.met[b] or motion.touching[b]
-    if note is not None:
-        edges = gathered(
-            world,
-            motion,
-            matrix,
-            reference(manifolds),
-            len(near.start),
-            (rules.options.substeps - 1) / rules.options.substeps,
-            edges,
-        )
     _shifted(world, work, motion, rules, 0.5)
     if held is not None:
         end_step(world, work, motion, rules, joints)
@@ -131,7 +118,7 @@ def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threa
     met = 0  # number of bodies that contacts moved and that are still awake
     for b in world.going:
         met += work.met[b] and motion.island[b] < 0
-    return manifolds, edges, (len(near.start), contacts, met)
+    return manifolds, (len(near.start), contacts, met)
 
 
 @njit(**BARE)

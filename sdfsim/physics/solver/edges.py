@@ -1,4 +1,8 @@
-"""The contact edges of networks on surface nodes, compiled."""
+"""The contact edges of networks, compiled: found in one query at the start of a step, from distances and free motion.
+
+Networks on surface nodes take the nodes that come near another body. The network on bodies takes the points at which
+two bodies are near each other, as `narrow_phase` finds them.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,11 @@ from numba import njit
 
 from sdfsim.physics.solver.broad_phase import near_pairs, swept
 from sdfsim.physics.solver.distance import distance
+from sdfsim.physics.solver.impulses import met_half_way
+from sdfsim.physics.solver.internal_edges import heed_supports
+from sdfsim.physics.solver.manifold import points_of
+from sdfsim.physics.solver.narrow_phase import find_near, narrow_phase
+from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.surface_distance import map_between, mapped
 from sdfsim.physics.solver.vectors import (
     ENTRY,
@@ -22,6 +31,7 @@ from sdfsim.physics.solver.vectors import (
     turn,
     vector,
 )
+from sdfsim.physics.solver.world import GAP, NORMAL, VOID
 
 
 @njit(**ENTRY)
@@ -89,3 +99,50 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
                     value[count, 1 + x], value[count, 4 + x] = normal[x], offset[x]
                 count += 1
     return index[:count], value[:count]
+
+
+@njit(**ENTRY)
+def points_within(shapes, world, work, motion, rules, manifolds, surfaces):
+    """Points at which bodies are within `rules.contact_margin` of each other, or will be by the end of the step
+    `rules.ahead` in free motion.
+
+    Args:
+        manifolds: empty, of this type.
+        surfaces: True if shapes may meet as surfaces, else None.
+
+    Returns:
+        [E, 2] int64, the two bodies; [E, 10], the contact point about the centre of mass of each, the normal from the
+        second to the first (all along world axes), and the distance.
+    """
+    shapes, world, work = reference(shapes), reference(world), reference(work)
+    motion, rules = reference(motion), reference(rules)
+    matrix, span = work.matrix, rules.ahead
+    for b in world.going:
+        to_matrix(motion.orientation, b, matrix)
+    manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, None)
+    points, parts = reference(manifolds), reference(near)
+    narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.gone, work.scratch, surfaces, None)
+    heed_supports(shapes, world, work, motion, rules, points, parts, work.scratch)
+    most = points_of(manifolds, len(near.start))
+    pair, value, count = np.empty((most, 2), np.int64), np.empty((most, 10)), 0
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        fall = (1.0 if world.moves[a] else 0.0) - (1.0 if world.moves[b] else 0.0)
+        between = sub(get(motion.position, a), get(motion.position, b))
+        for k in range(manifolds.count[m]):
+            point = manifolds.point[m, k]
+            n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
+            arm = turn(matrix, a, (point[0], point[1], point[2]))
+            other = turn(matrix, b, (point[3], point[4], point[5]))
+            arm, other = met_half_way(between, arm, other)
+            w, u = get(motion.angular, a), get(motion.angular, b)
+            speed = sub(add(get(motion.velocity, a), cross(w, arm)), add(get(motion.velocity, b), cross(u, other)))
+            closing = -dot(along(speed, vector(rules.options.gravity), fall * span), n)
+            bent = 0.5 * span * (dot(w, w) * norm(arm) + (dot(u, u) * norm(other) if dot(u, u) > 0.0 else 0.0))
+            if point[VOID] > 0.0 or point[GAP] - max(closing + bent, 0.0) * span > rules.contact_margin:
+                continue
+            pair[count, 0], pair[count, 1], value[count, 9] = a, b, point[GAP]
+            for x in range(3):
+                value[count, x], value[count, 3 + x], value[count, 6 + x] = arm[x], other[x], n[x]
+            count += 1
+    return pair[:count], value[:count]

@@ -123,7 +123,6 @@ def _equations(world, work, motion, rules, manifolds):
             continue
         friction = world.friction[a] * world.friction[b] if rules.options.friction else 0.0
         bounce = world.restitution[a] * world.restitution[b] if rules.options.restitution else 0.0
-        margin = rules.options.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
         between = sub(get(motion.position, a), get(motion.position, b))
         thin = THIN * min(world.thickness[a], world.thickness[b])
         first_of_pair = count
@@ -137,9 +136,9 @@ def _equations(world, work, motion, rules, manifolds):
             free_fall = add(now, _coming(free, a, b, arm, other))
             then = add(free_fall, _turning(free, a, b, arm, other))
             approach = dot(now, n)
-            gap = point[GAP] - margin
+            gap = point[GAP]
             way = -dot(then, n) * rules.substep_dt
-            early = not rules.options.adds and way > thin
+            early = way > thin
             if point[VOID] > 0.0 or (gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)):
                 point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
                 continue
@@ -161,7 +160,7 @@ def _equations(world, work, motion, rules, manifolds):
             elif gap > -rules.split:
                 if gap < -rules.slop:
                     push = (-gap - rules.slop) * rules.erp / rules.substep_dt
-                    target = max(push, min(target + push, -approach) if rules.options.adds else target)
+                    target = max(push, target)
             else:
                 deep = -gap * rules.erp / rules.substep_dt
             row[count, 0, WANTED] = target - before
@@ -186,12 +185,8 @@ def _equations(world, work, motion, rules, manifolds):
                 drag = (point[TANGENTIAL], point[TANGENTIAL + 1], point[TANGENTIAL + 2])
                 most_drag = friction * point[NORMAL_IMPULSE]
                 first, second = dot(drag, one), dot(drag, two)
-                if rules.options.cone:
-                    share = _within(first, second, most_drag)
-                    row[count, 1, IMPULSE], row[count, 2, IMPULSE] = share * first, share * second
-                else:
-                    row[count, 1, IMPULSE] = min(max(first, -most_drag), most_drag)
-                    row[count, 2, IMPULSE] = min(max(second, -most_drag), most_drag)
+                share = _within(first, second, most_drag)
+                row[count, 1, IMPULSE], row[count, 2, IMPULSE] = share * first, share * second
             where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
             count += 1
         for c in range(first_of_pair, count):
@@ -322,15 +317,14 @@ def _solve(mass, rules, system, change, shift, island):
 
 @njit(**BARE)
 def _sweeps(mass, rules, system, island):
-    """Largest number of sweeps of an island; PyBullet sweeps all islands equally often."""
+    """Largest number of sweeps of an island."""
     heaviest, lightest = math.inf, 0.0  # inverse masses
     for o in range(system.start[island], system.start[island + 1]):
         for x in (2, 3):
             inverse = mass[system.where[system.order[o], x]]
             if inverse > 0.0:
                 heaviest, lightest = min(heaviest, inverse), max(lightest, inverse)
-    uneven = 1.0 if rules.options.adds else lightest / (EVEN * heaviest)
-    return np.int64(rules.rounds * min(max(uneven, 1.0), OFTEN))
+    return np.int64(rules.rounds * min(max(lightest / (EVEN * heaviest), 1.0), OFTEN))
 
 
 @njit(**BARE)
@@ -377,41 +371,34 @@ def _balance(mass, rules, system, change, island, rounds):
         worst = 0.0
         for o in range(first, last):
             c = order[o]
-            worst = max(worst, _relax(where, row, mass, change, c, 0, 1, 0.0, math.inf))
+            worst = max(worst, _relax(where, row, mass, change, c))
         for o in range(first, last):
             c = order[o]
             if friction[c] > 0.0:
                 most = friction[c] * row[c, 0, IMPULSE]
-                if rules.options.cone:
-                    worst = max(worst, _relax_friction(where, row, mass, change, c, most))
-                else:
-                    worst = max(worst, _relax(where, row, mass, change, c, 1, 3, -most, most))
+                worst = max(worst, _relax_friction(where, row, mass, change, c, most))
         if worst <= rules.exact:
             break
 
 
 @njit(**INLINED)
-def _relax(where, row, mass, change, c, first, last, least, most):
-    """Bring rows of a contact to their wanted velocities, as far as limits allow. Returns the change of velocity."""
+def _relax(where, row, mass, change, c):
+    """Bring the normal row of a contact to its wanted velocity, by a push. Returns the change of velocity."""
     a, b = where[c, 2], where[c, 3]
     v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
     u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
-    worst = 0.0
-    for e in range(first, last):
-        axis = _three(row, c, e, AXIS)
-        short = row[c, e, WANTED] - _along_row(row, c, e, sub(v, u), w, z)
-        total = min(max(row[c, e, IMPULSE] + short * row[c, e, MASS], least), most)
-        step = total - row[c, e, IMPULSE]
-        if step == 0.0:
-            continue
-        row[c, e, IMPULSE] = total
-        v, u = along(v, axis, step * mass[a]), along(u, axis, -step * mass[b])
-        w, z = along(w, _three(row, c, e, SPIN), step), along(z, _three(row, c, e, COUNTER), step)
-        worst = max(worst, abs(step / row[c, e, MASS]))
-    if worst > 0.0:
-        for x in range(3):
-            change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
-    return worst
+    axis = _three(row, c, 0, AXIS)
+    short = row[c, 0, WANTED] - _along_row(row, c, 0, sub(v, u), w, z)
+    total = max(row[c, 0, IMPULSE] + short * row[c, 0, MASS], 0.0)
+    step = total - row[c, 0, IMPULSE]
+    if step == 0.0:
+        return 0.0
+    row[c, 0, IMPULSE] = total
+    v, u = along(v, axis, step * mass[a]), along(u, axis, -step * mass[b])
+    w, z = along(w, _three(row, c, 0, SPIN), step), along(z, _three(row, c, 0, COUNTER), step)
+    for x in range(3):
+        change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
+    return abs(step / row[c, 0, MASS])
 
 
 @njit(**INLINED)

@@ -979,7 +979,7 @@ def _grip(moves, rows, count, r, change):
 
 
 @njit(**BARE)
-def _sweep(moves, cone, rows, count, change):
+def _sweep(moves, rows, count, change):
     """Relax all bounded rows one after the other, friction of contacts last. Returns the largest change."""
     worst, last = 0.0, -1
     for r in range(count):
@@ -1008,21 +1008,14 @@ def _sweep(moves, cone, rows, count, change):
             r += 1
             continue
         most = rows.grip[r] * rows.impulse[r - 1]
-        if cone:
-            give, one, other = max(rows.give[r], rows.give[r + 1]), 0.0, 0.0
-            if rows.give[r] > 0.0:
-                one = rows.impulse[r] + _short(rows, r, change) / give
-            if rows.give[r + 1] > 0.0:
-                other = rows.impulse[r + 1] + _short(rows, r + 1, change) / give
-            share = _within(one, other, most)
-            worst = max(worst, _step(moves, rows, count, r, share * one, change))
-            worst = max(worst, _step(moves, rows, count, r + 1, share * other, change))
-        else:
-            for q in range(r, r + 2):
-                total = 0.0
-                if rows.give[q] > 0.0:
-                    total = rows.impulse[q] + _short(rows, q, change) / rows.give[q]
-                worst = max(worst, _step(moves, rows, count, q, min(max(total, -most), most), change))
+        give, one, other = max(rows.give[r], rows.give[r + 1]), 0.0, 0.0
+        if rows.give[r] > 0.0:
+            one = rows.impulse[r] + _short(rows, r, change) / give
+        if rows.give[r + 1] > 0.0:
+            other = rows.impulse[r + 1] + _short(rows, r + 1, change) / give
+        share = _within(one, other, most)
+        worst = max(worst, _step(moves, rows, count, r, share * one, change))
+        worst = max(worst, _step(moves, rows, count, r + 1, share * other, change))
         r += 2
     return worst
 
@@ -1056,7 +1049,7 @@ def _hold(world, work, motion, rules, held, comps, lo, hi, rows, count, steady):
                 rows.known[r] = rows.impulse[r]
                 rows.now[r] = _read(rows, r, change)
             for _ in range(rules.rounds):
-                worst = _sweep(world.moves, rules.options.cone, rows, count, change)
+                worst = _sweep(world.moves, rows, count, change)
                 if len(rows.see) == 0:
                     for i in range(lo, hi):
                         _project(world, work, motion, graph, factors, each, lines, comps[i], change, True)

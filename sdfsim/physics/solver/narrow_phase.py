@@ -361,7 +361,7 @@ def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, wen
     manifolds.count[p] = known
     # Numbers of one type, or everything would be compiled again.
     none, one = np.int64(0), np.int64(1)
-    count, look = none, rules.search_margin + 2.0 * rules.options.margin + _approach_margin(world, motion, rules, a, b)
+    count, look = none, rules.search_margin + _approach_margin(world, motion, rules, a, b)
     for side in range(2):
         if swallowed(shapes, world, motion, matrix, a, b, side, scratch.found):
             manifolds.count[p] = merged(rules, manifolds.point, p, none, scratch, one, none > one)
@@ -451,7 +451,7 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
     offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
-    look = rules.contact_margin + 2.0 * rules.options.margin + _approach_margin(world, motion, rules, a, b)
+    look = rules.contact_margin + _approach_margin(world, motion, rules, a, b)
     plane, pieces = shapes.table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])
     up, count = turn(matrix, b, (0.0, 0.0, 1.0)), 0
     for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):

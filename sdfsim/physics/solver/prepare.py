@@ -16,15 +16,14 @@ from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
 from sdfsim.physics.motion import MOTION, Motion
-from sdfsim.physics.options import COARSE, PYBULLET_ROUNDS, ROUNDS, SLOP, SLOP_A_TIME, SLOW, Options
+from sdfsim.physics.options import SLOP, SLOP_A_TIME, SLOW, Options
 from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
-from sdfsim.physics.solver.edges import nodes_within
+from sdfsim.physics.solver.edges import nodes_within, points_within
 from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows, Trial
 from sdfsim.physics.solver.manifold import scratch_room
-from sdfsim.physics.solver.record import Edges
-from sdfsim.physics.solver.run import HELD, NOTE, SURFACES, THREADS, Kept, Script, run_steps
+from sdfsim.physics.solver.run import HELD, SURFACES, THREADS, Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.physics.validity import NO_LIMITS, Fault, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -93,17 +92,16 @@ class Compiled:
         self.held = held_by(self.bodies)
         # Threads are used for all kinds of pairs alike.
         self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
-        self._announced: set[bool] = set()  # with and without recording what contacts did
+        self._announced = False  # whether the step is known to be compiled
         self._load: np.ndarray | None = None
         self._options: Options | None = None  # the options from which `_rules` were made
         self._latest: State | None = None  # the state whose arrays are `_motion` and `_manifolds`
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules, steps: int = 1,
-        script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, note: bool = False, keep: bool = False,
+        script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, keep: bool = False,
     ) -> tuple[Any, ...]:  # fmt: skip
-        """Make `steps` steps and write to `motion`. `note`: whether to record what contacts did. Returns what
-        `run_steps` does, and last the `Kept` of each step."""
+        """Make `steps` steps and write to `motion`. Returns what `run_steps` does, and last the `Kept` of each step."""
         n, count = steps if keep else 0, len(self.bodies)
         joints = 0 if self.held is None else len(self.held.each.body)
         kept = Kept(
@@ -113,22 +111,17 @@ class Compiled:
         # An integer of another type would cause another compilation.
         arguments = (
             self.shapes, self.world, self.work, motion, rules, manifolds, self.held, self.surfaces, self.threads,
-            note or None, script, most, kept, TOUCHING, int(steps),
+            script, most, kept, TOUCHING, int(steps),
         )  # fmt: skip
-        if note not in self._announced:
-            self._announced.add(note)
-            _compiled(arguments, joints > 0, self.surfaces is not None, self.threads is not None, note)
+        if not self._announced:
+            self._announced = True
+            _compiled(arguments, joints > 0, self.surfaces is not None, self.threads is not None)
         return *run_steps(*arguments), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make `steps` steps of the contact solve from `state`, or fewer if one leads to a state beyond the limits
         `most` (see `survey.broken`). `keep`: keep of each what a recording needs."""
-        if (moved := self._moved_since(state)) is not None:
-            rows, changed = moved
-            arrays = (self._motion.position, self._motion.orientation, self._motion.velocity, self._motion.angular)
-            for name, array in zip(MOTION, arrays, strict=True):
-                array[rows] = changed[name]
-        elif state is not self._latest:
+        if state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
             if self.held is not None:
@@ -146,15 +139,15 @@ class Compiled:
         rules, motion = self._rules, self._motion
         script, time = _script(self.bodies.tracks, state.time, rules, steps)
         self._latest = None  # in case the rest raises an error
-        manifolds, edges, counts, done, body, wrong, before, given, pair, point, kept = self.run(
-            motion, self._manifolds, rules, steps, script, most, note=options.record, keep=keep
+        manifolds, counts, done, body, wrong, before, given, pair, point, kept = self.run(
+            motion, self._manifolds, rules, steps, script, most, keep=keep
         )
         fault = None
         if body >= 0:
             found = Motion(motion.position, motion.orientation, motion.velocity, motion.angular)
             fault = fault_of(body, wrong, found, np.array(before), options.dt)
             if not done:
-                return Steps(state, edges, (0, 0, 0, 0), 0, fault, 0.0, kept, pair, point)
+                return Steps(state, (0, 0, 0, 0), 0, fault, 0.0, kept, pair, point)
             # The motion is one step beyond the last good state: repeat all steps but the last.
             again = self.advance(state, options, done, NO_LIMITS)
             return replace(again, fault=fault, kept=kept, pair=pair, point=point)
@@ -176,24 +169,15 @@ class Compiled:
             known[:, joint_columns.TARGET] = state.joints[:, joint_columns.TARGET]  # as `driven` received it
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         asleep = int((motion.island[rows] >= 0).sum())
-        return Steps(self._latest, edges, (*counts, asleep), done, fault, given, kept, pair, point)
-
-    def _moved_since(self, state: State) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
-        """The rows in which a state differs from the latest one, if only these differ, as after a network's step; else
-        None."""
-        latest, parts = self._latest, state.parts
-        if state is latest or latest is None or parts is None or parts[0] is not self._before:
-            return None
-        alike = ("touch", "load", "joints", "drive")
-        return parts[1:] if all(getattr(state, name) is getattr(latest, name) for name in alike) else None
+        return Steps(self._latest, (*counts, asleep), done, fault, given, kept, pair, point)
 
 
-def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool, note: bool) -> None:
+def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool) -> None:
     """Make sure that the step is compiled for scenes with these features."""
-    words = {"joints": joints, "hollow shapes": surfaces and not threads, "many bodies": threads, "a network": note}
+    words = {"joints": joints, "hollow shapes": surfaces and not threads, "many bodies": threads}
     given = [word for word, some in words.items() if some]
     what = "the contact step" + (f" for scenes with {', '.join(given)}" if given else "")
-    missing = {HELD: not joints, SURFACES: not surfaces, THREADS: not threads, NOTE: not note}
+    missing = {HELD: not joints, SURFACES: not surfaces, THREADS: not threads}
     compile_before(run_steps, arguments, what, "two minutes" if joints else "a minute", missing)
 
 
@@ -202,7 +186,6 @@ class Steps:
     """The result of several steps of the contact solve."""
 
     state: State  # the last good one
-    edges: Edges  # what contacts did in the last step, if that is recorded
     counts: tuple[int, ...]  # of the last step: pairs tested, contacts, bodies that contacts moved, sleeping bodies
     done: int  # how many steps were made
     fault: Fault | None  # fault of the state after them, which is not kept
@@ -289,6 +272,16 @@ def nodes_near(
     return nodes_within(scene.shapes, scene.world, scene.work, motion, rules, bodies.node, bodies.node_start)
 
 
+def points_near(scene: Compiled, state: State, gravity: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points at which bodies are near each other, or come near in a step of `dt` under `gravity` [3], model units; see
+    `edges.points_within`."""
+    rules = compiled_rules(Options(gravity, dt, 1))._replace(ahead=dt)
+    motion = taken_up(replace(state, touch=None))[0]
+    arguments = (scene.shapes, scene.world, scene.work, motion, rules, _manifolds(None), scene.surfaces)
+    compile_before(points_within, arguments, "the search for contacts", "half a minute", {6: scene.surfaces is None})
+    return points_within(*arguments)
+
+
 def compiled_rules(options: Options) -> compiled.Rules:
     """The options of a run in the form that the compiled step needs."""
     inner = options.dt / options.substeps
@@ -296,9 +289,7 @@ def compiled_rules(options: Options) -> compiled.Rules:
         options,
         inner,
         SLOW * math.hypot(*options.gravity) * inner,
-        ahead=inner if options.record and inner > COARSE else 0.0,
         slop=min(SLOP, SLOP_A_TIME * inner),
-        rounds=PYBULLET_ROUNDS if options.adds else ROUNDS,
     )
 
 

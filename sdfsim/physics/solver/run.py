@@ -10,13 +10,12 @@ from numba import njit
 from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
 from sdfsim.physics.solver.joints import given, rest_held, stored
-from sdfsim.physics.solver.record import no_edges
 from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.sleep import rests
 from sdfsim.physics.solver.survey import broken, energy, touching
 from sdfsim.physics.solver.vectors import BARE, ENTRY, FAST, add, dot, get, put, sub
 
-HELD, SURFACES, THREADS, NOTE = 6, 7, 8, 9  # positions of the arguments of `run_steps` that may be None
+HELD, SURFACES, THREADS = 6, 7, 8  # positions of the arguments of `run_steps` that may be None
 ROOM = 64  # number of contact points for which a recording has room at first
 
 
@@ -43,7 +42,7 @@ class Kept(NamedTuple):
 
 @njit(**ENTRY, nogil=True)
 def run_steps(
-    shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, most, kept, within, steps
+    shapes, world, work, motion, rules, manifolds, held, surfaces, threads, script, most, kept, within, steps
 ):
     """Advance `motion`, and the state of joints in `held`, by the given number of steps, in place. Ends early at the
     first invalid state.
@@ -52,12 +51,11 @@ def run_steps(
         held: None if no joint holds bodies. Code for an argument that is None is not compiled.
         surfaces: True if shapes may meet as surfaces, else None.
         threads: True if there may be enough pairs for threads to pay off, else None.
-        note: True to record what contacts did in the step, see `record`; else None.
         most: [5] limits of a valid state, see `survey.broken`.
         within: bodies that are no farther apart count as touching.
 
     Returns:
-        The manifolds at the end; what contacts did in the last step, if it is recorded; its counts, as in `Kept`; the
+        The manifolds at the end; the counts of the last step, as in `Kept`; the
         number of steps made; the body whose state is invalid after the next step (-1: none), and what is wrong with it;
         where that body was before that step; the work of pulls; and for all kept steps, one after the other, the pairs
         of bodies that touch [C, 2] and the points [C, 3] where they touch.
@@ -67,7 +65,7 @@ def run_steps(
     going, dt = world.going, rules.substep_dt * rules.options.substeps
     place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
     pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
-    edges, counts, total = no_edges(), (0, 0, 0), 0.0
+    counts, total = (0, 0, 0), 0.0
     for k in range(steps):
         for s in range(len(script.body)):
             b = script.body[s]
@@ -79,13 +77,13 @@ def run_steps(
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
         if rules.options.sleep and rests(world, motion):
-            edges, counts = no_edges(), (0, 0, 0)
+            counts = (0, 0, 0)
             _rest_on(world, work, motion)
             if held is not None:
                 rest_held(held.each)
         else:
-            manifolds, edges, counts = advance(
-                shapes, world, work, motion, rules, manifolds, held, surfaces, threads, note, script, k
+            manifolds, counts = advance(
+                shapes, world, work, motion, rules, manifolds, held, surfaces, threads, script, k
             )
         for s in range(len(script.body)):
             b = script.body[s]
@@ -100,7 +98,7 @@ def run_steps(
                     motion.position, motion.orientation, motion.velocity, motion.angular, place, i, b, dt, most
                 )
                 if wrong >= 0:
-                    return manifolds, edges, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
+                    return manifolds, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
         pulled = _pulled(going, work.wrench, motion, place, spin, dt)
         if held is not None:
             pulled += given(held.each)
@@ -117,7 +115,7 @@ def run_steps(
                 put(point, found, get(here.point, e))
                 written.depth[k] = max(written.depth[k], -here.gap[e])
                 found += 1
-    return manifolds, edges, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
+    return manifolds, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
 
 
 @njit(**BARE)

@@ -124,7 +124,7 @@ class Rules(NamedTuple):
     slow: float  # an approach up to this speed ends at the surface without a rebound
     ahead: float = 0.0  # time: new points are searched as much farther as two bodies approach each other in it
     contact_margin: float = 0.02  # contacts are kept up to this distance, and until they have slid by more
-    search_margin: float = 0.006  # new ones are searched up to this distance plus twice the options' margin
+    search_margin: float = 0.006  # new ones are searched up to this distance
     still: float = 1e-4  # pairs that have moved by less within a step are not tested again
     erp: float = 0.08  # share of a penetration that an inner step resolves, by velocity
     slop: float = SLOP  # penetration that is not resolved

@@ -1,8 +1,8 @@
-"""Contact frames: recorded steps in which something touches, with the contact solve's result for each.
+"""Contact frames: recorded steps in which bodies are near each other, with the points at which they are.
 
-The solve follows a recording step by step; each step starts from the recorded state. So training needs neither signed
-distances nor the solve itself, only torch and numpy. Disturbed starts are solved as well, because in a rollout a
-network gets states that differ slightly from recorded ones.
+The points are searched once, from recorded states, so that training needs no signed distances, only torch and numpy.
+They are searched from disturbed states as well, because in a rollout a network gets states that differ slightly from
+recorded ones.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,33 +22,28 @@ from sdfsim.data.dataset import (
     Trajectory,
     check_alike,
     conditions_of,
-    engine_substep,
     home_of,
     load_shapes,
     shapes_folder,
     trajectory_files,
 )
-from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.learned.contact_graph import OF_BODIES, OF_EDGES
 from sdfsim.physics import pose
-from sdfsim.physics.options import SUBSTEPS
 
 if TYPE_CHECKING:
+    from sdfsim.learned.inference import Edges
     from sdfsim.physics.bodies import Bodies, State
     from sdfsim.physics.options import Options
-    from sdfsim.physics.solver.record import Edges
 
 STEP = 0.02  # s, the step with which networks are trained
-FRAMES_VERSION = 11  # increase it whenever frames of the same recordings come out differently
-TOGETHER = 25  # trajectories that are followed side by side
+FRAMES_VERSION = 12  # increase it whenever frames of the same recordings come out differently
+TOGETHER = 25  # trajectories that are taken side by side
 ENDS = ("first", "second")
-# Recorded quantities of a step, and the names of the solve's results for them in a graph.
-TOLD = {"velocity": "solved_velocity", "angular": "solved_angular"} | {n: n for n in ("mean_velocity", "mean_angular")}
 
 
 @dataclass(frozen=True)
-class Solved:
-    draws: int = 2  # times that every recording is followed: first from recorded states, then from disturbed ones
+class Disturbed:
+    draws: int = 2  # times that every recording is taken: first its own states, then disturbed ones
     # shift, speed: m and m/s, standard deviations of the disturbance of a body's position and velocity, and, by
     # rotation and spin, of its surface. For each body it is multiplied by a factor, log-uniform from `least` to 1.
     shift: float = 0.003
@@ -125,7 +120,7 @@ class ContactFrames:
         return digest({name: array for name, array in self.arrays().items() if name != "trajectories"})[:16]
 
 
-def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress = silent) -> ContactFrames:
+def contact_frames(data: Path, split: str, how: Disturbed, *, on_progress: Progress = silent) -> ContactFrames:
     """The contact frames of a dataset split: from the cache file beside it, else made now and cached. Raises
     SdfsimError if there are no trajectories, if they are unreadable or differ in step or gravity, or if none has a
     contact."""
@@ -142,7 +137,7 @@ def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress
     check_alike(str(data / split), map(Trajectory.load, files))
     groups = [files[i : i + TOGETHER] for i in range(0, len(files), TOGETHER)]
     parts: list[list[ContactFrames]] = [[]] * len(groups)
-    for done, (index, part) in enumerate(parallel(_followed, [(group, how) for group in groups]), start=1):
+    for done, (index, part) in enumerate(parallel(_searched, [(group, how) for group in groups]), start=1):
         parts[index] = part
         on_progress(done / len(groups), f"contacts of {split}, part {done} of {len(groups)}")
     steps = [step for part in parts for step in part]
@@ -171,57 +166,41 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
     return ContactFrames.of_arrays(whole)
 
 
-def inner_steps(dt: float, substep: float) -> int:
-    """Number of inner steps of `substep` s in a recorded step of `dt` s; for 0 (unknown) that of our own recordings.
-    Raises SdfsimError for more than 5."""
-    count = round(dt / substep) if substep > 0 else SUBSTEPS
-    if not 1 <= count <= SUBSTEPS:
-        raise SdfsimError(f"recorded steps of {dt:g} s hold {count} inner ones of the engine", f"at most {SUBSTEPS}")
-    return count
-
-
-def _fingerprint(files: list[Path], how: Solved) -> str:
-    """A hash that changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are
-    solved."""
+def _fingerprint(files: list[Path], how: Disturbed) -> str:
+    """A hash that changes with the trajectories (names and sizes), the recipe, and the shapes."""
     info = [home / INFO] if (home := home_of(files[0].parent)) else []
     records = [*info, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))]
     contents = [record.read_text(encoding="utf-8") for record in records]
     return digest(FRAMES_VERSION, how, [[f.name, f.stat().st_size] for f in files], contents)[:12]
 
 
-def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
+def _searched(files: list[Path], how: Disturbed) -> list[ContactFrames]:
     """The frames of each draw and step, for all trajectories of a group."""
     from sdfsim.data.batching import merged, state_at  # needs the SDFs, hence more than torch and numpy
-    from sdfsim.learned.model import load_model
     from sdfsim.physics.bodies import Units
     from sdfsim.physics.options import Options
-    from sdfsim.simulate.steppers import stepper_of
+    from sdfsim.physics.solver.prepare import Compiled, points_near
 
-    substep, found = engine_substep(files[0].parent), conditions_of(files[0].parent)
+    floor = conditions_of(files[0].parent).floor
     group = [Trajectory.load(file) for file in files]
     shapes = load_shapes(files[0].parent, {str(n) for t in group for n in t.shape})
-    bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), found.floor)
-    gravity = np.asarray(group[0].gravity, dtype=np.float64)
-    options = Options(gravity, group[0].dt, inner_steps(group[0].dt, substep), record=True)
-    if found.by_teacher:
-        options = options._replace(margin=MARGIN, adds=True, cone=False)
-    solver, moves = stepper_of(load_model()), bodies.moves
+    bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), floor)
+    options = Options(np.asarray(group[0].gravity, dtype=np.float64), group[0].dt)
+    scene = Compiled(bodies, start, grids=False)
     count = min(len(t.position) for t in group)
     parts = []
     for draw in range(how.draws):
         rng = np.random.default_rng([draw, int(hashlib.sha256(files[0].name.encode()).hexdigest()[:8], 16)])
-        carry, touch = solver.init(bodies, start, options), None
         for now in range(count - 1):
-            state = replace(state_at(group, [now] * len(group), start), touch=touch)
+            state = state_at(group, [now] * len(group), start)
             state = _disturbed(bodies, state, how, rng) if draw else state
-            after, _ = solver.advance(solver.announce(state, carry, moves, moves), carry)
-            touch = after.touch
+            edges = points_near(scene, state, options.gravity, options.dt)
             recorded = state_at(group, [now + 1] * len(group), start)
-            parts += _of_step(bodies, state, after, cast("Edges", carry.edges), recorded, options, found.floor)
+            parts += _of_step(bodies, state, edges, recorded, options, floor)
     return parts
 
 
-def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generator) -> State:
+def _disturbed(bodies: Bodies, state: State, how: Disturbed, rng: np.random.Generator) -> State:
     moves = bodies.moves[:, None]
     lever = 2.0 / np.minimum(bodies.size, 1e3)[:, None]
     part = how.least ** rng.random((len(bodies), 1)) * moves
@@ -240,26 +219,25 @@ def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generat
 
 
 def _of_step(
-    bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, options: Options,
-    of_floor: tuple[float, float],
-) -> list[ContactFrames]:  # fmt: skip
+    bodies: Bodies, state: State, edges: Edges, recorded: State, options: Options, of_floor: tuple[float, float]
+) -> list[ContactFrames]:
     """The frames of a step of several trajectories on one floor with this friction and restitution, in units in which
-    the step is `STEP`; none if nothing touches."""
-    from sdfsim.learned.inference import step_graph
+    the step is `STEP`; none if nothing is near anything."""
+    from sdfsim.learned.inference import step_graph, velocities
+    from sdfsim.physics.free_flight import fly
 
-    if not len(edges.pair):
+    pair, value = edges
+    if not len(pair):
         return []
     world, floor = bodies.world, len(bodies) - 1
-    order = np.argsort(world[edges.pair[:, 0]], kind="stable")
-    edges = edges._replace(pair=edges.pair[order], value=edges.value[order])
-    used, frame, count = np.unique(world[edges.pair[:, 0]], return_inverse=True, return_counts=True)
+    order = np.argsort(world[pair[:, 0]], kind="stable")
+    pair, value = pair[order], value[order]
+    used, frame, count = np.unique(world[pair[:, 0]], return_inverse=True, return_counts=True)
     rows = np.flatnonzero(np.isin(world[:floor], used))
     begin = np.concatenate([[0], np.cumsum(np.bincount(world[rows])[used])])
-    # The same edges, once with the solve's result for the step, and once with the recorded one.
-    graph, truth = (
-        vars(step_graph(bodies, state, end, edges, options, STEP, np.append(rows, floor))[1])
-        for end in (after, recorded)
-    )
+    every, free = np.append(rows, floor), fly(bodies, state, options)
+    graph = vars(step_graph(bodies, state, free, (pair, value), options, STEP, every))
+    truth = vars(velocities(state, recorded, every, options.dt, STEP))
     ends = {name: graph[name].numpy() for name in ENDS}
     ends = {name: np.where(k == len(rows), -1, k - begin[frame]).astype(np.int16) for name, k in ends.items()}
     length = (options.dt / STEP) ** 2
@@ -269,7 +247,7 @@ def _of_step(
             edge_start=np.concatenate([[0], np.cumsum(count)]),
             bodies={name: graph[name][:-1].float().numpy() for name in OF_BODIES},
             edges=ends | {name: graph[name].float().numpy() for name in OF_EDGES},
-            truth={name: truth[of][:-1].float().numpy() for name, of in TOLD.items()},
+            truth={name: values[:-1].float().numpy() for name, values in truth.items()},
             mass=bodies.mass[rows].astype(np.float32),
             friction=bodies.friction[rows].astype(np.float32),
             restitution=bodies.restitution[rows].astype(np.float32),
