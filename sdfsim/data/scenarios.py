@@ -1,7 +1,7 @@
 """The starts of the teacher's scenes: MOVi-B and MOVi-C as Kubric spawns them (Greff et al., 2022), and our own."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -35,13 +35,19 @@ PILE_RADIUS = 0.55  # m for one body, growing with the cube root of their number
 PILE_GAPS = (0.02, 0.15)  # m between the boxes around bodies
 PILE_TRIES = 8  # places tried for one body, which takes the lowest
 
-VARIED_EXTENTS = (0.7, 1.4)  # m
+VARIED_EXTENTS = (0.7, 1.4)  # m, of the smallest kind of body in a scene
+LARGER = 8.0  # largest ratio of a body's extent to that, at rest; small ones are more frequent
+LARGER_TOSSED = 2.0  # the same for tossed bodies
+HOLLOW_SHARE = 0.2  # share of bowls among bodies that do not begin in one kind of motion
 FRICTIONS, RESTITUTIONS = (0.0, 1.0), (0.0, 1.0)
 DENSITIES = (0.1, 10.0)  # log-uniform
 MASS_RATIO = 100.0  # largest mass ratio within a scene
-OBSTACLES = {"obstacle_bowl": "bowl", "obstacle_torus": "torus", "obstacle_gear": "gear"}
-OBSTACLE_EXTENTS = (2.0, 4.0)  # m
-OBSTACLE_SHARE = 0.3  # share of the scenes whose bodies are tossed or at rest
+OBSTACLES = {
+    "obstacle_bowl": "bowl", "obstacle_torus": "torus", "obstacle_gear": "gear", "obstacle_table": "table"
+}  # fmt: skip
+OBSTACLE_EXTENTS = (2.0, 8.0)  # m
+OBSTACLE_SHARE = 0.5  # share of the scenes whose bodies are tossed or at rest
+ON_TOP = 0.5  # share of bodies at rest that are put on an obstacle, if there is one
 # Shares of scenes by their start: tossed as in MOVi, `at_rest`, or in one of the motions of `set_moving`.
 SHARES = {
     "tossed": 0.35,
@@ -163,12 +169,12 @@ def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
 def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
     """Any friction, restitution and mass ratio, and starts of all kinds, in the shares `SHARES`.
 
-    30 % of the scenes that are tossed or at rest (the kinds of `STARTS` in equal parts) have an obstacle. In the other
-    scenes one to four bodies, half of them balls, are in one kind of motion on an empty floor; pairs that meet head-on
-    do so in flight, far above it.
+    Half of the scenes that are tossed or at rest (the kinds of `STARTS` in equal parts) have an obstacle, on which
+    bodies may rest. Sizes in a scene differ by up to `LARGER`. In the other scenes one to four bodies, half of them
+    balls, are in one kind of motion on an empty floor; pairs that meet head-on do so in flight, far above it.
     """
     start = str(rng.choice(list(SHARES), p=list(SHARES.values())))
-    placed = []
+    placed, place = [], np.zeros(2)
     if start in ("tossed", "resting") and rng.random() < OBSTACLE_SHARE:
         source = cast.scenery[str(rng.choice(list(OBSTACLES)))]
         extent = rng.uniform(*OBSTACLE_EXTENTS)
@@ -177,9 +183,10 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | N
         teacher.add(obstacle, upright(source, obstacle, place, 0.0, rotation), rotation.as_quat())
         placed.append((source, obstacle))
     masses: list[float] = []
+    smallest, larger = rng.uniform(*VARIED_EXTENTS), {"tossed": LARGER_TOSSED, "resting": LARGER}.get(start, 1.0)
 
     def draw(source: ShapeSource) -> TeacherBody:
-        extent = rng.uniform(*VARIED_EXTENTS)
+        extent = smallest * larger ** (rng.random() ** 2)
         volume = source.volume * extent**3
         heaviest, most = max(masses, default=0.0), min(masses, default=np.inf) * MASS_RATIO
         low = min(max(volume * DENSITIES[0], heaviest / MASS_RATIO), most)
@@ -188,12 +195,14 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | N
         return TeacherBody(source.urdf, extent, masses[-1], rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))
 
     if start == "tossed":
-        tossed = _toss(teacher, rng, cast, draw)
+        tossed = _toss(teacher, rng, replace(cast, shapes=_with_bowls(cast)), draw)
         return None if tossed is None else placed + tossed
     if start == "resting":
-        picked = [cast.shapes[k] for k in rng.integers(len(cast.shapes), size=rng.integers(COUNT[0], COUNT[1] + 1))]
+        shapes = _with_bowls(cast)
+        picked = [shapes[k] for k in rng.integers(len(shapes), size=rng.integers(COUNT[0], COUNT[1] + 1))]
         bodies = [(source, draw(source)) for source in picked]
-        return placed + bodies if at_rest(teacher, rng, bodies, str(rng.choice(STARTS))) else None
+        under = (place, placed[0]) if placed else None
+        return placed + bodies if at_rest(teacher, rng, bodies, str(rng.choice(STARTS)), under) else None
     count = 2 * int(rng.integers(1, 3)) if start == "head-on" else int(rng.integers(FEW[0], FEW[1] + 1))
     balls = rng.random(count) < (1.0 if start == "rolling" else BALL_SHARE)
     picked = [cast.scenery["ball"] if ball else cast.shapes[rng.integers(len(cast.shapes))] for ball in balls]
@@ -230,9 +239,19 @@ def _toss(teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Draw) ->
     return bodies
 
 
-def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: str) -> bool:
+def _with_bowls(cast: Cast) -> list[ShapeSource]:
+    """The shapes to draw from, with as many bowls among them that `HOLLOW_SHARE` of the drawn ones are bowls."""
+    bowls = max(1, round(len(cast.shapes) * HOLLOW_SHARE / (1.0 - HOLLOW_SHARE)))
+    return cast.shapes + bowls * [cast.scenery["obstacle_bowl"]]
+
+
+def at_rest(
+    teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: str,
+    under: tuple[np.ndarray, tuple[ShapeSource, TeacherBody]] | None = None,
+) -> bool:  # fmt: skip
     """Put bodies down, after those that the teacher has already: all at rest, all dropped from `DROP` at most, all
-    given a nudge, or pressed into each other, as `start` says. False if there was no room for one.
+    given a nudge, or pressed into each other, as `start` says. `under` is where [2] m an obstacle stands on which they
+    may be put, and this obstacle. False if there was no room for one.
 
     Only pressed bodies overlap; from these models learn how bodies separate. Shapes have a largest extent of 1 m at
     scale 1.
@@ -242,10 +261,15 @@ def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: s
 
     def propose(source: ShapeSource, body: TeacherBody) -> Pose:
         stacked = len(poses) > 0 and rng.random() < STACKED
-        place = below + rng.uniform(-0.1, 0.1, 2) * body.scale if stacked else rng.uniform(-FIELD, FIELD, 2)
+        place, height = rng.uniform(-FIELD, FIELD, 2), 0.0
+        if stacked:
+            place, height = below + rng.uniform(-0.1, 0.1, 2) * body.scale, top
+        elif under is not None and rng.random() < ON_TOP:
+            low, high = _box(*under[1], Rotation.identity())
+            place, height = under[0] + rng.uniform(-0.4, 0.4, 2) * under[1][1].scale, float(high[2] - low[2])
         gap = rng.uniform(GAP, DROP) if start == "dropped" else GAP
         rotation = _standing(source, rng)
-        return upright(source, body, place, (top if stacked else 0.0) + gap, rotation), rotation
+        return upright(source, body, place, height + gap, rotation), rotation
 
     for index, (source, body) in enumerate(bodies, start=first):
         if (pose := _find_room(teacher, (source, body), propose)) is None:

@@ -134,10 +134,14 @@ def plane(half: float) -> Mesh:
 
 
 def convex_pieces(kind: str) -> list[Mesh]:
-    """Convex pieces whose union is (close to) the default mesh of a primitive; an empty list for "shoe" and unknown
-    names."""
+    """Convex pieces whose union is (close to) the default mesh of a primitive, or a table of 1 x 0.7 x 0.7 m ("table");
+    an empty list for "shoe" and unknown names."""
     if kind in ("box", "sphere", "cylinder", "cone"):
         return [convex_hull(PRIMITIVES[kind]().vertices)]
+    if kind == "table":
+        top, leg = box((1.0, 0.7, 0.06)), box((0.06, 0.06, 0.64))
+        corners = [(x, y, -0.35) for x in (-0.45, 0.45) for y in (-0.3, 0.3)]
+        return [top, *(Mesh(leg.vertices + corner, leg.faces) for corner in corners)]
     if kind == "torus":
         return _ring_hulls(_torus_rings(0.35, 0.15, 32, 16))
     if kind == "torus_knot":
