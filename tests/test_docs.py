@@ -280,7 +280,7 @@ def test_what_far_scenery_costs_is_the_same_everywhere():
     """Nothing, with the solver and with a network on top of it."""
     table = measured("contact step")
     solver, small = (
-        numbers(cells(table, f"the same with all of `Simulator`, {model}")[-1])[0] for model in ("solver", "small")
+        numbers(cells(table, f"the same with all of `Simulator`, {model}")[-1])[0] for model in ("solver", "gnn")
     )
     assert solver <= 1.1 and "costs the same beside 10,000 static bodies as beside 10" in page("docs/scale.md")
     assert small <= 1.1 and "with a network static bodies cost nothing" in page("CHANGELOG.md")
@@ -328,7 +328,7 @@ def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
     """The tutorial's commands and the card's make as many trajectories as the file of the model knows."""
     from sdfsim.learned.model import load_model
 
-    made = [known["trajectories"] for known in load_model("small").card["data"]]
+    made = [known["trajectories"] for known in load_model("gnn").card["data"]]
     loops = re.findall(r"for split in (.*?); do.*\n.*?-o (\S+)", page("docs/tutorial.md"))
     tutorial = {out: dict(pair.split(":") for pair in splits.split()) for splits, out in loops}
     card = page("sdfsim/models/small.md")
@@ -358,4 +358,4 @@ def test_presets_and_recipes_in_documents_exist():
             for found in re.finditer(r"(reconstruct|train|fit)\b[^`|]*?--(?:preset|recipe) ([\w-]+)", line):
                 assert found[2] in known[found[1]], f"{file.name}: {line}"
                 named.add((found[1], found[2]))
-    assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick"), ("train", "small")} <= named
+    assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick"), ("train", "gnn")} <= named

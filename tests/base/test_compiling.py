@@ -122,7 +122,7 @@ def test_a_run_says_nothing_of_threading_layers():
         "warnings.warn('The TBB threading layer requires TBB version 2021 update 6 or later', NumbaWarning)\n"
         "warnings.warn('something else', NumbaWarning)\n"
         "scene = sdfsim.Scene().add('floor', plane={}).add('ball', sphere={'radius': 0.1}, position=(0, 0, 0.1))\n"
-        "sdfsim.Simulator(scene, 'small').step(2)\n"
+        "sdfsim.Simulator(scene, 'gnn').step(2)\n"
         "import numba; numba.set_num_threads(1)\n"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

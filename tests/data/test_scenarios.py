@@ -32,7 +32,7 @@ from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape, sdf_of_mesh
-from sdfsim.training.contact_cache import Solved, contact_frames
+from sdfsim.training.contact_frames import Disturbed, contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 
 
@@ -224,7 +224,7 @@ def test_static_scenery_takes_part_in_contacts_but_never_in_what_is_learnt(cast,
     (tmp_path / "train").mkdir()
     t = make_trajectory("bowl", np.random.default_rng(0), replace(cast, bodies=5))
     t.save(tmp_path / "train" / "00000.npz")
-    frames = contact_frames(tmp_path, "train", Solved(draws=1))
+    frames = contact_frames(tmp_path, "train", Disturbed(draws=1))
     assert (frames.mass.reshape(-1, 6)[:, 0] == 0).all() and (frames.mass.reshape(-1, 6)[:, 1:] > 0).all()
     assert (frames.edges["second"] == 0).any() and not (frames.edges["first"] == 0).any()  # who is first moves
     task = ImpulseTask(frames)

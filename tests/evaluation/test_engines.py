@@ -25,7 +25,7 @@ from tests.helpers.scene_files import SCENE
 def started(folder, text: str = SCENE):
     (folder / "scene.yaml").write_text(text)
     scene = load_scene(folder / "scene.yaml")
-    units = stepper_of(load_model("small", weights=False)).units(scene)
+    units = stepper_of(load_model("gnn", weights=False)).units(scene)
     return start_of_scene(scene, folder / "engine", units), units
 
 

@@ -10,35 +10,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import reality
 from benchmarks.reality import (
     ENGINES,
     GRAVITY,
     OURS,
     SIDE,
-    TRAINED,
-    Lesson,
     Toss,
-    Trained,
-    dataset_of,
     errors,
     fall,
     fitted_start,
     flight,
-    learnt,
     load_tosses,
-    network_table,
-    networks,
-    on_surfaces,
-    recordings_of,
     split,
 )  # fmt: skip
 from benchmarks.tosses import FIT, FRAMES, TEST, Motion, Start, cost, ours, recorded, searched
 from sdfsim.base.errors import SdfsimError
-from sdfsim.data.dataset import Trajectory
 from sdfsim.data.public_tosses import CUBE
 from sdfsim.scene.load import load_scene
-from tests.helpers.scenes import surface_model
 
 DT = 1.0 / 148.0
 VALUES = {
@@ -209,107 +197,7 @@ def test_recorded_tosses_have_the_velocities_of_their_authors(folder):
 
 def test_tosses_are_split_apart(folder):
     fit, test, rest = split(load_tosses(folder))
-    assert (len(fit), len(test)) == (FIT, TEST) and len(fit) + len(rest) > max(TRAINED)  # some are left to choose by
+    assert (len(fit), len(test)) == (FIT, TEST)
     every = [*fit, *test, *rest]
     assert len({toss.position.tobytes() for toss in every}) == len(every)
     assert min(len(toss.position) for toss in every) > FRAMES
-
-
-# --- networks ---
-
-
-@pytest.fixture(scope="module")
-def lesson(tmp_path_factory) -> Lesson:
-    """Six tosses onto a table that is tilted and lower, and the scene that knows it."""
-    folder = tmp_path_factory.mktemp("lesson")
-    text = CUBE.format(gravity=-GRAVITY, factor=1.0)
-    text = text.replace("plane: {}", "plane: {normal: [0.1, -0.05, 1.0], offset: -0.02}")
-    (folder / "scene.yaml").write_text(text)
-    scene = load_scene(folder / "scene.yaml")
-    tosses = [thrown(np.array([0.5, 0.0, up]), np.array([1.0, 2.0, 3.0]), frames=90) for up in np.linspace(0.4, 1.2, 6)]
-    both = [fitted_start(toss) for toss in tosses[4:]], recorded(tosses[4:])
-    return Lesson(recordings_of(tosses[:4], scene), scene, both, both)
-
-
-def test_a_dataset_of_tosses_lies_on_the_table(lesson, tmp_path):
-    """Its floor is z = 0: heights there are distances from the plane of the scene; gravity and turns come along."""
-    dataset_of(lesson.known, lesson, tmp_path)
-    normal = np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
-    for k, r in enumerate(lesson.known):
-        read = Trajectory.load(tmp_path / "train" / f"{k:03}.npz")
-        assert read.position[:, 0, 2] == pytest.approx(r.position[:, 0] @ normal + 0.02, abs=1e-12)
-        corner = Rotation.from_quat(read.orientation[:, 0]).apply([0.05, 0.05, 0.05])[:, 2]
-        assert corner == pytest.approx(Rotation.from_quat(r.orientation[:, 0]).apply([0.05] * 3) @ normal, abs=1e-9)
-        assert read.gravity[2] == pytest.approx(-GRAVITY * normal[2]) and np.linalg.norm(read.gravity) == pytest.approx(
-            GRAVITY
-        )
-
-
-@pytest.mark.parametrize("kind", ["sdf-sim", "fignet"])
-def test_networks_on_surface_nodes_fly_exactly_where_nothing_touches(lesson, kind):
-    velocity, spin = np.array([1.0, 0.2, 1.5]), np.array([1.0, 2.0, 3.0])
-    start = fitted_start(thrown(velocity, spin, frames=60, height=9.0))
-    model = surface_model(kind)
-    model = model.__class__(**(vars(model) | {"dt": DT, "gravity": GRAVITY, "nodes": 8, "reach": 0.01}))
-    found = on_surfaces(model, lesson, [start, start])
-    time = DT * np.arange(1, FRAMES + 1)[:, None]
-    exact = start.position + time * start.velocity - 0.5 * time**2 * [0.0, 0.0, GRAVITY]
-    assert np.abs(found.position - exact).max() < 1e-6
-    turned = Rotation.from_rotvec(time * start.angular_velocity) * Rotation.from_quat(start.quat_xyzw)
-    assert (Rotation.from_quat(found.quat_xyzw[1]) * turned.inv()).magnitude().max() < 1e-5
-
-
-@pytest.mark.parametrize(("preset", "tosses", "steps"), [("impacts", 3, 4), ("alone", 0, 0), ("mgn", 4, 4)])
-def test_a_network_is_trained_and_judged(lesson, monkeypatch, preset, tosses, steps):
-    """The tosses that choose are those that judge here: the error by which a state was chosen is its own."""
-    monkeypatch.setattr(reality, "LOOKS", 2)
-    found = learnt(Trained(preset, tosses, steps, teacher=not steps), 0, lesson)
-    test = np.array(found["test"])
-    assert test.shape == (2, 2) and np.isfinite(test).all() and found["seconds"] > 0.0
-    assert found["chosen"] == pytest.approx(test.mean(1).sum(), rel=1e-9)
-    assert test[0].mean() < 1000.0  # % of a side, over half a second
-
-
-def test_kept_networks_are_not_trained_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(reality, "TRAINED", (2, 4))
-    monkeypatch.setattr(reality, "NETWORKS", {"on the solve, 2 tosses": Trained("impacts", 2, 2)})
-    monkeypatch.setattr(reality, "LOOKS", 1)
-    monkeypatch.setattr(reality, "SEEDS", 2)
-    tosses = [thrown(np.array([0.5, 0.0, up]), np.array([1.0, 2.0, 3.0]), frames=90) for up in np.linspace(0.4, 1.2, 9)]
-    groups = tosses[:3], tosses[3:5], tosses[5:]
-    (tmp_path / "scene.yaml").write_text(CUBE.format(gravity=-GRAVITY, factor=1.0))
-    first = networks(groups, tmp_path / "scene.yaml", GRAVITY, tmp_path / "kept")
-    assert set(first) == {
-        ("-", "the solve alone"),
-        ("seed 0", "on the solve, 2 tosses"),
-        ("seed 1", "on the solve, 2 tosses"),
-    }
-    (tmp_path / "kept" / "on the solve, 2 tosses" / "seed 1.json").unlink()
-    trained = []
-    monkeypatch.setattr(
-        reality, "learnt", lambda how, seed, lesson: trained.append(seed) or first["seed 0", "on the solve, 2 tosses"]
-    )
-    networks(groups, tmp_path / "scene.yaml", GRAVITY, tmp_path / "kept")
-    assert trained == [1]
-    networks((groups[0], groups[1], groups[2][:-1]), tmp_path / "scene.yaml", GRAVITY, tmp_path / "kept")
-    assert trained == [1, 0, 1]  # of other tosses, so anew
-
-
-def test_the_table_of_networks_begins_with_who_loses_most():
-    even = np.linspace(0.0, 2.0, 50)
-
-    def one(position: float, rotation: float, chosen: float) -> dict:
-        return {"test": [(position + even).tolist(), (rotation + 0 * even).tolist()], "chosen": chosen, "seconds": 12.0}
-
-    found = {
-        ("-", "the solve alone"): one(9.0, 5.0, 19.0),
-        ("seed 0", "better"): one(8.0, 5.0, 18.0), ("seed 0", "worse"): one(10.0, 7.0, 20.0),
-        ("seed 1", "better"): one(8.5, 4.0, 17.0), ("seed 1", "worse"): one(10.0, 9.0, 21.0),
-    }  # fmt: skip
-    head, *rows = network_table(found)
-    assert [row[0] for row in rows] == ["worse", "better", "the solve alone"]
-    row = dict(zip(head, rows[1], strict=True))
-    assert row["position, %"].startswith("9.25 [") and row["rotation, degrees"].startswith("4.5 [")
-    assert row["minus the solve"] == "-0.75 [-0.75, -0.75] / -0.5 [-0.5, -0.5]"  # paired: what tosses share is gone
-    assert "9 / 5; 9.5 / 4" in rows[1] and "18 / 17" in rows[1] and rows[1][-1] == "12"
-    assert "(solve: 19)" in head[5]

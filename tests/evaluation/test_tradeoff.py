@@ -28,9 +28,9 @@ def cases(cube_data):
 
 def test_every_setting_has_a_label_of_its_own():
     for quick in (False, True):
-        chosen = variants(["solver", "small"], quick=quick)
+        chosen = variants(["solver", "gnn"], quick=quick)
         assert len({s.label for s in chosen}) == len(chosen) and not any("/" in s.label for s in chosen)
-        assert chosen[0] == Variant("solver") and Variant("small") in chosen and chosen[-1].label == "ballistic"
+        assert chosen[0] == Variant("solver") and Variant("gnn") in chosen and chosen[-1].label == "ballistic"
         assert {s.nodes for s in variants(["solver"], quick=quick, nodes=False)} == {"own"} != {s.nodes for s in chosen}
 
 
@@ -48,8 +48,8 @@ def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
     from sdfsim.scene.load import load_scene
 
     (tmp_path / "scene.yaml").write_text(SCENE)
-    cases = cases_of_scene(load_scene(tmp_path / "scene.yaml"), "small", tmp_path / "engine", quick=True)
-    assert cases.length == pytest.approx(0.1 / load_model("small").length, rel=0.02)
+    cases = cases_of_scene(load_scene(tmp_path / "scene.yaml"), "gnn", tmp_path / "engine", quick=True)
+    assert cases.length == pytest.approx(0.1 / load_model("gnn").length, rel=0.02)
     assert cases.steps == min(50, round(0.4 / cases.time / 0.02)) and cases.floor == (0.8, 0.5)
     (recorded,) = cases.recorded
     t = np.arange(len(recorded.position)) * recorded.dt * cases.time
@@ -72,7 +72,7 @@ def test_half_as_many_steps_are_judged_over_the_same_time(cases, steps, stride):
 
 
 def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
-    chosen = [Variant("solver"), Variant("small", nodes="thin 20"), Variant("solver", contact=False)]
+    chosen = [Variant("solver"), Variant("gnn", nodes="thin 20"), Variant("solver", contact=False)]
     monkeypatch.setattr(study, "variants", lambda *_, **__: chosen)
     monkeypatch.setattr(study, "REPEATS", 2)
     monkeypatch.setattr(study, "MOST_QUICK", 1)

@@ -81,7 +81,7 @@ def test_samples_are_copied_to_be_changed(installed, tmp_path):
     call(installed, tmp_path, program, "samples", "-o", "samples")
     call(installed, tmp_path, "-c", "import sdfsim; assert len(sdfsim.load_scene('samples/pile.yaml').shapes) > 5")
     assert len(list((tmp_path / "samples" / "photos" / "table_vase" / "images").glob("*.jpg"))) == 48
-    assert "small" in call(installed, tmp_path, program, "info")
+    assert "gnn" in call(installed, tmp_path, program, "info")
 
 
 def test_a_users_type_checker_knows_what_functions_take_and_give(installed, tmp_path):

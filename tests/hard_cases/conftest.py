@@ -1,31 +1,29 @@
-"""What the gates run on: the contact solve, every bundled network on top of it, and the devices that there are."""
+"""What the gates run on: the contact solve, the bundled network on bodies, and the devices that there are."""
 
 import pytest
 
-from sdfsim.learned.model import SOLVER, Model, load_model, sound_models
+from sdfsim.learned.model import SOLVER, Model, load_model
 from tests.hard_cases.crashing import undisturbed, works
 
 __all__ = ["undisturbed", "works"]
 
-ON_SOLVE = [name for name in sound_models() if name != SOLVER]
+NETWORK = "gnn"
 
 
-@pytest.fixture(scope="session", params=sound_models())
+@pytest.fixture(scope="session", params=[SOLVER, NETWORK])
 def every_model(request) -> Model:
-    """The contact solve and every bundled network on it."""
     return load_model(request.param)
 
 
-@pytest.fixture(scope="session", params=[SOLVER, *(pytest.param(name, marks=pytest.mark.slow) for name in ON_SOLVE)])
+@pytest.fixture(scope="session", params=[SOLVER, pytest.param(NETWORK, marks=pytest.mark.slow)])
 def model(request) -> Model:
-    """The contact solve; the networks, which take longer, among the slow tests."""
+    """The contact solve; the network, which takes longer, among the slow tests."""
     return load_model(request.param)
 
 
-@pytest.fixture(scope="session", params=ON_SOLVE)
-def network(request) -> Model:
-    """Every bundled network on the solve."""
-    return load_model(request.param)
+@pytest.fixture(scope="session")
+def network() -> Model:
+    return load_model(NETWORK)
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

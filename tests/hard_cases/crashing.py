@@ -161,7 +161,7 @@ def tiny_train() -> None:
     """A training of 30 steps with a checkpoint after each, and a line of the log every three."""
     from sdfsim.training import train
 
-    train.PRESETS["small"] = train.Preset("impulse", {"width": 8, "rounds": 1}, steps=30, batch=4, rate=3e-3)
+    train.PRESETS["gnn"] = train.Preset("impulse", {"width": 8, "rounds": 1}, steps=30, batch=4, rate=3e-3)
     train.CHECKPOINT_SECONDS = 0.0
 
 

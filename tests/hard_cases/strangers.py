@@ -68,9 +68,7 @@ def scenes(draw: st.DrawFn) -> dict:
     """A valid document, as plain data."""
     effects = sometimes(contact=st.sampled_from(["auto", "on", "off"]), sleep=st.sampled_from(["on", "off"]))
     document = {"version": 1} | draw(
-        sometimes(
-            duration=positive, seed=st.integers(0, 10**17), gravity=vector, effects=effects, model=st.just("small")
-        )
+        sometimes(duration=positive, seed=st.integers(0, 10**17), gravity=vector, effects=effects, model=st.just("gnn"))
     )
     named = draw(st.lists(names, min_size=1, max_size=3, unique=True))
     document["shapes"] = {name: draw(shapes) for name in named}

@@ -61,10 +61,10 @@ def test_a_state_that_cannot_be_is_named_and_the_last_good_one_kept(kind, monkey
 
 
 def breaking(monkeypatch, at_call: int, name: str, value: float) -> None:
-    """At its `at_call`th call the network on the solve answers `value` in the array `name`, for the last body."""
-    real, calls = inference.corrected, []
+    """At its `at_call`th call the network on bodies answers `value` in the array `name`, for the last body."""
+    real, calls = inference.stepped, []
 
-    def corrected(*given) -> State:
+    def stepped(*given) -> State:
         calls.append(1)
         after = real(*given)
         if len(calls) == at_call:
@@ -73,7 +73,7 @@ def breaking(monkeypatch, at_call: int, name: str, value: float) -> None:
             after = replace(after, **{name: broken})
         return after
 
-    monkeypatch.setattr(inference, "corrected", corrected)
+    monkeypatch.setattr(inference, "stepped", stepped)
 
 
 IMPOSSIBLE = [
@@ -103,7 +103,7 @@ def test_a_run_on_disk_is_readable_up_to_the_last_good_step(tmp_path, monkeypatc
     )
     at = int(np.random.default_rng(7).integers(3, 20))
     breaking(monkeypatch, at, "velocity", np.nan)
-    done = run("simulate", scene, "-o", out, "--json", "--model", "small")
+    done = run("simulate", scene, "-o", out, "--json", "--model", "gnn")
     assert done.exit_code == 3
     rollout, report = Rollout.load(out / "rollout.npz"), json.loads((out / "report.json").read_text())
     # The network is first asked when the ball meets the floor.

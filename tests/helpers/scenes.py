@@ -42,16 +42,13 @@ def random_model(kind: str, seed: int = 0, push: float = 0.5, **config: int) -> 
     network = new_network(kind, config or {"width": 16, "rounds": 2} if kind == "impulse" else config)
     if kind == "impulse":
         for layer in network.rounds:  # type: ignore[union-attr]
-            torch.nn.init.normal_(layer.normal_impulse.weight, std=push)
-            torch.nn.init.normal_(layer.tangent_impulse.weight, std=push)
-            if layer.moment is not None:
-                torch.nn.init.normal_(layer.moment.weight, std=push)
+            torch.nn.init.normal_(layer.factor.weight, std=push)
     network.eval().requires_grad_(False)
     return Model("random", kind, network, dt=0.02, gravity=10.0, length=1.0, reach=0.1)
 
 
 def tiny_model(path: Path, **known) -> Path:
-    """The file of an untrained network on the solve, of the file's name; `known` are further fields of `Model`."""
+    """The file of an untrained network on bodies, of the file's name; `known` are further fields of `Model`."""
     torch.manual_seed(0)
     network = new_network("impulse", {"width": 8, "rounds": 1})
     Model(path.stem, "impulse", network, 0.02, 10.0, 1.0, 0.1, **known).save(path)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.learned.families import FAMILIES, vertices
-from sdfsim.learned.near import closest_points, face_pairs, node_pairs
+from benchmarks.baselines import FAMILIES, closest_points, face_pairs, node_pairs, vertices
 from sdfsim.learned.pose import rotate
 from sdfsim.learned.tensors import BodyTensors, StateTensors
 from sdfsim.physics.bodies import Units, from_scene

@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.learned.model import (
-    BUNDLED,
-    LEARNED,
-    SOLVER,
-    SURFACE,
-    bundled_models,
-    load_model,
-    model_names,
-    sound_models,
-)
+from sdfsim.base.errors import SdfsimError
+from sdfsim.learned.model import BUNDLED, bundled_models, load_model
 from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import random_model
 
@@ -42,11 +34,10 @@ def test_nothing_is_copied_where_nothing_has_to_move(tmp_path):
     assert unread.network is None and unread.to(META) is unread
 
 
-def test_what_knows_nothing_of_the_solve_is_not_run_unasked():
-    found = {name: load_model(name) for name in bundled_models()}
-    alone = {name for name, m in found.items() if m.kind in SURFACE or (m.kind == "impulse" and m.network.config.alone)}
-    assert alone == set(LEARNED) and {"gnn", "sdf-sim", "small"} <= set(found)
-    assert set(sound_models()) == {SOLVER, *found} - alone and set(model_names()) == {SOLVER, *found}
+def test_a_model_of_an_earlier_version_ends_in_one_line():
+    with pytest.raises(SdfsimError, match="'small' not found") as caught:
+        load_model("small")
+    assert caught.value.hint == "models are solver, gnn, sdf-sim; or give the path of a .safetensors"
 
 
 @pytest.mark.parametrize("name", bundled_models())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.learned.model import SURFACE
+from benchmarks.baselines import FAMILIES
 from sdfsim.learned.surfaces import advance, node_owner
 from sdfsim.learned.tensors import state_arrays
 from sdfsim.scene.scene import Effects, Scene
@@ -15,7 +15,7 @@ from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import angle_between, in_torch, make_body, random_model, surface_model
 
 
-@pytest.fixture(params=SURFACE)
+@pytest.fixture(params=FAMILIES)
 def kind(request) -> str:
     return request.param
 
@@ -64,7 +64,7 @@ def test_learned_free_flight_reaches_the_network_without_any_contact(dropped, ki
 
 
 def test_rotation_off_keeps_every_orientation(dropped):
-    for model in (*map(surface_model, SURFACE), random_model("impulse", push=0.05)):
+    for model in (*map(surface_model, FAMILIES), random_model("impulse", push=0.05)):
         scene = replace(dropped, effects=Effects(rotation="off"))
         rollout = Simulator(scene, model).run(steps=8)
         assert rollout.contact_count.sum() > 0

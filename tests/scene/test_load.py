@@ -139,7 +139,7 @@ def test_a_model_file_is_taken_from_the_scenes_folder(tmp_path):
     for said, meant in (
         ("model: models/mine.safetensors", str(tmp_path / "models/mine.safetensors")),
         ("model: /models/mine.safetensors", "/models/mine.safetensors"),
-        ("model: small", "small"),
+        ("model: gnn", "gnn"),
         ("effects: {sleep: off}", None),
     ):
         file.write_text(f"version: 1\n{said}\n{body}")

@@ -16,8 +16,7 @@ import torch
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.solver import prepare
 from sdfsim.training.batches import Draws, batches, moved
-from sdfsim.training.contact_cache import Solved, contact_frames
-from sdfsim.training.distributed import ALONE
+from sdfsim.training.contact_frames import Disturbed, contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 from sdfsim.training.presets import PRESETS
 from sdfsim.training.surface_task import SurfaceTask
@@ -38,21 +37,21 @@ def tensors(value):
 class Numbered:
     """A task whose batch is the first number that the step's generator gives, and the process that drew it."""
 
-    def draw(self, rng, count, team):
+    def draw(self, rng, count):
         return int(rng.integers(1 << 40)), os.getpid()
 
 
 class Fatal:
     """A task whose process is killed, as by a system without memory."""
 
-    def draw(self, rng, count, team):
+    def draw(self, rng, count):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Crashing:
     """A task whose process draws as it should, and aborts when it ends."""
 
-    def draw(self, rng, count, team):
+    def draw(self, rng, count):
         atexit.register(os.abort)
         return {}
 
@@ -60,7 +59,7 @@ class Crashing:
 def test_workers_that_crash_on_their_way_out_are_joined_in_silence(monkeypatch):
     told: list = []
     monkeypatch.setattr(sys, "unraisablehook", told.append)
-    drawn = batches(Draws(Crashing(), 1, 0, ALONE), 0, 2)
+    drawn = batches(Draws(Crashing(), 1, 0), 0, 2)
     assert next(drawn).batch == {} and len(multiprocessing.active_children()) == 2
     drawn.close()
     assert not multiprocessing.active_children()
@@ -72,10 +71,10 @@ def test_workers_that_crash_on_their_way_out_are_joined_in_silence(monkeypatch):
 @pytest.mark.parametrize("kind", ["impulse", "sdf-sim"])
 def test_workers_draw_what_the_run_itself_would_draw(ball_data, kind):
     if kind == "impulse":
-        task = ImpulseTask(contact_frames(ball_data, "train", Solved()))
+        task = ImpulseTask(contact_frames(ball_data, "train", Disturbed()))
     else:
         task = SurfaceTask(ball_data, "train", PRESETS["sdf-sim"], noisy=True)
-    draws = Draws(task, 3, 5, ALONE)
+    draws = Draws(task, 3, 5)
     own, theirs = (list(itertools.islice(batches(draws, 7, workers), 4)) for workers in (0, 1))
     assert len({sum(float(t.double().sum()) for t in tensors(d.batch)) for d in own}) == 4  # four different ones
     for mine, other in zip(own, theirs, strict=True):
@@ -85,7 +84,7 @@ def test_workers_draw_what_the_run_itself_would_draw(ball_data, kind):
 
 
 def test_batches_come_in_the_order_of_steps_from_several_processes():
-    found = list(itertools.islice(batches(Draws(Numbered(), 1, 3, ALONE), 10, 2), 12))
+    found = list(itertools.islice(batches(Draws(Numbered(), 1, 3), 10, 2), 12))
     for step, drawn in enumerate(found, start=10):
         rng = np.random.default_rng([3, 0, step])
         assert (drawn.mirrored, drawn.batch[0]) == (bool(rng.integers(2)), int(rng.integers(1 << 40)))
@@ -95,7 +94,7 @@ def test_batches_come_in_the_order_of_steps_from_several_processes():
 
 def test_a_worker_that_was_killed_is_told_in_one_line():
     with pytest.raises(SdfsimError, match="process that draws batches has ended"):
-        next(batches(Draws(Fatal(), 1, 0, ALONE), 0, 1))
+        next(batches(Draws(Fatal(), 1, 0), 0, 1))
 
 
 @pytest.mark.slow

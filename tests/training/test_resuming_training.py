@@ -9,13 +9,12 @@ import torch
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.model import load_model
-from sdfsim.training import contact_cache
 from sdfsim.training import train as train_module
-from sdfsim.training.contact_cache import Solved, contact_frames
+from sdfsim.training.contact_frames import FRAMES_VERSION, Disturbed, contact_frames, join_frames
 from sdfsim.training.train import train
 from tests.helpers.recordings import bouncing
 
-TRAIN, HELD_OUT = Solved(draws=2), Solved(draws=1)  # as training asks for them
+TRAIN, HELD_OUT = Disturbed(draws=2), Disturbed(draws=1)  # as training asks for them
 
 
 @pytest.fixture
@@ -45,7 +44,7 @@ def test_frames_alone_train_the_same_model_with_the_same_card(frames_only, ball_
     weights = two.network.state_dict()
     assert all(torch.equal(value, weights[name]) for name, value in one.network.state_dict().items())
     both = contact_frames(frames_only, "train", TRAIN), contact_frames(frames_only, "validation", HELD_OUT)
-    assert contact_cache.join_frames(list(both)).trajectories.tolist() == [6, 2]
+    assert join_frames(list(both)).trajectories.tolist() == [6, 2]
 
 
 def test_what_the_card_needs_is_missed_before_training(frames_only, presets, tmp_path):
@@ -57,7 +56,7 @@ def test_what_the_card_needs_is_missed_before_training(frames_only, presets, tmp
 
 def test_frames_of_another_version_are_refused_where_nothing_else_shows_it(frames_only):
     def change(arrays):
-        arrays["version"] = np.array(contact_cache.FRAMES_VERSION - 1)
+        arrays["version"] = np.array(FRAMES_VERSION - 1)
 
     file = next((frames_only / "frames").glob("train-*.npz"))
     rewritten(file, change)
@@ -100,7 +99,7 @@ def test_a_training_begins_with_the_weights_that_it_is_given(ball_data, presets,
 def test_weights_of_another_network_are_refused_to_begin_with(ball_data, presets, tmp_path):
     train(ball_data, tmp_path / "first", preset="tiny", steps=2)
     given = tmp_path / "first" / "model.safetensors"
-    for preset in ("tiny-sdf-sim", "small"):
+    for preset in ("tiny-sdf-sim", "gnn"):
         with pytest.raises(SdfsimError, match="another kind or size than the preset's"):
             train(ball_data, tmp_path / preset, preset=preset, steps=1, first=given)
     with pytest.raises(SdfsimError, match="'nothing' not found"):

@@ -12,8 +12,7 @@ from sdfsim.data.batching import merged, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, load_shapes
 from sdfsim.physics.bodies import Units
 from sdfsim.simulate.simulator import Simulator
-from sdfsim.training.contact_cache import Solved, contact_frames
-from sdfsim.training.distributed import Team
+from sdfsim.training.contact_frames import Disturbed, contact_frames
 from sdfsim.training.presets import PRESETS
 from sdfsim.training.surface_task import SurfaceTask
 from tests.helpers.recordings import bouncing, slab_data, sliding
@@ -72,24 +71,19 @@ def test_the_mass_ratio_is_that_within_a_scene(pair, ball_data):
     assert task.ranges()["mass_ratio"] == [1.0, pytest.approx(2.0)]
 
 
-def test_the_parts_of_a_noisy_batch_are_the_batch(ball_data):
-    task = SurfaceTask(ball_data, "train", SDF_SIM, noisy=True)
-
-    def drawn(team: Team):
-        batch = task.draw(np.random.default_rng(3), 8, team)
-        return torch.cat([batch.graph.nodes["node"], batch.target], -1)[batch.moves]
-
-    whole, parts = drawn(Team()), [drawn(Team(rank, 3)) for rank in range(3)]
-    torch.testing.assert_close(torch.cat(parts), whole, rtol=0, atol=0)
-    exact = SurfaceTask(ball_data, "train", SDF_SIM).draw(np.random.default_rng(3), 8)
-    assert not torch.equal(exact.graph.nodes["node"], task.draw(np.random.default_rng(3), 8).graph.nodes["node"])
+def test_noise_is_on_what_is_seen_when_training(ball_data):
+    exact, noisy = (
+        SurfaceTask(ball_data, "train", SDF_SIM, noisy=noisy).draw(np.random.default_rng(3), 8).graph.nodes["node"]
+        for noisy in (False, True)
+    )
+    assert exact.shape == noisy.shape and not torch.equal(exact, noisy)
 
 
 def test_noise_walks_by_the_given_size(ball_data):
     """The last of three poses is off by it, the first by a third of the variance; the recorded target is not."""
     task = SurfaceTask(ball_data, "train", SDF_SIM, noisy=True)
     picked = [task.trajectories[k % 6] for k in range(2000)]
-    noise = task._noise(picked, np.random.default_rng(0), Team())
+    noise = task._noise(picked, np.random.default_rng(0))
     assert noise is not None and noise.shape == (3, 2, 4001, 3)
     size = noise[:, 0].cumsum(0).std((1, 2)).tolist()
     assert size == pytest.approx([0.003 * (k / 3) ** 0.5 for k in (1, 2, 3)], rel=0.03)
@@ -112,7 +106,7 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
         replace(bouncing(3), **other).save(tmp_path / "data" / "train" / "9.npz")
         for read in (
             lambda data: SurfaceTask(data, "train", SDF_SIM),
-            lambda data: contact_frames(data, "train", Solved()),
+            lambda data: contact_frames(data, "train", Disturbed()),
         ):
             with pytest.raises(SdfsimError, match=r"train: .*\bstep\b.*\bgravity\b"):
                 read(tmp_path / "data")
