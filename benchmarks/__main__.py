@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 
 ALONE = ("contact_step", "effects")  # measured on one thread
-SHARED = ("results", "tosses")  # modules that the benchmarks share
+SHARED = ("results", "tosses", "baselines")  # modules that the benchmarks share
 
 if __name__ == "__main__":
     if sys.argv[1:2] and sys.argv[1] in ALONE:

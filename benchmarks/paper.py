@@ -6,6 +6,8 @@
         the same with 2 to 512 spheres in a bowl, and where memory ends
     python -m benchmarks paper accuracy DATA -o DIR [--minutes 5 15 30 60]
         trains all of them on one core for equal times, SDF-Sim also on unsigned distances, then rolls them out
+    python -m benchmarks paper train DATA -o DIR [--minutes 60] [--device auto] [--workers 0]
+        continues the training of SDF-Sim as published for so many minutes, then shows its curve so far
     python -m benchmarks paper sdf DATA -o DIR
         rollouts of the solver on networks of distances of several widths
 
@@ -29,7 +31,7 @@ import torch
 from benchmarks import baselines  # noqa: F401, adds its networks
 from benchmarks.results import progress
 from samples.large import write_scene
-from sdfsim.base.files import write_text
+from sdfsim.base.files import read_json, write_json, write_text
 from sdfsim.data.batching import batches, first_frames, roll_out
 from sdfsim.data.dataset import conditions_of, read_info
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
@@ -47,7 +49,7 @@ from sdfsim.shape.shape import Shape, load_shape
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.surface_task import SurfaceTask
-from sdfsim.training.train import train
+from sdfsim.training.train import train as run_training
 
 NAMES = {
     "sdf-sim": "SDF-Sim", "fignet": "FIGNet", "fignet-star": "FIGNet*", "mgn": "MGN", "mgn-large": "MGN, large radius",
@@ -207,7 +209,7 @@ def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
                 torch.set_num_threads(1)
                 place, budget = out / "runs" / name, 60 * spent
                 resume = (place / "checkpoint.npz").exists()
-                train(seen_by, place, preset=plan_of(name), resume=resume, budget=budget, on_progress=progress)
+                run_training(seen_by, place, preset=plan_of(name), resume=resume, budget=budget, on_progress=progress)
                 (place / "model.safetensors").rename(file)
             jobs = []
             for split in ("validation", "test") if spent == minutes[-1] else ("validation",):
@@ -220,6 +222,34 @@ def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
 
 def _case(name: str, minutes: float) -> str:
     return f"{name} after {minutes:g} minutes"
+
+
+PUBLISHED = 0.160  # m, SDF-Sim's error on MOVi-B at `FRAME`, after a million steps
+
+
+def train(data: Path, *, out: Path, minutes: float = 60.0, device: str = "auto", workers: int = 0) -> None:
+    """Continue the published training of SDF-Sim for `minutes` of processor time, and write its curve to train.md."""
+    file, run = out / "curve.json", out / "run"
+    curve = read_json(file) if file.exists() else []
+    budget = 60.0 * minutes + (curve[-1]["seconds"] if curve else 0.0)
+    resume = (run / "checkpoint.npz").exists()
+    report = run_training(
+        data, run, preset="sdf-sim", resume=resume, budget=budget, device=device, workers=workers, on_progress=progress
+    )
+    curve.append(report | judged(run / "model.safetensors", data, "validation", "exact"))
+    write_json(file, curve)
+    rows: list[tuple[str, ...]] = [("steps", "processor hours", "held-out loss", f"validation, {FRAME} steps")]
+    for look in curve:
+        told = f"{look['steps']:,}", number(look["seconds"] / 3600), number(look["held_out_loss"])
+        rows.append((*told, f"{number(look['translation_rmse'])} m, {look['rotation_error']:.1f}°"))
+    text = markdown(rows)
+    if len(curve) > 2 and curve[-1]["translation_rmse"] < curve[-3]["translation_rmse"]:
+        steps, metres = (np.log([look[name] for look in curve[-3:]]) for name in ("steps", "translation_rmse"))
+        slope, start = np.polyfit(metres, steps, 1)
+        needed = np.exp(start + slope * np.log(PUBLISHED))
+        hours = needed * curve[-1]["seconds"] / curve[-1]["steps"] / 3600
+        text += f"\nBy the power law of the last three, {PUBLISHED} m need {needed:.2g} steps, {hours:.2g} hours.\n"
+    written(out / "train.md", text)
 
 
 def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
@@ -294,4 +324,4 @@ def written(path: Path, table: str) -> None:
     print(table, flush=True)
 
 
-COMMANDS = (graphs, growth, accuracy, sdf)
+COMMANDS = (graphs, growth, accuracy, train, sdf)

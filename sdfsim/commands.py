@@ -285,7 +285,7 @@ def info(session: Session) -> None:
 @command
 def dataset(
     session: Session,
-    recipe: Annotated[Literal["movi-b", "movi-c", "bowl", "pile", "varied"], typer.Argument(show_default=False)],
+    recipe: Annotated[Literal["movi-b", "movi-c", "varied"], typer.Argument(show_default=False)],
     out: Out,
     trajectories: Annotated[int, typer.Option(help="How many.", min=1, show_default=False)],
     shapes: Annotated[
@@ -298,7 +298,6 @@ def dataset(
     random_solids: Annotated[
         int, typer.Option(help="Number of PyBullet's random solids to add (not movi-b).", min=0, max=1000)
     ] = 0,
-    bodies: Annotated[int | None, typer.Option(help="Number of bodies that move (bowl, pile).", min=1, max=512)] = None,
     fps: Annotated[Literal["50", "60"], typer.Option(help="Recorded frames a second.")] = "50",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     split: Literal["train", "validation", "test"] = "train",

@@ -26,7 +26,6 @@ def make_dataset(
     trajectories: int,
     shapes: Path | None = None,
     random_solids: int = 0,
-    bodies: int | None = None,
     fps: int = FPS,
     seed: int = 0,
     split: str = "train",
@@ -39,14 +38,13 @@ def make_dataset(
     `split_of`), so that shapes of validation and test are never trained on.
 
     `shapes` is a folder (see `origins`; movi-b takes NAME/ folders only) or the name of a public set; `random_solids`
-    of PyBullet are added. `bodies` is the number of moving bodies, in place of the recipe's range (bowl and pile);
-    `fps` is one of `RATES`. Raises SdfsimError if the recipe does not take an option, if there are no usable shapes or
-    they cannot be fetched, if PyBullet is not installed, or if `out` holds another dataset or another run is writing to
-    it.
+    of PyBullet are added. `fps` is one of `RATES`. Raises SdfsimError if the recipe does not take an option, if there
+    are no usable shapes or they cannot be fetched, if PyBullet is not installed, or if `out` holds another dataset or
+    another run is writing to it.
     """
     plan = RECIPES[recipe]
     engine = import_pybullet()
-    given = _origins(recipe, shapes, random_solids, bodies, on_progress)
+    given = _origins(recipe, shapes, random_solids, on_progress)
     info = {
         "recipe": recipe,
         "seed": seed,
@@ -58,8 +56,6 @@ def make_dataset(
         "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
         "made_from": {origin.name: {"pieces": origin.how, "sha256": origin.digest()} for origin in given},
     }
-    if plan.counted:
-        info["bodies"] = bodies
     with locked(out):
         # Before anything is written: engine files of another dataset's shapes must not change.
         _check_same(out, info)
@@ -71,7 +67,7 @@ def make_dataset(
         scenery = {source.name: source for source in found if source.name in plan.scenery}
         drawn = [source for source in found if source.name not in scenery]
         mine = drawn if plan.kubasic else [source for source in drawn if split_of(source.name) == split]
-        if plan.given and not mine:
+        if not mine:
             raise SdfsimError(f"none of the {len(drawn)} shapes belongs to the {split} split", "give more shapes")
         fit_shapes([*mine, *scenery.values()], out / "shapes", lambda f, m: on_progress(0.1 + 0.4 * f, m))
         write_json(out / INFO, info)
@@ -79,7 +75,7 @@ def make_dataset(
         folder.mkdir(parents=True, exist_ok=True)
         files = [(k, folder / f"{k:05d}.npz") for k in range(trajectories)]
         todo = [job for job in files if not job[1].exists()]
-        make_one = partial(_make_one, recipe, Cast(mine, scenery, bodies), fps, [seed, SPLITS.index(split)])
+        make_one = partial(_make_one, recipe, Cast(mine, scenery), fps, [seed, SPLITS.index(split)])
         for done, _ in enumerate(parallel(make_one, todo), start=1):
             on_progress(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
     return {
@@ -131,24 +127,16 @@ def _make_one(recipe: str, cast: Cast, fps: int, seed: list[int], index: int, pa
     make_trajectory(recipe, np.random.default_rng([*seed, index]), cast, fps).save(path)
 
 
-def _origins(
-    recipe: str, shapes: Path | None, random_solids: int, bodies: int | None, on_progress: Progress
-) -> list[Origin]:
+def _origins(recipe: str, shapes: Path | None, random_solids: int, on_progress: Progress) -> list[Origin]:
     """The origins of a recipe's shapes, its own scenery last. Raises SdfsimError for options that the recipe does not
     take."""
     plan = RECIPES[recipe]
-    unused = {
-        "--bodies": bodies is not None and not plan.counted,
-        "--random-solids": random_solids and (plan.kubasic or not plan.given),
-        "--shapes": shapes is not None and not plan.given,
-    }
-    for option, given in unused.items():
-        if given:
-            raise SdfsimError(f"{recipe} does not take {option}")
-    if plan.given and shapes is None and not random_solids:
+    if random_solids and plan.kubasic:
+        raise SdfsimError(f"{recipe} does not take --random-solids")
+    if shapes is None and not random_solids:
         raise SdfsimError(f"{recipe} needs shapes", "give --shapes a folder, or kubasic or ycb")
     folder = shapes and public_folder(shapes, on_progress)
-    found = origins(folder, random_solids, as_is=plan.kubasic) if plan.given else []
+    found = origins(folder, random_solids, as_is=plan.kubasic)
     if taken := {o.name for o in found} & set(plan.scenery):
         raise SdfsimError(f"{shapes}: the recipe has a shape {min(taken)!r} of its own", "rename yours")
     return found + [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]

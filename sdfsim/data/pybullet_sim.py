@@ -31,7 +31,6 @@ BODY_SETTINGS = {"contactProcessingThreshold": 0.0}
 MAXIMAL = {"useMaximalCoordinates": True}
 FAR = (0.0, 0.0, -100.0)  # m, where bodies wait to be placed
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
-MARGIN = 1e-3  # m, around the convex pieces of every body that is loaded from a file (Bullet's default)
 APART = 1000.0  # m between bodies that must not touch
 Vector = np.ndarray | tuple[float, ...]
 URDF_TEMPLATE = """<robot name="body"><link name="base">

@@ -7,10 +7,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from sdfsim.data.dataset import FLOOR
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import ShapeSource
-from sdfsim.geometry.primitives import bowl_radii
 from sdfsim.learned.training_ranges import DEEPEST
 
 TRIES = 100  # places for one body before the scene is drawn again
@@ -25,15 +23,6 @@ MATERIALS = {"metal": (2.7, 0.4, 0.3), "rubber": (1.1, 0.8, 0.7)}  # density, fr
 # have rubber's density.
 EXTENTS_C = (0.75, 3.0)
 PLAIN = (1.1, 0.5, 0.5)  # density, friction, restitution
-
-BALL = 0.52  # m, diameter
-BALLS = (1, 16)
-
-PILE = (5, 30)
-PILE_EXTENTS = (0.5, 1.5)  # m
-PILE_RADIUS = 0.55  # m for one body, growing with the cube root of their number
-PILE_GAPS = (0.02, 0.15)  # m between the boxes around bodies
-PILE_TRIES = 8  # places tried for one body, which takes the lowest
 
 VARIED_EXTENTS = (0.7, 1.4)  # m, of the smallest kind of body in a scene
 LARGER = 8.0  # largest ratio of a body's extent to that, at rest; small ones are more frequent
@@ -89,7 +78,6 @@ Pose = tuple[np.ndarray, Rotation]  # [3] m of the centre of mass, and the orien
 class Cast:
     shapes: list[ShapeSource]  # to draw bodies from
     scenery: dict[str, ShapeSource] = field(default_factory=dict)  # the recipe's own shapes, by name
-    bodies: int | None = None  # number of moving bodies, None for the recipe's own range
 
 
 @dataclass(frozen=True)
@@ -99,8 +87,6 @@ class Recipe:
 
     spawn: Callable[[Teacher, np.random.Generator, Cast], Bodies | None]
     kubasic: bool = False  # takes NAME/ folders as they are, in all splits; otherwise shapes are split by name
-    given: bool = True  # draws bodies from shapes that the caller gives
-    counted: bool = False  # can make a fixed number of bodies
     scenery: dict[str, str] = field(default_factory=dict)  # the recipe's own shapes, name -> primitive
 
 
@@ -112,58 +98,6 @@ def movi_b(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | N
 def movi_c(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
     """Kubric's `movi_c_worker`, restated."""
     return _toss(teacher, rng, cast, lambda source: _body(source, rng.uniform(*EXTENTS_C), *PLAIN))
-
-
-def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
-    """Balls in loose layers above a bowl that has room for them."""
-    count = cast.bodies or int(rng.integers(BALLS[0], BALLS[1] + 1))
-    inner, outer = bowl_radii(count, BALL)
-    vessel, ball = cast.scenery["bowl"], cast.scenery["ball"]
-    bodies = [(vessel, _body(vessel, 2 * outer, 0.0, *FLOOR))]
-    position = upright(*bodies[0], np.zeros(2), 0.0, Rotation.identity())
-    teacher.add(bodies[0][1], position)
-    rim = position[2] + _box(*bodies[0], Rotation.identity())[1][2]
-    for place in _layers(rng, count, max(0.75 * inner - 0.5 * BALL, 0.0)):
-        bodies.append((ball, _body(ball, BALL, *PLAIN)))
-        index = teacher.add(bodies[-1][1], place + rim * UP, Rotation.random(rng=rng).as_quat())
-        teacher.push(index, rng.uniform((-1.0, -1.0, 0.0), (1.0, 1.0, 0.0)), STILL)
-    return bodies
-
-
-def _layers(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
-    """[count, 3] m: centres of balls that do not touch, in layers from z = 0 within `radius` of the z axis."""
-    spacing, layers, found = 1.1 * BALL, [], 0
-    steps = np.arange(-np.ceil(radius / spacing) - 1, np.ceil(radius / spacing) + 2)
-    while found < count:
-        lattice = spacing * (np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2) + rng.random(2))
-        inside = lattice[np.linalg.norm(lattice, axis=1) <= radius]
-        if len(inside) == 0:
-            inside = radius * np.sqrt(rng.random()) * _direction(rng)[None, :2]
-        inside = rng.permutation(inside)[: count - found]
-        layers.append(np.column_stack([inside, np.full(len(inside), spacing * len(layers))]))
-        found += len(inside)
-    centres = np.concatenate(layers)
-    return centres + rng.uniform(-0.04, 0.04, centres.shape) * BALL
-
-
-def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
-    """Bodies of MOVi-B's materials at rest above each other in a column, dropped."""
-    count = cast.bodies or int(rng.integers(PILE[0], PILE[1] + 1))
-    radius = PILE_RADIUS * count ** (1 / 3)
-    bodies, boxes = [], np.empty((0, 2, 3))
-    for _ in range(count):
-        source = cast.shapes[rng.integers(len(cast.shapes))]
-        body = _of_material(source, rng, PILE_EXTENTS)
-        rotation = Rotation.random(rng=rng)
-        low, high = _box(source, body, rotation)
-        places = np.array([radius * np.sqrt(rng.random()) * _direction(rng)[:2] for _ in range(PILE_TRIES)])
-        below = [((boxes[:, 0, :2] < p + high[:2]) & (boxes[:, 1, :2] > p + low[:2])).all(1) for p in places]
-        tops = [boxes[under, 1, 2].max(initial=0.0) for under in below]
-        position = np.array([*places[np.argmin(tops)], min(tops) + rng.uniform(*PILE_GAPS) - low[2]])
-        boxes = np.concatenate([boxes, [[position + low, position + high]]])
-        teacher.add(body, position, rotation.as_quat())
-        bodies.append((source, body))
-    return bodies
 
 
 def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
@@ -213,8 +147,6 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | N
 RECIPES = {
     "movi-b": Recipe(movi_b, kubasic=True),
     "movi-c": Recipe(movi_c),
-    "bowl": Recipe(bowl, given=False, counted=True, scenery={"bowl": "bowl", "ball": "sphere"}),
-    "pile": Recipe(pile, counted=True),
     "varied": Recipe(varied, scenery=OBSTACLES | {"ball": "sphere"}),
 }
 

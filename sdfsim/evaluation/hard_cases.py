@@ -77,7 +77,6 @@ class Case:
     figures: tuple[Figure, ...]
     seconds: float = 3.0
     repeats: int = 3  # repetitions, with slightly different starts or other random scenes: their spread is the noise
-    cuda: bool = False  # the scenes are simulated a second time on CUDA, after the first
     engines: bool = True  # whether engines can take part
     x: float | None = None  # its x in the group's plot of the first figure; None if it is not plotted
     # figures of a model from scenes that this function makes itself; `scenes` is then empty
@@ -623,7 +622,6 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
 
     diverges = Figure("diverges after", "s", 2, longer=True)
     add("precision", "start-off", "start 1e-6 m/s off", off, diverged, diverges, repeats=2)
-    add("precision", "cuda", "on CUDA", plain, diverged, diverges, repeats=2, engines=False, cuda=True)
     return found
 
 

@@ -7,8 +7,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from sdfsim.apps.recording import save_rollout
 from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
@@ -25,7 +23,6 @@ from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import PlaneSdf
-from sdfsim.simulate.steppers import stepper_of
 
 VERSION = 5  # increase it when the measurements change, so that kept results are measured again
 TEACHER = "teacher"
@@ -105,12 +102,9 @@ def stress(
     jobs, cut = [], {}
     for case in sorted(found, key=work, reverse=True):
         figures = [figure.name for figure in case.figures]
-        content = [VERSION, case.seconds, case.cuda, figures, scenes[case.name]]
+        content = [VERSION, case.seconds, figures, scenes[case.name]]
         for model in tested:
-            # Another device is for networks: the solver has no network.
-            if not case.cuda or (stepper_of(model).network and torch.cuda.is_available()):
-                arguments = (case, model, device, out)
-                jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments))
+            jobs.append(Job(case.name, model.name, [content, model, device], _tried, (case, model, device, out)))
         for name in others if case.engines else []:
             settings = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
             jobs.append(Job(case.name, name, [content, settings], _tried, (case, engines[name], device, out)))
@@ -139,8 +133,7 @@ def _tried(case: Case, model: Model | Engine, device: str, out: Path) -> dict[st
             for name, value in case.own(model).items():
                 figures[name].append(value)
             continue
-        places = [device, "cuda"] if case.cuda else [device]
-        runs = [ran(model, scene, case.seconds, place, out / "engine") for place in places for scene in scenes]
+        runs = [ran(model, scene, case.seconds, device, out / "engine") for scene in scenes]
         measured = case.measure(runs)
         for name, values in figures.items():
             values.append(float(measured[name]))

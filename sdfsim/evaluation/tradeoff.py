@@ -142,7 +142,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
     solids = exact_solids(folder, shapes)
-    return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, True, units.length, units.time)
+    return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, units.length, units.time)
 
 
 def _centred(shape: Shape, name: str) -> Shape:

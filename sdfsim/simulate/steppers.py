@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # numba and torch are slow to load
     from sdfsim.learned.impulse import ImpulseNetwork
     from sdfsim.learned.near import Contacts
     from sdfsim.learned.tensors import BodyTensors
-    from sdfsim.physics.solver.prepare import Compiled, SharedShapes, Steps
+    from sdfsim.physics.solver.prepare import Compiled, SharedShapes
 
 FreeFlight = Literal["exact", "learned"]
 LONGEST = 0.01  # s, the longest inner step of the contact solve that its laws were checked with
@@ -215,13 +215,15 @@ class Solver(Stepper):
     def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
         """All steps in one call of compiled code."""
         started = running()
-        made = self._steps(state, carry, n, limits(carry.options.dt) if carry.checked else NO_LIMITS, keep=keep)
+        most = limits(carry.options.dt) if carry.checked else NO_LIMITS
+        made = cast("Compiled", carry.scene).advance(state, carry.options, n, most, keep=keep)
         spent = 1e3 * (running() - started) / max(n, 1)
         carry.done, carry.fault, carry.given = made.done, made.fault, made.given
         carry.frames = None
         if made.done:
-            active, asleep = carry.counts["active"], made.counts[3]
-            carry.counts |= {"asleep": asleep, "free": len(carry.bodies.movers) - asleep - active, "contact_ms": spent}
+            pairs, contacts, active, asleep = made.counts
+            carry.counts |= {"pairs": pairs, "contacts": contacts, "active": active, "asleep": asleep}
+            carry.counts |= {"free": len(carry.bodies.movers) - asleep - active, "contact_ms": spent}
         if keep:
             kept = {name: getattr(made.kept, name)[: made.done] for name in made.kept._fields}
             pairs, contacts, active, asleep, touching = kept.pop("count").T
@@ -230,16 +232,6 @@ class Solver(Stepper):
             counts = {name: counts.get(name, np.zeros(made.done)).astype(float) for name in (*COUNTS, *PHASES)}
             carry.frames = Frames(**kept, touching=touching, pair=made.pair, point=made.point, counts=counts)
         return made.state, carry
-
-    def _steps(self, state: State, carry: Carry, n: int, most: np.ndarray, *, keep: bool = False) -> Steps:
-        made = cast("Compiled", carry.scene).advance(state, carry.options, n, most, keep=keep)
-        if made.done:
-            carry.counts |= dict(zip(("pairs", "contacts", "active"), made.counts[:3], strict=True))
-        return made
-
-    def _step(self, state: State, carry: Carry) -> State:
-        with carry.timed("contact_ms"):
-            return self._steps(state, carry, 1, NO_LIMITS).state  # `Stepper.advance` checks the result
 
 
 class OnBodies(Stepper):

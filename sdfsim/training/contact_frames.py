@@ -126,10 +126,6 @@ def contact_frames(data: Path, split: str, how: Disturbed, *, on_progress: Progr
     contact."""
     folder = data / "frames"
     name = f"{split}-{how.draws}"
-    made = list(folder.glob(f"{name}-*.npz"))
-    if not (data / split).is_dir() and len(made) == 1:
-        # A machine that only trains may have only the cache.
-        return ContactFrames.load(made[0])
     files = trajectory_files(data, split)
     cached = folder / f"{name}-{_fingerprint(files, how)}.npz"
     if cached.exists():
@@ -145,7 +141,7 @@ def contact_frames(data: Path, split: str, how: Disturbed, *, on_progress: Progr
         raise SdfsimError(f"{data / split}: nothing touches anything in its trajectories")
     frames = replace(join_frames(steps), trajectories=np.array([len(files)]))
     folder.mkdir(exist_ok=True)
-    for old in made:
+    for old in folder.glob(f"{name}-*.npz"):
         old.unlink()
     frames.save(cached)
     return frames

@@ -84,7 +84,7 @@ def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]
     here."""
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
-    known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}
+    known["fps"] = info.get("fps")
     known["floor"] = list(conditions_of(data).floor)
     shapes = info.get("shapes", [])
     solids = sum(name.startswith(SOLID) for name in shapes)

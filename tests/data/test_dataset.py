@@ -74,16 +74,11 @@ def test_the_floor_is_what_the_dataset_says_else_the_recipes():
 
 def test_a_split_is_recorded_as_its_dataset_says(tmp_path):
     (tmp_path / "test").mkdir()
-    assert conditions_of(tmp_path / "test") == Conditions(FLOOR, floor_given=False, by_teacher=False)
+    assert conditions_of(tmp_path / "test") == Conditions(FLOOR, floor_given=False)
     told = {"engine": "pybullet", "engine_settings": engine_settings(1 / 240, 1)}
     write_json(tmp_path / "dataset.json", told | {"floor": {"friction": 0.7, "restitution": 0.1}})
     found = conditions_of(tmp_path / "test")
-    assert found == conditions_of(tmp_path) == Conditions((0.7, 0.1), floor_given=True, by_teacher=True)
-    for name, value in engine_settings(0.02, 5).items():
-        if name != "timeStep":
-            settings = told["engine_settings"] | {name: not value}
-            write_json(tmp_path / "dataset.json", told | {"engine_settings": settings})
-            assert not conditions_of(tmp_path).by_teacher, name
+    assert found == conditions_of(tmp_path) == Conditions((0.7, 0.1), floor_given=True)
 
 
 def test_datasets_of_another_version_of_the_teacher_are_refused_and_those_of_others_are_not(tmp_path):

@@ -23,8 +23,7 @@ KINDS = (
     analytic_shape("plane"),
 )  # fmt: skip
 RULES = (
-    {}, {"cone": False}, {"margin": 1e-3, "adds": True}, {"friction": False}, {"restitution": False},
-    {"cone": False, "margin": 1e-3, "adds": True},
+    {}, {"friction": False}, {"restitution": False},
 )  # fmt: skip
 SEEDS = [seed for seed in range(31) if seed != 11]  # nothing meets in that one
 
@@ -60,7 +59,6 @@ def known(world, work, motion, rules, manifolds) -> tuple[list[impulses.Body], l
             inverse_mass=world.inverse_mass[b], inverse_inertia=work.inverse[b],
             falls=work.free[b, :3], spins=work.free[b, 3:6], turns=work.free[b, 6:],
             restitution=world.restitution[b], thickness=world.thickness[b],
-            margin=rules.options.margin if np.isfinite(world.radius[b]) else 0.0,
         )
         for b in range(len(world.shape))
     ]  # fmt: skip

@@ -28,7 +28,6 @@ class Body:
     turns: np.ndarray  # [3] and what the gyroscopic torque adds to it
     restitution: float
     thickness: float
-    margin: float
     change: np.ndarray = field(default_factory=lambda: np.zeros(6))  # what contacts add to both velocities
     shift: np.ndarray = field(default_factory=lambda: np.zeros(6))  # and for this step only, to part the bodies
 
@@ -107,9 +106,9 @@ def acts(c: Contact, rules) -> bool:
     bodies, n, arms = c.bodies, c.normal, met(c.bodies, c.arms)
     approach = relative(bodies, arms, "now") @ n
     falling, then = (relative(bodies, arms, what) for what in ("falling", "then"))
-    gap = c.gap - bodies[0].margin - bodies[1].margin
+    gap = c.gap
     way = -(then @ n) * rules.substep_dt
-    early = not rules.options.adds and way > EARLY * min(b.thickness for b in bodies)
+    early = way > EARLY * min(b.thickness for b in bodies)
     later = -approach > rules.slow and not early  # it first touches, and rebounds in the inner step after
     if c.void or (gap > TOUCH and (gap > way or later)):
         return False
@@ -129,7 +128,7 @@ def acts(c: Contact, rules) -> bool:
         c.deep = -gap * rules.erp / rules.substep_dt
     elif gap < -rules.slop:
         c.out = (-gap - rules.slop) * rules.erp / rules.substep_dt
-        target = max(c.out, min(target + c.out, -approach) if rules.options.adds else target)
+        target = max(c.out, target)
     c.calm = rest - c.before
     c.rows = [Row(bodies, arms, n, target - c.before, c.push)]
     if c.friction == 0.0:
@@ -142,15 +141,13 @@ def acts(c: Contact, rules) -> bool:
             slip = np.cross(n, [1.0, 0.0, 0.0] if abs(n[0]) < 0.7 else [0.0, 1.0, 0.0])
     one = slip / np.linalg.norm(slip)
     c.rows += [Row(bodies, arms, t, -(then @ t), c.drag @ t) for t in (one, np.cross(n, one))]
-    c.rows[1].impulse, c.rows[2].impulse = bounded(c, c.rows[1].impulse, c.rows[2].impulse, rules)
+    c.rows[1].impulse, c.rows[2].impulse = bounded(c, c.rows[1].impulse, c.rows[2].impulse)
     return True
 
 
-def bounded(c: Contact, one: float, two: float, rules) -> tuple[float, float]:
-    """A tangential impulse within the cone of friction, or along two axes each by itself."""
+def bounded(c: Contact, one: float, two: float) -> tuple[float, float]:
+    """A tangential impulse within the cone of friction."""
     most = c.friction * c.rows[0].impulse
-    if not rules.options.cone:
-        return float(np.clip(one, -most, most)), float(np.clip(two, -most, most))
     length = np.hypot(one, two)
     return (one, two) if length <= most else (one * most / length, two * most / length)
 
@@ -169,7 +166,7 @@ def sweeps(island: list[Contact], rules) -> range:
     """As many more as masses are uneven."""
     masses = [b.inverse_mass for c in island for b in c.bodies if b.inverse_mass > 0.0]
     more = np.clip(max(masses) / min(masses) / 30.0, 1.0, 30.0)
-    return range(rules.rounds if rules.options.adds else int(rules.rounds * more))
+    return range(int(rules.rounds * more))
 
 
 def part(island: list[Contact], rules) -> None:
@@ -189,19 +186,16 @@ def balance(island: list[Contact], rules) -> None:
     """Sweeps over all normals, then all friction, until none changes a velocity by more than `exact`."""
     for _ in sweeps(island, rules):
         worst = [c.rows[0].bring(0.0, np.inf) for c in island]
-        worst += [rub(c, rules) for c in island if len(c.rows) == 3]
+        worst += [rub(c) for c in island if len(c.rows) == 3]
         if max(worst) <= rules.exact:
             return
 
 
-def rub(c: Contact, rules) -> float:
+def rub(c: Contact) -> float:
     """One sweep of friction at a contact; by how much it changed a velocity."""
     one, two = c.rows[1:]
-    if not rules.options.cone:  # one axis after the other
-        most = c.friction * c.rows[0].impulse
-        return max(one.bring(-most, most), two.bring(-most, most))
     mass = min(one.mass, two.mass)  # one for both: the impulse is against the slip
-    tried = bounded(c, *(r.impulse + (r.wanted - r.speed()) * mass for r in (one, two)), rules)
+    tried = bounded(c, *(r.impulse + (r.wanted - r.speed()) * mass for r in (one, two)))
     changed = [total - r.impulse for r, total in zip((one, two), tried, strict=True)]
     for r, impulse in zip((one, two), changed, strict=True):
         r.give(impulse)
