@@ -102,16 +102,16 @@ def numbers(words: Sequence[bytes], text: bytes, kind: type = np.float64) -> np.
 Element = dict[str, Any]  # columns [N] by their names, or `Ragged`
 
 
-def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, str]], str]:
-    """Elements of a PLY file by name, the NumPy types of their columns, and the name of a texture file if a comment
-    gives it."""
+def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, str]], list[str]]:
+    """Elements of a PLY file by name, the NumPy types of their columns, and the texture files that its comments
+    name."""
     first = re.match(rb"(?i:ply)[ \t]*(\r\n|\n|\r)", content)
     # Lines may end in several ways; but after CR alone, a line feed may be the first of the binary numbers.
     line = rb"\r" if first and first[1] == b"\r" else rb"(?:\r\n|\n|\r)"
     end = re.search(rb"[\r\n](?i:end_header)[ \t]*(?:" + line + rb"|\Z)", content)
     if first is None or end is None:
         raise ValueError("it has no complete PLY header")
-    order, texture = "", ""
+    order, textures = "", []
     counts: dict[str, int] = {}
     columns: dict[str, list[tuple[str, str, str]]] = {}  # name, type of the list's length or nothing, type
     for row in content[first.end() : end.start()].decode("latin-1").splitlines():
@@ -126,7 +126,7 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
             case ["property", kind, name] if counts and kind in KINDS:
                 columns[next(reversed(columns))].append((name, "", KINDS[kind]))
             case ["comment", word, *rest] if word.lower() == "texturefile":
-                texture = " ".join(rest)
+                textures.append(" ".join(rest))
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
@@ -142,7 +142,7 @@ def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, st
         layout = [(key, length and "f8", "f8") if text else (key, length, kind) for key, length, kind in columns[name]]
         found[name], start = _element(body, start, name, rows, layout, ORDERS[order])
     kinds = {name: {key: kind for key, _, kind in of} for name, of in columns.items()}
-    return found, kinds, texture
+    return found, kinds, textures
 
 
 def _element(
@@ -225,7 +225,7 @@ def _element(
 
 def ply_surface(content: bytes) -> FileMesh:
     """The triangles of a PLY file (polygons and strips are cut into triangles), with colours of vertices or faces."""
-    elements, kinds, texture = read_ply(content)
+    elements, kinds, textures = read_ply(content)
     vertex = elements.get("vertex", {})
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("it has no vertices with x, y and z")
@@ -246,7 +246,7 @@ def ply_surface(content: bytes) -> FileMesh:
         owner = np.repeat(np.arange(len(polygons.length)), polygons.length)
         colors = by_face[owner[cuts]]
     places = None
-    if texture and len(faces) == len(cuts):
+    if textures and len(faces) == len(cuts):
         own, names = face.get("texcoord"), next((two for two in PLACES if vertex.keys() >= set(two)), None)
         if isinstance(own, Ragged) and np.array_equal(own.length, 2 * polygons.length):
             places = own.values.reshape(-1, 2).astype(np.float64)[cuts]
@@ -254,7 +254,8 @@ def ply_surface(content: bytes) -> FileMesh:
             places = np.stack([vertex[name] for name in names], axis=1).astype(np.float64)[faces]
         if places is not None:  # PLY counts from the lower edge
             places = places * [1.0, -1.0] + [0.0, 1.0]
-    return FileMesh(vertices, faces, colors, places, texture)
+    notes = (f"it names {len(textures)} textures: only {textures[0]} is used",) if len(textures) > 1 else ()
+    return FileMesh(vertices, faces, colors, places, "".join(textures[:1]), notes=notes)
 
 
 def _strips(strips: Ragged) -> list[np.ndarray]:

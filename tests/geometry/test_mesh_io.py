@@ -128,6 +128,9 @@ def test_a_texture_that_a_ply_names_colours_its_vertices(tmp_path: Path) -> None
     (tmp_path / "a.ply").write_text(text)
     mesh = load_mesh(tmp_path / "a.ply")
     assert mesh.colors is not None and (mesh.colors == [250, 20, 30]).all()
+    (tmp_path / "a.ply").write_text(text.replace("element vertex", "comment TextureFile other.png\nelement vertex"))
+    loaded = load_textured(tmp_path / "a.ply")
+    assert loaded.notes == ("it names 2 textures: only paint.png is used",)
 
 
 @pytest.mark.parametrize(("outline", "area"), [(L_OUTLINE, 3.0), (U_OUTLINE, 5.0)])
