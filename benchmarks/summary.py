@@ -151,7 +151,7 @@ def summary() -> str:
         f"[Real tosses](#real-tosses-of-a-cube), engines with smaller errors: {joined(nearer)}. "
         f"[Elbows](../docs/joints.md#real-tosses-of-an-elbow): {joined(of_elbows())}.",
         f"[MOVi-B](#movi-b), 50 steps: an error of {solver[0]:g} m, and {engine[0]:g} m for PyBullet itself from "
-        f"starts 1 mm/s off. The graph network on top of the solve has {errors['`small`'][0]:g} m and takes longer.",
+        f"starts 1 mm/s off. The graph network `gnn` has {errors['`gnn`'][0]:g} m.",
         f"[Everyday checks](#everyday-scenes-beside-other-engines): {total[OURS][1] - total[OURS][0]} missed of "
         f"{total[OURS][1]}. [Hard cases](#hard-cases): {hard[0][2]} missed, {hard[0][3]} worse than PyBullet.",
         f"[Joints](../docs/joints.md#time), slower than MuJoCo: {joined(slow_joints)} times its time.",
