@@ -8,8 +8,6 @@
         trains all of them on one core for equal times, SDF-Sim also on unsigned distances, then rolls them out
     python -m benchmarks paper train DATA -o DIR [--minutes 60] [--device auto] [--workers 0]
         continues the training of SDF-Sim as published for so many minutes, then shows its curve so far
-    python -m benchmarks paper sdf DATA -o DIR
-        rollouts of the solver on networks of distances of several widths
 
 DATA is a MOVi-B dataset with train, validation and test. Graphs have the published number of surface nodes, about 440
 per body, and networks the published size. The trained networks have `NODES` nodes per body and the sizes `TRAINED`, so
@@ -23,7 +21,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -32,20 +29,15 @@ from benchmarks import baselines  # noqa: F401, adds its networks
 from benchmarks.results import progress
 from samples.large import write_scene
 from sdfsim.base.files import read_json, write_json, write_text
-from sdfsim.data.batching import batches, first_frames, roll_out
-from sdfsim.data.dataset import conditions_of, read_info
-from sdfsim.evaluation.evaluate import evaluate, load_recorded
+from sdfsim.data.dataset import read_info
+from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
-from sdfsim.evaluation.metrics import errors
-from sdfsim.geometry.mesh import convex_hull
-from sdfsim.learned.model import SOLVER, Model, load_model, new_network
+from sdfsim.learned.model import Model, new_network
 from sdfsim.learned.tensors import body_tensors, state_tensors
 from sdfsim.physics.solver.prepare import Compiled
 from sdfsim.scene.load import load_scene
-from sdfsim.sdf.fit.train import RECIPES
 from sdfsim.sdf.grid import sample_grid
-from sdfsim.shape.make import fit_pieces
-from sdfsim.shape.shape import Shape, load_shape
+from sdfsim.shape.shape import load_shape
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.surface_task import SurfaceTask
@@ -252,42 +244,6 @@ def train(data: Path, *, out: Path, minutes: float = 60.0, device: str = "auto",
     written(out / "train.md", text)
 
 
-def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
-    """Errors of the solver on validation data whose shapes are networks of `width` hidden units, refitted if they are
-    not 64 wide and kept in `home`; on the convex pieces themselves for None."""
-    torch.set_num_threads(1)
-    recorded, shapes = load_recorded(data, "validation")
-    recorded = [first_frames(t, int(FRAME) + 1) for t in recorded]
-    if width is not None:
-        shapes = {name: refitted(shape, width, home / name) for name, shape in shapes.items()}
-    solver, motions, floor = load_model(SOLVER), [], conditions_of(data).floor
-    for group in batches(recorded):
-        motions += roll_out(solver, group, shapes, int(FRAME), floor=floor)
-    return errors(motions, recorded)[FRAME]
-
-
-def refitted(shape: Shape, width: int, folder: Path) -> Shape:
-    """The shape with a network of `width` hidden units alone and its own nodes, fitted for a minute."""
-    usual = RECIPES["default"]
-    if width == usual.width:
-        return replace(shape, pieces=())
-    if not (folder / "shape.json").exists():
-        with patch.dict(RECIPES, default=replace(usual, width=width)):
-            fit_pieces([convex_hull(piece) for piece in shape.pieces], name=shape.name).save(folder)
-    return replace(shape, pieces=(), sdf=load_shape(folder).sdf)
-
-
-def sdf(data: Path, *, out: Path) -> None:
-    ways = {"convex pieces, exactly": None, "64 wide": 64, "32 wide": 32, "128 wide": 128}
-    jobs = [
-        Job("rollouts", name, [width, read_info(data)], rolled_out, (data, width, out / "shapes" / str(width)))
-        for name, width in ways.items()
-    ]
-    results = measure(jobs, out / "sdf", on_progress=progress)
-    rows = [("distances", f"validation, {FRAME} steps"), *((name, _cell(results["rollouts", name])) for name in ways)]
-    written(out / "sdf.md", markdown(rows))
-
-
 def accuracy_table(results: dict[tuple[str, str], dict[str, Any]], minutes: list[float]) -> str:
     """Errors by network and minutes; a table for each form of free flight."""
     parts = []
@@ -324,4 +280,4 @@ def written(path: Path, table: str) -> None:
     print(table, flush=True)
 
 
-COMMANDS = (graphs, growth, accuracy, train, sdf)
+COMMANDS = (graphs, growth, accuracy, train)

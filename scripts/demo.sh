@@ -27,4 +27,5 @@ a movie of it:            $sdfsim render $out/rollout -o movie.mp4
 Watch it:                 $sdfsim view $out/rollout
 in the browser:           $sdfsim view $out/rollout --web
 cameras and surface:      $sdfsim view $out/scene/reconstruction.rrd
+by the graph network:     $sdfsim simulate $out/scene/knock.yaml --model gnn -o $out/gnn
 TEXT

@@ -298,7 +298,6 @@ def dataset(
     random_solids: Annotated[
         int, typer.Option(help="Number of PyBullet's random solids to add (not movi-b).", min=0, max=1000)
     ] = 0,
-    fps: Annotated[Literal["50", "60"], typer.Option(help="Recorded frames a second.")] = "50",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     split: Literal["train", "validation", "test"] = "train",
     cluster: Cluster = None,
@@ -308,7 +307,7 @@ def dataset(
     from sdfsim.data.generate import make_dataset, report_lines
 
     with working_on(cluster):
-        report = make_dataset(**session.given("cluster", "fps"), fps=int(fps), on_progress=session.progress)
+        report = make_dataset(**session.given("cluster"), on_progress=session.progress)
     session.report(report, report_lines(report))
 
 
@@ -325,12 +324,6 @@ def train(
         typer.Option(help="Kind and size of the model."),
     ] = "gnn",
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in the folder.")] = False,
-    first: Annotated[
-        str | None,
-        typer.Option(
-            "--from", metavar="MODEL", help="Begin with the weights of a model of this preset.", show_default=False
-        ),
-    ] = None,
     workers: Annotated[
         int,
         typer.Option(help="Processes that prepare batches in advance, for networks on surface nodes on a GPU.", min=0),

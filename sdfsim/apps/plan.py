@@ -13,7 +13,6 @@ from sdfsim.base.console import duration
 from sdfsim.base.devices import pick_device
 from sdfsim.base.parallel import StageProgress
 from sdfsim.learned.model import load_model
-from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.plan import plan
 from sdfsim.simulate.simulator import Simulator
@@ -56,7 +55,6 @@ def describe(
         "substeps": simulator.options.substeps,
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
-        "constant_in_training": constant_in_training(simulator.model),
         "failed_checks": [f"fit of shape {line}" for line in scene.missed],
         "notes": list(scene.notes),
     }
@@ -93,5 +91,4 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
-        *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
     ]

@@ -122,7 +122,7 @@ def roll_out(
     stepper = stepper_of(model, contact=contact, free_flight=free_flight)
     units = model_units(stepper, group[0])
     gravity = np.asarray(group[0].gravity, dtype=np.float64) / units.acceleration
-    options = Options(gravity, group[0].dt / units.time, model.inner or substeps)
+    options = Options(gravity, group[0].dt / units.time, substeps)
     known, plane = {name: stepper.surface(shape) for name, shape in shapes.items()}, stepper.surface(PLANE)
     # The solve is fastest with one trajectory at a time, on all cores; a network with all of them in one graph.
     alone = model.kind == SOLVER

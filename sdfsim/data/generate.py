@@ -10,7 +10,7 @@ from sdfsim.base.files import locked, write_json
 from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.data.dataset import FLOOR, INFO, SPLITS, Trajectory, read_info
 from sdfsim.data.public_shapes import public_folder
-from sdfsim.data.pybullet_sim import FPS, RATES, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
+from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
 from sdfsim.data.scenarios import RECIPES, Cast
 from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare, split_of
 
@@ -26,7 +26,6 @@ def make_dataset(
     trajectories: int,
     shapes: Path | None = None,
     random_solids: int = 0,
-    fps: int = FPS,
     seed: int = 0,
     split: str = "train",
     on_progress: Progress = silent,
@@ -38,7 +37,7 @@ def make_dataset(
     `split_of`), so that shapes of validation and test are never trained on.
 
     `shapes` is a folder (see `origins`; movi-b takes NAME/ folders only) or the name of a public set; `random_solids`
-    of PyBullet are added. `fps` is one of `RATES`. Raises SdfsimError if the recipe does not take an option, if there
+    of PyBullet are added. Raises SdfsimError if the recipe does not take an option, if there
     are no usable shapes or they cannot be fetched, if PyBullet is not installed, or if `out` holds another dataset or
     another run is writing to it.
     """
@@ -48,11 +47,10 @@ def make_dataset(
     info = {
         "recipe": recipe,
         "seed": seed,
-        "fps": fps,
         "teacher": TEACHER_VERSION,
         "engine": "pybullet",
         "engine_version": str(engine.getAPIVersion()),
-        "engine_settings": engine_settings(1.0 / fps, RATES[fps]),
+        "engine_settings": engine_settings(DT, SUBSTEPS),
         "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
         "made_from": {origin.name: {"pieces": origin.how, "sha256": origin.digest()} for origin in given},
     }
@@ -75,7 +73,7 @@ def make_dataset(
         folder.mkdir(parents=True, exist_ok=True)
         files = [(k, folder / f"{k:05d}.npz") for k in range(trajectories)]
         todo = [job for job in files if not job[1].exists()]
-        make_one = partial(_make_one, recipe, Cast(mine, scenery), fps, [seed, SPLITS.index(split)])
+        make_one = partial(_make_one, recipe, Cast(mine, scenery), [seed, SPLITS.index(split)])
         for done, _ in enumerate(parallel(make_one, todo), start=1):
             on_progress(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
     return {
@@ -96,11 +94,11 @@ def report_lines(report: dict) -> list[str]:
     ]
 
 
-def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int = FPS) -> Trajectory:
-    """One trajectory of `STEPS` steps, with the velocities of the engine, at `fps` in `RATES`. Raises SdfsimError if
+def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajectory:
+    """One trajectory of `STEPS` steps, with the velocities of the engine. Raises SdfsimError if
     none of `REDRAWS` scenes had room for its bodies."""
     for _ in range(REDRAWS):
-        with Teacher(np.array(GRAVITY), FLOOR, step=1.0 / fps, substeps=RATES[fps]) as teacher:
+        with Teacher(np.array(GRAVITY), FLOOR) as teacher:
             placed = RECIPES[recipe].spawn(teacher, rng, cast)
             if placed is None:
                 continue
@@ -117,14 +115,14 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int 
             friction=np.array([b.friction for b in specs]),
             restitution=np.array([b.restitution for b in specs]),
             static=mass == 0,
-            dt=1.0 / fps,
+            dt=DT,
             gravity=np.array(GRAVITY),
         )
     raise SdfsimError(f"{recipe}: no room for the bodies in any of {REDRAWS:,} scenes", "are the meshes in metres?")
 
 
-def _make_one(recipe: str, cast: Cast, fps: int, seed: list[int], index: int, path: Path) -> None:
-    make_trajectory(recipe, np.random.default_rng([*seed, index]), cast, fps).save(path)
+def _make_one(recipe: str, cast: Cast, seed: list[int], index: int, path: Path) -> None:
+    make_trajectory(recipe, np.random.default_rng([*seed, index]), cast).save(path)
 
 
 def _origins(recipe: str, shapes: Path | None, random_solids: int, on_progress: Progress) -> list[Origin]:

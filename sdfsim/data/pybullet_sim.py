@@ -14,10 +14,8 @@ from sdfsim.base.files import write_text
 from sdfsim.base.lazy import optional
 
 TEACHER_VERSION = 2  # written to `dataset.json`; datasets of another version are refused
-RATES = {50: 5, 60: 4}  # recorded frames per second -> inner steps per frame
-FPS = 50  # the default rate
-DT = 1.0 / FPS  # s, one recorded step at that rate
-SUBSTEPS = RATES[FPS]
+DT = 0.02  # s, one recorded step
+SUBSTEPS = 5  # inner steps in it
 SUBSTEP = DT / SUBSTEPS  # s
 ENGINE_SETTINGS = {
     "restitutionVelocityThreshold": 0.0,
@@ -70,10 +68,9 @@ def engine_settings(step: float, substeps: int) -> dict:
 
 def substeps_of(step: float) -> int:
     """Inner steps in a recorded step of `step` s. Raises SdfsimError if the teacher does not record at this rate."""
-    for fps, substeps in RATES.items():
-        if abs(step - 1.0 / fps) < 1e-9:
-            return substeps
-    raise SdfsimError(f"a recorded step of {step:g} s: this teacher records {' or '.join(map(str, RATES))} frames/s")
+    if abs(step - DT) < 1e-9:
+        return SUBSTEPS
+    raise SdfsimError(f"a recorded step of {step:g} s: this teacher records steps of {DT:g} s")
 
 
 class Teacher:

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import ShapeSource
-from sdfsim.learned.training_ranges import DEEPEST
 
 TRIES = 100  # places for one body before the scene is drawn again
 UP, STILL = np.array([0.0, 0.0, 1.0]), np.zeros(3)
@@ -55,7 +54,7 @@ STARTS = ("still", "dropped", "nudged", "pressed")
 GAP = 2.5e-3  # m, under a body that is put down: the engine adds 1 mm around convex pieces, so 2 mm between two
 DROP = 0.1  # m, largest height of one that is dropped
 NUDGE = 0.3  # m/s, largest speed along x and along y
-PRESSED = 0.5 * DEEPEST  # relative to its extent: how far at most a body is moved into others, along each axis
+PRESSED = 0.08  # relative to its extent: how far at most a body is moved into others, along each axis
 FIELD = 3.0  # m, half the side of the square of floor that is used
 STACKED = 0.5  # share of bodies that are put on top of the one before
 STEADY = 0.03  # least distance of the centre of mass from the rim of the face below it, relative to the extent

@@ -64,7 +64,7 @@ def evaluate(
         model: bundled name, path or `Model`.
         steps: length of the rollouts; errors are reported at the horizons of `HORIZONS` up to it, and at it.
         free_flight: "exact" or (networks on surface nodes) "learned".
-        substeps: inner steps of the solve in a step; None: those of the model, else those of `users_inner`.
+        substeps: inner steps of the solve in a step; None: those of `users_inner`.
         chaos_floor: also run PyBullet again from starts that differ slightly (see `PERTURBATIONS`).
         errors_only: leave out penetration, energy gain and resting speed.
 
@@ -99,8 +99,6 @@ def evaluate(
     groups = batches(recorded)
     scenes, seconds = [scene_of([t], [0], shapes, conditions.floor)[0] for t in recorded], 0.0
     inner = substeps or (SUBSTEPS if stepper.network else users_inner(recorded[0].dt, scenes))
-    used = replace(used, inner=substeps or used.inner)
-    stepper = replace(stepper, model=used)
     for k, group in enumerate(groups):
         on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         common = (used, group, shapes, longest)
@@ -120,7 +118,7 @@ def evaluate(
         "steps_asked": steps,
         "engine_substep": substep,
         "floor": {"friction": friction, "restitution": restitution, "told": conditions.floor_given},
-        "inner_steps": used.inner or inner,
+        "inner_steps": inner,
         "outside_training": stepper.unknown(scenes, model_units(stepper, recorded[0])),
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
         **{who: errors(motions, recorded) for who, motions in contenders.items()},

@@ -38,7 +38,7 @@ def bundle(model: Path, data: Path, name: Annotated[str, typer.Option()], folder
 
 def card_text(model: Model, report: dict) -> str:
     card, parameters = model.card, sum(p.numel() for p in model.network.parameters())
-    shown = ("recipe", "fps", "seed", "trajectories", "random_solids", "engine")
+    shown = ("recipe", "seed", "trajectories", "random_solids", "engine")
     data = [", ".join(f"{key} {made[key]}" for key in shown if made.get(key)) for made in card["data"]]
     ranges = [(name.replace("_", " "), f"{low:.3g}", f"{high:.3g}") for name, (low, high) in model.ranges.items()]
     parts = [

@@ -19,7 +19,6 @@ from sdfsim.evaluation.engines import Engine, Ran, TooSlow, bullet, by_engine, b
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
 from sdfsim.learned.model import SOLVER, Model, load_model
-from sdfsim.learned.training_ranges import constant_in_training
 from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import PlaneSdf
@@ -125,8 +124,6 @@ def _tried(case: Case, model: Model | Engine, device: str, out: Path) -> dict[st
     """All repetitions of a case with one model or engine: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
     broke, outside, laws, recording = [], [], [], None
-    if isinstance(model, Model) and (about := GROUPS[case.group].about) in constant_in_training(model):
-        outside.append(f"{about} was constant in training, so it was not learned")
     for repeat in range(case.repeats):
         scenes = case.scenes(repeat)
         if case.own and isinstance(model, Model):

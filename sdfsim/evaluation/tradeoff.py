@@ -254,7 +254,7 @@ def _time_simulator(variant: Variant, model: Model, shapes: dict[str, Shape], ca
     scene = scene_of([start], [0], shapes, cases.floor)[0]
     effects = replace(scene.effects, sleep="off", contact="auto" if variant.contact else "off")
     simulator = Simulator(replace(scene, effects=effects), model, dt=start.dt)
-    simulator.options = simulator.options._replace(substeps=model.inner or variant.substeps)
+    simulator.options = simulator.options._replace(substeps=variant.substeps)
     steps = min(TIMED, cases.steps // variant.stride)
     taken = timed(lambda count: deque(simulator.steps(count), maxlen=0), steps)
     return Timing(taken.first_ms, taken.wall_ms / variant.stride, taken.cpu_ms / variant.stride)

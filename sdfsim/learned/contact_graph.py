@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 REST_SPEED = 0.2  # model units: the speed that gravity adds in one training step; slower counts as resting
-EDGE_FEATURES = 26
+EDGE_FEATURES = 27
 NEVER = 2.0  # steps: the time of touch that is told of surfaces that would not touch within this
 # The tensors of a graph with one row per edge, except its ends, and those with one row per body.
-OF_EDGES = ("normal", "arm_first", "arm_second", "gap", "friction", "restitution")
+OF_EDGES = ("normal", "arm_first", "arm_second", "gap", "when", "friction", "restitution")
 OF_BODIES = (
     "inverse_mass", "inverse_inertia", "velocity", "angular", "free_velocity", "free_angular", "mean_velocity",
     "mean_angular",
@@ -44,7 +44,8 @@ class ContactGraph:
     # arm_first, arm_second: [E, 3] from the centres of mass
     arm_first: Tensor
     arm_second: Tensor
-    gap: Tensor  # [E] signed distance at the start of the step
+    gap: Tensor  # [E] signed distance at the instant at which the edge was found
+    when: Tensor  # [E] the part of the step that had passed by then
     # friction, restitution: [E] products of the two bodies' coefficients
     friction: Tensor
     restitution: Tensor
@@ -66,7 +67,7 @@ class EdgeFrames:
     response_first: Tensor
     response_second: Tensor
     # [E, 3, 4] relative velocities along each axis: at the start of the step, what gravity and free spin add over the
-    # step, what the turn of the arms adds, and the one that closes the gap within the step
+    # step, what the turn of the arms adds, and the one that closes the gap within the step, bounded by `speed`
     told: Tensor
     start: Tensor  # [E, EDGE_FEATURES] input features
 
@@ -109,7 +110,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
     in_frame = axes @ torch.stack([slip, lift, _centripetal(g)], -1)  # [E, axis, quantity]
     scaled = (in_frame / speed[..., None]).flatten(1)
     gap = g.gap[:, None] / (speed * g.dt)
-    closing = torch.nn.functional.pad(g.gap[:, None] / g.dt, (0, 2))[..., None]
+    closing = torch.nn.functional.pad(speed * torch.tanh(gap), (0, 2))[..., None]
     fixed = torch.stack([(push_first == 0)[:, 0], (push_second == 0)[:, 0]], -1).to(gap.dtype)
     start = torch.cat(
         [
@@ -124,6 +125,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
             g.restitution[:, None],
             torch.log(count[g.pair])[:, None] * 0.5,
             fixed,
+            g.when[:, None],
             _touch(g.gap, in_frame[:, 0], g.dt)[:, None],
         ],
         -1,
@@ -208,7 +210,7 @@ def _centripetal(g: ContactGraph) -> Tensor:
 
 
 def _touch(gap: Tensor, along: Tensor, dt: float) -> Tensor:
-    """[E] when surfaces would touch in free motion, in steps from the start, at most `NEVER`; 0 if they do already.
+    """[E] when surfaces would touch in free motion, in steps from then, at most `NEVER`; 0 if they do already.
     `along` [E, quantity] are relative velocities along the normal, as in `EdgeFrames.told`."""
     speed, pull = along[:, 0], along[:, 1:].sum(-1)
     away = gap / dt

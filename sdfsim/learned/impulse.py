@@ -18,12 +18,15 @@ from torch import Tensor, nn
 
 from sdfsim.learned.contact_graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames
 
-QUANTITIES = 6  # the relative velocities of `EdgeFrames.told`, and those that are left at the end and in the mean
+# The relative velocities of `EdgeFrames.told`, those that are left at the end and in the mean, and the latter two as
+# directions: `EdgeFrames.speed` along them, less below `STICK`. Coulomb's friction is of this form.
+QUANTITIES = 8
+STICK = 0.05  # model units of speed
 
 
 @dataclass(frozen=True)
 class ImpulseConfig:
-    width: int = 32  # width of every latent and hidden layer
+    width: int = 64  # width of every latent and hidden layer
     rounds: int = 4  # rounds of message passing, each with its own weights
 
     def __post_init__(self) -> None:
@@ -105,7 +108,8 @@ class ImpulseNetwork(nn.Module):
             seen = relative(graph, frames, twist)
             hidden = layer.read(body, edge, graph.first, graph.second, (seen / frames.speed[..., None]).mT.flatten(1))
             weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
-            change = layer.change(hidden, torch.cat([frames.told, seen], -1))
+            along = frames.speed[..., None] * torch.tanh(seen / STICK)
+            change = layer.change(hidden, torch.cat([frames.told, seen, along], -1))
             twist = pushed(graph, frames, change * (weight * mass)[..., None], twist)
             if number < len(self.rounds):  # the last round's latents are not read
                 edge, body = layer.update(edge, body, hidden, weight, graph)

@@ -65,6 +65,7 @@ def step_graph(
         arm_second=_tensor(value[:, 3:6] / length),
         normal=_tensor(value[:, 6:9]),
         gap=_tensor(value[:, 9] / length),
+        when=_tensor(value[:, 10]),
         friction=_tensor(bodies.friction[pair].prod(1) * options.friction),
         restitution=_tensor(bodies.restitution[pair].prod(1) * options.restitution),
         dt=known,

@@ -37,8 +37,6 @@ class Model:
     length: float
     reach: float  # m, contact radius D
     nodes: int | None = None  # surface nodes per body in training; None for all
-    # inner steps of the solve in a step; 0: as in the engine that recorded the data (5 without one)
-    inner: int = 0
     # name -> [low, high] of the training data (friction, restitution, mass_ratio, speed, size)
     ranges: dict[str, list[float]] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)  # training record (data, steps, seconds, errors)
@@ -62,7 +60,7 @@ class Model:
             "version": MODEL_VERSION,
             "kind": self.kind,
             "config": asdict(self.network.config),
-            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "inner", "ranges", "card")},
+            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "ranges", "card")},
         }
         weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
         with replacing(path) as partial:

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from sdfsim.learned.model import Model
-from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
+from sdfsim.physics.bodies import Units, largest_extent
 from sdfsim.scene.scene import Scene
 
 LABELS = {
@@ -16,8 +16,6 @@ LABELS = {
     "friction": "friction of two bodies, multiplied",
     "restitution": "restitution of two bodies, multiplied",
 }
-# Deepest overlap at a start in the training data, relative to the body's largest side.
-DEEPEST = 0.16
 SLACK = 0.05  # relative: for rounding, and for fits that extend slightly beyond the solid
 
 
@@ -61,11 +59,6 @@ def _values(scene: Scene, units: Units) -> dict[str, list[float]]:
     }
 
 
-def constant_in_training(model: Model) -> list[str]:
-    """The quantities that never varied in training: the model has not learned their effect."""
-    return [name for name, (low, high) in model.ranges.items() if high - low <= 1e-9]
-
-
 def _products(scene: Scene, name: str) -> list[float]:
     """Products of a coefficient for pairs with a dynamic body, including the smallest and the largest of all."""
     moving, others = (
@@ -74,28 +67,3 @@ def _products(scene: Scene, name: str) -> list[float]:
     # A product is extreme if both of its factors are; the two dynamic bodies of a pair must be different.
     ends = moving[:2] + moving[2:][-2:]
     return [a * b for a, b in combinations(ends, 2)] + [a * b for a in ends for b in (*others[:1], *others[-1:])]
-
-
-def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
-    """A line if pairs overlap deeper than any in the models' training data; else empty. Bodies have `names` [N]; a
-    model unit is `metres` m."""
-    from sdfsim.physics.solver.prepare import Compiled, nodes_near  # numba is slow to load
-
-    index, value = nodes_near(Compiled(bodies, state), state, np.zeros(3), reach=0.0, dt=0.0)
-    if not len(index):
-        return []
-    owners, _, others = index.T
-    # Relative to the smaller dynamic body of the two, which is the one to be pushed out.
-    size = np.where(bodies.moves, bodies.size, np.inf)
-    part = -value[:, 0] / np.minimum(size[owners], size[others])
-    deep = part > DEEPEST
-    if not deep.any():
-        return []
-    pairs = len(np.unique(np.sort(index[deep][:, [0, 2]], axis=1), axis=0))
-    worst = int(part.argmax())
-    owner, body = names[owners[worst]], names[others[worst]]
-    return [
-        f"pairs that overlap at the start: {pairs} here, {owner!r} in {body!r} by "
-        f"{-float(value[worst, 0]) * metres:.3g} m, {float(part[worst]):.0%} of a body's size; "
-        f"trained on up to {DEEPEST:.0%}"
-    ]

@@ -16,7 +16,6 @@ from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import Progress, parallel, silent, threads
 from sdfsim.base.version import __version__
 from sdfsim.learned.model import SOLVER, Model, load_model
-from sdfsim.learned.training_ranges import deep_starts
 from sdfsim.physics.bodies import Bodies, Moment, State, from_scene
 from sdfsim.physics.joint_columns import TARGET
 from sdfsim.physics.motion import MOTION
@@ -149,8 +148,6 @@ class Simulator(LiveScene):
         self._joint_names = tuple(joint.name for joint in scene.joints)
         self._joint_unit = [1.0 if joint.kind in ("hinge", "ball") else self.units.length for joint in scene.joints]
         check_sizes(self.bodies, self._names, self.units.length)
-        if effects.contact.on and self.model.ranges:
-            self.outside_training += deep_starts(self.bodies, state, self._names, self.units.length)
         self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
@@ -162,7 +159,7 @@ class Simulator(LiveScene):
             friction=effects.friction.on,
             restitution=effects.restitution.on,
             rotation=effects.rotation.on,
-            substeps=self.model.inner or inner_steps(scene),
+            substeps=inner_steps(scene),
             sleep=effects.sleep.on and stepper.sleeps,
         )
         super().__init__(self.stepper.began(state, self.bodies, self._options))

@@ -194,7 +194,7 @@ class Solver(Stepper):
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
         """The solve has no training. A line if its inner step is longer than any that its laws were checked with."""
-        inner = self.model.dt * units.time / (self.model.inner or SUBSTEPS)
+        inner = self.model.dt * units.time / SUBSTEPS
         if inner <= LONGEST:
             return []
         return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
@@ -251,10 +251,10 @@ class OnBodies(Stepper):
 
         bodies, options, free = carry.bodies, carry.options, super()._step(state, carry)
         with carry.timed("contact_ms"):
-            pair, value = points_near(cast("Compiled", carry.scene), state, options.gravity, options.dt)
-        touch = value[:, 9] <= TOUCHING
+            pair, value = points_near(cast("Compiled", carry.scene), state, options)
+        touch = (value[:, 9] <= TOUCHING) & (value[:, 10] == 0.0)
         point = state.position[pair[touch, 0]] + value[touch, :3]
-        carry.touched = point, pair[touch], float((-value[:, 9]).max(initial=0.0))
+        carry.touched = point, pair[touch], float((-value[touch, 9]).max(initial=0.0))
         if not len(pair):
             return free
         with carry.timed("network_ms"):

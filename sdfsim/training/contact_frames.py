@@ -1,4 +1,4 @@
-"""Contact frames: recorded steps in which bodies are near each other, with the points at which they are.
+"""Contact frames: recorded steps in which bodies meet or nearly meet, with the points at which they do.
 
 The points are searched once, from recorded states, so that training needs no signed distances, only torch and numpy.
 They are searched from disturbed states as well, because in a rollout a network gets states that differ slightly from
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from sdfsim.physics.options import Options
 
 STEP = 0.02  # s, the step with which networks are trained
-FRAMES_VERSION = 12  # increase it whenever frames of the same recordings come out differently
+FRAMES_VERSION = 13  # increase it whenever frames of the same recordings come out differently
 TOGETHER = 25  # trajectories that are taken side by side
 ENDS = ("first", "second")
 
@@ -190,7 +190,7 @@ def _searched(files: list[Path], how: Disturbed) -> list[ContactFrames]:
         for now in range(count - 1):
             state = state_at(group, [now] * len(group), start)
             state = _disturbed(bodies, state, how, rng) if draw else state
-            edges = points_near(scene, state, options.gravity, options.dt)
+            edges = points_near(scene, state, options)
             recorded = state_at(group, [now + 1] * len(group), start)
             parts += _of_step(bodies, state, edges, recorded, options, floor)
     return parts

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import digest, read_arrays, write_arrays
+from sdfsim.base.files import read_arrays, write_arrays
 from sdfsim.training.batches import Drawn, Draws, batches, moved
 from sdfsim.training.presets import Preset
 
 if TYPE_CHECKING:
-    from sdfsim.learned.model import Model
+    pass
 
 EMA_DECAY = 0.999
 CLIP = 1.0
@@ -34,13 +34,12 @@ class Run:
     """Everything that changes during training, and how to save it.
 
     The task is an `ImpulseTask` or a `SurfaceTask`. The learning rate depends on `total`, the
-    optimiser's steps of the whole run; `workers` draw batches ahead. It begins with the
-    weights of `first`, if given. Raises SdfsimError if that is another network than the plan's.
+    optimiser's steps of the whole run; `workers` draw batches ahead.
     """
 
     def __init__(
         self, plan: Preset, task: Any, total: int, seed: int, device: torch.device,
-        workers: int = 0, first: Model | None = None,
+        workers: int = 0,
     ) -> None:  # fmt: skip
         from sdfsim.learned.model import new_network
 
@@ -49,14 +48,8 @@ class Run:
         self.workers = workers
         self.origin = {"plan": json.loads(json.dumps(asdict(plan))), "seed": seed, "data": task.digest()}
         self.network: nn.Module = new_network(plan.kind, plan.config)
-        if first is not None:
-            self.origin["first"] = digest(first.network)
-            if (first.kind, first.network.config) != (plan.kind, self.network.config):  # type: ignore[union-attr]
-                message = f"{first.name}: a network of another kind or size than the preset's"
-                raise SdfsimError(message, "use the preset that it was trained with")
-            self.network.load_state_dict(first.network.state_dict())
         self.network = self.network.to(device)
-        if hasattr(task, "prepare") and first is None:  # weights from another training include statistics
+        if hasattr(task, "prepare"):
             task.prepare(self.network, np.random.default_rng([seed, 1]), device)
         # Only trained weights are averaged; feature statistics are fixed before the first step.
         self.weights = dict(self.network.named_parameters())
@@ -125,8 +118,6 @@ class Run:
                 raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")
             if info["data"] != self.origin["data"]:
                 raise SdfsimError(f"{path} was trained on other data", "give the same --data, or choose another -o")
-            if info.get("first") != self.origin.get("first"):
-                raise SdfsimError(f"{path} began with other weights", "give the same --from, or choose another -o")
             states: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
             for key, value in arrays.items():
                 of, name = key.split("/", 1)

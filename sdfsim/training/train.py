@@ -33,22 +33,19 @@ def train(
     device: str = "cpu",
     budget: float = math.inf,
     workers: int = 0,
-    first: str | Path | None = None,
     on_progress: Progress = silent,
 ) -> dict:
     """Train a preset on one or several datasets; write `model.safetensors`, `log.jsonl` and a checkpoint in `out`.
 
     Datasets have train/ and validation/; several (impulse only) are used as if they were one. The preset is a name in
-    `PRESETS`, or your own, with other `steps` if given. `first` is a model, by bundled name or path, with whose weights
-    training begins. `resume` continues from the checkpoint in `out`, with the result of an uninterrupted run. `budget`
-    is processor time in s, all cores together, after which training stops early. `workers` is a number of processes
-    that draw batches in advance, with the same result: otherwise a GPU waits for the contacts of networks on surface
-    nodes, which are found on the CPU. Returns paths, losses and processor time. Raises SdfsimError if data are
-    unusable, if `first` is another network than the preset's, if `out` has a checkpoint and `resume` is not set, if
-    another run is writing to `out`, or if training diverges.
+    `PRESETS`, or your own, with other `steps` if given. `resume` continues from the checkpoint in `out`, with the
+    result of an uninterrupted run. `budget` is processor time in s, all cores together, after which training stops
+    early. `workers` is a number of processes that draw batches in advance, with the same result: otherwise a GPU waits
+    for the contacts of networks on surface nodes, which are found on the CPU. Returns paths, losses and processor time.
+    Raises SdfsimError if data are unusable, if `out` has a checkpoint and `resume` is not set, if another run is
+    writing to `out`, or if training diverges.
     """
     from sdfsim.base.devices import pick_device
-    from sdfsim.learned.model import load_model
 
     plan = PRESETS[preset] if isinstance(preset, str) else preset
     folders = [data] if isinstance(data, Path) else list(data)
@@ -65,14 +62,11 @@ def train(
     with locked(out):
         task, held_out = _tasks(plan, folders, lambda _, message: on_progress(0.0, message))
         made = [_made(*one) for one in zip(folders, infos, task.counts, held_out.counts, strict=True)]
-        begun = None if first is None else load_model(first)
-        run = Run(plan, task, total, seed, place, workers, begun)
+        run = Run(plan, task, total, seed, place, workers)
         if checkpoint.exists():
             run.load(checkpoint)
         _shorten(out / "log.jsonl", run.step)
         _loop(run, held_out, out, budget, on_progress)
-        if begun is not None:
-            made = [*made, {"weights": begun.name, "data": begun.card.get("data", [])}]
         run.export(preset if isinstance(preset, str) else preset.kind, made).save(out / "model.safetensors")
         report = {"steps": run.step, "seconds": run.seconds, "loss": run.loss}
         report |= {"model": str(out / "model.safetensors"), "held_out_loss": held_out_loss(run, held_out)}
@@ -84,7 +78,6 @@ def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]
     here."""
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
-    known["fps"] = info.get("fps")
     known["floor"] = list(conditions_of(data).floor)
     shapes = info.get("shapes", [])
     solids = sum(name.startswith(SOLID) for name in shapes)

@@ -43,7 +43,7 @@ def first_graph(scene: Scene, steps: int = 30, model: Model | None = None) -> tu
     sim = Simulator(scene, model or random_model("impulse"))
     options, rows = sim.options, np.arange(len(sim.bodies))
     for _ in range(steps):
-        edges = points_near(sim.carry.scene, sim.state, options.gravity, options.dt)
+        edges = points_near(sim.carry.scene, sim.state, options)
         free = fly(sim.bodies, sim.state, options)
         if len(edges[0]):
             return sim, step_graph(sim.bodies, sim.state, free, edges, options, sim.model.dt, rows)
@@ -55,7 +55,7 @@ def test_impulses_keep_angular_momentum_at_the_instant_they_act(free_pair):
     sim, graph = first_graph(free_pair)
     # One edge: others act at other instants of the step, at which the centres are elsewhere.
     one = {k: getattr(graph, k)[:1] for k in ("first", "second", "pair", "normal", "arm_first", "arm_second")}
-    one |= {k: getattr(graph, k)[:1] for k in ("gap", "friction", "restitution")}
+    one |= {k: getattr(graph, k)[:1] for k in ("gap", "when", "friction", "restitution")}
     graph = replace(graph, **one, pairs=1)
     after = doubled(sim.model.network)(graph)
     mass = 1.0 / graph.inverse_mass
@@ -83,7 +83,7 @@ def test_bodies_at_rest_feel_nothing_but_what_holds_them(box_shape):
     for seed in range(5):
         model = random_model("impulse", seed, width=16, rounds=1)
         _, graph = first_graph(scene, model=model)
-        made = model.network(graph)
+        made = doubled(model.network)(graph)
         box = int(graph.inverse_mass.argmax())
         assert made.velocity[box, 2] != graph.free_velocity[box, 2]
         torch.testing.assert_close(made.velocity[box, :2], torch.zeros(2, dtype=torch.float64), atol=1e-12, rtol=0)

@@ -41,7 +41,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data):
     options, scene, found = Options(first.gravity, first.dt), Compiled(bodies, start), []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], shapes, Units(1.0, 1.0, 1.0))
-        edges = points_near(scene, state, options.gravity, options.dt)
+        edges = points_near(scene, state, options)
         if len(edges[0]):
             free, rows = fly(bodies, state, options), np.arange(len(bodies))
             found.append(step_graph(bodies, state, free, edges, options, first.dt, rows))

@@ -102,17 +102,18 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
 
 
 @njit(**ENTRY)
-def points_within(shapes, world, work, motion, rules, manifolds, surfaces):
-    """Points at which bodies are within `rules.contact_margin` of each other, or will be by the end of the step
-    `rules.ahead` in free motion.
+def points_within(shapes, world, work, motion, rules, manifolds, surfaces, soon):
+    """Points at which bodies are within `rules.contact_margin` of each other, or will be after the time `rules.ahead`
+    in free motion.
 
     Args:
         manifolds: empty, of this type.
         surfaces: True if shapes may meet as surfaces, else None.
+        soon: a shorter time.
 
     Returns:
-        [E, 2] int64, the two bodies; [E, 10], the contact point about the centre of mass of each, the normal from the
-        second to the first (all along world axes), and the distance.
+        [E, 2] int64, the two bodies; [E, 11], the contact point about the centre of mass of each, the normal from the
+        second to the first (all along world axes), the distance, and the distance after the time `soon`.
     """
     shapes, world, work = reference(shapes), reference(world), reference(work)
     motion, rules = reference(motion), reference(rules)
@@ -124,7 +125,7 @@ def points_within(shapes, world, work, motion, rules, manifolds, surfaces):
     narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.gone, work.scratch, surfaces, None)
     heed_supports(shapes, world, work, motion, rules, points, parts, work.scratch)
     most = points_of(manifolds, len(near.start))
-    pair, value, count = np.empty((most, 2), np.int64), np.empty((most, 10)), 0
+    pair, value, count = np.empty((most, 2), np.int64), np.empty((most, 11)), 0
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         fall = (1.0 if world.moves[a] else 0.0) - (1.0 if world.moves[b] else 0.0)
@@ -139,9 +140,10 @@ def points_within(shapes, world, work, motion, rules, manifolds, surfaces):
             speed = sub(add(get(motion.velocity, a), cross(w, arm)), add(get(motion.velocity, b), cross(u, other)))
             closing = -dot(along(speed, vector(rules.options.gravity), fall * span), n)
             bent = 0.5 * span * (dot(w, w) * norm(arm) + (dot(u, u) * norm(other) if dot(u, u) > 0.0 else 0.0))
-            if point[VOID] > 0.0 or point[GAP] - max(closing + bent, 0.0) * span > rules.contact_margin:
+            gap, approach = point[GAP], max(closing + bent, 0.0)
+            if point[VOID] > 0.0 or gap - approach * span > rules.contact_margin:
                 continue
-            pair[count, 0], pair[count, 1], value[count, 9] = a, b, point[GAP]
+            pair[count, 0], pair[count, 1], value[count, 9], value[count, 10] = a, b, gap, gap - approach * soon
             for x in range(3):
                 value[count, x], value[count, 3 + x], value[count, 6 + x] = arm[x], other[x], n[x]
             count += 1

@@ -15,6 +15,7 @@ from sdfsim.base.compiling import compile_before
 from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
+from sdfsim.physics.free_flight import fly
 from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import SLOP, SLOP_A_TIME, SLOW, Options
 from sdfsim.physics.solver import distance as kinds
@@ -37,6 +38,7 @@ FORMS = {
 SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
 CROWD = 64  # number of dynamic bodies from which threads may test pairs
 TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
+INSTANTS = 4  # of a step, at which networks look for contacts
 NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 0, 6)))
 
 
@@ -272,14 +274,35 @@ def nodes_near(
     return nodes_within(scene.shapes, scene.world, scene.work, motion, rules, bodies.node, bodies.node_start)
 
 
-def points_near(scene: Compiled, state: State, gravity: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points at which bodies are near each other, or come near in a step of `dt` under `gravity` [3], model units; see
-    `edges.points_within`."""
-    rules = compiled_rules(Options(gravity, dt, 1))._replace(ahead=dt)
-    motion = taken_up(replace(state, touch=None))[0]
-    arguments = (scene.shapes, scene.world, scene.work, motion, rules, _manifolds(None), scene.surfaces)
-    compile_before(points_within, arguments, "the search for contacts", "half a minute", {6: scene.surfaces is None})
-    return points_within(*arguments)
+def points_near(scene: Compiled, state: State, options: Options) -> tuple[np.ndarray, np.ndarray]:
+    """Points at which bodies meet, or nearly meet, in a step of free flight: for each pair of bodies those at the first
+    of `INSTANTS` instants after which it is near within the time to the next one.
+
+    Returns:
+        [E, 2] int64, the two bodies; [E, 11], model units: the contact point about the centre of mass of each, the
+        normal from the second to the first (all along world axes), the distance, and the part of the step that has
+        passed by then.
+    """
+    known, pairs, values = np.zeros(0, np.int64), [], []
+    for k in range(INSTANTS):
+        part = k / INSTANTS
+        at = fly(scene.bodies, replace(state, touch=None), options._replace(dt=part * options.dt)) if k else state
+        rules = compiled_rules(options)._replace(ahead=(1.0 - part) * options.dt)
+        motion = taken_up(replace(at, touch=None))[0]
+        soon = options.dt / INSTANTS
+        arguments = (scene.shapes, scene.world, scene.work, motion, rules, _manifolds(None), scene.surfaces, soon)
+        if not k:
+            missing = {6: scene.surfaces is None}
+            compile_before(points_within, arguments, "the search for contacts", "half a minute", missing)
+        pair, value = points_within(*arguments)
+        key = pair[:, 0] * len(scene.bodies) + pair[:, 1]
+        due = np.setdiff1d(key[value[:, 10] <= rules.contact_margin], known)
+        chosen = np.isin(key, due)
+        value[:, 10] = part
+        pairs.append(pair[chosen])
+        values.append(value[chosen])
+        known = np.concatenate([known, due])
+    return np.concatenate(pairs), np.concatenate(values)
 
 
 def compiled_rules(options: Options) -> compiled.Rules:
