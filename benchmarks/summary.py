@@ -170,7 +170,7 @@ def summary() -> str:
         "Everyday checks that other engines miss: "
         + joined([f"{name} {run - held} of {run}" for name, (held, run) in total.items() if name != OURS])
         + ". Hard cases that they miss: "
-        + joined([f"{who.replace('teacher', 'PyBullet')} {missed}" for who, _, missed, _ in hard[2:]])
+        + joined([f"{who.replace('teacher', 'PyBullet')} {missed}" for who, _, missed, _ in hard[1:]])
         + ".",
         f"Joints, relative to MuJoCo's time: {joined(fast_joints)}.",
     ]

@@ -187,16 +187,6 @@ def test_errors_on_movi_b_are_the_results_on_every_page():
         assert told == [short, turn, long, further][: len(told)] and len(told) >= 3
 
 
-def test_errors_beside_hopnet_are_the_results():
-    table = measured("instants")
-    text = page("docs/simulator.md").partition("### Beside HOPNet")[2].partition("\n## ")[0]
-    for first in ("`solver`", "HOPNet"):
-        *_, last = cells(table, first)
-        metres, degrees = (numbers(last)[k] for k in (0, -1 if first == "`solver`" else 1))
-        assert f"{metres:g} m" in text and f"{degrees:g} degrees" in text
-    assert cells(table, "bodies that have met nothing yet")[-1] in text
-
-
 def test_errors_on_real_tosses_are_the_same_everywhere():
     """On the page about them to the digits that it has; `identify` found on all of them, and on a few."""
     rows = {row[0]: row[1:] for row in cells_of(measured("reality"))[1:]}
@@ -317,7 +307,7 @@ def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
     loops = re.findall(r"for split in (.*?); do.*\n.*?-o (\S+)", page("docs/tutorial.md"))
     tutorial = {out: dict(pair.split(":") for pair in splits.split()) for splits, out in loops}
     card = page("sdfsim/models/gnn.md")
-    for counts, out, name in zip(made, ("data", "data-60", "data-v"), ("MOVI-B", "MOVI-B-60", "VARIED"), strict=True):
+    for counts, out, name in zip(made, ("data", "data-v"), ("MOVI-B", "VARIED"), strict=True):
         for split in ("train", "validation"):
             assert int(tutorial[out][split]) == counts[split]
             assert re.search(rf"-o {name} .*--trajectories {counts[split]} .*--split {split}", card)
@@ -325,7 +315,7 @@ def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
 
 def test_hard_cases_are_summed_up_alike():
     lines = re.findall(r"^- .* 0 cases.*$|^- \w+: \d+ figures.*$", measured("hard cases"), re.M)
-    assert len(lines) == 5
+    assert len(lines) == 4
     assert all(line in measured("hard cases", ROOT / "docs" / "stability.md") for line in lines)
 
 

@@ -4,14 +4,24 @@ from copy import deepcopy
 
 import numpy as np
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from sdfsim.learned.contact_graph import ContactGraph, number_pairs
+from sdfsim.learned.contact_graph import REST_SPEED, ContactGraph, number_pairs
 from sdfsim.learned.impulse import ImpulseNetwork, Velocities
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
+
+# Fields of `Velocities`, and those of a graph that hold the same for free flight.
+FREE = {
+    "velocity": "free_velocity", "angular": "free_angular", "mean_velocity": "mean_velocity",
+    "mean_angular": "mean_angular",
+}  # fmt: skip
+# Relative to `REST_SPEED`: contacts may give a body the energy of this speed, so that bodies that overlap come apart.
+SPARE = 0.25
 
 Edges = tuple[np.ndarray, np.ndarray]  # as `physics.solver.prepare.points_near` gives them
 
@@ -83,8 +93,10 @@ def stepped(
         made = network(graph, friction=options.friction)
     time, moves = options.dt / known, bodies.moves[rows]
     rows = rows[moves]
+    share = _passive(graph, made, options.gravity)[moves, None]
     end, spin, mean, turn = (
-        getattr(made, name).numpy()[moves] for name in ("velocity", "angular", "mean_velocity", "mean_angular")
+        getattr(graph, of).numpy()[moves] + share * (getattr(made, name) - getattr(graph, of)).numpy()[moves]
+        for name, of in FREE.items()
     )
     orientation = before.rows_of("orientation", rows)
     moved = {
@@ -97,6 +109,33 @@ def stepped(
         turned = pose.multiply(pose.from_rotvec(turn * known), orientation)
         moved |= {"orientation": pose.normalise(turned), "angular_velocity": spin / time}
     return free.with_rows(rows, moved)
+
+
+def _passive(graph: ContactGraph, made: Velocities, gravity: np.ndarray) -> np.ndarray:
+    """[A] the largest part, 0 to 1, of the changes of velocity with which contacts give no energy, except for `SPARE`:
+    the same for all bodies of an island, so that momentum is kept."""
+    inverse = graph.inverse_mass.numpy()
+    ends = np.stack([graph.first.numpy(), graph.second.numpy()])
+    both = ends[:, (inverse[ends] > 0).all(0)]
+    count = len(inverse)
+    joined = coo_matrix((np.ones(both.shape[1]), both), shape=(count, count))
+    island = connected_components(joined, directed=False)[1]
+    mass = np.divide(1.0, inverse, out=np.zeros(count), where=inverse > 0)
+    inertia = np.linalg.pinv(graph.inverse_inertia.numpy(), hermitian=True)
+    before = graph.free_velocity.numpy(), graph.free_angular.numpy()
+    change = made.velocity.numpy() - before[0], made.angular.numpy() - before[1]
+    momentum = mass[:, None] * change[0], (inertia @ change[1][..., None])[..., 0]
+    linear, square = (
+        np.bincount(island, sum((one * other).sum(-1) for one, other in zip(momentum, of, strict=True)))
+        for of in (before, change)
+    )
+    lifted = graph.dt * (made.mean_velocity - graph.mean_velocity).numpy()
+    linear = linear - np.bincount(island, mass * (lifted @ gravity))
+    spare = np.bincount(island, 0.5 * mass * (SPARE * REST_SPEED) ** 2)
+    # linear s + square s^2 / 2 <= spare
+    root = np.sqrt(linear**2 + 2.0 * square * spare)
+    most = np.divide(root - linear, square, out=np.ones(len(spare)), where=square > 0)
+    return np.minimum(most, 1.0)[island]
 
 
 def _tensor(values: np.ndarray) -> Tensor:

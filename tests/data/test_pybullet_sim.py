@@ -10,7 +10,7 @@ pytest.importorskip("pybullet")
 
 from sdfsim.data.dataset import Trajectory, at_instants, trajectory_files
 from sdfsim.data.generate import make_trajectory
-from sdfsim.data.pybullet_sim import DT, RATES, SUBSTEP, Teacher, TeacherBody
+from sdfsim.data.pybullet_sim import DT, SUBSTEP, Teacher, TeacherBody
 from sdfsim.data.scenarios import MATERIALS, REGION, SIZES, Cast
 from sdfsim.data.shape_assets import Origin, origins, prepare
 from sdfsim.evaluation.evaluate import evaluate
@@ -35,9 +35,9 @@ def sources_of(meshes, engine):
     return prepare(origins(meshes, as_is=True), engine, lambda fraction, message: None)[0]
 
 
-def motion(*bodies, steps, gravity=(0.0, 0.0, -GRAVITY), floor=(1.0, 1.0), fps=50):
+def motion(*bodies, steps, gravity=(0.0, 0.0, -GRAVITY), floor=(1.0, 1.0)):
     """Recorded motion of bodies, each a `TeacherBody`, its position, and its velocities where it has any."""
-    with Teacher(np.array(gravity), floor, step=1 / fps, substeps=RATES[fps]) as teacher:
+    with Teacher(np.array(gravity), floor) as teacher:
         for body, position, *velocities in bodies:
             index = teacher.add(body, position)
             if velocities:
@@ -45,20 +45,19 @@ def motion(*bodies, steps, gravity=(0.0, 0.0, -GRAVITY), floor=(1.0, 1.0), fps=5
         return teacher.run(steps)
 
 
-def rebound(urdf, restitution, height, fps):
+def rebound(urdf, restitution, height):
     """Of a ball of 1 m dropped from `height` m: the top of its first bounce over `height`."""
     ball = TeacherBody(urdf, 1.0, 1.0, 0.5, restitution)
-    found = motion((ball, (0.0, 0.0, 0.5 + height)), steps=2 * fps, fps=fps)
+    found = motion((ball, (0.0, 0.0, 0.5 + height)), steps=100)
     up = np.flatnonzero(found["velocity"][:, 0, 2] > 0)
     down = np.flatnonzero(found["velocity"][up[0] :, 0, 2] < 0)[0] + up[0]
     return (found["position"][up[0] : down + 1, 0, 2].max() - 0.5) / height
 
 
-@pytest.mark.parametrize("fps", list(RATES))
 @pytest.mark.parametrize("restitution", [0.3, 0.5, 0.7, 0.9])
-def test_a_ball_rebounds_to_the_square_of_its_restitution(urdfs, restitution, fps):
+def test_a_ball_rebounds_to_the_square_of_its_restitution(urdfs, restitution):
     """What the engine adds to it is how it pushes out the depth of the step in which it sees the hit."""
-    found = [rebound(urdfs["ball"], restitution, height, fps) for height in (0.9, 0.95, 1.0, 1.05, 1.1)]
+    found = [rebound(urdfs["ball"], restitution, height) for height in (0.9, 0.95, 1.0, 1.05, 1.1)]
     assert np.mean(found) == pytest.approx(restitution**2, abs=0.15 * restitution**2 + 0.02)
     assert np.std(found) < 0.05
 
@@ -152,15 +151,14 @@ def test_a_body_that_touches_in_its_first_step_answers_with_its_own_inertia(urdf
         np.testing.assert_allclose(heavy[name], light[name], atol=1e-9)
 
 
-@pytest.mark.parametrize("fps", list(RATES))
-def test_recorded_velocities_are_those_at_the_end_of_the_step(urdfs, fps):
+def test_recorded_velocities_are_those_at_the_end_of_the_step(urdfs):
     """A ball that lies, one that falls, and one that bounces: what flies then follows the parabola of its velocity."""
-    step, gravity = 1 / fps, np.array([0.0, 0.0, -GRAVITY])
+    step, gravity = DT, np.array([0.0, 0.0, -GRAVITY])
     body = TeacherBody(urdfs["ball"], 1.0, 1.0, 0.5, 0.9)
     places = ((-3.0, 0.0, 0.5), (0.0, 0.0, 50.0), (3.0, 0.0, 1.3))
-    found = motion(*((body, place) for place in places), steps=fps, fps=fps)
+    found = motion(*((body, place) for place in places), steps=50)
     recorded = replace(balls(found["position"]), velocity=found["velocity"], dt=step)
-    corrected = at_instants(recorded, step / RATES[fps])
+    corrected = at_instants(recorded, SUBSTEP)
     position, velocity = corrected.position, corrected.velocity
     assert np.abs(velocity[:, 0]).max() < 1e-3
     off = position[1:] - position[:-1] - velocity[:-1] * step - 0.5 * gravity * step**2

@@ -141,6 +141,20 @@ def test_whatever_it_adds_keeps_momentum(free_pair):
     np.testing.assert_allclose((mass * sim.state.velocity).sum(0), (mass * start).sum(0), rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("push", [0.5, 5.0, 500.0])
+def test_contacts_give_no_energy_whatever_the_weights(push):
+    """Kinetic and potential energy of balls and cubes on the floor (whose inertia does not change with a turn), in SI
+    units; a step may add that of a slow speed to a body."""
+    scene, cube = pile(4), analytic_shape("box", size=(0.8, 0.8, 0.8))
+    scene = replace(scene, shapes=(cube, *scene.shapes[1:]))
+    sim = Simulator(scene, random_model("impulse", push=push, width=16, rounds=2))
+    rollout = sim.run(steps=60)
+    spare = 0.5 * (0.25 * 0.2 * sim.units.velocity) ** 2 * sum(b.mass for b in sim.scene.bodies)
+    assert rollout.contact_count.sum() > 0
+    gained = np.diff(rollout.counters["kinetic_energy"] + rollout.counters["potential_energy"])
+    assert gained.max() < 1.01 * spare
+
+
 def test_the_same_steps_give_the_same_bits():
     one, other = (Simulator(pile(2), MODEL).run(steps=20) for _ in range(2))
     for name in MOTION:
