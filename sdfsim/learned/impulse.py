@@ -26,7 +26,7 @@ STICK = 0.05  # model units of speed
 
 @dataclass(frozen=True)
 class ImpulseConfig:
-    width: int = 64  # width of every latent and hidden layer
+    width: int = 32  # width of every latent and hidden layer
     rounds: int = 4  # rounds of message passing, each with its own weights
 
     def __post_init__(self) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 from sdfsim.data.dataset import ranges_of
 from sdfsim.learned.contact_graph import OF_BODIES, OF_EDGES, ContactGraph, number_pairs
 from sdfsim.learned.impulse import ImpulseNetwork, Velocities
+from sdfsim.physics.options import LENGTH
 from sdfsim.training.contact_frames import ENDS, STEP, ContactFrames
 
 HUBER = 0.01  # m/s: smaller errors count squared, larger ones linearly; bodies at rest may creep more slowly than this
@@ -32,7 +33,7 @@ class ImpulseTask:
         self.frames = frames
         self.weight = _importance(frames)
         self.counts = frames.trajectories.tolist()  # trajectories of each set of frames
-        self.dt = STEP
+        self.dt, self.length = STEP, LENGTH  # the smallest body of a scene gets this size, as with the solve
         self.gravity = float(np.linalg.norm(frames.gravity))
 
     def digest(self) -> str:

@@ -137,7 +137,6 @@ class Run:
         """The averaged weights as a `Model`; `data` describes the datasets in its card."""
         from sdfsim.learned.model import Model
 
-        ranges = self.task.ranges()
         card = {
             "data": data,
             "seed": self.seed,
@@ -154,10 +153,10 @@ class Run:
             network=self.averaged(),
             dt=self.task.dt,
             gravity=self.task.gravity,
-            length=float(np.mean(ranges["size"])),
+            length=self.task.length,
             reach=self.plan.reach,
             nodes=self.plan.nodes,
-            ranges=ranges,
+            ranges=self.task.ranges(),
             card=card,
         )
 

@@ -117,6 +117,11 @@ class SurfaceTask:
         error = network(graph) - network.target(target)
         return error[batch.moves].square().mean()
 
+    @property
+    def length(self) -> float:
+        """The middle of the bodies' sizes: those of a scene have it on average."""
+        return float(np.mean(self.ranges()["size"]))
+
     def ranges(self) -> dict[str, list[float]]:
         """The ranges of the trajectories; see `ranges_of`."""
         extent = {name: largest_extent(shape) for name, shape in self.shapes.items()}

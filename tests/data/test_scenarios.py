@@ -68,21 +68,22 @@ def test_movi_c_keeps_to_its_ranges(cast):
 
 def test_varied_scenes_keep_to_their_ranges_and_few_start_in_each_other(cast):
     resting = obstacles = pressed = balls = 0
-    coefficients = []
+    coefficients, ratios = [], []
     for seed in range(60):
         placed, start, inside = spawned("varied", seed, cast)
         moving = [body for _, body in placed if body.mass > 0]
         masses = [body.mass for body in moving]
         assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9) and 1 <= len(moving) <= 10
         coefficients += [(b.friction, b.restitution) for _, b in placed]
-        assert all(0.7 <= b.scale <= 1.4 for b in moving)
+        assert all(0.7 <= b.scale <= 1.4 * 8.0 for b in moving)
+        ratios.append(max(b.scale for b in moving) / min(b.scale for b in moving))
         balls += any(source.name == "ball" for source, _ in placed)
         pressed += any(inside)
         assert {s.name for s, b in placed if b.mass == 0} <= set(OBSTACLES)
         resting += bool((np.abs(start["velocity"]) <= NUDGE).all())
         obstacles += len(placed) - len(moving)
-    assert 12 <= resting <= 40 and 5 <= obstacles <= 24 and 8 <= balls <= 24
-    assert 1 <= pressed <= 12
+    assert 12 <= resting <= 40 and 8 <= obstacles <= 35 and 8 <= balls <= 24
+    assert 1 <= pressed <= 12 and max(ratios) > 4.0
     low, high = np.min(coefficients, axis=0), np.max(coefficients, axis=0)
     assert (low >= 0).all() and (low < 0.05).all() and (high > 0.95).all() and (high <= 1).all()
 

@@ -90,10 +90,10 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     report = run()
     by_label = {p["label"]: p for p in report["points"]}
     error = {label: p["translation_rmse"]["50"] for label, p in by_label.items() if "failed" not in p}
-    assert set(error) == {"solver", "small, nodes thin 20", "ballistic", "PyBullet 4 ms", study.FLOOR_LABEL}
+    assert set(error) == {"solver", "gnn, nodes thin 20", "ballistic", "PyBullet 4 ms", study.FLOOR_LABEL}
     assert error["PyBullet 4 ms"] < 1e-6, "the teacher repeats itself"
     assert error["solver"] < 0.5 * error["ballistic"] and by_label["solver"]["ms"] > by_label["PyBullet 4 ms"]["ms"] / 9
-    assert set(report["front"]) <= {"solver", "small, nodes thin 20"} and report["front"]
+    assert set(report["front"]) <= {"solver", "gnn, nodes thin 20"} and report["front"]
     assert torch.get_num_threads() == before
     rows = list(csv.DictReader((tmp_path / "tradeoff.csv").read_text().splitlines()))
     assert len(rows) == 6 and float(rows[0]["translation_rmse_50"]) == pytest.approx(error["solver"], rel=1e-4)

@@ -71,30 +71,6 @@ def test_products_reach_from_the_smallest_to_the_largest_of_all_pairs(box_shape,
     assert len(found) == len(everything) == 0 or (min(found), max(found)) == (min(everything), max(everything))
 
 
-def test_starts_inside_one_another_are_flagged_from_a_sixth_of_the_size_on(dropped):
-    floor, low, _, high = dropped.bodies  # of 1 x 0.8 x 0.6 m, above one another
-    flat = replace(low, quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]), velocity=np.zeros(3))
-
-    def lines(height: float, apart: float, factor: float = 1.0) -> list[str]:
-        bodies = (
-            replace(flat, position=np.array([0.0, 0.0, height])),
-            replace(high, position=np.array([apart, 0.0, 9.0])),
-        )
-        other = replace(high, name="other", position=np.array([0.0, 0.0, 9.0]))
-        scaled = [replace(b, scale=factor * b.scale, position=factor * b.position) for b in (*bodies, other)]
-        return flags(replace(dropped, bodies=(floor, *scaled)))
-
-    assert lines(0.3, 1.0) == lines(0.15, 0.86) == lines(0.15, 0.86, 0.1) == []
-    (line,) = lines(0.1, 0.8, 0.1)
-    assert line.startswith("pairs that overlap at the start: 2 here") and "20%" in line and "0.02 m" in line
-    (line,) = lines(-5.0, 1.0)
-    assert "1 here, 'low' in 'floor' by 5.3 m, 530% of a body's size; trained on up to 16%" in line
-    apart = replace(
-        dropped, bodies=(replace(floor, collides_with=()), replace(flat, position=np.array([0.0, 0.0, -5.0])))
-    )
-    assert flags(apart) == []
-
-
 @pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf])
 def test_steps_that_are_none_are_refused(dropped, dt):
     with pytest.raises(SdfsimError, match=r"^dt: .*> 0 s"):

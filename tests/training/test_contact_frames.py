@@ -80,13 +80,6 @@ def test_every_body_is_disturbed_by_a_part_of_the_noise_from_the_least_to_all():
     assert 0.5 < np.median(np.abs(0.5 * turned)) / np.median(np.abs(shift[:-1])) < 1.5
 
 
-def test_a_folder_with_nothing_but_its_frames_can_be_trained_on(tmp_path):
-    made = contact_frames(dataset(tmp_path / "all", bouncing(0)), "train", ONCE)
-    (tmp_path / "bare").mkdir()
-    (tmp_path / "all" / "frames").rename(tmp_path / "bare" / "frames")
-    assert contact_frames(tmp_path / "bare", "train", ONCE).digest() == made.digest()
-
-
 def test_errors_at_a_frame_are_those_of_that_frame_alone():
     from sdfsim.evaluation.metrics import errors
 
