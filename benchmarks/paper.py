@@ -6,7 +6,7 @@
         the same with 2 to 512 spheres in a bowl, and where memory ends
     python -m benchmarks paper accuracy DATA -o DIR [--minutes 5 15 30 60]
         trains all of them on one core for equal times, SDF-Sim also on unsigned distances, then rolls them out
-    python -m benchmarks paper train DATA -o DIR [--minutes 60] [--device auto] [--workers 0]
+    python -m benchmarks paper train DATA -o DIR [--minutes 60] [--device auto]
         continues the training of SDF-Sim as published for so many minutes, then shows its curve so far
 
 DATA is a MOVi-B dataset with train, validation and test. Graphs have the published number of surface nodes, about 440
@@ -219,14 +219,14 @@ def _case(name: str, minutes: float) -> str:
 PUBLISHED = 0.160  # m, SDF-Sim's error on MOVi-B at `FRAME`, after a million steps
 
 
-def train(data: Path, *, out: Path, minutes: float = 60.0, device: str = "auto", workers: int = 0) -> None:
+def train(data: Path, *, out: Path, minutes: float = 60.0, device: str = "auto") -> None:
     """Continue the published training of SDF-Sim for `minutes` of processor time, and write its curve to train.md."""
     file, run = out / "curve.json", out / "run"
     curve = read_json(file) if file.exists() else []
     budget = 60.0 * minutes + (curve[-1]["seconds"] if curve else 0.0)
     resume = (run / "checkpoint.npz").exists()
     report = run_training(
-        data, run, preset="sdf-sim", resume=resume, budget=budget, device=device, workers=workers, on_progress=progress
+        data, run, preset="sdf-sim", resume=resume, budget=budget, device=device, on_progress=progress
     )
     curve.append(report | judged(run / "model.safetensors", data, "validation", "exact"))
     write_json(file, curve)

@@ -324,10 +324,6 @@ def train(
         typer.Option(help="Kind and size of the model."),
     ] = "gnn",
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in the folder.")] = False,
-    workers: Annotated[
-        int,
-        typer.Option(help="Processes that prepare batches in advance, for networks on surface nodes on a GPU.", min=0),
-    ] = 0,
     device: str = "auto",
 ) -> None:
     """Train a model on datasets."""

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Generator
 from copy import deepcopy
 from dataclasses import asdict
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +16,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_arrays
-from sdfsim.training.batches import Drawn, Draws, batches, moved
+from sdfsim.training.batches import moved
 from sdfsim.training.presets import Preset
 
 if TYPE_CHECKING:
@@ -34,18 +32,16 @@ class Run:
     """Everything that changes during training, and how to save it.
 
     The task is an `ImpulseTask` or a `SurfaceTask`. The learning rate depends on `total`, the
-    optimiser's steps of the whole run; `workers` draw batches ahead.
+    optimiser's steps of the whole run.
     """
 
     def __init__(
         self, plan: Preset, task: Any, total: int, seed: int, device: torch.device,
-        workers: int = 0,
     ) -> None:  # fmt: skip
         from sdfsim.learned.model import new_network
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device = plan, task, total, seed, device
-        self.workers = workers
         self.origin = {"plan": json.loads(json.dumps(asdict(plan))), "seed": seed, "data": task.digest()}
         self.network: nn.Module = new_network(plan.kind, plan.config)
         self.network = self.network.to(device)
@@ -59,11 +55,10 @@ class Run:
 
     def advance(self) -> None:
         """One optimiser step on the step's batch."""
-        drawn = next(self.drawn)
-        if self.workers:
-            self.seconds += drawn.seconds
-        batch = moved(drawn.batch, self.device)
-        loss = self.task.loss(self.network, batch, mirrored=drawn.mirrored)
+        rng = np.random.default_rng([self.seed, 0, self.step])  # the batch depends only on the seed and the step
+        mirrored = bool(rng.integers(2))
+        batch = moved(self.task.draw(rng, self.plan.batch), self.device)
+        loss = self.task.loss(self.network, batch, mirrored=mirrored)
         self.optimiser.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
@@ -80,15 +75,6 @@ class Run:
         decay = min(EMA_DECAY, (1.0 + self.step) / (10.0 + self.step))
         follow = get_ema_multi_avg_fn(decay)
         follow([self.average[name] for name in self.weights], list(self.weights.values()), self.step)
-
-    @cached_property
-    def drawn(self) -> Generator[Drawn, None, None]:
-        return batches(Draws(self.task, self.plan.batch, self.seed), self.step, self.workers)
-
-    def close(self) -> None:
-        """End the workers; a further step would start new ones."""
-        if drawn := self.__dict__.pop("drawn", None):
-            drawn.close()
 
     def share(self) -> float:
         """Factor on the peak learning rates: a warm-up over 2 % of all steps, at most 1000, then a cosine down to a
@@ -127,7 +113,6 @@ class Run:
             self.optimiser.load(states["optimiser"])
             self.step, self.seconds, self.loss = info["step"], info["seconds"], info["loss"]
             self.skipped = info["skipped"]
-            self.close()
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise SdfsimError(
                 f"{path}: not a checkpoint of this training: {error}", "delete it to start again"

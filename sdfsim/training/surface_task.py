@@ -39,7 +39,6 @@ class SurfaceTask:
     poses; on the CPU, since contacts are found there."""
 
     def __init__(self, data: Path, split: str, plan: Preset, *, noisy: bool = False) -> None:
-        self.made_of = (data, split, plan, noisy)
         files = trajectory_files(data, split)
         self.trajectories, self.floor = [Trajectory.load(f) for f in files], conditions_of(files[0].parent).floor
         check_alike(f"{data / split}", self.trajectories)
@@ -53,14 +52,6 @@ class SurfaceTask:
         self.dt = self.trajectories[0].dt
         self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
         self.shared = SharedShapes()
-
-    def __getstate__(self) -> tuple:
-        """A process that draws batches makes its own task."""
-        return self.made_of
-
-    def __setstate__(self, made_of: tuple) -> None:
-        data, split, plan, noisy = made_of
-        self.__init__(data, split, plan, noisy=noisy)
 
     def digest(self) -> str:
         return digest(self.floor, self.trajectories, {name: shape.nodes for name, shape in self.shapes.items()})[:16]

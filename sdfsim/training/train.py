@@ -32,7 +32,6 @@ def train(
     seed: int = 0,
     device: str = "cpu",
     budget: float = math.inf,
-    workers: int = 0,
     on_progress: Progress = silent,
 ) -> dict:
     """Train a preset on one or several datasets; write `model.safetensors`, `log.jsonl` and a checkpoint in `out`.
@@ -40,8 +39,7 @@ def train(
     Datasets have train/ and validation/; several (impulse only) are used as if they were one. The preset is a name in
     `PRESETS`, or your own, with other `steps` if given. `resume` continues from the checkpoint in `out`, with the
     result of an uninterrupted run. `budget` is processor time in s, all cores together, after which training stops
-    early. `workers` is a number of processes that draw batches in advance, with the same result: otherwise a GPU waits
-    for the contacts of networks on surface nodes, which are found on the CPU. Returns paths, losses and processor time.
+    early. Returns paths, losses and processor time.
     Raises SdfsimError if data are unusable, if `out` has a checkpoint and `resume` is not set, if another run is
     writing to `out`, or if training diverges.
     """
@@ -52,8 +50,6 @@ def train(
     total = plan.steps if steps is None else steps
     if total < 1:
         raise SdfsimError(f"steps: must be at least 1 (got {total})")
-    if workers < 0:
-        raise SdfsimError(f"workers: must be at least 0 (got {workers})")
     checkpoint = out / "checkpoint.npz"
     if checkpoint.exists() and not resume:
         raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
@@ -62,7 +58,7 @@ def train(
     with locked(out):
         task, held_out = _tasks(plan, folders, lambda _, message: on_progress(0.0, message))
         made = [_made(*one) for one in zip(folders, infos, task.counts, held_out.counts, strict=True)]
-        run = Run(plan, task, total, seed, place, workers)
+        run = Run(plan, task, total, seed, place)
         if checkpoint.exists():
             run.load(checkpoint)
         _shorten(out / "log.jsonl", run.step)
@@ -123,7 +119,6 @@ def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progre
                 run.save(out / "checkpoint.npz")
                 saved = time.monotonic()
     finally:
-        run.close()
         # Also after Ctrl-C, so that the training so far is kept.
         run.save(out / "checkpoint.npz")
 
