@@ -253,7 +253,7 @@ class OnBodies(Stepper):
         with carry.timed("contact_ms"):
             pair, value = points_near(cast("Compiled", carry.scene), state, options)
         touch = (value[:, 9] <= TOUCHING) & (value[:, 10] == 0.0)
-        point = state.position[pair[touch, 0]] + value[touch, :3]
+        point = state.rows_of("position", pair[touch, 0]) + value[touch, :3]
         carry.touched = point, pair[touch], float((-value[touch, 9]).max(initial=0.0))
         if not len(pair):
             return free
@@ -263,7 +263,7 @@ class OnBodies(Stepper):
             after = stepped(carry.weights, bodies, state, free, (pair, value), options, self.model.dt)
         rows = np.unique(pair)
         carry.counts |= {"active": int(bodies.moves[rows].sum()), "contacts": int(touch.sum())}
-        carry.counts |= {"nodes": len(rows), "edges": len(pair)}
+        carry.counts |= {"nodes": len(rows), "edges": len(pair), "pairs": len(np.unique(pair, axis=0))}
         return after
 
 

@@ -94,6 +94,7 @@ class Compiled:
         self.held = held_by(self.bodies)
         # Threads are used for all kinds of pairs alike.
         self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
+        self.seen: compiled.Motion | None = None  # motion in which `points_near` searches
         self._announced = False  # whether the step is known to be compiled
         self._load: np.ndarray | None = None
         self._options: Options | None = None  # the options from which `_rules` were made
@@ -283,12 +284,18 @@ def points_near(scene: Compiled, state: State, options: Options) -> tuple[np.nda
         normal from the second to the first (all along world axes), the distance, and the part of the step that has
         passed by then.
     """
+    state = state if state.touch is None else replace(state, touch=None)
+    if scene.seen is None:
+        scene.seen = taken_up(state)[0]
+    going, motion = scene.world.going, scene.seen
     known, pairs, values = np.zeros(0, np.int64), [], []
     for k in range(INSTANTS):
         part = k / INSTANTS
-        at = fly(scene.bodies, replace(state, touch=None), options._replace(dt=part * options.dt)) if k else state
+        at = fly(scene.bodies, state, options._replace(dt=part * options.dt)) if k else state
+        arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
+        for name, array in zip(MOTION, arrays, strict=True):  # static bodies stay as they are
+            array[going] = at.rows_of(name, going)
         rules = compiled_rules(options)._replace(ahead=(1.0 - part) * options.dt)
-        motion = taken_up(replace(at, touch=None))[0]
         soon = options.dt / INSTANTS
         arguments = (scene.shapes, scene.world, scene.work, motion, rules, _manifolds(None), scene.surfaces, soon)
         if not k:
