@@ -16,7 +16,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -109,11 +108,11 @@ def bowl(count: int, folder: Path) -> tuple[float, float]:
 
 
 @one_thread()
-def user_steps(model: str) -> tuple[float, float]:
+def user_steps() -> tuple[float, float]:
     """Milliseconds a step of `Simulator`, including its Python code, with few and with many static bodies."""
     taken = []
     for count in FAR:
-        simulator = Simulator(with_far(count), model)
+        simulator = Simulator(with_far(count))
         simulator.options = simulator.options._replace(sleep=False)
         simulator.step(2)  # not timed: it prepares shapes
         taken.append(timed(lambda count, of=simulator: deque(of.steps(count), maxlen=0), SLIDE + 1).cpu_ms)
@@ -139,9 +138,7 @@ def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable
     few, many = FAR
     both("static boxes far away", (str(few), with_far(few)), (str(many), with_far(many)), 500)
     found["64 boxes at rest"] = ("awake", "asleep", lambda: asleep(apart(64)))
-    for model in ("solver", "gnn"):
-        few, many = map(str, FAR)
-        found[f"the same with all of `Simulator`, {model}"] = (few, many, partial(user_steps, model))
+    found["the same with all of `Simulator`, solver"] = (*map(str, FAR), user_steps)
     return found
 
 

@@ -8,12 +8,13 @@ import pytest
 
 from sdfsim import SdfsimError, Simulator, load_scene
 from sdfsim.apps import run
+from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.sdf.grid import sample_grid
 from sdfsim.shape.make import analytic_shape
 from tests.helpers.runs import Killed, simulate
-from tests.helpers.scenes import make_body, random_model
+from tests.helpers.scenes import make_body
 
 TOWER = Path(__file__).resolve().parents[2] / "samples" / "tower.yaml"
 
@@ -82,7 +83,7 @@ def described() -> tuple[Scene, dict]:
     still = np.array([[0.0, 0.0, 0.0, 1.0]] * 2)
     path = Waypoints(np.array([0.0, 1.0]), np.array([[0.0, 0.0, -2.0], [0.0, 0.0, -1.0]]), still)
     bodies = (make_body("paddle", 0, [0, 0, -2], motion="kinematic", path=path), make_body("ball", 0, [0, 0, 0]))
-    return Scene((ball,), bodies, np.array([5.0, 0.0, -12.0]), 1.0), {"model": random_model("impulse")}
+    return Scene((ball,), bodies, np.array([5.0, 0.0, -12.0]), 1.0), {"model": load_model()}
 
 
 def waypoint(scene: Scene, options: dict):

@@ -73,7 +73,7 @@ def test_a_rotation_in_single_precision_is_one_in_double_after_a_step():
 
 def test_a_scene_without_contacts_never_calls_the_network(dropped, monkeypatch):
     model = random_model("impulse")
-    monkeypatch.setattr(inference, "corrected", lambda *a, **k: (_ for _ in ()).throw(AssertionError("network called")))
+    monkeypatch.setattr(inference, "stepped", lambda *a, **k: (_ for _ in ()).throw(AssertionError("network called")))
     high = Scene(dropped.shapes, (dropped.bodies[0], dropped.bodies[3]), dropped.gravity, 1.0)
     rollout = Simulator(high, model).run(seconds=1.0)
     assert (rollout.contact_count == 0).all()
