@@ -100,21 +100,15 @@ class ContactFrames:
         return cls(**fields)
 
     def save(self, path: Path) -> None:
-        write_arrays(path, self.arrays() | {"version": np.array(FRAMES_VERSION)}, compressed=False)
+        write_arrays(path, self.arrays(), compressed=False)
 
     @classmethod
     def load(cls, path: Path) -> ContactFrames:
         """Read a cache file. Raises SdfsimError if it does not hold contact frames of this version."""
-        arrays = read_arrays(path, "contact frames", "delete it to have it made again")
         try:
-            if int(arrays.pop("version", 0)) == FRAMES_VERSION:
-                return cls.of_arrays(arrays)
-        except TypeError:
-            pass
-        raise SdfsimError(
-            f"{path}: not contact frames of this version of sdfsim ({FRAMES_VERSION})",
-            "where the trajectories are, delete it and train once: it is made again; then copy it here",
-        )
+            return cls.of_arrays(read_arrays(path, "contact frames", "delete it to have it made again"))
+        except TypeError as error:
+            raise SdfsimError(f"{path}: not contact frames: {error}", "delete it to have it made again") from error
 
     def digest(self) -> str:
         return digest({name: array for name, array in self.arrays().items() if name != "trajectories"})[:16]
