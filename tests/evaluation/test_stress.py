@@ -21,15 +21,15 @@ from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.learned.model import Model, new_network
 from tests.helpers import command
 
-FEW = ("overlap-balls", "thin-5", "cuda")
+FEW = ("overlap-balls", "thin-5")
 
 
 def save_model(path: Path, *, seed: int = 0, wild: bool = False) -> Path:
-    """An untrained model; a wild one pushes beyond all bounds and knows no ranges, so that nothing holds it back."""
+    """An untrained model; the answers of a wild one are no numbers."""
     torch.manual_seed(seed)
-    network = new_network("impulse", {"width": 8, "rounds": 1, "alone": int(wild)})
+    network = new_network("impulse", {"width": 8, "rounds": 1})
     for weights in network.parameters():
-        weights.data *= 1e12 if wild else 1.0
+        weights.data *= torch.nan if wild else 1.0
     ranges = {} if wild else {"friction": [0.2, 0.6], "restitution": [0.25, 0.25], "speed": [0.0, 4.0]}
     Model(path.stem, "impulse", network, 0.02, 10.0, 1.0, 0.1, ranges=ranges).save(path)
     return path
@@ -47,7 +47,7 @@ def all_cases() -> list[hard_cases.Case]:
 
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
-    """Three short cases, in this process, noted as they run."""
+    """Two short cases, in this process, noted as they run."""
     found = [replace(c, seconds=0.1, repeats=2) for c in all_cases() if c.name in FEW]
     ran: list[tuple[str, str]] = []
 
@@ -67,19 +67,19 @@ def run(out: Path, *models: str, **options):
 
 def test_what_is_finished_is_kept_and_what_changed_is_run_again(tmp_path, model, few):
     first = run(tmp_path / "out", model)
-    assert sorted(few) == [(case, who) for case in FEW[:2] for who in ("teacher", "untrained")]
+    assert sorted(few) == [(case, who) for case in FEW for who in ("teacher", "untrained")]
     few.clear()
     again = run(tmp_path / "out", model)
     assert few == [] and again.results == first.results
     save_model(Path(model), seed=1)
     run(tmp_path / "out", model)
-    assert sorted(few) == [(case, "untrained") for case in FEW[:2]], "the teacher is as it was"
+    assert sorted(few) == [(case, "untrained") for case in FEW], "the teacher is as it was"
 
 
-def test_the_solver_takes_part_in_all_but_other_arithmetic(tmp_path, model):
+def test_the_solver_takes_part(tmp_path, model):
     found = run(tmp_path / "out", "solver", model)
     assert found.who == ["solver", "untrained", "teacher"]
-    assert {case for case, who in found.results if who == "solver"} == set(FEW[:2])
+    assert {case for case, who in found.results if who == "solver"} == set(FEW)
     assert losses(found)["solver"] == {"figures": 3, "missed": 0, "behind the teacher": 0, "cases that blew up": 0}
 
 
@@ -89,7 +89,6 @@ def test_the_table_has_a_row_for_every_figure_and_says_what_was_not_run(tmp_path
     assert head == ("case", "figure", "wanted", "untrained", "teacher")
     assert [row[1] for row in shown] == [figure.name for case in found.cases for figure in case.figures]
     cells = {(row[0], row[1]): row[3:] for row in shown}
-    assert cells["on CUDA", "diverges after"][1] == "-", "the teacher has no part in it"
     assert "†" in cells["5 m/s", "through"][0], "faster than the model was trained on"
     report = write_report(found, tmp_path / "out")
     assert report["failed_checks"] == [] and report["models"]["untrained"]["cases that blew up"] == 0
