@@ -108,6 +108,7 @@ say "installing Python packages (a few minutes the first time)"
 rm -f .venv/.set-up
 .venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" \
     --config-settings editable_mode=compat --editable ".${extras:+[$extras]}"  # a path, so that type checkers find it too
-.venv/bin/python -c 'import sdfsim; sdfsim.Simulator(sdfsim.load_scene("samples/tower.yaml"), "small").step(2)'
+# Compiles the contact step and the search for contacts.
+.venv/bin/python -c 'import sdfsim; [sdfsim.Simulator("samples/tower.yaml", name).step(2) for name in ("solver", "gnn")]'
 printf '%s\n%s\n' "$made_from" "${extras//,/ }" >.venv/.set-up
 say "done: $(.venv/bin/python --version), $PWD/.venv"
