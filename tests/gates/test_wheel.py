@@ -56,7 +56,7 @@ def test_what_the_wheel_is_and_needs(wheel):
     folders = {name.partition("/")[0] for name in names}
     assert folders == {"cli.py", "pipeline", "sdfsim", f"sdfsim-{__version__}.dist-info"}
     code = {str(f.relative_to(ROOT).as_posix()) for room in ("sdfsim", "pipeline") for f in (ROOT / room).rglob("*.py")}
-    assert code <= names and {"sdfsim/py.typed", "sdfsim/models/small.safetensors"} <= names
+    assert code <= names and {"sdfsim/py.typed", "sdfsim/models/gnn.safetensors"} <= names
     samples = [f for f in (ROOT / "samples").rglob("*") if f.is_file() and "__pycache__" not in f.parts]
     missing = {path for f in samples if f"sdfsim/{(path := f.relative_to(ROOT).as_posix())}" not in names}
     assert missing == {"samples/photos/make.py", "samples/photos/phone.py"}  # these draw the photos for tests
