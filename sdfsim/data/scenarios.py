@@ -60,7 +60,7 @@ STACKED = 0.5  # share of bodies that are put on top of the one before
 STEADY = 0.03  # least distance of the centre of mass from the rim of the face below it, relative to the extent
 
 # Starts in one kind of motion.
-SPEEDS = (0.5, 4.0)  # m/s
+SPEEDS = (0.5, 16.0)  # m/s, log-uniform
 SPINS = (1.0, 10.0)  # rad/s, about the vertical
 HEIGHTS = (0.1, 2.0)  # m, under a body that falls
 MEETING = (0.1, 1.0)  # s, until the bodies of a pair touch
@@ -248,7 +248,7 @@ def _velocities(rng: np.random.Generator, motion: str, extent: float) -> tuple[n
     if motion == "spinning":
         return STILL, rng.choice((-1.0, 1.0)) * rng.uniform(*SPINS) * UP
     turn = 0.5 * np.pi * rng.integers(4) if rng.random() < HALF else rng.uniform(0.0, 2 * np.pi)
-    velocity = rng.uniform(*SPEEDS) * np.array([np.cos(turn), np.sin(turn), 0.0])
+    velocity = _speeds(rng) * np.array([np.cos(turn), np.sin(turn), 0.0])
     if motion == "sliding":
         return velocity, STILL
     spin = np.cross(UP, velocity) / (0.5 * extent)
@@ -257,10 +257,14 @@ def _velocities(rng: np.random.Generator, motion: str, extent: float) -> tuple[n
     return velocity, spin
 
 
+def _speeds(rng: np.random.Generator, count: int = 1) -> np.ndarray:
+    return np.exp(rng.uniform(*np.log(SPEEDS), count))
+
+
 def _meet(teacher: Teacher, rng: np.random.Generator, pair: Bodies, height: float) -> None:
     """Put two bodies at `height` m that fly towards each other along a horizontal line."""
     line = _direction(rng)
-    speeds, rotations = rng.uniform(*SPEEDS, 2), Rotation.random(2, rng=rng)
+    speeds, rotations = _speeds(rng, 2), Rotation.random(2, rng=rng)
     reach = [body.scale * np.linalg.norm(source.vertices, axis=1).max() for source, body in pair]
     middle = np.array([*rng.uniform(-FIELD, FIELD, 2), height])
     time = rng.uniform(*MEETING)
