@@ -19,7 +19,7 @@ class Preset:
 
 
 PRESETS = {
-    "gnn": Preset("impulse", {"width": 32, "rounds": 4}, steps=40_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    "gnn": Preset("impulse", {"width": 32, "rounds": 4}, steps=30_000, batch=32, rate=2e-3, matrix_rate=0.01),
     # SDF-Sim as published
     "sdf-sim": Preset("sdf-sim", {"width": 128, "steps": 10}, 1_000_000, batch=8, rate=1e-3, nodes=64, noise=0.003),
     # SDF-Sim's graph with a network that is small enough for a CPU
