@@ -31,11 +31,11 @@ from sdfsim.physics.joint_columns import DAMPING, DRAG
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver.world import FIRST
+from sdfsim.physics.steps import Frames
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import read_scene
 from sdfsim.scene.scene import Joint, Scene
 from sdfsim.simulate.batch import Copies, inner_of_frame
-from sdfsim.simulate.steppers import Frames
 
 # Model units of time, about seconds for bodies of a metre: length and spacing of short windows, and length of long
 # ones.
@@ -535,8 +535,7 @@ class _Part:
         compiled = cast("Any", self.carry.scene)
         compiled.bodies, start = self.problem.applied(values, self.bodies, self.start, len(self.begin))
         compiled.place(start)
-        _, carry = self.solver.advance(start, self.carry, self.length, keep=True)
-        return cast("Frames", carry.frames)
+        return cast("Frames", self.solver.advance(start, self.carry, self.length, keep=True).frames)
 
     def errors(self, values: np.ndarray) -> np.ndarray:
         frames = self.frames(values)
@@ -560,7 +559,7 @@ class _Part:
         for t in range(self.length):
             before, now = state.velocity, set()
             for _ in range(inner):
-                state, _ = self.solver.advance(state, carry)
+                state = self.solver.advance(state, carry).state
                 touch = cast("Any", state.touch)
                 for (a, b), count, points in zip(touch.pair.tolist(), touch.count.tolist(), touch.point, strict=True):
                     if count and there[t:, a // many].any():

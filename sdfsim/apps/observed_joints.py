@@ -9,10 +9,10 @@ import numpy as np
 from sdfsim.apps.export_joints import Held, trees
 from sdfsim.physics import pose
 from sdfsim.physics.options import Options
+from sdfsim.physics.steps import Frames as Moved
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.batch import Copies, inner_of_frame
-from sdfsim.simulate.steppers import Frames as Moved
 
 ROUNDS = 5  # Gauss-Newton rounds for the flight of a tree
 BEGIN = 8  # frames of a flight from which its fit starts
@@ -221,8 +221,7 @@ def _flown(begun: tuple[np.ndarray, ...], dt: float, frames: int, scene: Scene) 
     u, solver, step = copies.units, copies.solver, dt / copies.units.time
     state = copies.begun(*(array.reshape(count * many, -1) for array in begun))
     options = Options(np.zeros(3), step, inner_of_frame(step))
-    _, carry = solver.advance(state, solver.init(copies.bodies, state, options), frames, keep=True)
-    moved = cast("Moved", carry.frames)
+    moved = cast("Moved", solver.advance(state, solver.init(copies.bodies, state, options), frames, keep=True).frames)
     kept = (moved.position * u.length, moved.orientation, moved.velocity * u.velocity, moved.angular_velocity / u.time)
     paths = []
     for first, later in zip(begun, kept, strict=True):

@@ -19,11 +19,11 @@ from sdfsim.geometry.primitives import plane
 from sdfsim.physics import pose
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.steps import PHASES
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.scene import Joint, Scene
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.shape import Shape
-from sdfsim.simulate.steppers import PHASES
 
 if TYPE_CHECKING:  # these are slow to load
     import rerun as rr

@@ -34,12 +34,12 @@ from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics.bodies import State, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.steps import COUNTS, PHASES
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene, fingerprints
 from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
-from sdfsim.simulate.steppers import COUNTS, PHASES
 
 Viewer = Literal["none", "file", "native", "web"]
 EVERY = 30.0  # s between two checkpoints

@@ -44,7 +44,9 @@ def _shown(value: Any) -> str:
     if isinstance(value, str):
         text = str(value) if isinstance(value, Numeral) else repr(value)
         return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
-    return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
+    if isinstance(value, int | float):
+        return repr(value)
+    return "nothing" if value in (NOTHING, None) else "a list" if isinstance(value, list) else "a mapping"
 
 
 _LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names", "joints": "be a list"}
@@ -117,7 +119,7 @@ def _message(error: Any, table: "type[Table]") -> str:
 
 
 def _numeral(value: Any) -> Any:
-    if not isinstance(value, Numeral):
+    if not isinstance(value, Numeral) and not (type(value) in (int, float) and math.isfinite(value)):
         raise PydanticCustomError("number", "not a number")
     return value
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from sdfsim.base.compiling import running, say_compiling
-from sdfsim.base.devices import check_device, pick_device
+from sdfsim.base.devices import check_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import Progress, parallel, silent, threads
 from sdfsim.base.version import __version__
@@ -21,6 +21,7 @@ from sdfsim.physics.joint_columns import TARGET
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
+from sdfsim.physics.steps import Frames, Steps
 from sdfsim.physics.units import inner_steps
 from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
 from sdfsim.scene.builder import loaded
@@ -28,17 +29,7 @@ from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
 from sdfsim.simulate.joint import JointHandle
-from sdfsim.simulate.steppers import (
-    COUNTS,
-    PHASES,
-    Carry,
-    Frames,
-    FreeFlight,
-    energies_of,
-    joint_frame,
-    stacked,
-    stepper_of,
-)
+from sdfsim.simulate.steppers import Carry, FreeFlight, energies_of, stacked, stepper_of
 
 if TYPE_CHECKING:
     from sdfsim.physics.solver.prepare import SharedShapes
@@ -129,11 +120,10 @@ class Simulator(LiveScene):
         asked = effects.contact.on or free_flight == "learned"
         model = model if isinstance(model, Model) else load_model(model, weights=asked)
         self._asked = {"dt": dt, "free_flight": free_flight}
-        stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight)
+        stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight, device=device)
         if not stepper.forces:
             _check_inputs(scene, model.name, joints=jointed)
-        self.device = str(pick_device(device)) if stepper.on_surfaces else "cpu"
-        self.model = model.to(self.device)
+        self.stepper, self.model, self.device = stepper, stepper.model, stepper.device
         self.seed = scene.seed if seed is None else seed
         self.units = stepper.units(scene, dt)
         self.dt = self.model.dt * self.units.time
@@ -148,7 +138,6 @@ class Simulator(LiveScene):
         self._joint_names = tuple(joint.name for joint in scene.joints)
         self._joint_unit = [1.0 if joint.kind in ("hinge", "ball") else self.units.length for joint in scene.joints]
         check_sizes(self.bodies, self._names, self.units.length)
-        self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
         self._shared: SharedShapes | None = None  # shared with simulators of other scenes
@@ -162,7 +151,7 @@ class Simulator(LiveScene):
             substeps=inner_steps(scene),
             sleep=effects.sleep.on and stepper.sleeps,
         )
-        super().__init__(self.stepper.began(state, self.bodies, self._options))
+        super().__init__(stepper.began(state, self.bodies, self._options))
         dynamic = self.bodies.moves
         weight = self.bodies.mass[dynamic] * np.linalg.norm(gravity)
         lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
@@ -209,9 +198,9 @@ class Simulator(LiveScene):
         while made < count:
             some = min(some, count - made)
             started = running()
-            self._advance(some, keep=True)
+            kept = self._advance(some, keep=True).frames
             spent = running() - started
-            yield self._rollout(cast("Frames", self.carry.frames), 1e3 * spent / some)
+            yield self._rollout(cast("Frames", kept), 1e3 * spent / some)
             made += some
             if at_once is None:
                 some = max(1, min(2 * some, int(some * GLANCE / max(spent, 1e-6))))
@@ -336,19 +325,9 @@ class Simulator(LiveScene):
     def initial_rollout(self) -> Rollout:
         """The current state as a rollout of one frame. Raises as `steps` does."""
         self._accept()
-        state, (points, pairs, depth) = self._state, self.stepper.touching(self._state, self._carry)
-        counts = dict.fromkeys((*COUNTS, *PHASES), 0.0) if self._carry is None else self._carry.counts
-        frames = Frames(
-            **{name: getattr(state, name)[None] for name in MOTION},
-            energy=np.array([[*energies_of(self.bodies, state, self._options.gravity), 0.0]]),
-            depth=np.array([depth]),
-            touching=np.array([len(pairs)]),
-            pair=pairs,
-            point=points,
-            counts={name: np.array([value], float) for name, value in counts.items()},
-            joint=joint_frame(state)[None],
-        )
-        return self._rollout(frames, 0.0)
+        state, counts = self._state, {} if self._carry is None else self._carry.counts
+        one = state, 0.0, counts, self.stepper.touching(state, self._carry)
+        return self._rollout(stacked(state, [one], self.bodies, self._options), 0.0)
 
     def si_state(self) -> Moment:
         """Motion and time of the current state, in metres and seconds. To return to it later, keep `state` instead."""
@@ -366,16 +345,17 @@ class Simulator(LiveScene):
         moved = {name: changed[name] * unit for name, unit in u.motion.items() if name in changed}
         return self._si[1].with_rows(rows, moved, time=state.time * u.time)
 
-    def _advance(self, count: int, *, keep: bool = False) -> None:
+    def _advance(self, count: int, *, keep: bool = False) -> Steps:
         """Make `count` steps, in one call if the stepper can."""
         self._accept(keep=keep)
-        after, carry = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep)
-        self._state = self._good = after
-        self.steps_done += carry.done
+        made = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep)
+        self._state = self._good = made.state
+        self.steps_done += made.done
         if not keep:
-            self._given += carry.given
-        if carry.fault is not None:
-            raise self._broke(self._described(carry.fault), carry.frames if keep else None)
+            self._given += made.given
+        if made.fault is not None:
+            raise self._broke(self._described(made.fault), made.frames)
+        return made
 
     def _accept(self, *, keep: bool = False) -> None:
         """Check the user's changes before anything is computed from them, and announce them to the stepper. Raises

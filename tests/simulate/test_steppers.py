@@ -9,11 +9,11 @@ import pytest
 from sdfsim import SdfsimError
 from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout, join
+from sdfsim.physics.steps import COUNTS, PHASES
 from sdfsim.physics.validity import FARTHEST, FASTEST
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import SimulationError, Simulator
-from sdfsim.simulate.steppers import COUNTS, PHASES
 from tests.helpers.scenes import make_body, random_model, surface_model
 
 MODELS = {"solver": load_model, "impulse": lambda: random_model("impulse", push=0.1), "sdf-sim": surface_model}
@@ -41,11 +41,11 @@ def resting() -> Simulator:
 @pytest.mark.parametrize("kind", MODELS)
 def test_steps_in_one_call_are_the_steps_one_by_one(dropped, kind, contact):
     sim = Simulator(replace(dropped, effects=Effects(contact=contact)), MODELS[kind]())
-    at_once, carry = sim.stepper.advance(sim.state, sim.stepper.init(sim.bodies, sim.state, sim.options), 6)
+    made = sim.stepper.advance(sim.state, sim.stepper.init(sim.bodies, sim.state, sim.options), 6)
     sim.step(6)
     for name in NAMES:
-        np.testing.assert_array_equal(getattr(at_once, name), getattr(sim.state, name), err_msg=name)
-    assert carry.counts["active"] == sim.carry.counts["active"]
+        np.testing.assert_array_equal(getattr(made.state, name), getattr(sim.state, name), err_msg=name)
+    assert made.counts["active"] == sim.carry.counts["active"]
 
 
 def busy() -> Scene:
