@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import yaml
 
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import path_from, replacing, write_text
+from sdfsim.base.files import replacing
 from sdfsim.base.lazy import NotInstalled, pyplot
 from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.physics import pose
@@ -33,8 +32,8 @@ from sdfsim.physics.options import Options
 from sdfsim.physics.solver.world import FIRST
 from sdfsim.physics.steps import Frames
 from sdfsim.physics.units import scene_units
-from sdfsim.scene.load import read_scene
-from sdfsim.scene.scene import Joint, Scene
+from sdfsim.scene.builder import SceneBuilder
+from sdfsim.scene.scene import Body, Joint, Scene
 from sdfsim.simulate.batch import Copies, inner_of_frame
 
 # Model units of time, about seconds for bodies of a metre: length and spacing of short windows, and length of long
@@ -109,24 +108,29 @@ class Ground:
 
 @dataclass(frozen=True)
 class Estimate:
-    kind: str
+    kind: str  # key of `HEADS`
     name: str
     unit: str
     value: float | None  # None if the recordings do not show it
     interval: tuple[float, float] | None
+
+    def lines(self) -> tuple[str, str]:
+        """What it is, and its value with the interval."""
+        shown, digits = "not shown by these recordings", 5 if self.kind == "height" or self.kind in OF_JOINTS else 3
+        if self.interval:
+            low, high = (f"{end:.{digits}f}" for end in self.interval)
+            shown = f"{self.value:.{digits}f}{self.unit} ({low} to {high})"
+        return f"{HEADS[self.kind]}: {self.name}", shown
 
 
 @dataclass(frozen=True)
 class Profile:
     """The loss as a function of one parameter; the others are fitted again for each value."""
 
-    kind: str  # key of `HEADS`
-    name: str
-    unit: str
-    value: float  # the value found, in this unit
-    interval: tuple[float, float] | None  # None if the recordings do not show it
+    estimate: Estimate
+    best: float  # the value with the lowest loss, in the estimate's unit
     x: list[float]
-    loss: list[float]  # loss relative to that of `value`
+    loss: list[float]  # loss relative to that of `best`
 
 
 @dataclass(frozen=True)
@@ -165,14 +169,7 @@ OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/
 
 
 def report_lines(found: Identified) -> list[str]:
-    lines = []
-    for e in found.estimates:
-        digits = 5 if e.kind == "height" or e.kind in OF_JOINTS else 3
-        seen = "not shown by these recordings"
-        if e.interval:
-            low, high = e.interval
-            seen = f"{e.value:.{digits}f}{e.unit} ({low:.{digits}f} to {high:.{digits}f})"
-        lines.append(f"{HEADS[e.kind]}: {e.name}: {seen}")
+    lines = [": ".join(e.lines()) for e in found.estimates]
     lines.append(f"{found.windows} windows, repeated with an error of {found.error_m:.2g} m")
     h = found.held_out
     who = f"{h['recordings']} whole motions that the fit has not seen" if h["recordings"] else "the same motions, whole"
@@ -285,7 +282,7 @@ class Problem:
         self.hit = {k for _, *pair, _, impact in touched for k in pair if impact}
         groups: dict[str, list[int]] = {}
         for k, body in enumerate(self.bodies):
-            groups.setdefault(re.sub(r"\[\d+\]$", "", body.name), []).append(k)
+            groups.setdefault(_entry(body), []).append(k)
         seen = {name: rows for name, rows in groups.items() if any(k in pair for k in rows for pair in self.pairs)}
         static = {name: rows for name, rows in seen.items() if rows[0] >= many}
         count = {name: sum(b in rows for _, _, b, *_ in touched) for name, rows in static.items()}
@@ -663,8 +660,7 @@ def identify(
     return Identified(
         found, len(short.begin),
         error * math.sqrt(3.0) * problem.units.length, confirmed, [*_notes(recordings), *_late(confirmed["covered"])],
-        _scene_values(problem, best),
-        _joint_values(problem, best), drawn,
+        *_file_values(problem, best), drawn,
     )  # fmt: skip
 
 
@@ -785,10 +781,10 @@ def _profiles(
 
     least = max(loss(best), 1e-12)  # for a recording that is reproduced exactly
     for k, p in enumerate(problem.parameters):
-        kind, unit, value = _own(problem, p, float(best[k]))
-        interval = next(e.interval for e in estimates if (e.kind, e.name) == (kind, p.name))
+        kind, _, value = _own(problem, p, float(best[k]))
+        own = next(e for e in estimates if (e.kind, e.name) == (kind, p.name))
         by = (_own(problem, p, best[k] + 1e-6 * width[k])[2] - value) / 1e-6  # units per width
-        half = 0.5 * (interval[1] - interval[0]) / by if interval else 0.5 / BEYOND
+        half = 0.5 * (own.interval[1] - own.interval[0]) / by if own.interval else 0.5 / BEYOND
         half = max(half, NUDGE[p.kind] / BEYOND)
         others = np.delete(np.arange(len(best)), k)
         along = np.zeros(len(best))
@@ -802,7 +798,7 @@ def _profiles(
             values = np.clip(values, low, high)
             x.append(_own(problem, p, float(values[k]))[2])
             y.append(loss(values) / least if step else 1.0)
-        found.append(Profile(kind, p.name, unit, value, interval, x, y))
+        found.append(Profile(own, value, x, y))
     return found
 
 
@@ -833,54 +829,49 @@ def _notes(recordings: Sequence[Recording]) -> list[str]:
 # --- the scene ---
 
 
-def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Body (for copies, their common name) -> key of the scene file -> value, for all parameters of the fit: parameters
-    that are not determined one by one may be so together."""
+def _entry(body: Body) -> str:
+    """The name of a body's entry in the scene file: for copies, their common name."""
+    return re.sub(r"\[\d+\]$", "", body.name)
+
+
+def _file_values(problem: Problem, values: np.ndarray) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
+    """For bodies and for joints: name of the entry -> key of the scene file -> value, for all parameters of the fit:
+    parameters that are not determined one by one may be so together."""
     found: dict[str, dict[str, Any]] = {}
-    many = len(problem.moving)
-    for p, value in zip(problem.parameters, values, strict=True):
+    joints: dict[str, dict[str, Any]] = {}
+    many, length = len(problem.moving), problem.units.length
+    for p, value in zip(problem.parameters, values.tolist(), strict=True):
         if p.kind in OF_JOINTS:
+            number = value * problem.heft(problem.joints[p.axis], p.kind)
+            joints.setdefault(p.name, {})[p.kind.removeprefix("joint_")] = number
             continue
         b = problem.bodies[p.bodies[0]]
-        name = re.sub(r"\[\d+\]$", "", b.name)
-        entry = found.setdefault(name, {})
+        entry = found.setdefault(_entry(b), {})
         if p.kind in HIGH:
-            entry[p.kind] = float(value)
-        elif p.kind == "mass":
-            entry["mass"] = b.mass * math.exp(value)
-        elif p.kind == "size":
-            entry["scale"] = b.scale * math.exp(value)
-        elif p.kind == "inertia":
-            entry["inertia_factor"] = problem.inertia_factor(p.bodies[0]) * math.exp(value)
+            entry[p.kind] = value
+        elif p.kind in FACTORS:
+            own = {"mass": b.mass, "scale": b.scale, "inertia_factor": problem.inertia_factor(p.bodies[0])}
+            key = {"size": "scale", "inertia": "inertia_factor"}.get(p.kind, p.kind)
+            entry[key] = own[key] * math.exp(value)
         if p.bodies[0] < many:
             entry.setdefault("mass", b.mass)  # with a density another size would mean another mass
     for body, ground in problem.ground.items():
         b, (turn, shift) = problem.bodies[body], problem.lie(values, body)
-        centre, length = ground.centre * problem.units.length, problem.units.length
+        centre = ground.centre * length
         position = centre + pose.rotate(turn, b.position - centre) + shift * length
         found.setdefault(b.name, {}).update(
             position=position.tolist(), quat_xyzw=pose.normalise(pose.multiply(turn, b.quat_xyzw)).tolist()
         )
     # A scene has no restitution above 1; as contacts show products, the static body can have more of it.
-    moving = {re.sub(r"\[\d+\]$", "", b.name) for b in problem.moving}
+    moving = {_entry(b) for b in problem.moving}
     most = max((entry.get("restitution", 0.0) for name, entry in found.items() if name in moving), default=0.0)
     if most > 1.0:
         for b in problem.fixed:
-            found.setdefault(re.sub(r"\[\d+\]$", "", b.name), {}).setdefault("restitution", b.restitution)
+            found.setdefault(_entry(b), {}).setdefault("restitution", b.restitution)
         for name, entry in found.items():
             if "restitution" in entry:
                 entry["restitution"] = min(1.0, entry["restitution"] * (1.0 / most if name in moving else most))
-    return found
-
-
-def _joint_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Joint -> key of the scene file -> value."""
-    found: dict[str, dict[str, Any]] = {}
-    for p, value in zip(problem.parameters, values, strict=True):
-        if p.kind in OF_JOINTS:
-            key = p.kind.removeprefix("joint_")
-            found.setdefault(p.name, {})[key] = float(value) * problem.heft(problem.joints[p.axis], p.kind)
-    return found
+    return found, joints
 
 
 INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
@@ -889,47 +880,29 @@ INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
 def write_scene(found: Identified, scene_file: Path, out: Path) -> list[str]:
     """Write a copy of a scene file with the values that were found; everything else is as in the file, except comments.
     Returns notes."""
-    root, notes = cast("Any", yaml.compose(scene_file.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)), []
-    for entry in _value(root, "bodies").value:
-        values = dict(found.scene_values.get(_value(entry, "name").value, {}))
-        if (plane := _value(entry, "plane")) is not None and "position" in values:
+    scene = SceneBuilder.read(scene_file, allow_outside=True)
+    for entry in scene.bodies:
+        values = dict(found.scene_values.get(entry["name"], {}))
+        if "plane" in entry and "position" in values:
             place, turn = np.array(values.pop("position")), np.array(values.pop("quat_xyzw"))
             normal = pose.rotate(turn, np.array([0.0, 0.0, 1.0]))
-            _set(plane, "normal", normal.tolist())
-            _set(plane, "offset", float(normal @ place))
+            entry["plane"] = {"normal": _rounded(normal), "offset": _rounded(normal @ place)}
         for key, value in values.items():
-            entry.value = [(k, v) for k, v in entry.value if k.value not in INSTEAD.get(key, ())]
-            _set(entry, key, value)
-    joints = _value(root, "joints")
-    for entry in joints.value if joints is not None else ():
-        for key, value in found.joint_values.get(_value(entry, "name").value, {}).items():
-            _set(entry, key, value)
-    if out.resolve().parent != scene_file.resolve().parent:
-        shapes = _value(root, "shapes")
-        named = [(_value(s, k)) for _, s in (shapes.value if shapes is not None else ()) for k in ("mesh", "asset")]
-        model = _value(root, "model")
-        named += [model] if model is not None and model.value.endswith(".safetensors") else []
-        for node in (node for node in named if node is not None):
-            node.value = path_from(out.resolve().parent, scene_file.resolve().parent / node.value)
-            notes = [f"{out} names files outside its folder: simulate it with --allow-outside, or write it beside them"]
-    text = yaml.serialize(root, Dumper=yaml.SafeDumper, width=120)
-    read_scene(out, allow_outside=True, text=text)
-    write_text(out, text)
-    return notes
-
-
-def _value(mapping: Any, key: str) -> Any:
-    return next((value for k, value in mapping.value if k.value == key), None)
-
-
-def _set(mapping: Any, key: str, value: Any) -> None:
-    node = yaml.compose(yaml.safe_dump(_rounded(value), default_flow_style=True), Loader=yaml.SafeLoader)
-    at = next((i for i, (k, _) in enumerate(mapping.value) if k.value == key), len(mapping.value))
-    mapping.value[at : at + 1] = [(yaml.ScalarNode("tag:yaml.org,2002:str", key), node)]
+            for other in INSTEAD.get(key, ()):
+                entry.pop(other, None)
+            entry[key] = _rounded(value)
+    for entry in scene.joints:
+        entry |= {key: _rounded(value) for key, value in found.joint_values.get(entry["name"], {}).items()}
+    scene.save(out)
+    files = any({"mesh", "asset"} & shape.keys() for shape in scene.shapes.values())
+    files |= str(scene.settings.get("model")).endswith(".safetensors")
+    if files and out.resolve().parent != scene_file.resolve().parent:
+        return [f"{out} names files outside its folder: simulate it with --allow-outside, or write it beside them"]
+    return []
 
 
 def _rounded(value: Any) -> Any:
-    return [_rounded(v) for v in value] if isinstance(value, list) else float(f"{value:.9g}")
+    return np.vectorize(lambda number: float(f"{number:.9g}"))(value).tolist()
 
 
 # --- the picture beside the scene: the loss against each parameter ---
@@ -953,16 +926,16 @@ def picture(found: Identified, path: Path) -> str:
     for axis in axes.flat[len(found.profiles) :]:
         axis.axis("off")
     for axis, profile in zip(axes.flat, found.profiles, strict=False):
-        shown = profile.interval is not None
-        if profile.interval is not None:
-            axis.axvspan(*profile.interval, color="tab:blue", alpha=0.15, linewidth=0)
-        axis.plot(profile.x, profile.loss, "o-", markersize=3, linewidth=1.2, color="tab:blue" if shown else "0.6")
-        axis.axvline(profile.value, color="0.4", linewidth=0.8, linestyle=":")
+        interval = profile.estimate.interval
+        if interval is not None:
+            axis.axvspan(*interval, color="tab:blue", alpha=0.15, linewidth=0)
+        axis.plot(profile.x, profile.loss, "o-", markersize=3, linewidth=1.2, color="tab:blue" if interval else "0.6")
+        axis.axvline(profile.best, color="0.4", linewidth=0.8, linestyle=":")
         # A flat curve should look flat: the scale covers at least a tenth of the loss.
         low, high = axis.get_ylim()
         axis.set_ylim(min(low, 0.99), max(high, 1.1))
-        axis.set_title(title(profile), fontsize=8, color="black" if shown else "0.4")
-        axis.set_xlabel(profile.unit.strip() or "no unit", fontsize=7)
+        axis.set_title("\n".join(profile.estimate.lines()), fontsize=8, color="black" if interval else "0.4")
+        axis.set_xlabel(profile.estimate.unit.strip() or "no unit", fontsize=7)
         axis.set_ylabel("loss over the best", fontsize=7)
         axis.tick_params(labelsize=7)
         axis.grid(alpha=0.3)
@@ -970,12 +943,3 @@ def picture(found: Identified, path: Path) -> str:
         figure.savefig(partial, dpi=110, format="png")
     plots.close(figure)
     return ""
-
-
-def title(profile: Profile) -> str:
-    head = f"{HEADS[profile.kind]}: {profile.name}"
-    if profile.interval is None:
-        return f"{head}\nnot shown by these recordings"
-    digits = 4 if profile.unit == " m" or profile.kind.startswith("joint") else 3
-    low, high = (f"{end:.{digits}f}" for end in profile.interval)
-    return f"{head}\n{profile.value:.{digits}f}{profile.unit} ({low} to {high})"

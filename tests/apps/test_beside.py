@@ -148,14 +148,3 @@ def test_a_run_without_leaves_nothing_of_an_earlier_one(folder):
     np.savez(folder / "run" / "beside.npz", name="x", bodies=["who"], time=[0.0], position=[0.0], orientation=[0.0])
     with pytest.raises(SdfsimError, match=r"beside\.npz: not of this scene"):
         beside_of(folder / "run", read_run(folder / "run")[0])
-
-
-def test_the_sample_is_shown_beside_its_recording(tmp_path):
-    """`toss.yaml` has other numbers than toss.csv was made with: the run leaves it after the first impact."""
-    from sdfsim.scene.bundled import sample_folder
-
-    beside = load_beside(sample_folder() / "toss.csv", sample_folder() / "toss.yaml")
-    simulate(sample_folder() / "toss.yaml", tmp_path / "run", seconds=0.9, beside=beside)
-    rollout = read_run(tmp_path / "run")[1]
-    away = np.linalg.norm(rollout.position[:, 1] - beside.at(rollout.time)[0][:, 0], axis=1)
-    assert away[rollout.time < 0.25].max() < 2e-3 and away[-1] > 0.02

@@ -12,14 +12,12 @@ from benchmarks.robots import poses
 from sdfsim import Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
-from sdfsim.apps.recording import ends, marks, save_rollout
+from sdfsim.apps.recording import ends, marks
 from sdfsim.base.errors import SdfsimError
-from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
 from tests.helpers.command import run
-from tests.helpers.runs import read
 
 LINK = """
   <link name="{0}">
@@ -361,13 +359,6 @@ def test_bytes_of_another_encoding_are_told_and_unknown_encodings_refused(tmp_pa
     (tmp_path / "arm.urdf").write_text(f'<?xml version="1.0" encoding="klingon"?>{ARM}')
     with pytest.raises(SdfsimError, match=r"arm\.urdf:1: unknown encoding 'klingon'"):
         import_robot(tmp_path / "arm.urdf", tmp_path / "scene.yaml")
-
-
-def test_a_floor_is_under_the_lowest_link(tmp_path: Path) -> None:
-    scene, _ = imported(write(tmp_path, "arm.urdf", ARM), floor=True)
-    base = next(body for body in scene.bodies if body.name == "base")
-    assert base.position[2] == pytest.approx(0.1)  # half its height, of a frame in its middle
-    assert scene.bodies[0].name == "floor" and base.motion == "dynamic"
 
 
 def test_a_floor_carries_only_what_touches(tmp_path: Path) -> None:
@@ -733,24 +724,3 @@ def test_recordings_show_axes_and_limits_where_they_are(tmp_path: Path) -> None:
     assert ends([by_name["string"]], place, turns, scene)[0, 0] == pytest.approx(
         np.array([[1.4, 0.3, 1.4], [1.4, 0.3, 0.4]])
     )
-
-
-def test_a_recording_has_a_line_for_each_joint(tmp_path: Path) -> None:
-    scene = jointed().load()
-    shape = (3, len(scene.bodies))
-    still = Rollout(
-        time=np.arange(3) * 0.1,
-        position=np.tile([b.position for b in scene.bodies], (3, 1, 1)),
-        orientation=np.tile([b.quat_xyzw for b in scene.bodies], (3, 1, 1)),
-        velocity=np.zeros((*shape, 3)),
-        angular_velocity=np.zeros((*shape, 3)),
-        contact_count=np.zeros(3, np.int64),
-        contact_point=np.zeros((0, 3)),
-        contact_body=np.zeros((0, 2), np.int64),
-        names=tuple(b.name for b in scene.bodies),
-    )
-    save_rollout(scene, still, tmp_path / "rollout.rrd")
-    entities = set(read(tmp_path / "rollout.rrd"))
-    told = " ".join(sorted(map(str, entities)))
-    for joint in scene.joints:
-        assert f"joint\\ {joint.name}" in told, told

@@ -8,7 +8,7 @@ import mujoco  # noqa: TID253
 import numpy as np
 import pytest
 
-from sdfsim import Simulator, load_scene
+from sdfsim import load_scene
 from sdfsim.apps import mjcf_fields
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.scene.scene import Scene
@@ -55,18 +55,6 @@ def test_what_a_flag_switches_off_is_off_and_nothing_else(tmp_path: Path, flag: 
     off = ["limit", "frictionloss", "equality", "contact"] if flag == "constraint" else [flag]
     assert features(scene) == {name: name not in off for name in features(scene)}
     assert f"the file switches off (1: {flag})" in report["notes"]
-
-
-def test_without_gravity_nothing_falls(tmp_path: Path) -> None:
-    xml = text(option='<flag gravity="disable"/>')
-    model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    while data.time < 0.3:
-        mujoco.mj_step(model, data)
-    scene, _ = imported(tmp_path, xml)
-    ball = [body.name for body in scene.bodies].index("ball")
-    ended = Simulator(scene).run(seconds=0.3).position[-1, ball]
-    assert ended == pytest.approx([2, 0, 0.1], abs=1e-6) and data.body("ball").xpos == pytest.approx(ended, abs=1e-3)
 
 
 def test_flags_that_are_not_done_are_named(tmp_path: Path) -> None:

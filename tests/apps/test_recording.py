@@ -285,12 +285,3 @@ def test_every_copy_is_where_its_body_is(tmp_path):
         np.testing.assert_allclose(scales, 2.0)
         corners = np.array(found[path + "!"]["Mesh3D:vertex_positions"][0])
         np.testing.assert_allclose(np.linalg.norm(corners, axis=1), 0.5, atol=1e-3)
-
-
-def test_a_hundred_steps_of_four_hundred_bodies_are_small(tmp_path):
-    """A mesh of 10,000 vertices: as one a body it would be a hundred megabytes."""
-    scene, rollout = crowd(tmp_path, 400, 101)
-    fine = sphere(0.5, subdivisions=5)
-    shapes = tuple(replace(s, mesh=Mesh(fine.vertices, fine.faces)) if s.name == "ball" else s for s in scene.shapes)
-    save_rollout(replace(scene, shapes=shapes), rollout, tmp_path / "rollout.rrd")
-    assert (tmp_path / "rollout.rrd").stat().st_size < 10e6

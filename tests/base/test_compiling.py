@@ -129,16 +129,6 @@ def test_a_run_says_nothing_of_threading_layers():
     assert "TBB" not in ended.stderr and "something else" in ended.stderr
 
 
-def test_what_is_compiled_already_is_not_reported(caplog):
-    assert pytest.importorskip("numba")
-    sim = Simulator(Scene((analytic_shape("sphere", radius=0.5),), (make_body("a", 0, [0, 0, 1]),), np.zeros(3), 1.0))
-    sim.step(1)
-    caplog.clear()
-    compiling._ready.clear()
-    Simulator(sim.scene).step(1)
-    assert "compiling" not in caplog.text
-
-
 def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeypatch, caplog):
     """Arrays of another layout need code of their own, which used to be compiled without a word."""
     from numba.core import config
