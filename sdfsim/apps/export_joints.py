@@ -168,7 +168,8 @@ def gains(joint: Joint) -> tuple[float, float]:
 # --- MJCF ---
 
 
-def _text(*values: Any) -> str:
+def numbers(*values: Any) -> str:
+    """Numbers and arrays as an XML attribute."""
     return " ".join(f"{value + 0.0:.12g}" for value in np.concatenate([np.ravel(value) for value in values]))
 
 
@@ -189,15 +190,15 @@ def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) ->
     speed = speed_of(scene, one, child)
     if joint.kind == "fixed":
         return np.zeros(0), speed
-    keys = {"type": {"hinge": "hinge", "slider": "slide", "ball": "ball"}[joint.kind], "pos": _text(one.anchor)}
+    keys = {"type": {"hinge": "hinge", "slider": "slide", "ball": "ball"}[joint.kind], "pos": numbers(one.anchor)}
     if joint.kind != "ball":
-        keys |= {"axis": _text(one.axis()), "ref": _text(start)}
-    keys |= {"damping": _text(joint.damping)} if joint.damping else {}
-    keys |= {"frictionloss": _text(joint.friction)} if joint.friction else {}
+        keys |= {"axis": numbers(one.axis()), "ref": numbers(start)}
+    keys |= {"damping": numbers(joint.damping)} if joint.damping else {}
+    keys |= {"frictionloss": numbers(joint.friction)} if joint.friction else {}
     if joint.limits is not None:
-        keys |= {"limited": "true", "range": _text(joint.limits)}
+        keys |= {"limited": "true", "range": numbers(joint.limits)}
     if joint.spring is not None:
-        keys |= {"stiffness": _text(joint.spring.stiffness), "springref": _text(joint.spring.rest)}
+        keys |= {"stiffness": numbers(joint.spring.stiffness), "springref": numbers(joint.spring.rest)}
     add(node, "joint", name=name, **keys)
     return (np.array([1.0, 0.0, 0.0, 0.0]) if joint.kind == "ball" else np.array([start])), speed
 
@@ -214,7 +215,7 @@ def mjcf_rest(
 
     def end(joint: Joint, side: int) -> str:
         name = f"{names[joint.name]}_end{side}"
-        add(sites[joint.bodies[side]], "site", name=name, pos=_text(joint.anchor[side]), size="0.002")
+        add(sites[joint.bodies[side]], "site", name=name, pos=numbers(joint.anchor[side]), size="0.002")
         return name
 
     for joint in tree.loops:
@@ -222,10 +223,10 @@ def mjcf_rest(
         if joint.kind == "distance":
             keys: dict[str, str] = {}
             if joint.limits is not None:
-                keys |= {"limited": "true", "range": _text(joint.limits)}
+                keys |= {"limited": "true", "range": numbers(joint.limits)}
             if joint.spring is not None:
-                keys |= {"stiffness": _text(joint.spring.stiffness), "springlength": _text(joint.spring.rest)}
-            keys |= {"damping": _text(joint.damping)} if joint.damping else {}
+                keys |= {"stiffness": numbers(joint.spring.stiffness), "springlength": numbers(joint.spring.rest)}
+            keys |= {"damping": numbers(joint.damping)} if joint.damping else {}
             rope = add(into["tendon"], "spatial", name=name, width="0.003", **keys)
             for side in (0, 1):
                 add(rope, "site", site=end(joint, side))
@@ -235,7 +236,7 @@ def mjcf_rest(
         one = held(joint, joint.bodies[0])
         ends = {"body1": bodies[joint.bodies[0]]} | ({"body2": bodies[one.parent]} if one.parent >= 0 else {})
         if joint.kind == "fixed":
-            add(into["equality"], "weld", name=name, **ends, anchor=_text(np.zeros(3)))
+            add(into["equality"], "weld", name=name, **ends, anchor=numbers(np.zeros(3)))
         elif joint.kind == "slider":
             lines.append(f"slider {joint.name}, which closes a loop")
         else:  # a hinge is held at two points of its axis
@@ -243,7 +244,7 @@ def mjcf_rest(
             for number, point in enumerate(points):
                 add(
                     into["equality"], "connect", name=name + (f"_{number}" if number else ""), **ends,
-                    anchor=_text(point),
+                    anchor=numbers(point),
                 )  # fmt: skip
             if joint.limits or joint.damping or joint.friction or joint.spring or joint.motor:
                 lines.append(f"limits, damping, friction, spring and motor of {joint.name}, which closes a loop")
@@ -257,12 +258,12 @@ def mjcf_rest(
             continue
         kp, kv = gains(joint)
         keys = {"name": f"{names[joint.name]}_motor", "joint": names[joint.name]}
-        keys |= {"forcerange": _text((-joint.motor.most, joint.motor.most))}
+        keys |= {"forcerange": numbers((-joint.motor.most, joint.motor.most))}
         if joint.motor.speed is not None:
-            add(into["actuator"], "velocity", kv=_text(kv), **keys)
+            add(into["actuator"], "velocity", kv=numbers(kv), **keys)
             controls.append(joint.motor.speed)
         elif joint.motor.position is not None:
-            add(into["actuator"], "position", kp=_text(kp), kv=_text(kv), **keys)
+            add(into["actuator"], "position", kp=numbers(kp), kv=numbers(kv), **keys)
             controls.append(joint.motor.position)
         else:  # no target is set
             add(into["actuator"], "motor", **keys)
@@ -291,15 +292,15 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
     add(made, "parent", link=links[one.parent])
     add(made, "child", link=links[child])
     turn = one.parent_frame * one.frame.inv()
-    add(made, "origin", xyz=_text(one.parent_anchor - origin), rpy=_text(turn.as_euler("xyz")))
+    add(made, "origin", xyz=numbers(one.parent_anchor - origin), rpy=numbers(turn.as_euler("xyz")))
     if joint.kind in ("hinge", "slider"):
-        add(made, "axis", xyz=_text(one.axis()))
+        add(made, "axis", xyz=numbers(one.axis()))
         low, high = joint.limits or (-EFFORT, EFFORT)
         effort = EFFORT if joint.motor is None else joint.motor.most
-        ends = {} if joint.kind == "hinge" and not bounded else {"lower": _text(low), "upper": _text(high)}
-        add(made, "limit", **ends, effort=_text(effort), velocity=_text(EFFORT))
+        ends = {} if joint.kind == "hinge" and not bounded else {"lower": numbers(low), "upper": numbers(high)}
+        add(made, "limit", **ends, effort=numbers(effort), velocity=numbers(EFFORT))
     if joint.damping or joint.friction:
-        add(made, "dynamics", damping=_text(joint.damping), friction=_text(joint.friction))
+        add(made, "dynamics", damping=numbers(joint.damping), friction=numbers(joint.friction))
 
 
 def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:

@@ -646,11 +646,8 @@ def identify(
         last, best = longer, settled(longer, near, every, TRIES[2])
     whole = problem.whole(held or fit)
     before, after = (whole.off(values) for values in (start, best))
-    change = after - before
-    sure = SURE * change.std(0, ddof=1) / math.sqrt(len(change)) if len(change) > 2 else np.full(2, np.nan)
     confirmed: dict[str, Any] = {
         "recordings": len(held), "before": before.mean(0).tolist(), "after": after.mean(0).tolist(),
-        "change": change.mean(0).tolist(), "change_95": sure.tolist() if np.isfinite(sure).all() else None,
         "covered": problem.covered(whole),
     }  # fmt: skip
     error = float(np.sqrt(np.nanmean(np.concatenate([e[..., :3].ravel() for e in short.run(best)]) ** 2)))
@@ -659,7 +656,7 @@ def identify(
     drawn = _profiles(problem, best, by, there, partial(errors_of, last), found) if profiles else []
     return Identified(
         found, len(short.begin),
-        error * math.sqrt(3.0) * problem.units.length, confirmed, [*_notes(recordings), *_late(confirmed["covered"])],
+        error * math.sqrt(3.0) * problem.units.length, confirmed, _notes(recordings, confirmed["covered"]),
         *_file_values(problem, best), drawn,
     )  # fmt: skip
 
@@ -802,14 +799,7 @@ def _profiles(
     return found
 
 
-def _late(covered: float) -> list[str]:
-    if covered >= COVERED:
-        return []
-    what = "earlier frames are not smooth enough to begin from"
-    return [f"these whole motions are {100.0 * covered:.2g} % of the recorded way: {what}"]
-
-
-def _notes(recordings: Sequence[Recording]) -> list[str]:
+def _notes(recordings: Sequence[Recording], covered: float) -> list[str]:
     """Notes on faults of trackers, and on what recordings lack."""
     lost, jumps = sum(r.lost for r in recordings), sum(r.jumps for r in recordings)
     notes = []
@@ -823,6 +813,9 @@ def _notes(recordings: Sequence[Recording]) -> list[str]:
         notes.append(f"not used, as never smooth:  {', '.join(still[:3])}" + (" ..." if still[3:] else ""))
     if len(recordings) < ENOUGH:
         notes.append(f"with {ENOUGH} recordings or more, some are kept to confirm what the others show")
+    if covered < COVERED:
+        what = "earlier frames are not smooth enough to begin from"
+        notes.append(f"these whole motions are {100.0 * covered:.2g} % of the recorded way: {what}")
     return notes
 
 

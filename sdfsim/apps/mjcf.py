@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps import mjcf_fields as fields
+from sdfsim.apps.export import rebound
 from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, named, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.lazy import optional
@@ -492,12 +493,9 @@ class _Reader:
 
 
 def _restitution(solref: np.ndarray) -> float:
-    """Restitution of a body against one like itself, from the damping of its contacts: a spring that only pushes
-    returns exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed, with the damping z relative to the critical one.
-    MuJoCo's default counts as no rebound."""
+    """Restitution of a body against one like itself, from the damping of its contacts. MuJoCo's default counts as no
+    rebound."""
     time, damping = float(solref[0]), float(solref[1])
     if time <= 0.0 or damping <= 0.0 or damping >= SOFTEST or (time, damping) == USUAL:
         return 0.0
-    damping = damping if abs(damping - 1.0) > 1e-6 else 1.0 - 1e-6
-    turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
-    return float(np.sqrt(np.exp(-damping * np.abs(turned))))
+    return float(np.sqrt(rebound(np.array(damping if abs(damping - 1.0) > 1e-6 else 1.0 - 1e-6))))

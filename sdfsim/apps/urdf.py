@@ -26,8 +26,6 @@ MARKS = {
     codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
     codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
 }  # fmt: skip
-# Encodings by the zero bytes in the first four, as XML begins with ASCII.
-ZEROS = {(1, 2, 3): "utf-32-le", (0, 1, 2): "utf-32-be", (1, 3): "utf-16-le", (0, 2): "utf-16-be"}
 DECLARED = re.compile(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([^\"'>]*)[\"']")
 KINDS = {
     "revolute": "hinge",
@@ -105,13 +103,11 @@ class _Reader:
     def _decoded(self, content: bytes) -> str:
         """The text of the file, in the encoding that its first bytes show or that it declares, else UTF-8. As in other
         readers, a byte that this encoding does not have is replaced, with a note: most are in comments."""
-        zeros = tuple(k for k, byte in enumerate(content[:4]) if byte == 0)
-        name = next((name for mark, name in MARKS.items() if content.startswith(mark)), ZEROS.get(zeros))
-        if name is None:
-            declared = DECLARED.match(content)
-            name = declared[1].decode("ascii", "replace") if declared else "utf-8"
-            # What can be read byte by byte is not of two or four bytes a character, whatever it says.
-            name = "utf-8" if re.match(r"(?i)utf.?(16|32)|ucs", name) else name
+        declared = DECLARED.match(content)
+        name = declared[1].decode("ascii", "replace") if declared else "utf-8"
+        # What can be read byte by byte is not of two or four bytes a character, whatever it says.
+        name = "utf-8" if re.match(r"(?i)utf.?(16|32)|ucs", name) else name
+        name = next((shown for mark, shown in MARKS.items() if content.startswith(mark)), name)
         try:
             text = content.decode(name, "replace")
         except (LookupError, UnicodeError) as error:

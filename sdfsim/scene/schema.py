@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import (
@@ -186,9 +186,10 @@ def _version(number: int) -> int:
     return number
 
 
-def key(what: str, default: Any = ..., unit: str = "", **limits: float) -> Any:
-    """A key of a table: its meaning, default, unit and limits."""
-    return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)  # type: ignore[arg-type]
+def key(what: str, default: Any = ..., unit: str = "", of: str = "", **limits: float) -> Any:
+    """A key of a table: its meaning, default, unit, the kinds of entries that have it (if not all), and limits."""
+    extra: dict[str, Any] = {"unit": unit, "of": of}
+    return Field(default, description=what, json_schema_extra=extra, **limits)
 
 
 _THREE = Field(min_length=3, max_length=3)
@@ -554,15 +555,6 @@ class BreaksTable(Table):
             yield (), "force or torque is required"
 
 
-# Which keys belong to which joints, besides those that all joints have.
-_OF_JOINT: dict[str, tuple[str, ...]] = {
-    "hinge": ("axis", "limits_deg", "start_deg", "restitution", "damping", "friction", "spring", "motor"),
-    "slider": ("axis", "limits", "start", "restitution", "damping", "friction", "spring", "motor"),
-    "ball": ("axis", "cone_deg", "restitution", "damping", "friction"),
-    "fixed": (),
-    "distance": ("to", "rod", "rope", "restitution", "damping", "spring"),
-}
-_OF_ALL_JOINTS = ("name", "type", "bodies", "anchor", "frame", "breaks_at", "collide")
 _NEEDED = {"hinge": ("anchor", "axis"), "slider": ("axis",), "ball": ("anchor",), "distance": ("anchor", "to")}
 
 
@@ -591,41 +583,51 @@ class JointTable(Table):
         "the point that both share, or the end of a distance at the first body; required for hinges, balls, distances, "
         "for others by default the first body's origin", None, "m",
     )  # fmt: skip
-    to: Vector | None = key("end of a distance at the second body", None, "m")
-    axis: Direction | None = key("axis of a hinge, a slider or the cone of a ball; of any length", None)
+    to: Vector | None = key("end of a distance at the second body", None, "m", of="distance")
+    axis: Direction | None = key(
+        "axis of a hinge, a slider or the cone of a ball; of any length", None, of="hinge slider ball"
+    )
     frame: Text = key(
         f"frame of anchor, to and axis: `{WORLD}`, with bodies as they are at the start, or the name of one of the two "
         "bodies: relative to its shape's origin, along its axes",
         WORLD,
     )
-    start: Number = key("position of a slider at the start", 0.0, "m")
-    start_deg: Number = key("angle of a hinge at the start", 0.0, "degrees")
-    limits: Ends | None = key("lowest and highest position of a slider", None, "m")
-    limits_deg: Ends | None = key("lowest and highest angle of a hinge; full turns add up", None, "degrees")
+    start: Number = key("position of a slider at the start", 0.0, "m", of="slider")
+    start_deg: Number = key("angle of a hinge at the start", 0.0, "degrees", of="hinge")
+    limits: Ends | None = key("lowest and highest position of a slider", None, "m", of="slider")
+    limits_deg: Ends | None = key("lowest and highest angle of a hinge; full turns add up", None, "degrees", of="hinge")
     cone_deg: Number | None = key(
-        "for a ball: largest angle between the axes of the two bodies", None, "degrees", ge=0, le=180
+        "for a ball: largest angle between the axes of the two bodies", None, "degrees", ge=0, le=180, of="ball"
     )
-    rod: Number | None = key("the distance that the points keep; it must be that at the start", None, "m", gt=0)
-    rope: Number | None = key("the largest distance of the points", None, "m", gt=0)
-    restitution: Number = key("coefficient with which limits and ropes rebound", 0.0, ge=0, le=1)
-    damping: Number = key("in N m s/rad for hinges and balls, else in N s/m", 0.0, ge=0)
-    friction: Number = key("torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0)
-    spring: SpringTable | None = key("a spring that pulls back", None)
-    motor: MotorTable | None = key("a motor that drives it", None)
+    rod: Number | None = key(
+        "the distance that the points keep; it must be that at the start", None, "m", gt=0, of="distance"
+    )
+    rope: Number | None = key("the largest distance of the points", None, "m", gt=0, of="distance")
+    restitution: Number = key(
+        "coefficient with which limits and ropes rebound", 0.0, ge=0, le=1, of="hinge slider ball distance"
+    )
+    damping: Number = key(
+        "in N m s/rad for hinges and balls, else in N s/m", 0.0, ge=0, of="hinge slider ball distance"
+    )
+    friction: Number = key(
+        "torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0, of="hinge slider ball"
+    )
+    spring: SpringTable | None = key("a spring that pulls back", None, of="hinge slider distance")
+    motor: MotorTable | None = key("a motor that drives it", None, of="hinge slider")
     breaks_at: BreaksTable | None = key("load at which it breaks", None)
     collide: Literal["on", "off"] = key("whether the two bodies may touch each other", "off")
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
-        kind = data.get("type")
-        if kind not in _OF_JOINT:
+        kind, extra = data.get("type"), {name: field.json_schema_extra for name, field in cls.model_fields.items()}
+        if kind not in get_args(JointKind):
             return
+        fit = {name: str(own["of"]).split() for name, own in extra.items() if isinstance(own, dict) and own["of"]}
         for name in data:
-            if name in cls.model_fields and name not in (*_OF_JOINT[kind], *_OF_ALL_JOINTS):
-                fit = ", ".join(k for k, keys in _OF_JOINT.items() if name in keys)
+            if kind not in fit.get(name, [kind]):
                 other = name.removesuffix("_deg") if name.endswith("_deg") else f"{name}_deg"
-                other = f"; give {other}" if other in _OF_JOINT[kind] else ""
-                yield (name,), f"is for {fit} only (this is a {kind}{other})"
+                other = f"; give {other}" if kind in fit.get(other, ()) else ""
+                yield (name,), f"is for {', '.join(fit[name])} only (this is a {kind}{other})"
         for name in _NEEDED.get(kind, ()):
             if name not in data:
                 yield (name,), f"is required: this is a {kind}"
@@ -643,7 +645,7 @@ class JointTable(Table):
         for table, wrong in (("spring", ("rest", "rest_deg")), ("motor", ("position", "position_deg"))):
             inner = data.get(table)
             name = wrong[0 if kind == "hinge" else 1]
-            if isinstance(inner, dict) and name in inner and table in _OF_JOINT[kind]:
+            if isinstance(inner, dict) and name in inner and kind in fit[table]:
                 yield (table, name), f"is not for a {kind}: give {wrong[1 if kind == 'hinge' else 0]}"
 
     def check_values(self) -> Iterator[Fault]:

@@ -14,7 +14,7 @@ import pytest
 from sdfsim import Scene, SdfsimError, load_scene
 from sdfsim.apps.export import plain_names
 from sdfsim.base import files
-from sdfsim.base.files import LOCK, locked, path_from
+from sdfsim.base.files import path_from
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = [
@@ -62,50 +62,6 @@ def test_code_takes_nothing_that_only_unix_has(file):
     found += [f"line {call.lineno}: shell" for call in calls(tree) if any(k.arg == "shell" for k in call.keywords)]
     found += [f"line {call.lineno}: no encoding" for call in calls(tree) if reads_text(call)]
     assert not found
-
-
-class Windows:
-    """Stands for msvcrt: a byte of a file that one handle has locked is locked to all others."""
-
-    LK_NBLCK = 2
-
-    def __init__(self) -> None:
-        self.taken: dict[int, int] = {}  # the handle by the file
-
-    def locking(self, handle: int, mode: int, count: int) -> None:
-        assert mode == self.LK_NBLCK and count == 1
-        if self.taken.setdefault(os.fstat(handle).st_ino, handle) != handle:
-            raise PermissionError(13, "Permission denied")
-
-
-def test_a_folder_is_locked_as_windows_locks(tmp_path, monkeypatch):
-    """Where `fcntl` is not there, and no file that is open can be removed."""
-    monkeypatch.setitem(sys.modules, "fcntl", None)
-    monkeypatch.setitem(sys.modules, "msvcrt", Windows())
-    real, opened = Path.unlink, []
-    real_open = open
-
-    def opening(path, *rest, **more):
-        file = real_open(path, *rest, **more)
-        opened.append(file)
-        return file
-
-    def unlink(path, missing_ok=False):
-        if any(not file.closed and Path(file.name) == path for file in opened):
-            raise PermissionError(13, "The process cannot access the file", str(path))
-        real(path, missing_ok=missing_ok)
-
-    monkeypatch.setattr(files, "open", opening, raising=False)
-    monkeypatch.setattr(Path, "unlink", unlink)
-    out = tmp_path / "out"
-    with locked(out):
-        with pytest.raises(SdfsimError, match="another run is writing"), locked(out):
-            pass
-        (out / "result").touch()
-    assert [path.name for path in out.iterdir()] == ["result"]
-    with pytest.raises(ValueError, match="broken"), locked(tmp_path / "other"):
-        raise ValueError("broken")
-    assert not (tmp_path / "other" / LOCK).exists()
 
 
 def test_paths_in_files_have_slashes_and_drives(monkeypatch):
