@@ -44,10 +44,6 @@ WHOLE = 8  # least number of long windows for a final fit to them: a few chaotic
 OUTLIER = 2e-3  # model lengths: larger errors of windows count less than squared
 FAR = 0.3  # relative to a body's size: bound of the error of a motion
 WEAK = 1e-3  # weight that keeps parameters that nothing shows at the scene's values
-# Steps for finite differences, relative to a parameter's width: contacts come and go, and impacts are resolved to an
-# inner step, so smaller differences tell nothing.
-NUDGE = {"friction": 0.02, "restitution": 0.02, "mass": 0.02, "inertia": 0.1, "size": 0.2, "height": 0.2, "tilt": 0.1,
-         "joint_friction": 0.05, "joint_damping": 0.05}  # fmt: skip
 GRAVITY = 9.81  # m/s^2, used for joints of scenes without gravity
 SURE = 1.96  # half of an interval of 95 %, in standard deviations
 SHOWN = 0.25  # relative to its width: how precisely windows must determine a parameter, with noise of `OUTLIER`
@@ -61,41 +57,55 @@ TRIES = 15, 15, 8  # largest numbers of iterations of the fits to short windows,
 DRAWS = 400  # random draws of recordings, for intervals
 POINTS, BEYOND = 4, 2.0  # points of a profile on each side, and their farthest distance, in half intervals
 CROWD, ROUNDS, AROUND = 24, 14, 0.15  # the search for long windows: points, rounds, and range, in widths
-# Search ranges of parameters around the scene's values: logarithms of factors, model lengths, rad.
-WIDTH = {
-    "friction": 1.0, "restitution": 1.0, "mass": 3.0, "inertia": 0.5, "size": 0.1, "height": 0.05, "tilt": 0.05,
-    "joint_friction": 0.05, "joint_damping": 0.05,
-}  # fmt: skip
-FARTHEST = {
-    "joint_friction": 0.5,
-    "joint_damping": 0.5,
-    "mass": 7.0,
-    "inertia": 0.5,
-    "size": 0.15,
-    "height": 0.15,
-    "tilt": 0.15,
-}
 SHELL = 5.0 / 3.0  # inertia of a hollow cube or ball over that of a solid one: the most that such a body can have
-FACTORS = ("mass", "inertia", "size")
 # Columns of joints; the parameters are in units of `heft`.
 OF_JOINTS = {"joint_friction": DRAG, "joint_damping": DAMPING}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of parameters. Those of factors are logarithms."""
+
+    head: str  # what reports call it
+    width: float  # of the search around the scene's value: logarithms of factors, model lengths, rad
+    # Step for finite differences, relative to the width: contacts come and go, and impacts are resolved to an inner
+    # step, so smaller differences tell nothing.
+    nudge: float
+    farthest: float = 0.0  # the largest change
+    unit: str = ""  # in reports
+    key: str = ""  # of the scene file, for factors
+    scales: dict[str, float] = field(default_factory=dict)  # array of `Bodies` -> power of a factor that scales it
+
+
+SIZES = {"scale": 1.0, "com": 1.0, "bounds": 1.0, "size": 1.0, "radius": 1.0, "inertia": 2.0}
+KINDS = {
+    "friction": Kind("friction, product", 1.0, 0.02),
+    "restitution": Kind("restitution, product", 1.0, 0.02),
+    "mass": Kind("mass", 3.0, 0.02, 7.0, " kg", "mass", {"mass": 1.0, "inverse_mass": -1.0, "inertia": 1.0}),
+    "inertia": Kind("inertia, factor", 0.5, 0.1, 0.5, "", "inertia_factor", {"inertia": 1.0}),
+    "size": Kind("size, factor", 0.1, 0.2, 0.15, "", "scale", SIZES),
+    "height": Kind("shift along its normal", 0.05, 0.2, 0.15, " m"),
+    "tilt": Kind("tilted", 0.05, 0.1, 0.15, " degrees"),
+    "joint_friction": Kind("friction of a joint", 0.05, 0.05, 0.5),
+    "joint_damping": Kind("damping of a joint", 0.05, 0.05, 0.5),
+}
+HEADS = {name: kind.head for name, kind in KINDS.items()}
+HEADS |= {"own_friction": "friction of its own", "own_restitution": "restitution of its own"}
+# Units for hinges and balls, and for sliders.
+OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One unknown number: of one body, or of all copies of one."""
 
-    kind: str  # key of `WIDTH`
+    kind: str  # key of `KINDS`
     bodies: tuple[int, ...]  # indices: moving bodies first, then static ones
     name: str
     start: float = 0.0  # value in the scene; logarithms for factors
     low: float = -math.inf
     high: float = math.inf
     axis: int = 0  # axis of a tilt; or the number of a joint
-
-    @property
-    def width(self) -> float:
-        return WIDTH[self.kind]
 
 
 @dataclass(frozen=True)
@@ -147,7 +157,7 @@ class Identified:
     profiles: list[Profile] = field(default_factory=list)  # if they are asked for
 
     def report(self) -> dict[str, Any]:
-        kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(WIDTH)[2:])
+        kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(KINDS)[2:])
         values: dict[str, Any] = {kind: {} for kind in kinds}
         for e in self.estimates:
             values[e.kind][e.name] = {"value": e.value, "interval": e.interval}
@@ -155,17 +165,6 @@ class Identified:
             "windows": self.windows, "error_m": self.error_m, "held_out": self.held_out, "notes": self.notes,
             "scene": self.scene_values, "joints": self.joint_values,
         }  # fmt: skip
-
-
-HEADS = {
-    "friction": "friction, product", "restitution": "restitution, product", "own_friction": "friction of its own",
-    "own_restitution": "restitution of its own", "mass": "mass", "inertia": "inertia, factor", "size": "size, factor",
-    "height": "shift along its normal", "tilt": "tilted", "joint_friction": "friction of a joint",
-    "joint_damping": "damping of a joint",
-}  # fmt: skip
-UNITS = {"mass": " kg", "height": " m", "tilt": " degrees"}
-# Units for hinges and balls, and for sliders.
-OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}
 
 
 def report_lines(found: Identified) -> list[str]:
@@ -316,7 +315,7 @@ class Problem:
         self, kind: str, name: str, rows: list[int], start: float = 0.0, low: float | None = None,
         high: float | None = None, axis: int = 0,
     ) -> None:  # fmt: skip
-        most = FARTHEST.get(kind, 0.0)
+        most = KINDS[kind].farthest
         low, high = -most if low is None else low, most if high is None else high
         self.parameters.append(Parameter(kind, tuple(rows), name, start, low, high, axis))
 
@@ -371,7 +370,7 @@ class Problem:
 
     @cached_property
     def width(self) -> np.ndarray:
-        return np.array([p.width for p in self.parameters])
+        return np.array([KINDS[p.kind].width for p in self.parameters])
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -413,15 +412,8 @@ class Problem:
                 rows: Any = slice(k, total, many) if k < many else total + k - many
                 if p.kind in HIGH:
                     new[p.kind][rows] = value
-                elif p.kind == "inertia":
-                    new["inertia"][rows] *= math.exp(value)
-                elif p.kind == "mass":
-                    for name, power in (("mass", 1), ("inverse_mass", -1), ("inertia", 1)):
-                        new[name][rows] *= math.exp(power * value)
-                elif p.kind == "size":
-                    for name in ("scale", "com", "bounds", "size", "radius"):
-                        new[name][rows] *= math.exp(value)
-                    new["inertia"][rows] *= math.exp(2.0 * value)
+                for name, power in KINDS[p.kind].scales.items():
+                    new[name][rows] *= math.exp(power * value)
         for body, ground in self.ground.items():
             row, (turn, shift) = total + body - many, self.lie(values, body)
             position[row] = ground.centre + pose.rotate(turn, position[row] - ground.centre) + shift
@@ -610,10 +602,10 @@ def identify(
         on_progress(min(0.95, 0.2 + 0.002 * count[0]), f"fit, run {count[0]} of all windows")
         return np.concatenate([windows.errors(values), WEAK * (values - start) / width])
 
-    nudge = width * [NUDGE[p.kind] for p in problem.parameters]
+    nudge = width * [KINDS[p.kind].nudge for p in problem.parameters]
 
     def slope(windows: Windows, values: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """[R, F] derivatives by central differences of `NUDGE`, one-sided at the bounds."""
+        """[R, F] derivatives by central differences (see `Kind.nudge`), one-sided at the bounds."""
         columns = []
         for k in free:
             one, other = values.copy(), values.copy()
@@ -745,7 +737,7 @@ def _estimates(
             found.append(estimate(kind, f"{problem.bodies[a].name} / {problem.bodies[b].name}", product, gradient))
     for i, (p, value) in enumerate(zip(parameters, values, strict=True)):
         kind, unit, own = _own(problem, p, value)
-        by = own if p.kind in FACTORS else _own(problem, p, 1.0)[2]
+        by = own if KINDS[p.kind].key else _own(problem, p, 1.0)[2]
         found.append(replace(estimate(kind, p.name, own, {i: by}), unit=unit))
     return found
 
@@ -758,8 +750,8 @@ def _own(problem: Problem, p: Parameter, value: float) -> tuple[str, str, float]
         joint = problem.joints[p.axis]
         unit = OF_TURNS[p.kind][0 if joint.kind in ("hinge", "ball") else 1]
         return p.kind, unit, value * problem.heft(joint, p.kind)
-    unit = UNITS.get(p.kind, "")
-    if p.kind in FACTORS:
+    unit = KINDS[p.kind].unit
+    if KINDS[p.kind].key:
         return p.kind, unit, math.exp(value) * (problem.bodies[p.bodies[0]].mass if p.kind == "mass" else 1.0)
     return p.kind, unit, value * (problem.units.length if p.kind == "height" else math.degrees(1.0))
 
@@ -782,7 +774,7 @@ def _profiles(
         own = next(e for e in estimates if (e.kind, e.name) == (kind, p.name))
         by = (_own(problem, p, best[k] + 1e-6 * width[k])[2] - value) / 1e-6  # units per width
         half = 0.5 * (own.interval[1] - own.interval[0]) / by if own.interval else 0.5 / BEYOND
-        half = max(half, NUDGE[p.kind] / BEYOND)
+        half = max(half, KINDS[p.kind].nudge / BEYOND)
         others = np.delete(np.arange(len(best)), k)
         along = np.zeros(len(best))
         along[k] = 1.0
@@ -842,9 +834,8 @@ def _file_values(problem: Problem, values: np.ndarray) -> tuple[dict[str, dict[s
         entry = found.setdefault(_entry(b), {})
         if p.kind in HIGH:
             entry[p.kind] = value
-        elif p.kind in FACTORS:
+        elif key := KINDS[p.kind].key:
             own = {"mass": b.mass, "scale": b.scale, "inertia_factor": problem.inertia_factor(p.bodies[0])}
-            key = {"size": "scale", "inertia": "inertia_factor"}.get(p.kind, p.kind)
             entry[key] = own[key] * math.exp(value)
         if p.bodies[0] < many:
             entry.setdefault("mass", b.mass)  # with a density another size would mean another mass

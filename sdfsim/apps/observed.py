@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfsim.apps.beside import Beside
 from sdfsim.apps.observed_joints import Swing, flying_trees, held_together, jointed, swung, tree_of
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
@@ -20,6 +19,7 @@ from sdfsim.physics import pose
 from sdfsim.physics.bodies import from_scene, largest_extent
 from sdfsim.physics.free_flight import torque_free
 from sdfsim.physics.motion import MOTION
+from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Scene
@@ -110,10 +110,12 @@ def load_recordings(
     return with_velocities(found, scene), scene
 
 
-def load_beside(path: Path, scene_file: Path, *, allow_outside: bool = False, on_progress: Progress = silent) -> Beside:
-    """Read one recording, to simulate a scene beside it: a run, a file of poses, or `FILE[K]` for one of many in a
-    file. It begins with the first frame whose velocities are known. Raises SdfsimError as `load_recordings` does, and
-    also if the file has several recordings and none is selected, or if no velocities are known."""
+def load_beside(
+    path: Path, scene_file: Path, *, allow_outside: bool = False, on_progress: Progress = silent
+) -> Rollout:
+    """Read one recording, to simulate a scene beside it (see `beside`): a run, a file of poses, or `FILE[K]` for one of
+    many in a file. It begins with the first frame whose velocities are known. Raises SdfsimError as `load_recordings`
+    does, and also if the file has several recordings and none is selected, or if no velocities are known."""
     numbered = None if path.exists() else re.fullmatch(r"(.+)\[(\d+)\]", str(path))
     file, only = (Path(numbered[1]), int(numbered[2])) if numbered else (path, None)
     found, scene = load_recordings([file], scene_file, only=only, allow_outside=allow_outside, on_progress=on_progress)
@@ -124,9 +126,13 @@ def load_beside(path: Path, scene_file: Path, *, allow_outside: bool = False, on
         raise SdfsimError(f"{one.name}: no stretch is smooth enough to find a velocity", "give a longer recording")
     first = int(one.known.argmax())
     frames = first + np.flatnonzero(one.seen[first:].all(1))
-    return Beside(
-        one.name, tuple(body.name for body in movers(scene)), one.dt * (frames - first), one.goal[0][frames],
-        one.goal[1][frames], {name: getattr(one, name)[first] for name in MOTION},
+    place, turn = (poses[frames] for poses in one.goal)
+    place[0], turn[0] = one.position[first], one.orientation[first]
+    none = np.zeros((0, 3))
+    return Rollout(
+        one.dt * (frames - first), place, turn, one.velocity[frames], one.angular_velocity[frames],
+        np.zeros(len(frames), np.int64), none, none[:, :2].astype(np.int64),
+        names=tuple(body.name for body in movers(scene)), meta={"recording": one.name},
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.apps.beside import COLOR, OPACITY, Beside
+from sdfsim.apps.beside import COLOR, OPACITY, between, rows_in
 from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh, face_normals, sample_surface, vertex_normals
 from sdfsim.geometry.primitives import plane
@@ -79,7 +79,7 @@ class Playback:
     `network`: whether the run uses one. A recorded motion `beside` it is shown with translucent bodies."""
 
     def __init__(
-        self, scene: Scene, motion: Rollout | None = None, *, network: bool = True, beside: Beside | None = None
+        self, scene: Scene, motion: Rollout | None = None, *, network: bool = True, beside: Rollout | None = None
     ) -> None:
         import rerun as rr
 
@@ -102,7 +102,7 @@ class Playback:
         crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
         paths = [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
         self._alone = [(k, path) for k, path in enumerate(paths) if k not in crowded]
-        rows = () if beside is None else beside.rows(scene)
+        rows = () if beside is None else rows_in(scene, beside)
         self._ghosts = [(int(k), f"{BESIDE}/{rr.escape_entity_path_part(scene.bodies[k].name)}") for k in rows]
         self._beside = beside
         self._ropes = [joint for joint in shown_joints(scene) if joint.kind == "distance"]
@@ -203,7 +203,7 @@ class Playback:
             lines = rr.LineStrips3D.columns(strips=strips.reshape(-1, 2, 3).astype(np.float32))
             self.stream.send_columns(f"{JOINTS}/ropes", times, lines.partition(np.full(frames, len(self._ropes))))
         if self._beside is not None:
-            places, turns = self._beside.at(chunk.time)
+            places, turns = between(self._beside.time, self._beside.position, self._beside.orientation, chunk.time)
             for d, (_, path) in enumerate(self._ghosts):
                 motion = rr.Transform3D.columns(translation=places[:, d], quaternion=turns[:, d])
                 self.stream.send_columns(path, times, motion)
@@ -268,7 +268,7 @@ def _crowds(scene: Scene) -> list[Crowd]:
     return found
 
 
-def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Beside | None = None) -> None:
+def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Rollout | None = None) -> None:
     """Write `rollout` as a rerun recording, with a recorded motion `beside` it. Raises SdfsimError if the file cannot
     be written."""
     playback = Playback(scene, rollout, beside=beside)

@@ -49,20 +49,19 @@ def _shown(value: Any) -> str:
     return "nothing" if value in (NOTHING, None) else "a list" if isinstance(value, list) else "a mapping"
 
 
-_LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names", "joints": "be a list"}
-_LENGTHS = {"quat_xyzw": 4, "quat_wxyz": 4, "limits": 2, "limits_deg": 2, "grid": 3}
+def _holds(table: "type[Table]", name: str) -> str:
+    """How many entries a list of a table has, for a message."""
+    known = _schema(table, name)
+    what = "names" if known.get("items", {}).get("type") == "string" else "numbers"
+    return (
+        f"be {known['maxItems']} {what}" if "maxItems" in known else f"have at least {known.get('minItems', 0)} entry"
+    )
 
 
-def _numbers(name: str) -> str:
-    """What a list of numbers with this name holds; lists that are not named here are vectors."""
-    return f"{_LENGTHS.get(name, 3)} numbers"
-
-
-def _many(value: Any, name: str) -> str:
-    """How many entries a list with this name has."""
-    if name == "bodies" and not any(isinstance(entry, str) for entry in value):
-        return "have at least one body"
-    return _LISTS.get(name) or f"be {_numbers(name)}"
+def _schema(table: "type[Table]", name: str) -> dict[str, Any]:
+    """The JSON schema of a key; of one that may be left out, that of its values."""
+    known = table.model_json_schema()["properties"][name]
+    return {**next(iter(known.get("anyOf", [])), {}), **known}
 
 
 # Keys of other programs, and their names here.
@@ -104,15 +103,16 @@ def _message(error: Any, table: "type[Table]") -> str:
     got, allowed = _shown(error["input"]), limits.get("expected", "").replace("'", "").replace(" or ", ", ")
     if kind.startswith("int_"):
         return f"must be a whole number (got {got})"
+    holds = _holds(table, str(key)) if kind in ("too_short", "too_long", "list_type") else ""
     texts = {
         "number": f"must be a number{unit and ' in '}{unit} (got {got})",
         "greater_than": f"must be > {limits.get('gt', 0):g} (got {got}{unit and ' '}{unit})",
         "greater_than_equal": f"must be >= {limits.get('ge', 0):g} (got {got}{unit and ' '}{unit})",
         "less_than_equal": f"must be <= {limits.get('le', 0):g} (got {got}{unit and ' '}{unit})",
-        "too_short": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
-        "too_long": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
+        "too_short": f"must {holds} (got {limits.get('actual_length')})",
+        "too_long": f"must {holds} (got {limits.get('actual_length')})",
         "literal_error": f"must be one of {allowed} (got {got})",
-        "list_type": f"must be {'a list' if key in _LISTS else _numbers(str(key))} (got {got})",
+        "list_type": f"must {holds if holds.startswith('be') else 'be a list'} (got {got})",
         "dict_type": f"must be a mapping (got {got})",
     }
     return texts.get(kind, f"must be a text (got {got})")
@@ -798,11 +798,11 @@ def reference() -> str:
         "`python -m sdfsim.scene.schema > docs/scene.md` writes this page.",
     ]
     for title, table in _SECTIONS.items():
-        schema = table.model_json_schema().get("properties", {})
         lines += ["", f"## {title}", "", table.__doc__ or ""]
-        lines += ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"] if schema else []
+        head = ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"]
+        lines += head if table.model_fields else []
         for key, field in table.model_fields.items():
-            known = {**next(iter(schema[key].get("anyOf", [])), {}), **schema[key]}
+            known = _schema(table, key)
             default = "required" if field.is_required() else known.get("default")
             default = "" if default is None or isinstance(default, dict) else str(default)
             cells = (f"`{key}`", known["description"], known["unit"], _allowed(known), default)

@@ -191,24 +191,6 @@ def test_a_texture_lies_where_it_lay(tmp_path):
     assert "extensionsUsed" not in tree and "extensions" not in tree["materials"][0]
 
 
-@pytest.mark.parametrize("fps", [24, 29.97, 1000])
-def test_motion_has_the_rate_that_was_asked_for(dropped, tmp_path, fps):
-    """Whole frames of an editing program, where a run has a step of its own; the poses are those of the run."""
-    export(dropped.folder, tmp_path / "run.glb", fps=fps, allow_outside=True)
-    tree, binary = chunks(tmp_path / "run.glb")
-    (animation,) = tree["animations"]
-    time = values(tree, binary, animation["samplers"][0]["input"])[:, 0]
-    end = dropped.rollout.time[-1]
-    np.testing.assert_allclose(time, np.arange(len(time)) / fps, atol=1e-6)
-    assert end - 1e-3 / fps <= time[-1] < end + 1 / fps
-    node = next(k for k, n in enumerate(tree["nodes"]) if n["name"] == "ball")
-    channel = next(c for c in animation["channels"] if c["target"] == {"node": node, "path": "translation"})
-    place = values(tree, binary, animation["samplers"][channel["sampler"]]["output"])
-    true = dropped.rollout.position[:, dropped.index("ball")]  # the centre of a ball is its origin
-    for axis in range(3):
-        np.testing.assert_allclose(place[:, axis], np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
-
-
 def test_options_that_a_format_has_no_use_for_are_refused(dropped, tmp_path):
     for ending, options, told in (
         ("xml", {"fps": 24}, "--fps 24: no motion in it"),

@@ -306,17 +306,6 @@ def test_an_mjcf_hinge_of_more_than_a_turn_falls_as_in_mujoco(tmp_path: Path) ->
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")).key_qpos[0] == pytest.approx([0.0], abs=1e-9)
 
 
-def test_an_exported_motor_without_a_target_comes_back(tmp_path: Path) -> None:
-    built = SceneBuilder().add("arm", box={"size": (0.3, 0.1, 0.1)}, position=(0.15, 0, 1), mass=1.0)
-    built.join("pin", "hinge", "arm", anchor=(0, 0, 1), axis=(0, 1, 0), motor={"most": 7.0})
-    export(built.save(tmp_path / "scene.yaml"), tmp_path / "out.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-    assert model.nu == 1 and model.actuator_forcerange[0] == pytest.approx([-7, 7]) and not model.actuator_biasprm.any()
-    again, _ = imported(tmp_path / "out.xml")
-    motor = again.joints[0].motor
-    assert (motor.most, motor.position, motor.speed) == (pytest.approx(7.0), None, None)
-
-
 def test_what_other_readers_pass_over_is_passed_over(tmp_path: Path) -> None:
     text = "\n \n" + ARM.replace('xyz="0.01 0.02 0.25"', 'xyz="$(optenv NO_SUCH_VARIABLE 0.01 0.02 0.25)"')
     (tmp_path / "arm.urdf").write_bytes(text.encode() + b"\n\0")

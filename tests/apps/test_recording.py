@@ -79,16 +79,6 @@ def test_the_first_view_shows_all_of_the_motion(scene, rollout):
     assert framed(scene, rollout)[1] < (FARTHEST + 1) * 2 * framed(scene)[1] * np.sqrt(3)
 
 
-def test_before_the_motion_is_known_the_view_reaches_down_to_the_floor(tmp_path):
-    (tmp_path / "scene.yaml").write_text(
-        "version: 1\nshapes:\n  ball: {sphere: {radius: 0.1}}\nbodies:\n"
-        "  - {name: floor, plane: {}}\n  - {name: ball, shape: ball, position: [3, 0, 1]}\n"
-    )
-    centre, radius = framed(load_scene(tmp_path / "scene.yaml"))
-    for height in (0.0, 1.1):
-        assert np.linalg.norm(centre - [3, 0, height]) < radius < 1.0
-
-
 def test_a_file_holds_the_rollout(scene, rollout, tmp_path):
     path = tmp_path / "rollout.rrd"
     save_rollout(scene, rollout, path)
