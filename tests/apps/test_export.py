@@ -489,18 +489,6 @@ def test_the_command_reports_what_it_wrote_and_what_it_left_out(dropped, tmp_pat
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_names_that_would_be_one_stay_apart(tmp_path):
-    shape = analytic_shape("sphere", radius=0.1)
-    shape.save(tmp_path / "ball")
-    (tmp_path / "scene.yaml").write_text(
-        "version: 1\nshapes: {s: {asset: ball}}\nbodies:\n"
-        + "".join(f"  - {{name: {name!r}, shape: s, motion: static}}\n" for name in ("a b", "a_b", "A.b", "world", "é"))
-    )
-    export(tmp_path / "scene.yaml", tmp_path / "scene.urdf")
-    found = {path.name for path in tmp_path.glob("scene.*.urdf")}
-    assert found == {f"scene.{name}.urdf" for name in ("a_b", "a_b_1", "A_b_2", "world_1", "_")}
-
-
 # --- shapes far from their origin, small ones, and names ---
 
 FAR = np.array([512345.27, 5401234.61, 331.0])  # no sums of a few powers of two

@@ -383,18 +383,6 @@ def test_the_scene_that_is_written_moves_as_identified(tmp_path):
     Simulator(made, "solver").run(steps=3)
 
 
-def test_a_scene_elsewhere_names_its_files_from_there(tmp_path, recorded):
-    other = tmp_path / "elsewhere" / "scene.yaml"
-    other.parent.mkdir()
-    text = (recorded / "scene.yaml").read_text().replace("model: solver", "model: solver\neffects: {sleep: off}")
-    (tmp_path / "scene.yaml").write_text(text + "# 1e-3 stays a number\n")
-    found = identify(*load_recordings([recorded / "rollout.npz"], tmp_path / "scene.yaml"))
-    assert write_scene(found, tmp_path / "scene.yaml", other) == []
-    made = load_scene(other)
-    assert made.effects.sleep == "off"
-    assert made.bodies[1].friction == pytest.approx(BOX["friction"], abs=0.01)
-
-
 # --- what is refused ---
 
 HEAD = ",".join(COLUMNS)

@@ -8,8 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.identify import Problem, Windows
-from sdfsim.apps.observed import cleaned, with_velocities
-from sdfsim.apps.observed_joints import flying_trees, held_together
+from sdfsim.apps.observed import cleaned, flying_trees, held_together, with_velocities
 from sdfsim.scene.builder import SceneBuilder
 
 ORIGIN, AXIS = np.array([0.05, 0.02, 0.0]), np.array([0.0, 0.6, 0.8])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sdfsim import load_scene
-from sdfsim.apps import mjcf_fields
+from sdfsim.apps import mjcf
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.scene.scene import Scene
 
@@ -110,12 +110,12 @@ class Newer:
 
 def test_a_field_that_only_a_newer_mujoco_has_is_named() -> None:
     model = mujoco.MjModel.from_xml_string(text())
-    plain = mujoco.MjModel.from_xml_string(mjcf_fields.PLAIN)
+    plain = mujoco.MjModel.from_xml_string(mjcf.PLAIN)
     glue = np.zeros((model.ngeom, 2))
-    assert not list(mjcf_fields.unused(Newer(model, geom_glue=glue, moon=0.0), plain))
+    assert not list(mjcf.unused(Newer(model, geom_glue=glue, moon=0.0), plain))
     glue[2, 1] = 0.5
     quiet = Newer(model, geom_glue=glue, foam_size=np.ones(1), moon=1.6, nfoam=1)
-    found = [(element, line, rows.tolist()) for element, line, rows in mjcf_fields.unused(quiet, plain)]
+    found = [(element, line, rows.tolist()) for element, line, rows in mjcf.unused(quiet, plain)]
     assert found == [
         ("foam", "foam_size of MuJoCo's model", [0]),
         ("geom", "geom_glue of MuJoCo's model", [2]),

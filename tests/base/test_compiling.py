@@ -51,20 +51,6 @@ def test_a_function_is_compiled_where_numba_keeps_it_by_its_own_source(tmp_path,
     assert is_compiled(loaded(copy).py_func)  # runs as Python
 
 
-def test_each_form_of_a_function_with_optional_arguments_is_compiled_by_itself(tmp_path, monkeypatch):
-    from numba.core import config
-
-    file = tmp_path / "doubling.py"
-    file.write_text(SOURCE.replace("double(x)", "double(x, y)").replace("2 * x", "2 * x if y is None else x * y"))
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
-    first = loaded(file)
-    assert first(3, None) == 6
-    for function in (first, loaded(file)):
-        assert is_compiled(function) and is_compiled(function, {1: True}) and not is_compiled(function, {1: False})
-    assert first(3, 4) == 12
-    assert is_compiled(first, {1: False}) and is_compiled(loaded(file), {0: False, 1: False})
-
-
 @pytest.mark.parametrize("cache", ["True", "False"])
 def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, caplog, cache):
     from numba.core import config

@@ -86,6 +86,8 @@ def test_a_scene_that_names_files_with_backslashes_is_read(tmp_path):
 def test_no_exported_file_has_the_name_of_a_device():
     assert plain_names(["torus[0]", "torus[1]", "the ring", "!", "a_"]) == ["torus_0", "torus_1", "the_ring", "_", "a_"]
     assert plain_names(["con", "NUL", "com1", "cup"]) == ["con_1", "NUL_1", "com1_1", "cup"]
+    # Nor of another one, where case does not count.
+    assert plain_names(["a b", "a_b", "A.b", "world", "é"], True) == ["a_b", "a_b_1", "A_b_2", "world_1", "_"]
 
 
 def test_a_console_that_knows_few_characters_shows_the_others_escaped(tmp_path):
