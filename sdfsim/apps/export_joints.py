@@ -103,22 +103,6 @@ def place(body: Body | None) -> tuple[np.ndarray, Rotation]:
     return (np.zeros(3), Rotation.identity()) if body is None else (body.position, Rotation.from_quat(body.quat_xyzw))
 
 
-def start_of(scene: Scene, one: Held, child: int) -> float:
-    """rad or m: the angle of a hinge or position of a slider at the start; 0 for other joints."""
-    (here, turn), (there, other) = place(scene.bodies[child]), place(_body(scene, one.parent))
-    own, theirs = turn * one.frame, other * one.parent_frame
-    if one.joint.kind == "hinge":
-        vector = (theirs.inv() * own).as_rotvec()
-        angle = one.sense * vector[0]
-        # Full turns add up, but a pose does not show them.
-        whole = 2.0 * math.pi
-        return float(angle + whole * round((one.joint.start - angle) / whole))
-    if one.joint.kind == "slider":
-        apart = here + turn.apply(one.anchor) - there - other.apply(one.parent_anchor)
-        return float(one.sense * theirs.apply([1.0, 0.0, 0.0]) @ apart)
-    return 0.0
-
-
 def _body(scene: Scene, k: int) -> Body | None:
     return scene.bodies[k] if k >= 0 else None
 
@@ -186,7 +170,7 @@ def mjcf_pose(scene: Scene, tree: Trees, k: int) -> tuple[np.ndarray, np.ndarray
 
 def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Write the joint that holds a body, and return its part of qpos and of qvel."""
-    joint, start = one.joint, start_of(scene, one, child)
+    joint, start = one.joint, one.joint.start
     speed = speed_of(scene, one, child)
     if joint.kind == "fixed":
         return np.zeros(0), speed
@@ -314,8 +298,8 @@ def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
         lines.append("motors of joints: only their largest force is exported, as the effort")
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
         lines.append("cones of balls")
-    for k, one in tree.above.items():
-        if abs(start := start_of(scene, one, k)) > 1e-9:
+    for one in tree.above.values():
+        if abs(start := one.joint.start) > 1e-9:
             unit = "m" if one.joint.kind == "slider" else "rad"
             lines.append(
                 f"that joint {one.joint.name} starts at {start:.6g} {unit}: in a URDF all joints start at zero"

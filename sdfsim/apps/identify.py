@@ -190,6 +190,7 @@ class Problem:
         self.scene, self.recordings = scene, list(recordings)
         self.moving, self.fixed = movers(scene), [b for b in scene.bodies if b.motion == "static"]
         self.bodies, self.units = [*self.moving, *self.fixed], scene_units(scene)
+        self.sizes = np.array([largest_extent(scene.shapes[b.shape]) * b.scale for b in self.moving])
         self.joints = scene.joints if scene.effects.joints != "off" else ()
         self.parameters: list[Parameter] = []
         self.ground: dict[int, Ground] = {}
@@ -205,9 +206,8 @@ class Problem:
         span = max(1, round(0.5 * WINDOW * self.units.time / r.dt))
         frames = np.arange(len(r.known))
         around = np.clip(frames[:, None] + np.arange(-span, span + 1), 0, len(frames) - 1)
-        sizes = [largest_extent(self.scene.shapes[b.shape]) * b.scale for b in self.moving]
         moves = np.zeros(len(frames), bool)
-        for d, size in enumerate(sizes):
+        for d, size in enumerate(self.sizes):
             ways = np.linalg.norm(r.goal[0][around, d] - r.goal[0][:, None, d], axis=2)
             turns = np.linalg.norm(
                 pose.to_rotvec(pose.multiply(r.goal[1][around, d], pose.conjugate(r.goal[1][:, None, d]))), axis=2
@@ -262,9 +262,8 @@ class Problem:
         ways, there = [], []
         for k in np.unique(windows.recording).tolist():
             r = self.recordings[k]
-            sizes = np.array([largest_extent(self.scene.shapes[b.shape]) * b.scale for b in self.moving])
             turn = pose.to_rotvec(pose.multiply(r.goal[1][1:], pose.conjugate(r.goal[1][:-1])))
-            step = np.linalg.norm(np.diff(r.goal[0], axis=0), axis=2) + 0.5 * sizes * np.linalg.norm(turn, axis=2)
+            step = np.linalg.norm(np.diff(r.goal[0], axis=0), axis=2) + 0.5 * self.sizes * np.linalg.norm(turn, axis=2)
             step = np.where(r.seen[1:] & r.seen[:-1] & self.tells[k][1:, None], step, 0.0).sum(1)
             inside = np.zeros(len(step), bool)
             for part in windows.parts:

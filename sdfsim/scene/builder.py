@@ -33,8 +33,10 @@ class SceneBuilder:
 
     def __init__(self, **settings: Any) -> None:
         _known(settings, [key for key in SceneTable.model_fields if key not in _LISTED], "a scene")
-        self.settings: dict[str, Any] = _plain(settings)
-        _refuse("a scene", (SceneTable, {"version": VERSION, **self.settings, "bodies": [{"name": "a", "plane": {}}]}))
+        self.settings: dict[str, Any] = plain(settings)
+        validated(
+            "a scene", (SceneTable, {"version": VERSION, **self.settings, "bodies": [{"name": "a", "plane": {}}]})
+        )
         self.shapes: dict[str, dict[str, Any]] = {}
         self.bodies: list[dict[str, Any]] = []
         self.joints: list[dict[str, Any]] = []
@@ -44,7 +46,7 @@ class SceneBuilder:
         """Read a scene file, or a sample by its name, to extend it: `Scene.read("arm.yaml").add(...)`. Raises
         SceneError as `load_scene` does, with one line for every fault."""
         path = find_scene(path)
-        document = _plain(read_scene(path, allow_outside=allow_outside)[1].data)
+        document = plain(read_scene(path, allow_outside=allow_outside)[1].data)
         scene, home = cls(), path.parent
         scene.shapes, scene.bodies = document.get("shapes") or {}, document["bodies"]
         scene.joints = document.get("joints") or []
@@ -67,10 +69,10 @@ class SceneBuilder:
         _known(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], what)
         if any(body["name"] == name for body in self.bodies):
             raise SceneError([f"{what}: two bodies have this name"], "give each a name of its own")
-        shape = _plain({key: value for key, value in keys.items() if key in _OF_SHAPE})
-        own = _plain({key: value for key, value in keys.items() if key not in _OF_SHAPE})
+        shape = plain({key: value for key, value in keys.items() if key in _OF_SHAPE})
+        own = plain({key: value for key, value in keys.items() if key not in _OF_SHAPE})
         body = {"name": name, **({"shape": name} if shape else {}), **own}
-        _refuse(what, *([(ShapeTable, shape)] if shape else []), (BodyTable, body))
+        validated(what, *([(ShapeTable, shape)] if shape else []), (BodyTable, body))
         self.shapes |= {name: shape} if shape else {}
         self.bodies.append(body)
         return self
@@ -85,8 +87,8 @@ class SceneBuilder:
         given = ("name", "type", "bodies")
         _known(keys, [key for key in JointTable.model_fields if key not in given], f"joint {name!r}")
         held = [*bodies, WORLD] if len(bodies) == 1 else list(bodies)
-        joint = _plain({"name": name, "type": type, "bodies": held, **keys})
-        _refuse(f"joint {name!r}", (JointTable, joint))
+        joint = plain({"name": name, "type": type, "bodies": held, **keys})
+        validated(f"joint {name!r}", (JointTable, joint))
         self.joints.append(joint)
         return self
 
@@ -140,17 +142,18 @@ def loaded(scene: Any, on_progress: Progress = silent) -> Scene:
     raise SdfsimError(message)
 
 
-def _refuse(what: str, *parts: tuple[type[Table], dict[str, Any]]) -> None:
-    """Raise SceneError with a line for every fault of these tables; each line begins with `what`."""
+def validated(what: str, *parts: tuple[type[Table], dict[str, Any]]) -> list[Any]:
+    """The tables of these plain values. Raises SceneError with a line for every fault; each line begins with `what`."""
     found: dict[str, None] = {}
+    made = []
     for table, data in parts:
         try:
-            table.model_validate(data, context=_CONTEXT)
+            made.append(table.model_validate(data, context=_CONTEXT))
         except ValidationError as error:
-            for e in error.errors(include_url=False):
-                found[f"{what}: {at(e['loc'], e['msg'])}"] = None
+            found |= {f"{what}: {at(e['loc'], e['msg'])}": None for e in error.errors(include_url=False)}
     if found:
         raise SceneError(list(found), "docs/scene.md has every key")
+    return made
 
 
 def _known(keys: Mapping[str, Any], known: list[str], what: str) -> None:
@@ -159,15 +162,15 @@ def _known(keys: Mapping[str, Any], known: list[str], what: str) -> None:
         raise SceneError(wrong, f"known keys: {', '.join(known)}")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """A value of Python or of a document as dicts, lists, texts and numbers only: arrays and tuples become lists, paths
     become texts, and True and False become "on" and "off"."""
     if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items() if entry is not None}
+        return {str(key): plain(entry) for key, entry in value.items() if entry is not None}
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, Numeral):
         return int(value) if value.lstrip("+-").isdigit() else float(value)
     if isinstance(value, bool):

@@ -24,9 +24,10 @@ from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.steps import Frames, Steps
 from sdfsim.physics.units import inner_steps
 from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
-from sdfsim.scene.builder import loaded
+from sdfsim.scene.builder import loaded, plain, validated
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.schema import BodyTable
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
 from sdfsim.simulate.joint import JointHandle
 from sdfsim.simulate.steppers import Carry, FreeFlight, energies_of, stacked, stepper_of
@@ -37,11 +38,7 @@ if TYPE_CHECKING:
 
 GLANCE = 0.1  # s between two progress reports
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
-# what a variant may change: the length of the vector (0: a number), and the largest value of a number
-VARIED = {
-    "position": (3, np.inf), "quat_xyzw": (4, np.inf), "velocity": (3, np.inf), "angular_velocity": (3, np.inf),
-    "mass": (0, np.inf), "friction": (0, np.inf), "restitution": (0, 1.0),
-}  # fmt: skip
+VARIED = ("position", "quat_xyzw", "velocity", "angular_velocity", "mass", "friction", "restitution")
 CHUNKS = 16  # largest number of pieces that variants are cut into, so that all cores finish together
 
 
@@ -461,8 +458,8 @@ def differing_motion(state: State, other: State) -> np.ndarray:
 
 
 def varied(scene: Scene, variant: Variant) -> Scene:
-    """The scene with some of the fields `VARIED` changed, in SI units. A body's own inertia scales with its mass.
-    Raises SdfsimError for an unknown body or field, or an invalid value."""
+    """The scene with some of the fields `VARIED` changed, in SI units, with the limits of a scene file. A body's own
+    inertia scales with its mass. Raises SdfsimError for an unknown body or field, or an invalid value."""
     known = {body.name for body in scene.bodies}
     for name in variant:
         if name not in known:
@@ -471,29 +468,19 @@ def varied(scene: Scene, variant: Variant) -> Scene:
 
 
 def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
-    new: dict[str, Any] = {}
-    for name, given in fields.items():
-        where = f"variant: body {body.name!r}: {name}"
+    what = f"variant: body {body.name!r}"
+    for name in fields:
         if name not in VARIED:
-            raise SdfsimError(f"{where}: no such field{nearest(name, VARIED)}; fields are {', '.join(VARIED)}")
-        value, (count, most) = np.asarray(given, dtype=np.float64), VARIED[name]
-        if value.shape != ((count,) if count else ()) or not np.isfinite(value).all():
-            raise SdfsimError(f"{where}: must be {count or 1} finite numbers (got {given!r})")
-        if not count and not 0.0 <= value <= most:
-            raise SdfsimError(f"{where}: must be 0 to {most:g} (got {given!r})")
+            raise SdfsimError(f"{what}: {name}: no such field{nearest(name, VARIED)}; fields are {', '.join(VARIED)}")
         if body.motion != "dynamic" and name in ("velocity", "angular_velocity", "mass"):
-            raise SdfsimError(f"variant: body {body.name!r}: is {body.motion}, so it has no {name}")
+            raise SdfsimError(f"{what}: is {body.motion}, so it has no {name}")
         if body.path is not None and name in ("position", "quat_xyzw"):
-            message = f"variant: body {body.name!r}: is on a path, so its {name} cannot be changed"
-            raise SdfsimError(message, "change the path in the scene")
-        new[name] = value if count else float(value)
-    if "quat_xyzw" in new:
-        new["quat_xyzw"] = new["quat_xyzw"] / max(np.linalg.norm(new["quat_xyzw"]), 1e-300)
-    if "mass" in new:
-        if not new["mass"] > 0:
-            raise SdfsimError(f"variant: body {body.name!r}: mass: must be > 0")
-        if body.inertia is not None:
-            new["inertia"] = body.inertia * (new["mass"] / body.mass)
+            raise SdfsimError(f"{what}: is on a path, so its {name} cannot be changed", "change the path in the scene")
+    (table,) = validated(what, (BodyTable, plain({"name": body.name, "shape": "its own", **fields})))
+    values = {name: getattr(table, name) for name in fields}
+    new: dict[str, Any] = {name: np.array(v) if isinstance(v, list) else v for name, v in values.items()}
+    if "mass" in new and body.inertia is not None:
+        new["inertia"] = body.inertia * (new["mass"] / body.mass)
     return replace(body, **new)
 
 

@@ -207,8 +207,8 @@ def test_a_body_on_a_path_is_where_its_path_has_it():
         ({"bix": {}}, r"no body 'bix' \(did you mean 'box'\?\)"),
         ({"box": {"masss": 1}}, r"no such field \(did you mean 'mass'\?\); fields are position"),
         ({"box": {"mass": 0}}, "mass: must be > 0"),
-        ({"box": {"restitution": 1.5}}, "must be 0 to 1"),
-        ({"box": {"velocity": (1, 2)}}, "must be 3 finite numbers"),
+        ({"box": {"restitution": 1.5}}, "must be <= 1"),
+        ({"box": {"velocity": (1, 2)}}, "must be 3 numbers"),
         ({"floor": {"velocity": (1, 2, 3)}}, "is static, so it has no velocity"),
     ],
 )
