@@ -186,7 +186,7 @@ def _version(number: int) -> int:
     return number
 
 
-def key(what: str, default: Any = ..., unit: str = "", of: str = "", **limits: float) -> Any:
+def key(what: str, default: Any = ..., unit: str = "", of: str = "", **limits: Any) -> Any:
     """A key of a table: its meaning, default, unit, the kinds of entries that have it (if not all), and limits."""
     extra: dict[str, Any] = {"unit": unit, "of": of}
     return Field(default, description=what, json_schema_extra=extra, **limits)
@@ -619,7 +619,7 @@ class JointTable(Table):
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
-        kind, extra = data.get("type"), {name: field.json_schema_extra for name, field in cls.model_fields.items()}
+        kind, extra = str(data.get("type")), {name: field.json_schema_extra for name, field in cls.model_fields.items()}
         if kind not in get_args(JointKind):
             return
         fit = {name: str(own["of"]).split() for name, own in extra.items() if isinstance(own, dict) and own["of"]}

@@ -120,7 +120,7 @@ class Simulator(LiveScene):
         stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight, device=device)
         if not stepper.forces:
             _check_inputs(scene, model.name, joints=jointed)
-        self.stepper, self.model, self.device = stepper, stepper.model, stepper.device
+        self.stepper, self.model, self.device = stepper, stepper.model, str(stepper.device)
         self.seed = scene.seed if seed is None else seed
         self.units = stepper.units(scene, dt)
         self.dt = self.model.dt * self.units.time

@@ -88,7 +88,7 @@ class Stepper:
         return False
 
     @property
-    def device(self) -> str:
+    def device(self) -> Any:
         """Where it computes: "cpu", or the device of the network's weights."""
         return "cpu"
 
@@ -247,8 +247,8 @@ class OnSurfaces(Stepper):
         return self.contact and self.family.distances
 
     @property
-    def device(self) -> str:
-        return str(next(iter(self.model.network.state_dict().values())).device)
+    def device(self) -> Any:
+        return next(iter(self.model.network.state_dict().values())).device
 
     def surface(self, shape: Shape) -> Shape:
         return self.family.surface(shape, self.model.nodes)
