@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import yaml
@@ -13,6 +13,7 @@ from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.document import NOTHING, Faults, Numeral, at
+from sdfsim.scene.keys import BodyKeys, JointKeys
 from sdfsim.scene.load import checked, load_scene, read_scene, scene_of
 from sdfsim.scene.scene import WORLD, JointKind, Scene
 from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, ShapeTable, Table, meant
@@ -57,7 +58,7 @@ class SceneBuilder:
             scene.settings["model"] = str(home / scene.settings["model"])
         return scene
 
-    def add(self, name: str, **keys: Any) -> "SceneBuilder":
+    def add(self, name: str, **keys: Unpack[BodyKeys]) -> "SceneBuilder":
         """Add a body, or many copies of one, and return the scene.
 
         The keys are those of a body and of its shape in docs/scene.md, such as sphere={"radius": 0.1}, position=(0, 0,
@@ -77,7 +78,7 @@ class SceneBuilder:
         self.bodies.append(body)
         return self
 
-    def join(self, name: str, type: JointKind, *bodies: str, **keys: Any) -> "SceneBuilder":
+    def join(self, name: str, type: JointKind, *bodies: str, **keys: Unpack[JointKeys]) -> "SceneBuilder":
         """Add a joint between two bodies, and return the scene. The second body may be "world", which is also the
         default.
 

@@ -133,25 +133,3 @@ def test_a_body_slides_without_friction_if_all_of_its_contacts_do(tmp_path: Path
     scene, report = imported(tmp_path, alone)
     assert all(body.friction == 0.0 for body in scene.bodies)
     assert not any("friction of" in note for note in report["notes"])
-
-
-def test_the_note_on_friction_has_what_mujoco_takes(tmp_path: Path) -> None:
-    """Three bodies that all overlap: MuJoCo's own contacts have the coefficients and dimensions of each pair."""
-    xml = """<mujoco><worldbody>
-      <body name="a"><freejoint/><geom size="0.1" friction="0.9" condim="1"/></body>
-      <body name="b" pos="0.1 0 0"><freejoint/><geom size="0.1" friction="0.3" condim="1"/></body>
-      <body name="c" pos="0 0.1 0"><freejoint/><geom size="0.1" friction="0.2" priority="1"/></body>
-      </worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    own = np.sqrt([0.9, 0.3, 0.2])
-    off = {}
-    for contact in data.contact:
-        one, other = (int(model.geom_bodyid[g]) - 1 for g in contact.geom)
-        theirs = 0.0 if contact.dim == 1 else contact.friction[0]
-        off[abs(own[one] * own[other] - theirs)] = f"{own[one] * own[other]:.3g} in place of {theirs:.3g}"
-    _, report = imported(tmp_path, xml)
-    assert len(off) == 3 and any(
-        note.startswith("friction of 3 pairs") and off[max(off)] in note for note in report["notes"]
-    )

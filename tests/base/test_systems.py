@@ -1,6 +1,5 @@
 """What Windows and macOS do otherwise, as far as Linux can try it: consoles, locks, paths, what is not there."""
 
-import ast
 import ntpath
 import os
 import subprocess
@@ -17,51 +16,14 @@ from sdfsim.base import files
 from sdfsim.base.files import path_from
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = [
-    file
-    for folder in ("sdfsim", "pipeline", "samples", "scripts")
-    for file in sorted((ROOT / folder).rglob("*.py"))
-    if "__pycache__" not in file.parts
-] + [ROOT / "cli.py", ROOT / "setup.py"]
-UNIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
-UNIX_NAMES = {"fork", "forkpty", "getpgid", "getuid", "geteuid", "killpg", "mkfifo", "setsid", "uname", "SIGKILL"}
-UNIX_NAMES |= {"SIGHUP", "SIGALRM", "SIGUSR1", "SIGUSR2", "setitimer", "alarm", "sched_getaffinity", "fchmod"}
 
 
-def calls(tree: ast.AST) -> list[ast.Call]:
-    return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-
-
-def reads_text(call: ast.Call) -> bool:
-    """Whether a call opens a text file, and leaves its encoding to the system."""
-    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
-    given = {keyword.arg for keyword in call.keywords}
-    texts = [a.value for a in [*call.args, *(k.value for k in call.keywords)] if isinstance(a, ast.Constant)]
-    if "encoding" in given:
-        return False
-    if name == "read_text":
-        return not call.args
-    if name == "write_text":  # a method of paths takes one argument, our function two
-        return len(call.args) == 1
-    if isinstance(call.func, ast.Attribute) and call.args and not isinstance(call.args[0], ast.Constant):
-        return False  # of an archive or an image: the first argument of a path's is the mode
-    return name == "open" and not any(isinstance(text, str) and "b" in text and len(text) < 4 for text in texts)
-
-
-@pytest.mark.parametrize("file", SOURCES, ids=lambda f: str(f.relative_to(ROOT)))
-def test_code_takes_nothing_that_only_unix_has(file):
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names if alias.name in UNIX_MODULES]
-        if isinstance(node, ast.ImportFrom) and node.module in UNIX_MODULES:
-            found.append(node.module)
-        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") in ("os", "signal"):
-            found += [node.attr] if node.attr in UNIX_NAMES else []
-    found += [f"line {call.lineno}: shell" for call in calls(tree) if any(k.arg == "shell" for k in call.keywords)]
-    found += [f"line {call.lineno}: no encoding" for call in calls(tree) if reads_text(call)]
-    assert not found
+def test_text_files_are_opened_with_an_encoding():
+    """What only Unix has is refused by the linter's settings; this rule of it is not stable yet."""
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--preview", "--select", "PLW1514"]
+    folders = ["sdfsim", "pipeline", "samples", "scripts", "cli.py"]
+    done = subprocess.run([*command, *folders], cwd=ROOT, capture_output=True)
+    assert done.returncode == 0, done.stdout
 
 
 def test_paths_in_files_have_slashes_and_drives(monkeypatch):

@@ -9,7 +9,9 @@ import sdfsim
 from sdfsim import SceneError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import wavefront
+from sdfsim.scene.keys import BodyKeys, JointKeys
 from sdfsim.scene.load import load_scene
+from sdfsim.scene.schema import BodyTable, JointTable, ShapeTable
 
 ROOT = Path(__file__).parents[2]
 
@@ -133,6 +135,12 @@ def test_a_scene_of_a_file_can_be_gone_on_with(tmp_path):
     assert sdfsim.Scene.read("door").load().joints[0].name == "door"
     with pytest.raises(SceneError, match="no such file"):
         sdfsim.Scene.read(tmp_path / "none.yaml")
+
+
+def test_type_checkers_know_the_keys_of_the_file():
+    of_shape = {*ShapeTable.model_fields, *BodyTable.model_fields} - {"name"}
+    assert set(BodyKeys.__annotations__) == of_shape
+    assert set(JointKeys.__annotations__) == set(JointTable.model_fields) - {"name", "type", "bodies"}
 
 
 def test_what_does_not_fit_together_is_reported_by_the_names_of_bodies():

@@ -49,23 +49,6 @@ def test_friction_holds_a_smaller_effort_and_a_slider_holds_its_weight():
     assert lift.joint("joint").force[2] == pytest.approx(MASS * 9.81)
 
 
-def test_torque_control_of_a_pendulum_is_a_spring_of_its_own():
-    """Every step an effort of -k x angle: the period is 2 pi sqrt(I / k)."""
-    stiffness, sim = 4.0, free("hinge")
-    joint = sim.joint("joint")
-    sim["box"].angular_velocity = (0, 0, 1.0)
-    turns, before = [], 0.0
-    for step in range(400):
-        joint.effort = -stiffness * joint.angle
-        sim.step()
-        if before < 0.0 <= joint.angle:
-            turns.append((step + 1 - joint.angle / (joint.angle - before)) * sim.dt)
-        before = joint.angle
-    period = 2.0 * np.pi * np.sqrt(INERTIA / stiffness)
-    assert len(turns) > 2
-    np.testing.assert_allclose(np.diff(turns), period, rtol=0.01)
-
-
 def test_a_motor_may_be_given_and_its_strength_changed():
     sim = free("hinge")
     joint = sim.joint("joint")
