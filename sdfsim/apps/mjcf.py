@@ -259,13 +259,9 @@ class _Reader:
         smooth = {int(k) for k in owner[meet.any(1)]} - rough
         links = [replace(link, friction=0.0) if k in smooth else link for k, link in enumerate(links)]
         has = np.array([link.friction for link in links])[owner]
-        off = np.where(meet, np.abs(has[:, None] * has - friction), 0.0)
-        if off.max(initial=0.0) > ALIKE:
-            a, b = np.unravel_index(np.argmax(off), off.shape)
-            pairs = {tuple(sorted(pair)) for pair in np.stack([owner[i] for i in np.nonzero(off > ALIKE)], 1).tolist()}
-            one, other = (links[owner[k]].name for k in (a, b))
-            worst = f"{has[a] * has[b]:.3g} in place of {friction[a, b]:.3g} between {one} and {other}"
-            self.notes.append(f"friction of {len(pairs)} pairs of bodies is the product of theirs: at worst {worst}")
+        off = meet & (np.abs(has[:, None] * has - friction) > ALIKE)
+        if pairs := {tuple(sorted(pair)) for pair in owner[np.argwhere(off)].tolist()}:
+            self.notes.append(f"friction of {len(pairs)} pairs of bodies is the product of theirs, unlike MuJoCo's")
         return links
 
     def _names(self, of: Any, which: Any) -> list[str]:
