@@ -309,6 +309,10 @@ class Problem:
                 self._add("height", name, rows)
                 for axis, way in enumerate(self.ground[rows[0]].axes[:2]):
                     self._add("tilt", f"{name} about {'xyz'[np.abs(way).argmax()]}", rows, axis=axis)
+        some = self.parameters
+        self.bounds = np.array([p.low for p in some]), np.array([p.high for p in some])
+        self.width = np.array([KINDS[p.kind].width for p in some])
+        self.start = np.clip([p.start for p in some], *self.bounds)  # the values in the scene
 
     def _add(
         self, kind: str, name: str, rows: list[int], start: float = 0.0, low: float | None = None,
@@ -362,19 +366,6 @@ class Problem:
         first = along - normal * (normal @ along)
         first /= np.linalg.norm(first)
         return Ground(points.mean(0), np.stack([first, np.cross(normal, first), normal]))
-
-    @cached_property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.array([p.low for p in self.parameters]), np.array([p.high for p in self.parameters])
-
-    @cached_property
-    def width(self) -> np.ndarray:
-        return np.array([KINDS[p.kind].width for p in self.parameters])
-
-    @cached_property
-    def start(self) -> np.ndarray:
-        """The parameters' values in the scene."""
-        return np.clip([p.start for p in self.parameters], *self.bounds)
 
     def lie(self, values: np.ndarray, body: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (a quaternion) of a static body about its ground's centre, and its shift, model units."""
