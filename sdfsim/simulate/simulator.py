@@ -113,11 +113,11 @@ class Simulator(LiveScene):
         check_device(device)
         effects = plan(scene)
         model = model if model is not None else scene.model
-        jointed = effects.joints.on
-        asked = effects.contact.on or free_flight == "learned"
+        jointed = effects["joints"].on
+        asked = effects["contact"].on or free_flight == "learned"
         model = model if isinstance(model, Model) else load_model(model, weights=asked)
         self._asked = {"dt": dt, "free_flight": free_flight}
-        stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight, device=device)
+        stepper = stepper_of(model, contact=effects["contact"].on or jointed, free_flight=free_flight, device=device)
         if not stepper.forces:
             _check_inputs(scene, model.name, joints=jointed)
         self.stepper, self.model, self.device = stepper, stepper.model, str(stepper.device)
@@ -129,7 +129,7 @@ class Simulator(LiveScene):
         worked_on = replace(scene, shapes=surfaces, joints=scene.joints if jointed else ())
         check_nodes(worked_on)
         self.bodies, state = from_scene(worked_on, self.units)
-        if jointed and not effects.contact.on:
+        if jointed and not effects["contact"].on:
             self.bodies = replace(self.bodies, allowed=np.zeros_like(self.bodies.allowed))
         self._names = tuple(b.name for b in scene.bodies)
         self._joint_names = tuple(joint.name for joint in scene.joints)
@@ -142,11 +142,11 @@ class Simulator(LiveScene):
         self._options = Options(
             gravity=gravity,
             dt=self.model.dt,
-            friction=effects.friction.on,
-            restitution=effects.restitution.on,
-            rotation=effects.rotation.on,
+            friction=effects["friction"].on,
+            restitution=effects["restitution"].on,
+            rotation=effects["rotation"].on,
             substeps=inner_steps(scene),
-            sleep=effects.sleep.on and stepper.sleeps,
+            sleep=effects["sleep"].on and stepper.sleeps,
         )
         super().__init__(stepper.began(state, self.bodies, self._options))
         dynamic = self.bodies.moves
