@@ -4,6 +4,7 @@ On a CPU it is compiled, because torch's `grid_sample` uses one thread per volum
 the eight corners of a point are rows of a table, summed by `embedding_bag`.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -13,11 +14,11 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn import functional
 
-from sdfsim.physics import solver as kernels
+from sdfsim.base.compiling import cache_of, kept
 
 NEAR = 2.0  # cells from a surface within which all bricks exist
 
-with kernels.kept():
+with kept(cache_of([Path(__file__).with_name("trilinear.py")])):
     from pipeline.grids.trilinear import BRICK, gather, gather_with_threads, scatter, scatter_with_threads
 
 WHOLE = torch.zeros((0, 0, 0), dtype=torch.int32)  # the bricks of a complete grid

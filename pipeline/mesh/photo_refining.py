@@ -18,12 +18,12 @@ from pipeline.cameras import View, frame_of
 from pipeline.inputs.images import stacked
 from pipeline.inputs.photos import open_photo
 from pipeline.mesh.visibility import FAIR, Visibility
+from sdfsim.base.compiling import cache_of, kept
 from sdfsim.base.parallel import threads
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
-from sdfsim.physics import solver as kernels
 
-with kernels.kept():
+with kept(cache_of([Path(__file__).with_name("patch_kernel.py")])):
     from pipeline.mesh.patch_kernel import read_patches
 
 # Chosen by hand on the rendered sets, mostly `shelf`; other sets may need other values.

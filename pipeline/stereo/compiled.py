@@ -1,8 +1,10 @@
 """The compiled functions of stereo, kept in the user's cache folder."""
 
-from sdfsim.physics import solver as kernels
+from pathlib import Path
 
-with kernels.kept():
+from sdfsim.base.compiling import cache_of, kept
+
+with kept(cache_of([Path(__file__).with_name("kernels.py")])):
     from pipeline.stereo.kernels import agreeing as agreeing
     from pipeline.stereo.kernels import carve as carve
     from pipeline.stereo.kernels import paint as paint

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.apps import export_joints as jointed
 from sdfsim.apps.beside import between
-from sdfsim.apps.export_joints import add
+from sdfsim.apps.export_joints import add, numbers
 from sdfsim.apps.observed import COLUMNS
 from sdfsim.apps.recording import body_colors, framed, is_infinite, shown, with_normals
 from sdfsim.apps.run import read_run
@@ -250,7 +250,7 @@ def _near(scene: Scene) -> tuple[Scene, list[str]]:
     held = [[np.zeros(3) if k < 0 else arms[k] for k in joint.bodies] for joint in scene.joints]
     joints = tuple(replace(joint, anchor=joint.anchor - arm) for joint, arm in zip(scene.joints, held, strict=True))
     far = [(shape.name, c) for shape, c in zip(scene.shapes, middles, strict=True) if c.any()]
-    notes = [f"{name} is far from its origin: poses are those of its middle, at {_numbers(c)} m" for name, c in far]
+    notes = [f"{name} is far from its origin: poses are those of its middle, at {numbers(c)} m" for name, c in far]
     return replace(scene, shapes=tuple(shapes), bodies=tuple(bodies), joints=joints), notes
 
 
@@ -343,17 +343,13 @@ def _write_assets(
     return seen, cut
 
 
-def _numbers(*values: Any) -> str:
-    return " ".join(f"{value + 0.0:.12g}" for value in np.concatenate([np.ravel(value) for value in values]))
-
-
 def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
     return np.roll(quat_xyzw, 1, axis=-1)
 
 
 def _rgba(shape: Shape, color: np.ndarray) -> str:
     """The colour for formats with one colour per mesh: the mean of its own colours, or `color`."""
-    return _numbers((color if shape.mesh.colors is None else shape.mesh.colors.mean(0)) / 255.0, 1.0)
+    return numbers((color if shape.mesh.colors is None else shape.mesh.colors.mean(0)) / 255.0, 1.0)
 
 
 def _write_xml(path: Path, root: XML) -> None:
@@ -380,7 +376,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     file, (middle, radius) = GltfWriter(), framed(take.scene)
     file.origin = np.round(far_middle(middle + radius * np.array([[-1.0], [1.0]])))
     # Bodies of the same shape and colour share a mesh; those of the same shape share its arrays.
-    numbers: dict[tuple[int, int], tuple[dict[str, int], int]] = {}
+    arrays: dict[tuple[int, int], tuple[dict[str, int], int]] = {}
     drawn: dict[tuple[str, tuple[int, int]], int] = {}
     time = file.array(take.time) if take.moving else 0
     samplers, channels = [], []
@@ -388,7 +384,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
         seen = shown(take.scene, k, take.plane_size())
         form = (body.shape, k if is_infinite(shape) else -1)  # planes differ by the scenery that lies in them
         own = seen.colors is not None or seen.texture is not None
-        if form not in numbers:
+        if form not in arrays:
             mesh, normals = with_normals(seen)
             attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
             if mesh.uv is not None:
@@ -396,11 +392,11 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             if mesh.colors is not None:  # in 16 bits: for linear light, 8 are too few for dark colours
                 shades = np.pad(light(mesh.colors), ((0, 0), (0, 1)), constant_values=1.0)
                 attributes["COLOR_0"] = file.array(np.round(65535 * shades), "<u2")
-            numbers[form] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
+            arrays[form] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if (key, form) not in drawn:
             material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8, lit=True)
-            drawn[key, form] = file.mesh(key, *numbers[form], material)
+            drawn[key, form] = file.mesh(key, *arrays[form], material)
         place, turn = take.position[:, k] - file.origin, take.quat_xyzw[:, k]
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
         file.nodes.append({"name": name, "mesh": drawn[key, form], **node})
@@ -578,7 +574,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     root = XML("mujoco", model=plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
     add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
-    add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
+    add(root, "option", timestep=numbers(STEP), gravity=numbers(scene.gravity), cone="elliptic", impratio="10")
     if scene.joints:  # with the explicit default, stiff motors of light links chatter
         root[-1].set("integrator", "implicitfast")
     if sampled:  # number of starts and iterations with which MuJoCo searches the nearest points of two bodies
@@ -602,34 +598,34 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             meshes.add(name)
             # "convex" and "shell" also work without an enclosed volume, which meshes for display may lack.
             inertia = "convex" if "-" in file.stem else "shell"
-            add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
+            add(asset, "mesh", name=name, file=file.name, scale=numbers([scale] * 3), inertia=inertia)
         return name
 
     every = list(take.each())
     for k in tree.order:
         (name, body, shape, color), quat, above = every[k], every[k][1].quat_xyzw, tree.above.get(k)
         place, turned = jointed.mjcf_pose(scene, tree, k)
-        node = add(nodes[above.parent if above else -1], "body", name=name, pos=_numbers(place))
-        node.set("quat", _numbers(_wxyz(turned)))
+        node = add(nodes[above.parent if above else -1], "body", name=name, pos=numbers(place))
+        node.set("quat", numbers(_wxyz(turned)))
         nodes[k] = node
         if body.motion == "kinematic":
             node.set("mocap", "true")
         elif body.motion == "dynamic":
             if above:
                 start, moving = jointed.mjcf_joint(node, scene, above, k, joint_names[above.joint.name])
-                places += [_numbers(start)] * (len(start) > 0)
-                speeds += [_numbers(moving)] * (len(moving) > 0)
+                places += [numbers(start)] * (len(start) > 0)
+                speeds += [numbers(moving)] * (len(moving) > 0)
             else:
                 add(node, "freejoint", name=f"{name}_free")
             com, tensor = body.scale * shape.com, _inertia(body, shape)
-            full = _numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
-            add(node, "inertial", pos=_numbers(com), mass=_numbers(body.mass), fullinertia=full)
+            full = numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+            add(node, "inertial", pos=numbers(com), mass=numbers(body.mass), fullinertia=full)
         if body.motion == "dynamic" and not above:
             com, turn = body.scale * shape.com, Rotation.from_quat(quat)
             # Velocity of the body's own origin, in world axes; and angular velocity, in body axes.
             speed = body.velocity - np.cross(body.angular_velocity, turn.apply(com))
-            places.append(_numbers(body.position, _wxyz(quat)))
-            speeds.append(_numbers(speed, turn.inv().apply(body.angular_velocity)))
+            places.append(numbers(body.position, _wxyz(quat)))
+            speeds.append(numbers(speed, turn.inv().apply(body.angular_velocity)))
         rgba = _rgba(shape, color)
         if body.shape in seen:
             mesh = mesh_of(seen[body.shape], body.scale)
@@ -640,7 +636,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         else:
             form: Any = shape.sdf
             sizes = (take.plane_size(),) * 3 if isinstance(form, PlaneSdf) else form.scaled(body.scale).sizes
-            solids = [{"type": form.KIND, "size": _numbers(sizes), "rgba": rgba}]
+            solids = [{"type": form.KIND, "size": numbers(sizes), "rgba": rgba}]
         mates = sum(1 << g for g in np.flatnonzero(allowed[group[k]]))
         surface = {"condim": "3", "contype": f"{1 << group[k]}", "conaffinity": f"{mates}"}
         surface |= _mjcf_surface(body.friction**2, body.restitution**2)
@@ -674,9 +670,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         controls, lines = jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names)
         left_out += lines
     if places:
-        start = {"qpos": " ".join(places), "qvel": " ".join(speeds)} | (
-            {"ctrl": _numbers(controls)} if controls else {}
-        )
+        start = {"qpos": " ".join(places), "qvel": " ".join(speeds)} | ({"ctrl": numbers(controls)} if controls else {})
         add(add(root, "keyframe"), "key", name="start", **start)
     _write_xml(out, root)
     return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
@@ -704,7 +698,7 @@ def _refined(take: Take) -> tuple[Take, list[str]]:
         for body in scene.bodies
     )  # fmt: skip
     scene = replace(scene, bodies=bodies, joints=tuple(map(_refined_joint, scene.joints)), gravity=k * scene.gravity)
-    fall = _numbers(np.linalg.norm(scene.gravity))
+    fall = numbers(np.linalg.norm(scene.gravity))
     line = (
         f"metres and kilograms, as MuJoCo refuses bodies as small as {small[0]}: lengths are in mm, masses in 1e-9 kg"
     )
@@ -731,19 +725,21 @@ def _refined_joint(joint: Joint) -> Joint:
     )  # fmt: skip
 
 
+def rebound(damping: np.ndarray) -> np.ndarray:
+    """The part of the speed that a contact of MuJoCo returns, which is a spring that only pushes, by its damping z
+    relative to the critical one: exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)); also for z above 1, where arccos and root
+    are imaginary."""
+    turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
+    return np.exp(-damping * np.abs(turned))
+
+
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
     """Friction, and a contact as stiff as the step allows, damped so that bodies separate with the part `restitution`
-    of their speed.
-
-    MuJoCo has no restitution. A spring that only pushes, with the damping z relative to the critical one, returns
-    exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed; also for z above 1, where arccos and root are imaginary.
-    """
+    of their speed: MuJoCo has no restitution."""
     damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to the largest that MuJoCo does not change
-    turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
-    back = np.exp(-damping * np.abs(turned))
-    found = np.interp(-restitution, -back, damping)
+    found = np.interp(-restitution, -rebound(damping), damping)
     sliding = [friction, friction, 0.005, 0.0001, 0.0001] if pair else [friction, 0.005, 0.0001]
-    return {"friction": _numbers(sliding), "solref": _numbers(SOFT * STEP / found, found)}
+    return {"friction": numbers(sliding), "solref": numbers(SOFT * STEP / found, found)}
 
 
 # --- URDF ---
@@ -770,31 +766,31 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         # The origin of a link that a joint holds is at the joint.
         origin = np.zeros(3) if above is None else above.anchor
         surface = add(link, "contact")
-        add(surface, "lateral_friction", value=_numbers(body.friction))
-        add(surface, "restitution", value=_numbers(body.restitution))
+        add(surface, "lateral_friction", value=numbers(body.friction))
+        add(surface, "restitution", value=numbers(body.restitution))
         moves = body.motion == "dynamic"
         inertial = add(link, "inertial")
-        add(inertial, "origin", xyz=_numbers(body.scale * shape.com - origin), rpy="0 0 0")
-        add(inertial, "mass", value=_numbers(body.mass if moves else 0.0))
+        add(inertial, "origin", xyz=numbers(body.scale * shape.com - origin), rpy="0 0 0")
+        add(inertial, "mass", value=numbers(body.mass if moves else 0.0))
         tensor = _inertia(body, shape) if moves else np.zeros((3, 3))
-        sides = {f"i{'xyz'[a]}{'xyz'[b]}": _numbers(tensor[a, b]) for a in range(3) for b in range(a, 3)}
+        sides = {f"i{'xyz'[a]}{'xyz'[b]}": numbers(tensor[a, b]) for a in range(3) for b in range(a, 3)}
         add(inertial, "inertia", **sides)
 
         def part(tag: str, link: XML = link, origin: np.ndarray = origin, **keys: str) -> XML:
             made = add(link, tag, **keys)
             if np.any(origin):
-                add(made, "origin", xyz=_numbers(-origin), rpy="0 0 0")
+                add(made, "origin", xyz=numbers(-origin), rpy="0 0 0")
             return made
 
         def mesh(element: XML, file: Path, scale: float = body.scale) -> None:
             path = f"{file.parent.name}/{file.name}"
-            add(add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
+            add(add(element, "geometry"), "mesh", filename=path, scale=numbers([scale] * 3))
 
         if body.shape not in seen:
             if isinstance(shape.sdf, PlaneSdf):  # PyBullet does not draw planes
                 visual = add(link, "visual")
                 add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
-                add(add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
+                add(add(visual, "geometry"), "box", size=numbers([2.0 * take.plane_size()] * 2, 0.002))
             else:
                 visual = part("visual")
                 _urdf_form(add(visual, "geometry"), shape.sdf, body.scale)
@@ -829,11 +825,11 @@ def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
     if isinstance(form, PlaneSdf):
         add(geometry, "plane", normal="0 0 1")
     elif isinstance(form, SphereSdf):
-        add(geometry, "sphere", radius=_numbers(form.radius))
+        add(geometry, "sphere", radius=numbers(form.radius))
     elif isinstance(form, BoxSdf):
-        add(geometry, "box", size=_numbers(2.0 * np.array(form.half)))
+        add(geometry, "box", size=numbers(2.0 * np.array(form.half)))
     else:
-        add(geometry, form.KIND, radius=_numbers(form.radius), length=_numbers(2.0 * form.half))
+        add(geometry, form.KIND, radius=numbers(form.radius), length=numbers(2.0 * form.half))
 
 
 # --- poses ---

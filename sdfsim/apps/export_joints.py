@@ -103,22 +103,6 @@ def place(body: Body | None) -> tuple[np.ndarray, Rotation]:
     return (np.zeros(3), Rotation.identity()) if body is None else (body.position, Rotation.from_quat(body.quat_xyzw))
 
 
-def start_of(scene: Scene, one: Held, child: int) -> float:
-    """rad or m: the angle of a hinge or position of a slider at the start; 0 for other joints."""
-    (here, turn), (there, other) = place(scene.bodies[child]), place(_body(scene, one.parent))
-    own, theirs = turn * one.frame, other * one.parent_frame
-    if one.joint.kind == "hinge":
-        vector = (theirs.inv() * own).as_rotvec()
-        angle = one.sense * vector[0]
-        # Full turns add up, but a pose does not show them.
-        whole = 2.0 * math.pi
-        return float(angle + whole * round((one.joint.start - angle) / whole))
-    if one.joint.kind == "slider":
-        apart = here + turn.apply(one.anchor) - there - other.apply(one.parent_anchor)
-        return float(one.sense * theirs.apply([1.0, 0.0, 0.0]) @ apart)
-    return 0.0
-
-
 def _body(scene: Scene, k: int) -> Body | None:
     return scene.bodies[k] if k >= 0 else None
 
@@ -168,7 +152,8 @@ def gains(joint: Joint) -> tuple[float, float]:
 # --- MJCF ---
 
 
-def _text(*values: Any) -> str:
+def numbers(*values: Any) -> str:
+    """Numbers and arrays as an XML attribute."""
     return " ".join(f"{value + 0.0:.12g}" for value in np.concatenate([np.ravel(value) for value in values]))
 
 
@@ -185,19 +170,19 @@ def mjcf_pose(scene: Scene, tree: Trees, k: int) -> tuple[np.ndarray, np.ndarray
 
 def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Write the joint that holds a body, and return its part of qpos and of qvel."""
-    joint, start = one.joint, start_of(scene, one, child)
+    joint, start = one.joint, one.joint.start
     speed = speed_of(scene, one, child)
     if joint.kind == "fixed":
         return np.zeros(0), speed
-    keys = {"type": {"hinge": "hinge", "slider": "slide", "ball": "ball"}[joint.kind], "pos": _text(one.anchor)}
+    keys = {"type": {"hinge": "hinge", "slider": "slide", "ball": "ball"}[joint.kind], "pos": numbers(one.anchor)}
     if joint.kind != "ball":
-        keys |= {"axis": _text(one.axis()), "ref": _text(start)}
-    keys |= {"damping": _text(joint.damping)} if joint.damping else {}
-    keys |= {"frictionloss": _text(joint.friction)} if joint.friction else {}
+        keys |= {"axis": numbers(one.axis()), "ref": numbers(start)}
+    keys |= {"damping": numbers(joint.damping)} if joint.damping else {}
+    keys |= {"frictionloss": numbers(joint.friction)} if joint.friction else {}
     if joint.limits is not None:
-        keys |= {"limited": "true", "range": _text(joint.limits)}
+        keys |= {"limited": "true", "range": numbers(joint.limits)}
     if joint.spring is not None:
-        keys |= {"stiffness": _text(joint.spring.stiffness), "springref": _text(joint.spring.rest)}
+        keys |= {"stiffness": numbers(joint.spring.stiffness), "springref": numbers(joint.spring.rest)}
     add(node, "joint", name=name, **keys)
     return (np.array([1.0, 0.0, 0.0, 0.0]) if joint.kind == "ball" else np.array([start])), speed
 
@@ -214,7 +199,7 @@ def mjcf_rest(
 
     def end(joint: Joint, side: int) -> str:
         name = f"{names[joint.name]}_end{side}"
-        add(sites[joint.bodies[side]], "site", name=name, pos=_text(joint.anchor[side]), size="0.002")
+        add(sites[joint.bodies[side]], "site", name=name, pos=numbers(joint.anchor[side]), size="0.002")
         return name
 
     for joint in tree.loops:
@@ -222,10 +207,10 @@ def mjcf_rest(
         if joint.kind == "distance":
             keys: dict[str, str] = {}
             if joint.limits is not None:
-                keys |= {"limited": "true", "range": _text(joint.limits)}
+                keys |= {"limited": "true", "range": numbers(joint.limits)}
             if joint.spring is not None:
-                keys |= {"stiffness": _text(joint.spring.stiffness), "springlength": _text(joint.spring.rest)}
-            keys |= {"damping": _text(joint.damping)} if joint.damping else {}
+                keys |= {"stiffness": numbers(joint.spring.stiffness), "springlength": numbers(joint.spring.rest)}
+            keys |= {"damping": numbers(joint.damping)} if joint.damping else {}
             rope = add(into["tendon"], "spatial", name=name, width="0.003", **keys)
             for side in (0, 1):
                 add(rope, "site", site=end(joint, side))
@@ -235,7 +220,7 @@ def mjcf_rest(
         one = held(joint, joint.bodies[0])
         ends = {"body1": bodies[joint.bodies[0]]} | ({"body2": bodies[one.parent]} if one.parent >= 0 else {})
         if joint.kind == "fixed":
-            add(into["equality"], "weld", name=name, **ends, anchor=_text(np.zeros(3)))
+            add(into["equality"], "weld", name=name, **ends, anchor=numbers(np.zeros(3)))
         elif joint.kind == "slider":
             lines.append(f"slider {joint.name}, which closes a loop")
         else:  # a hinge is held at two points of its axis
@@ -243,7 +228,7 @@ def mjcf_rest(
             for number, point in enumerate(points):
                 add(
                     into["equality"], "connect", name=name + (f"_{number}" if number else ""), **ends,
-                    anchor=_text(point),
+                    anchor=numbers(point),
                 )  # fmt: skip
             if joint.limits or joint.damping or joint.friction or joint.spring or joint.motor:
                 lines.append(f"limits, damping, friction, spring and motor of {joint.name}, which closes a loop")
@@ -257,12 +242,12 @@ def mjcf_rest(
             continue
         kp, kv = gains(joint)
         keys = {"name": f"{names[joint.name]}_motor", "joint": names[joint.name]}
-        keys |= {"forcerange": _text((-joint.motor.most, joint.motor.most))}
+        keys |= {"forcerange": numbers((-joint.motor.most, joint.motor.most))}
         if joint.motor.speed is not None:
-            add(into["actuator"], "velocity", kv=_text(kv), **keys)
+            add(into["actuator"], "velocity", kv=numbers(kv), **keys)
             controls.append(joint.motor.speed)
         elif joint.motor.position is not None:
-            add(into["actuator"], "position", kp=_text(kp), kv=_text(kv), **keys)
+            add(into["actuator"], "position", kp=numbers(kp), kv=numbers(kv), **keys)
             controls.append(joint.motor.position)
         else:  # no target is set
             add(into["actuator"], "motor", **keys)
@@ -291,15 +276,15 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
     add(made, "parent", link=links[one.parent])
     add(made, "child", link=links[child])
     turn = one.parent_frame * one.frame.inv()
-    add(made, "origin", xyz=_text(one.parent_anchor - origin), rpy=_text(turn.as_euler("xyz")))
+    add(made, "origin", xyz=numbers(one.parent_anchor - origin), rpy=numbers(turn.as_euler("xyz")))
     if joint.kind in ("hinge", "slider"):
-        add(made, "axis", xyz=_text(one.axis()))
+        add(made, "axis", xyz=numbers(one.axis()))
         low, high = joint.limits or (-EFFORT, EFFORT)
         effort = EFFORT if joint.motor is None else joint.motor.most
-        ends = {} if joint.kind == "hinge" and not bounded else {"lower": _text(low), "upper": _text(high)}
-        add(made, "limit", **ends, effort=_text(effort), velocity=_text(EFFORT))
+        ends = {} if joint.kind == "hinge" and not bounded else {"lower": numbers(low), "upper": numbers(high)}
+        add(made, "limit", **ends, effort=numbers(effort), velocity=numbers(EFFORT))
     if joint.damping or joint.friction:
-        add(made, "dynamics", damping=_text(joint.damping), friction=_text(joint.friction))
+        add(made, "dynamics", damping=numbers(joint.damping), friction=numbers(joint.friction))
 
 
 def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
@@ -313,8 +298,8 @@ def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
         lines.append("motors of joints: only their largest force is exported, as the effort")
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
         lines.append("cones of balls")
-    for k, one in tree.above.items():
-        if abs(start := start_of(scene, one, k)) > 1e-9:
+    for one in tree.above.values():
+        if abs(start := one.joint.start) > 1e-9:
             unit = "m" if one.joint.kind == "slider" else "rad"
             lines.append(
                 f"that joint {one.joint.name} starts at {start:.6g} {unit}: in a URDF all joints start at zero"

@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import yaml
 
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import path_from, replacing, write_text
+from sdfsim.base.files import replacing
 from sdfsim.base.lazy import NotInstalled, pyplot
 from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.physics import pose
@@ -31,11 +30,11 @@ from sdfsim.physics.joint_columns import DAMPING, DRAG
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver.world import FIRST
+from sdfsim.physics.steps import Frames
 from sdfsim.physics.units import scene_units
-from sdfsim.scene.load import read_scene
-from sdfsim.scene.scene import Joint, Scene
+from sdfsim.scene.builder import SceneBuilder
+from sdfsim.scene.scene import Body, Joint, Scene
 from sdfsim.simulate.batch import Copies, inner_of_frame
-from sdfsim.simulate.steppers import Frames
 
 # Model units of time, about seconds for bodies of a metre: length and spacing of short windows, and length of long
 # ones.
@@ -45,10 +44,6 @@ WHOLE = 8  # least number of long windows for a final fit to them: a few chaotic
 OUTLIER = 2e-3  # model lengths: larger errors of windows count less than squared
 FAR = 0.3  # relative to a body's size: bound of the error of a motion
 WEAK = 1e-3  # weight that keeps parameters that nothing shows at the scene's values
-# Steps for finite differences, relative to a parameter's width: contacts come and go, and impacts are resolved to an
-# inner step, so smaller differences tell nothing.
-NUDGE = {"friction": 0.02, "restitution": 0.02, "mass": 0.02, "inertia": 0.1, "size": 0.2, "height": 0.2, "tilt": 0.1,
-         "joint_friction": 0.05, "joint_damping": 0.05}  # fmt: skip
 GRAVITY = 9.81  # m/s^2, used for joints of scenes without gravity
 SURE = 1.96  # half of an interval of 95 %, in standard deviations
 SHOWN = 0.25  # relative to its width: how precisely windows must determine a parameter, with noise of `OUTLIER`
@@ -62,41 +57,55 @@ TRIES = 15, 15, 8  # largest numbers of iterations of the fits to short windows,
 DRAWS = 400  # random draws of recordings, for intervals
 POINTS, BEYOND = 4, 2.0  # points of a profile on each side, and their farthest distance, in half intervals
 CROWD, ROUNDS, AROUND = 24, 14, 0.15  # the search for long windows: points, rounds, and range, in widths
-# Search ranges of parameters around the scene's values: logarithms of factors, model lengths, rad.
-WIDTH = {
-    "friction": 1.0, "restitution": 1.0, "mass": 3.0, "inertia": 0.5, "size": 0.1, "height": 0.05, "tilt": 0.05,
-    "joint_friction": 0.05, "joint_damping": 0.05,
-}  # fmt: skip
-FARTHEST = {
-    "joint_friction": 0.5,
-    "joint_damping": 0.5,
-    "mass": 7.0,
-    "inertia": 0.5,
-    "size": 0.15,
-    "height": 0.15,
-    "tilt": 0.15,
-}
 SHELL = 5.0 / 3.0  # inertia of a hollow cube or ball over that of a solid one: the most that such a body can have
-FACTORS = ("mass", "inertia", "size")
 # Columns of joints; the parameters are in units of `heft`.
 OF_JOINTS = {"joint_friction": DRAG, "joint_damping": DAMPING}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of parameters. Those of factors are logarithms."""
+
+    head: str  # what reports call it
+    width: float  # of the search around the scene's value: logarithms of factors, model lengths, rad
+    # Step for finite differences, relative to the width: contacts come and go, and impacts are resolved to an inner
+    # step, so smaller differences tell nothing.
+    nudge: float
+    farthest: float = 0.0  # the largest change
+    unit: str = ""  # in reports
+    key: str = ""  # of the scene file, for factors
+    scales: dict[str, float] = field(default_factory=dict)  # array of `Bodies` -> power of a factor that scales it
+
+
+SIZES = {"scale": 1.0, "com": 1.0, "bounds": 1.0, "size": 1.0, "radius": 1.0, "inertia": 2.0}
+KINDS = {
+    "friction": Kind("friction, product", 1.0, 0.02),
+    "restitution": Kind("restitution, product", 1.0, 0.02),
+    "mass": Kind("mass", 3.0, 0.02, 7.0, " kg", "mass", {"mass": 1.0, "inverse_mass": -1.0, "inertia": 1.0}),
+    "inertia": Kind("inertia, factor", 0.5, 0.1, 0.5, "", "inertia_factor", {"inertia": 1.0}),
+    "size": Kind("size, factor", 0.1, 0.2, 0.15, "", "scale", SIZES),
+    "height": Kind("shift along its normal", 0.05, 0.2, 0.15, " m"),
+    "tilt": Kind("tilted", 0.05, 0.1, 0.15, " degrees"),
+    "joint_friction": Kind("friction of a joint", 0.05, 0.05, 0.5),
+    "joint_damping": Kind("damping of a joint", 0.05, 0.05, 0.5),
+}
+HEADS = {name: kind.head for name, kind in KINDS.items()}
+HEADS |= {"own_friction": "friction of its own", "own_restitution": "restitution of its own"}
+# Units for hinges and balls, and for sliders.
+OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One unknown number: of one body, or of all copies of one."""
 
-    kind: str  # key of `WIDTH`
+    kind: str  # key of `KINDS`
     bodies: tuple[int, ...]  # indices: moving bodies first, then static ones
     name: str
     start: float = 0.0  # value in the scene; logarithms for factors
     low: float = -math.inf
     high: float = math.inf
     axis: int = 0  # axis of a tilt; or the number of a joint
-
-    @property
-    def width(self) -> float:
-        return WIDTH[self.kind]
 
 
 @dataclass(frozen=True)
@@ -109,24 +118,29 @@ class Ground:
 
 @dataclass(frozen=True)
 class Estimate:
-    kind: str
+    kind: str  # key of `HEADS`
     name: str
     unit: str
     value: float | None  # None if the recordings do not show it
     interval: tuple[float, float] | None
+
+    def lines(self) -> tuple[str, str]:
+        """What it is, and its value with the interval."""
+        shown, digits = "not shown by these recordings", 5 if self.kind == "height" or self.kind in OF_JOINTS else 3
+        if self.interval:
+            low, high = (f"{end:.{digits}f}" for end in self.interval)
+            shown = f"{self.value:.{digits}f}{self.unit} ({low} to {high})"
+        return f"{HEADS[self.kind]}: {self.name}", shown
 
 
 @dataclass(frozen=True)
 class Profile:
     """The loss as a function of one parameter; the others are fitted again for each value."""
 
-    kind: str  # key of `HEADS`
-    name: str
-    unit: str
-    value: float  # the value found, in this unit
-    interval: tuple[float, float] | None  # None if the recordings do not show it
+    estimate: Estimate
+    best: float  # the value with the lowest loss, in the estimate's unit
     x: list[float]
-    loss: list[float]  # loss relative to that of `value`
+    loss: list[float]  # loss relative to that of `best`
 
 
 @dataclass(frozen=True)
@@ -143,7 +157,7 @@ class Identified:
     profiles: list[Profile] = field(default_factory=list)  # if they are asked for
 
     def report(self) -> dict[str, Any]:
-        kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(WIDTH)[2:])
+        kinds = ("friction", "restitution", "own_friction", "own_restitution", *list(KINDS)[2:])
         values: dict[str, Any] = {kind: {} for kind in kinds}
         for e in self.estimates:
             values[e.kind][e.name] = {"value": e.value, "interval": e.interval}
@@ -153,26 +167,8 @@ class Identified:
         }  # fmt: skip
 
 
-HEADS = {
-    "friction": "friction, product", "restitution": "restitution, product", "own_friction": "friction of its own",
-    "own_restitution": "restitution of its own", "mass": "mass", "inertia": "inertia, factor", "size": "size, factor",
-    "height": "shift along its normal", "tilt": "tilted", "joint_friction": "friction of a joint",
-    "joint_damping": "damping of a joint",
-}  # fmt: skip
-UNITS = {"mass": " kg", "height": " m", "tilt": " degrees"}
-# Units for hinges and balls, and for sliders.
-OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}
-
-
 def report_lines(found: Identified) -> list[str]:
-    lines = []
-    for e in found.estimates:
-        digits = 5 if e.kind == "height" or e.kind in OF_JOINTS else 3
-        seen = "not shown by these recordings"
-        if e.interval:
-            low, high = e.interval
-            seen = f"{e.value:.{digits}f}{e.unit} ({low:.{digits}f} to {high:.{digits}f})"
-        lines.append(f"{HEADS[e.kind]}: {e.name}: {seen}")
+    lines = [": ".join(e.lines()) for e in found.estimates]
     lines.append(f"{found.windows} windows, repeated with an error of {found.error_m:.2g} m")
     h = found.held_out
     who = f"{h['recordings']} whole motions that the fit has not seen" if h["recordings"] else "the same motions, whole"
@@ -194,6 +190,7 @@ class Problem:
         self.scene, self.recordings = scene, list(recordings)
         self.moving, self.fixed = movers(scene), [b for b in scene.bodies if b.motion == "static"]
         self.bodies, self.units = [*self.moving, *self.fixed], scene_units(scene)
+        self.sizes = np.array([largest_extent(scene.shapes[b.shape]) * b.scale for b in self.moving])
         self.joints = scene.joints if scene.effects.joints != "off" else ()
         self.parameters: list[Parameter] = []
         self.ground: dict[int, Ground] = {}
@@ -209,9 +206,8 @@ class Problem:
         span = max(1, round(0.5 * WINDOW * self.units.time / r.dt))
         frames = np.arange(len(r.known))
         around = np.clip(frames[:, None] + np.arange(-span, span + 1), 0, len(frames) - 1)
-        sizes = [largest_extent(self.scene.shapes[b.shape]) * b.scale for b in self.moving]
         moves = np.zeros(len(frames), bool)
-        for d, size in enumerate(sizes):
+        for d, size in enumerate(self.sizes):
             ways = np.linalg.norm(r.goal[0][around, d] - r.goal[0][:, None, d], axis=2)
             turns = np.linalg.norm(
                 pose.to_rotvec(pose.multiply(r.goal[1][around, d], pose.conjugate(r.goal[1][:, None, d]))), axis=2
@@ -266,9 +262,8 @@ class Problem:
         ways, there = [], []
         for k in np.unique(windows.recording).tolist():
             r = self.recordings[k]
-            sizes = np.array([largest_extent(self.scene.shapes[b.shape]) * b.scale for b in self.moving])
             turn = pose.to_rotvec(pose.multiply(r.goal[1][1:], pose.conjugate(r.goal[1][:-1])))
-            step = np.linalg.norm(np.diff(r.goal[0], axis=0), axis=2) + 0.5 * sizes * np.linalg.norm(turn, axis=2)
+            step = np.linalg.norm(np.diff(r.goal[0], axis=0), axis=2) + 0.5 * self.sizes * np.linalg.norm(turn, axis=2)
             step = np.where(r.seen[1:] & r.seen[:-1] & self.tells[k][1:, None], step, 0.0).sum(1)
             inside = np.zeros(len(step), bool)
             for part in windows.parts:
@@ -285,7 +280,7 @@ class Problem:
         self.hit = {k for _, *pair, _, impact in touched for k in pair if impact}
         groups: dict[str, list[int]] = {}
         for k, body in enumerate(self.bodies):
-            groups.setdefault(re.sub(r"\[\d+\]$", "", body.name), []).append(k)
+            groups.setdefault(_entry(body), []).append(k)
         seen = {name: rows for name, rows in groups.items() if any(k in pair for k in rows for pair in self.pairs)}
         static = {name: rows for name, rows in seen.items() if rows[0] >= many}
         count = {name: sum(b in rows for _, _, b, *_ in touched) for name, rows in static.items()}
@@ -314,12 +309,16 @@ class Problem:
                 self._add("height", name, rows)
                 for axis, way in enumerate(self.ground[rows[0]].axes[:2]):
                     self._add("tilt", f"{name} about {'xyz'[np.abs(way).argmax()]}", rows, axis=axis)
+        some = self.parameters
+        self.bounds = np.array([p.low for p in some]), np.array([p.high for p in some])
+        self.width = np.array([KINDS[p.kind].width for p in some])
+        self.start = np.clip([p.start for p in some], *self.bounds)  # the values in the scene
 
     def _add(
         self, kind: str, name: str, rows: list[int], start: float = 0.0, low: float | None = None,
         high: float | None = None, axis: int = 0,
     ) -> None:  # fmt: skip
-        most = FARTHEST.get(kind, 0.0)
+        most = KINDS[kind].farthest
         low, high = -most if low is None else low, most if high is None else high
         self.parameters.append(Parameter(kind, tuple(rows), name, start, low, high, axis))
 
@@ -368,19 +367,6 @@ class Problem:
         first /= np.linalg.norm(first)
         return Ground(points.mean(0), np.stack([first, np.cross(normal, first), normal]))
 
-    @cached_property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.array([p.low for p in self.parameters]), np.array([p.high for p in self.parameters])
-
-    @cached_property
-    def width(self) -> np.ndarray:
-        return np.array([p.width for p in self.parameters])
-
-    @cached_property
-    def start(self) -> np.ndarray:
-        """The parameters' values in the scene."""
-        return np.clip([p.start for p in self.parameters], *self.bounds)
-
     def lie(self, values: np.ndarray, body: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (a quaternion) of a static body about its ground's centre, and its shift, model units."""
         turn, shift = np.zeros(3), np.zeros(3)
@@ -416,15 +402,8 @@ class Problem:
                 rows: Any = slice(k, total, many) if k < many else total + k - many
                 if p.kind in HIGH:
                     new[p.kind][rows] = value
-                elif p.kind == "inertia":
-                    new["inertia"][rows] *= math.exp(value)
-                elif p.kind == "mass":
-                    for name, power in (("mass", 1), ("inverse_mass", -1), ("inertia", 1)):
-                        new[name][rows] *= math.exp(power * value)
-                elif p.kind == "size":
-                    for name in ("scale", "com", "bounds", "size", "radius"):
-                        new[name][rows] *= math.exp(value)
-                    new["inertia"][rows] *= math.exp(2.0 * value)
+                for name, power in KINDS[p.kind].scales.items():
+                    new[name][rows] *= math.exp(power * value)
         for body, ground in self.ground.items():
             row, (turn, shift) = total + body - many, self.lie(values, body)
             position[row] = ground.centre + pose.rotate(turn, position[row] - ground.centre) + shift
@@ -535,8 +514,7 @@ class _Part:
         compiled = cast("Any", self.carry.scene)
         compiled.bodies, start = self.problem.applied(values, self.bodies, self.start, len(self.begin))
         compiled.place(start)
-        _, carry = self.solver.advance(start, self.carry, self.length, keep=True)
-        return cast("Frames", carry.frames)
+        return cast("Frames", self.solver.advance(start, self.carry, self.length, keep=True).frames)
 
     def errors(self, values: np.ndarray) -> np.ndarray:
         frames = self.frames(values)
@@ -560,7 +538,7 @@ class _Part:
         for t in range(self.length):
             before, now = state.velocity, set()
             for _ in range(inner):
-                state, _ = self.solver.advance(state, carry)
+                state = self.solver.advance(state, carry).state
                 touch = cast("Any", state.touch)
                 for (a, b), count, points in zip(touch.pair.tolist(), touch.count.tolist(), touch.point, strict=True):
                     if count and there[t:, a // many].any():
@@ -614,10 +592,10 @@ def identify(
         on_progress(min(0.95, 0.2 + 0.002 * count[0]), f"fit, run {count[0]} of all windows")
         return np.concatenate([windows.errors(values), WEAK * (values - start) / width])
 
-    nudge = width * [NUDGE[p.kind] for p in problem.parameters]
+    nudge = width * [KINDS[p.kind].nudge for p in problem.parameters]
 
     def slope(windows: Windows, values: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """[R, F] derivatives by central differences of `NUDGE`, one-sided at the bounds."""
+        """[R, F] derivatives by central differences (see `Kind.nudge`), one-sided at the bounds."""
         columns = []
         for k in free:
             one, other = values.copy(), values.copy()
@@ -650,11 +628,8 @@ def identify(
         last, best = longer, settled(longer, near, every, TRIES[2])
     whole = problem.whole(held or fit)
     before, after = (whole.off(values) for values in (start, best))
-    change = after - before
-    sure = SURE * change.std(0, ddof=1) / math.sqrt(len(change)) if len(change) > 2 else np.full(2, np.nan)
     confirmed: dict[str, Any] = {
         "recordings": len(held), "before": before.mean(0).tolist(), "after": after.mean(0).tolist(),
-        "change": change.mean(0).tolist(), "change_95": sure.tolist() if np.isfinite(sure).all() else None,
         "covered": problem.covered(whole),
     }  # fmt: skip
     error = float(np.sqrt(np.nanmean(np.concatenate([e[..., :3].ravel() for e in short.run(best)]) ** 2)))
@@ -663,9 +638,8 @@ def identify(
     drawn = _profiles(problem, best, by, there, partial(errors_of, last), found) if profiles else []
     return Identified(
         found, len(short.begin),
-        error * math.sqrt(3.0) * problem.units.length, confirmed, [*_notes(recordings), *_late(confirmed["covered"])],
-        _scene_values(problem, best),
-        _joint_values(problem, best), drawn,
+        error * math.sqrt(3.0) * problem.units.length, confirmed, _notes(recordings, confirmed["covered"]),
+        *_file_values(problem, best), drawn,
     )  # fmt: skip
 
 
@@ -753,7 +727,7 @@ def _estimates(
             found.append(estimate(kind, f"{problem.bodies[a].name} / {problem.bodies[b].name}", product, gradient))
     for i, (p, value) in enumerate(zip(parameters, values, strict=True)):
         kind, unit, own = _own(problem, p, value)
-        by = own if p.kind in FACTORS else _own(problem, p, 1.0)[2]
+        by = own if KINDS[p.kind].key else _own(problem, p, 1.0)[2]
         found.append(replace(estimate(kind, p.name, own, {i: by}), unit=unit))
     return found
 
@@ -766,8 +740,8 @@ def _own(problem: Problem, p: Parameter, value: float) -> tuple[str, str, float]
         joint = problem.joints[p.axis]
         unit = OF_TURNS[p.kind][0 if joint.kind in ("hinge", "ball") else 1]
         return p.kind, unit, value * problem.heft(joint, p.kind)
-    unit = UNITS.get(p.kind, "")
-    if p.kind in FACTORS:
+    unit = KINDS[p.kind].unit
+    if KINDS[p.kind].key:
         return p.kind, unit, math.exp(value) * (problem.bodies[p.bodies[0]].mass if p.kind == "mass" else 1.0)
     return p.kind, unit, value * (problem.units.length if p.kind == "height" else math.degrees(1.0))
 
@@ -786,11 +760,11 @@ def _profiles(
 
     least = max(loss(best), 1e-12)  # for a recording that is reproduced exactly
     for k, p in enumerate(problem.parameters):
-        kind, unit, value = _own(problem, p, float(best[k]))
-        interval = next(e.interval for e in estimates if (e.kind, e.name) == (kind, p.name))
+        kind, _, value = _own(problem, p, float(best[k]))
+        own = next(e for e in estimates if (e.kind, e.name) == (kind, p.name))
         by = (_own(problem, p, best[k] + 1e-6 * width[k])[2] - value) / 1e-6  # units per width
-        half = 0.5 * (interval[1] - interval[0]) / by if interval else 0.5 / BEYOND
-        half = max(half, NUDGE[p.kind] / BEYOND)
+        half = 0.5 * (own.interval[1] - own.interval[0]) / by if own.interval else 0.5 / BEYOND
+        half = max(half, KINDS[p.kind].nudge / BEYOND)
         others = np.delete(np.arange(len(best)), k)
         along = np.zeros(len(best))
         along[k] = 1.0
@@ -803,18 +777,11 @@ def _profiles(
             values = np.clip(values, low, high)
             x.append(_own(problem, p, float(values[k]))[2])
             y.append(loss(values) / least if step else 1.0)
-        found.append(Profile(kind, p.name, unit, value, interval, x, y))
+        found.append(Profile(own, value, x, y))
     return found
 
 
-def _late(covered: float) -> list[str]:
-    if covered >= COVERED:
-        return []
-    what = "earlier frames are not smooth enough to begin from"
-    return [f"these whole motions are {100.0 * covered:.2g} % of the recorded way: {what}"]
-
-
-def _notes(recordings: Sequence[Recording]) -> list[str]:
+def _notes(recordings: Sequence[Recording], covered: float) -> list[str]:
     """Notes on faults of trackers, and on what recordings lack."""
     lost, jumps = sum(r.lost for r in recordings), sum(r.jumps for r in recordings)
     notes = []
@@ -828,60 +795,57 @@ def _notes(recordings: Sequence[Recording]) -> list[str]:
         notes.append(f"not used, as never smooth:  {', '.join(still[:3])}" + (" ..." if still[3:] else ""))
     if len(recordings) < ENOUGH:
         notes.append(f"with {ENOUGH} recordings or more, some are kept to confirm what the others show")
+    if covered < COVERED:
+        what = "earlier frames are not smooth enough to begin from"
+        notes.append(f"these whole motions are {100.0 * covered:.2g} % of the recorded way: {what}")
     return notes
 
 
 # --- the scene ---
 
 
-def _scene_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Body (for copies, their common name) -> key of the scene file -> value, for all parameters of the fit: parameters
-    that are not determined one by one may be so together."""
+def _entry(body: Body) -> str:
+    """The name of a body's entry in the scene file: for copies, their common name."""
+    return re.sub(r"\[\d+\]$", "", body.name)
+
+
+def _file_values(problem: Problem, values: np.ndarray) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
+    """For bodies and for joints: name of the entry -> key of the scene file -> value, for all parameters of the fit:
+    parameters that are not determined one by one may be so together."""
     found: dict[str, dict[str, Any]] = {}
-    many = len(problem.moving)
-    for p, value in zip(problem.parameters, values, strict=True):
+    joints: dict[str, dict[str, Any]] = {}
+    many, length = len(problem.moving), problem.units.length
+    for p, value in zip(problem.parameters, values.tolist(), strict=True):
         if p.kind in OF_JOINTS:
+            number = value * problem.heft(problem.joints[p.axis], p.kind)
+            joints.setdefault(p.name, {})[p.kind.removeprefix("joint_")] = number
             continue
         b = problem.bodies[p.bodies[0]]
-        name = re.sub(r"\[\d+\]$", "", b.name)
-        entry = found.setdefault(name, {})
+        entry = found.setdefault(_entry(b), {})
         if p.kind in HIGH:
-            entry[p.kind] = float(value)
-        elif p.kind == "mass":
-            entry["mass"] = b.mass * math.exp(value)
-        elif p.kind == "size":
-            entry["scale"] = b.scale * math.exp(value)
-        elif p.kind == "inertia":
-            entry["inertia_factor"] = problem.inertia_factor(p.bodies[0]) * math.exp(value)
+            entry[p.kind] = value
+        elif key := KINDS[p.kind].key:
+            own = {"mass": b.mass, "scale": b.scale, "inertia_factor": problem.inertia_factor(p.bodies[0])}
+            entry[key] = own[key] * math.exp(value)
         if p.bodies[0] < many:
             entry.setdefault("mass", b.mass)  # with a density another size would mean another mass
     for body, ground in problem.ground.items():
         b, (turn, shift) = problem.bodies[body], problem.lie(values, body)
-        centre, length = ground.centre * problem.units.length, problem.units.length
+        centre = ground.centre * length
         position = centre + pose.rotate(turn, b.position - centre) + shift * length
         found.setdefault(b.name, {}).update(
             position=position.tolist(), quat_xyzw=pose.normalise(pose.multiply(turn, b.quat_xyzw)).tolist()
         )
     # A scene has no restitution above 1; as contacts show products, the static body can have more of it.
-    moving = {re.sub(r"\[\d+\]$", "", b.name) for b in problem.moving}
+    moving = {_entry(b) for b in problem.moving}
     most = max((entry.get("restitution", 0.0) for name, entry in found.items() if name in moving), default=0.0)
     if most > 1.0:
         for b in problem.fixed:
-            found.setdefault(re.sub(r"\[\d+\]$", "", b.name), {}).setdefault("restitution", b.restitution)
+            found.setdefault(_entry(b), {}).setdefault("restitution", b.restitution)
         for name, entry in found.items():
             if "restitution" in entry:
                 entry["restitution"] = min(1.0, entry["restitution"] * (1.0 / most if name in moving else most))
-    return found
-
-
-def _joint_values(problem: Problem, values: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Joint -> key of the scene file -> value."""
-    found: dict[str, dict[str, Any]] = {}
-    for p, value in zip(problem.parameters, values, strict=True):
-        if p.kind in OF_JOINTS:
-            key = p.kind.removeprefix("joint_")
-            found.setdefault(p.name, {})[key] = float(value) * problem.heft(problem.joints[p.axis], p.kind)
-    return found
+    return found, joints
 
 
 INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
@@ -890,47 +854,29 @@ INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
 def write_scene(found: Identified, scene_file: Path, out: Path) -> list[str]:
     """Write a copy of a scene file with the values that were found; everything else is as in the file, except comments.
     Returns notes."""
-    root, notes = cast("Any", yaml.compose(scene_file.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)), []
-    for entry in _value(root, "bodies").value:
-        values = dict(found.scene_values.get(_value(entry, "name").value, {}))
-        if (plane := _value(entry, "plane")) is not None and "position" in values:
+    scene = SceneBuilder.read(scene_file, allow_outside=True)
+    for entry in scene.bodies:
+        values = dict(found.scene_values.get(entry["name"], {}))
+        if "plane" in entry and "position" in values:
             place, turn = np.array(values.pop("position")), np.array(values.pop("quat_xyzw"))
             normal = pose.rotate(turn, np.array([0.0, 0.0, 1.0]))
-            _set(plane, "normal", normal.tolist())
-            _set(plane, "offset", float(normal @ place))
+            entry["plane"] = {"normal": _rounded(normal), "offset": _rounded(normal @ place)}
         for key, value in values.items():
-            entry.value = [(k, v) for k, v in entry.value if k.value not in INSTEAD.get(key, ())]
-            _set(entry, key, value)
-    joints = _value(root, "joints")
-    for entry in joints.value if joints is not None else ():
-        for key, value in found.joint_values.get(_value(entry, "name").value, {}).items():
-            _set(entry, key, value)
-    if out.resolve().parent != scene_file.resolve().parent:
-        shapes = _value(root, "shapes")
-        named = [(_value(s, k)) for _, s in (shapes.value if shapes is not None else ()) for k in ("mesh", "asset")]
-        model = _value(root, "model")
-        named += [model] if model is not None and model.value.endswith(".safetensors") else []
-        for node in (node for node in named if node is not None):
-            node.value = path_from(out.resolve().parent, scene_file.resolve().parent / node.value)
-            notes = [f"{out} names files outside its folder: simulate it with --allow-outside, or write it beside them"]
-    text = yaml.serialize(root, Dumper=yaml.SafeDumper, width=120)
-    read_scene(out, allow_outside=True, text=text)
-    write_text(out, text)
-    return notes
-
-
-def _value(mapping: Any, key: str) -> Any:
-    return next((value for k, value in mapping.value if k.value == key), None)
-
-
-def _set(mapping: Any, key: str, value: Any) -> None:
-    node = yaml.compose(yaml.safe_dump(_rounded(value), default_flow_style=True), Loader=yaml.SafeLoader)
-    at = next((i for i, (k, _) in enumerate(mapping.value) if k.value == key), len(mapping.value))
-    mapping.value[at : at + 1] = [(yaml.ScalarNode("tag:yaml.org,2002:str", key), node)]
+            for other in INSTEAD.get(key, ()):
+                entry.pop(other, None)
+            entry[key] = _rounded(value)
+    for entry in scene.joints:
+        entry |= {key: _rounded(value) for key, value in found.joint_values.get(entry["name"], {}).items()}
+    scene.save(out)
+    files = any({"mesh", "asset"} & shape.keys() for shape in scene.shapes.values())
+    files |= str(scene.settings.get("model")).endswith(".safetensors")
+    if files and out.resolve().parent != scene_file.resolve().parent:
+        return [f"{out} names files outside its folder: simulate it with --allow-outside, or write it beside them"]
+    return []
 
 
 def _rounded(value: Any) -> Any:
-    return [_rounded(v) for v in value] if isinstance(value, list) else float(f"{value:.9g}")
+    return np.vectorize(lambda number: float(f"{number:.9g}"))(value).tolist()
 
 
 # --- the picture beside the scene: the loss against each parameter ---
@@ -954,16 +900,16 @@ def picture(found: Identified, path: Path) -> str:
     for axis in axes.flat[len(found.profiles) :]:
         axis.axis("off")
     for axis, profile in zip(axes.flat, found.profiles, strict=False):
-        shown = profile.interval is not None
-        if profile.interval is not None:
-            axis.axvspan(*profile.interval, color="tab:blue", alpha=0.15, linewidth=0)
-        axis.plot(profile.x, profile.loss, "o-", markersize=3, linewidth=1.2, color="tab:blue" if shown else "0.6")
-        axis.axvline(profile.value, color="0.4", linewidth=0.8, linestyle=":")
+        interval = profile.estimate.interval
+        if interval is not None:
+            axis.axvspan(*interval, color="tab:blue", alpha=0.15, linewidth=0)
+        axis.plot(profile.x, profile.loss, "o-", markersize=3, linewidth=1.2, color="tab:blue" if interval else "0.6")
+        axis.axvline(profile.best, color="0.4", linewidth=0.8, linestyle=":")
         # A flat curve should look flat: the scale covers at least a tenth of the loss.
         low, high = axis.get_ylim()
         axis.set_ylim(min(low, 0.99), max(high, 1.1))
-        axis.set_title(title(profile), fontsize=8, color="black" if shown else "0.4")
-        axis.set_xlabel(profile.unit.strip() or "no unit", fontsize=7)
+        axis.set_title("\n".join(profile.estimate.lines()), fontsize=8, color="black" if interval else "0.4")
+        axis.set_xlabel(profile.estimate.unit.strip() or "no unit", fontsize=7)
         axis.set_ylabel("loss over the best", fontsize=7)
         axis.tick_params(labelsize=7)
         axis.grid(alpha=0.3)
@@ -971,12 +917,3 @@ def picture(found: Identified, path: Path) -> str:
         figure.savefig(partial, dpi=110, format="png")
     plots.close(figure)
     return ""
-
-
-def title(profile: Profile) -> str:
-    head = f"{HEADS[profile.kind]}: {profile.name}"
-    if profile.interval is None:
-        return f"{head}\nnot shown by these recordings"
-    digits = 4 if profile.unit == " m" or profile.kind.startswith("joint") else 3
-    low, high = (f"{end:.{digits}f}" for end in profile.interval)
-    return f"{head}\n{profile.value:.{digits}f}{profile.unit} ({low} to {high})"

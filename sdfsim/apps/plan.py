@@ -13,11 +13,13 @@ from sdfsim.base.console import duration
 from sdfsim.base.devices import pick_device
 from sdfsim.base.parallel import StageProgress
 from sdfsim.learned.model import load_model
+from sdfsim.scene.collision_filter import count_pairs
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.plan import plan
 from sdfsim.simulate.simulator import Simulator
 
 TRIAL_STEPS = 5
+KINDS = ("dynamic", "static", "kinematic")
 
 
 def describe(
@@ -29,20 +31,18 @@ def describe(
     if model:
         load_model(model, weights=False)
     scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
-    decided = plan(scene)
+    pairs = count_pairs(scene.bodies)
     simulator = Simulator(scene, model=model, device=device)
     units, steps = simulator.units, simulator.steps_in(scene.duration)
     counters = simulator.run(steps=TRIAL_STEPS).counters
     near, step_ms = int(counters["pairs"][1]), float(np.median(counters["step_ms"][1:]))
     return {
         "scene": str(scene_file),
-        "effects": {name: asdict(effect) for name, effect in decided.effects().items()},
-        "static": list(decided.static),
-        "dynamic": list(decided.dynamic),
-        "kinematic": list(decided.kinematic_bodies),
+        "effects": {name: asdict(effect) for name, effect in plan(scene).items()},
+        **{kind: [b.name for b in scene.bodies if b.motion == kind] for kind in KINDS},
         "masses_kg": {b.name: b.mass for b in scene.bodies if b.motion == "dynamic"},
-        "nodes": decided.nodes,
-        "pairs": {**asdict(decided.pairs), "apart": decided.pairs.possible - near, "near": near},
+        "nodes": sum(len(scene.shapes[b.shape].nodes) for b in scene.bodies),
+        "pairs": {**asdict(pairs), "apart": pairs.possible - near, "near": near},
         "step": {k: float(counters[k][1:].max()) for k in ("contacts", "nodes", "edges")},
         "memory_mib": _peak_mib(),
         "step_ms": step_ms,
@@ -71,7 +71,7 @@ def _peak_mib() -> float | None:
 
 def plan_lines(report: dict[str, Any]) -> list[str]:
     units, pairs, step = report["units"], report["pairs"], report["step"]
-    counts = ", ".join(f"{len(report[kind])} {kind}" for kind in ("dynamic", "static", "kinematic"))
+    counts = ", ".join(f"{len(report[kind])} {kind}" for kind in KINDS)
     widest = max(len(e["why"]) for e in report["effects"].values())
     return [
         *(

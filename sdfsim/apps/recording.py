@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.apps.beside import COLOR, OPACITY, Beside
+from sdfsim.apps.beside import COLOR, OPACITY, between, rows_in
 from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh, face_normals, sample_surface, vertex_normals
 from sdfsim.geometry.primitives import plane
 from sdfsim.physics import pose
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.steps import PHASES
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.scene import Joint, Scene
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.shape import Shape
-from sdfsim.simulate.steppers import PHASES
 
 if TYPE_CHECKING:  # these are slow to load
     import rerun as rr
@@ -79,7 +79,7 @@ class Playback:
     `network`: whether the run uses one. A recorded motion `beside` it is shown with translucent bodies."""
 
     def __init__(
-        self, scene: Scene, motion: Rollout | None = None, *, network: bool = True, beside: Beside | None = None
+        self, scene: Scene, motion: Rollout | None = None, *, network: bool = True, beside: Rollout | None = None
     ) -> None:
         import rerun as rr
 
@@ -102,7 +102,7 @@ class Playback:
         crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
         paths = [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
         self._alone = [(k, path) for k, path in enumerate(paths) if k not in crowded]
-        rows = () if beside is None else beside.rows(scene)
+        rows = () if beside is None else rows_in(scene, beside)
         self._ghosts = [(int(k), f"{BESIDE}/{rr.escape_entity_path_part(scene.bodies[k].name)}") for k in rows]
         self._beside = beside
         self._ropes = [joint for joint in shown_joints(scene) if joint.kind == "distance"]
@@ -155,9 +155,9 @@ class Playback:
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
                 self.stream.log(f"{path}/nodes", nodes, static=True)
             if body.motion == "static":  # its pose never changes
-                centre = body.position + _turned(com, body.quat_xyzw)
-                pose = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
-                self.stream.log(path, pose, static=True)
+                centre = body.position + pose.rotate(body.quat_xyzw, com)
+                placed = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
+                self.stream.log(path, placed, static=True)
         for k, path in self._ghosts:
             body, mesh = scene.bodies[k], scene.shapes[scene.bodies[k].shape].mesh
             plain = Mesh(mesh.vertices * body.scale - self._com[k], mesh.faces)
@@ -203,7 +203,7 @@ class Playback:
             lines = rr.LineStrips3D.columns(strips=strips.reshape(-1, 2, 3).astype(np.float32))
             self.stream.send_columns(f"{JOINTS}/ropes", times, lines.partition(np.full(frames, len(self._ropes))))
         if self._beside is not None:
-            places, turns = self._beside.at(chunk.time)
+            places, turns = between(self._beside.time, self._beside.position, self._beside.orientation, chunk.time)
             for d, (_, path) in enumerate(self._ghosts):
                 motion = rr.Transform3D.columns(translation=places[:, d], quaternion=turns[:, d])
                 self.stream.send_columns(path, times, motion)
@@ -268,7 +268,7 @@ def _crowds(scene: Scene) -> list[Crowd]:
     return found
 
 
-def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Beside | None = None) -> None:
+def save_rollout(scene: Scene, rollout: Rollout, path: Path, beside: Rollout | None = None) -> None:
     """Write `rollout` as a rerun recording, with a recorded motion `beside` it. Raises SdfsimError if the file cannot
     be written."""
     playback = Playback(scene, rollout, beside=beside)
@@ -407,11 +407,11 @@ def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
     for k, body in enumerate(scene.bodies):
         shape = scene.shapes[body.shape]
         if is_infinite(shape):
-            planes.append((body.position, _turned(np.array([0.0, 0.0, 1.0]), body.quat_xyzw)))
+            planes.append((body.position, pose.rotate(body.quat_xyzw, np.array([0.0, 0.0, 1.0]))))
         elif len(shape.mesh.vertices):
             box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
             corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
-            boxes[k] = body.position + _turned(corners, body.quat_xyzw)
+            boxes[k] = body.position + pose.rotate(body.quat_xyzw, corners)
     if not boxes:
         return np.array([[-1.0] * 3, [1.0] * 3]) / np.sqrt(3.0)
     start = np.concatenate(list(boxes.values()))
@@ -425,13 +425,6 @@ def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
             way = np.clip(motion.position[:, k], low - FARTHEST * size, high + FARTHEST * size)
             low, high = np.minimum(low, way.min(0) - half), np.maximum(high, way.max(0) + half)
     return np.stack([low, high])
-
-
-def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
-    """Vectors [..., 3] rotated by a unit quaternion [4]."""
-    axis, real = quat_xyzw[:3], quat_xyzw[3]  # written out, because scipy's Rotation takes a fifth of a second to load
-    across = 2.0 * np.cross(axis, vectors)
-    return vectors + real * across + np.cross(axis, across)
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
@@ -472,13 +465,12 @@ def shown(scene: Scene, row: int, half: float) -> Mesh:
     if not is_infinite(shape):
         return shape.shown
     most = 0.02 * framed(scene)[1]
-    back = body.quat_xyzw * [-1.0, -1.0, -1.0, 1.0]
     found = [np.zeros((0, 3))]
     for other in scene.bodies:
         of = scene.shapes[other.shape]
         if other.motion == "static" and not isinstance(of.sdf, ClosedForm):
-            places = other.position + _turned(of.shown.vertices * other.scale, other.quat_xyzw)
-            mesh = Mesh(_turned(places - body.position, back), of.shown.faces)
+            places = other.position + pose.rotate(other.quat_xyzw, of.shown.vertices * other.scale)
+            mesh = Mesh(pose.rotate(pose.conjugate(body.quat_xyzw), places - body.position), of.shown.faces)
             flat = mesh.faces[(np.abs(mesh.vertices[mesh.faces, 2]) < most).all(1)]
             found += [mesh.vertices[np.abs(mesh.vertices[:, 2]) < most]]
             if len(flat):  # also the insides of large faces

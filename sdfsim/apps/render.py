@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.beside import COLOR, OPACITY, Beside, between
+from sdfsim.apps.beside import COLOR, OPACITY, between, rows_in
 from sdfsim.apps.recording import Eye, body_colors, extent, eye_around, framed, is_infinite, shown, with_normals
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import replacing
@@ -41,7 +41,7 @@ _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
 
 def render(
     scene: Scene | SceneBuilder | Path | str, rollout: Rollout | Path | str, out: Path | str, *,
-    camera: Place | None = None, look_at: Place | None = None, at: float | None = None, beside: Beside | None = None,
+    camera: Place | None = None, look_at: Place | None = None, at: float | None = None, beside: Rollout | None = None,
     on_progress: Progress = silent,
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, at the time `at` s, by default the end) of a
@@ -169,7 +169,7 @@ class Studio:
     recorded motion that is shown too. `axes` [3, 3] are unit vectors to the right, down, and into the picture; `sun`
     [3] points to the sun."""
 
-    def __init__(self, scene: Scene, eye: Eye, radius: float, beside: Beside | None = None) -> None:
+    def __init__(self, scene: Scene, eye: Eye, radius: float, beside: Rollout | None = None) -> None:
         self._eye, self._radius, self._beside = eye, radius, beside
         shapes = [scene.shapes[b.shape] for b in scene.bodies]
         self._floors = np.array([is_infinite(shape) for shape in shapes])
@@ -180,7 +180,7 @@ class Studio:
             vertices = body.scale * (mesh.vertices - shape.com)
             self._models.append((replace(mesh, vertices=vertices, colors=colors), normals))
         self._ghosts: list[_Model] = []
-        for k in () if beside is None else beside.rows(scene):
+        for k in () if beside is None else rows_in(scene, beside):
             mesh, normals = self._models[k]
             self._ghosts.append((Mesh(mesh.vertices, mesh.faces, np.broadcast_to(COLOR, mesh.vertices.shape)), normals))
         self.axes = _axes(eye)
@@ -190,12 +190,15 @@ class Studio:
 
     def picture_at(self, rollout: Rollout, time: float) -> np.ndarray:
         """[H, W, 3] uint8 for a moment of a run, with the recorded motion at that time."""
-        place, turn = (p[0] for p in between(rollout.time, rollout.position, rollout.orientation, np.array([time])))
+
+        def at(motion: Rollout) -> tuple[np.ndarray, np.ndarray]:
+            place, turn = between(motion.time, motion.position, motion.orientation, np.array([time]))
+            return place[0], turn[0]
+
         if self._beside is None:
-            return self.picture(place, turn)
-        place_beside, turn_beside = self._beside.at(np.array([time]))
-        matrix = Rotation.from_quat(turn_beside[0]).as_matrix()
-        return self.picture(place, turn, _Cast(self._ghosts, place_beside[0], matrix))
+            return self.picture(*at(rollout))
+        place, turn = at(self._beside)
+        return self.picture(*at(rollout), _Cast(self._ghosts, place, Rotation.from_quat(turn).as_matrix()))
 
     def picture(self, position: np.ndarray, orientation: np.ndarray, ghosts: _Cast | None = None) -> np.ndarray:
         """[H, W, 3] uint8 for bodies with these centres of mass [N, 3] m and orientations [N, 4], and `ghosts`."""

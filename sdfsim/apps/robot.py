@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.export import plain_names
@@ -469,20 +471,12 @@ def _avoided(
 ) -> list[list[str] | None]:
     """The links that each link `avoids`; None: nothing, an empty list: all. Jointed bodies do not touch anyway."""
     links, count = robot.links, len(robot.links)
-    rigid = list(range(count))  # groups of links that move together, and all static ones
     still = [k for k, link in enumerate(links) if link.still]
-    for k in still:
-        rigid[k] = still[0]
-
-    def root(k: int) -> int:
-        while rigid[k] != k:
-            k = rigid[k]
-        return k
-
     tree = [joint for joint in robot.joints if not joint.loop and joint.kind != "distance"]
-    for joint in tree:
-        if joint.kind == "fixed" and joint.parent >= 0:
-            rigid[root(joint.child)] = root(joint.parent)
+    fixed = [(joint.child, joint.parent) for joint in tree if joint.kind == "fixed" and joint.parent >= 0]
+    rows, columns = np.reshape([*fixed, *((still[0], k) for k in still)], (-1, 2)).astype(int).T
+    # [links] the groups of links that move together; all static ones are one.
+    rigid = connected_components(coo_matrix((np.ones(len(rows)), (rows, columns)), (count, count)), directed=False)[1]
     bare = [not link.solid for link in links]
     denied: set[tuple[int, int]] = set()
     above = {joint.child: joint.parent for joint in tree}
@@ -495,13 +489,13 @@ def _avoided(
         if parent >= 0 and links[parent].still:
             denied |= {(joint.child, parent), (parent, joint.child)}
         elif parent >= 0:
-            near |= {(root(joint.child), root(parent)), (root(parent), root(joint.child))}
+            near |= {(rigid[joint.child], rigid[parent]), (rigid[parent], rigid[joint.child])}
     overlapping: list[str] = []
     for a in range(count):
         for b in range(a + 1, count):
             if (links[a].still and links[b].still) or (a, b) in own:
                 continue
-            if bare[a] or bare[b] or root(a) == root(b) or (root(a), root(b)) in near:
+            if bare[a] or bare[b] or rigid[a] == rigid[b] or (rigid[a], rigid[b]) in near:
                 denied.add((a, b))
             elif robot.apart is not None:
                 denied |= {(a, b)} & robot.apart

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from sdfsim.apps.beside import FILE, Beside, beside_of
+from sdfsim.apps.beside import FILE, begun, beside_of, off
 from sdfsim.apps.recording import Playback, framed, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
 from sdfsim.base.compiling import running, seconds_spent
@@ -34,12 +34,12 @@ from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics.bodies import State, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.steps import COUNTS, PHASES
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene, fingerprints
 from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
-from sdfsim.simulate.steppers import COUNTS, PHASES
 
 Viewer = Literal["none", "file", "native", "web"]
 EVERY = 30.0  # s between two checkpoints
@@ -68,7 +68,7 @@ def simulate(
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
-    beside: Beside | None = None,
+    beside: Rollout | None = None,
 ) -> dict[str, Any]:
     """Simulate a scene file, or a sample by its name, and write config.yaml, report.json, rollout.npz and (unless
     `viewer` is none) rollout.rrd; an earlier run in `out` is replaced. Returns the report. Of the fitted shapes of this
@@ -101,7 +101,7 @@ def simulate(
         say(note)
     known = fingerprints(scene)
     if beside is not None:
-        scene = beside.begun(scene)
+        scene = begun(scene, beside)
     compiled = seconds_spent()
     simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
@@ -116,7 +116,7 @@ def simulate(
         "allow_outside": allow_outside,
         "until_settled": until_settled,
         "device": simulator.device,
-        **({"beside": beside.name} if beside else {}),
+        **({"beside": beside.meta["recording"]} if beside else {}),
     }
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
@@ -185,7 +185,7 @@ def simulate(
         if until_settled:
             report["settled"] = settled()
         if beside is not None:
-            report["beside"] = beside.off(scene, rollout)
+            report["beside"] = off(scene, rollout, beside)
             beside.save(out / FILE)
         if isinstance(broken, SdfsimError):
             report["error"] = broken.message
@@ -312,10 +312,10 @@ def ending_lines(report: dict[str, Any]) -> list[str]:
 
 def beside_lines(report: dict[str, Any]) -> list[str]:
     """How far a run is from the recorded motion beside which it was simulated; empty if there was none."""
-    if not (off := report.get("beside")):
+    if not (way := report.get("beside")):
         return []
-    far = f"{1e3 * off['position_m']:.3g} mm (root mean square), {off['rotation_degrees']:.3g} degrees (mean)"
-    return [f"off {off['recording']} by {far} over {off['seconds']:.3g} s"]
+    far = f"{1e3 * way['position_m']:.3g} mm (root mean square), {way['rotation_degrees']:.3g} degrees (mean)"
+    return [f"off {way['recording']} by {far} over {way['seconds']:.3g} s"]
 
 
 class Checkpoint:

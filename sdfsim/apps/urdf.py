@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -26,8 +27,6 @@ MARKS = {
     codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
     codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
 }  # fmt: skip
-# Encodings by the zero bytes in the first four, as XML begins with ASCII.
-ZEROS = {(1, 2, 3): "utf-32-le", (0, 1, 2): "utf-32-be", (1, 3): "utf-16-le", (0, 2): "utf-16-be"}
 DECLARED = re.compile(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([^\"'>]*)[\"']")
 KINDS = {
     "revolute": "hinge",
@@ -80,21 +79,22 @@ class _Reader:
             content = self.path.read_bytes()
         except OSError as error:
             raise SdfsimError(f"{self.path}: cannot be read ({error.strerror or error})") from error
+        # Blanks before the first element and zero bytes after the last are not valid XML, but common.
         text = self._decoded(content).rstrip("\0 \t\r\n")
+        skipped = text[: len(text) - len(text.lstrip())].count("\n")
         builder, parser = TreeBuilder(), expat.ParserCreate("utf-8")  # whatever the file declares
 
         def start(tag: str, attributes: dict[str, str]) -> None:
-            self.line[id(builder.start(tag, attributes))] = parser.CurrentLineNumber
+            self.line[id(builder.start(tag, attributes))] = parser.CurrentLineNumber + skipped
 
         parser.StartElementHandler, parser.CharacterDataHandler = start, builder.data
         parser.EndElementHandler = lambda tag: builder.end(tag)
         try:
-            # Blanks before the first element and zero bytes after the last are not valid XML, but common.
-            self.skipped = text[: len(text) - len(text.lstrip())].count("\n")
             parser.Parse(OPTIONAL.sub(_environment, text.lstrip()).encode(), True)
         except expat.ExpatError as error:
-            line = error.lineno + self.skipped
-            raise SdfsimError(f"{self.path}:{line}: not valid XML ({expat.ErrorString(error.code)})") from error
+            raise SdfsimError(
+                f"{self.path}:{error.lineno + skipped}: not valid XML ({expat.ErrorString(error.code)})"
+            ) from error
         root = builder.close()
         if root.tag != "robot":
             raise self.wrong(root, "must be <robot>", "a URDF file has one <robot>; give MJCF the ending .xml")
@@ -105,13 +105,11 @@ class _Reader:
     def _decoded(self, content: bytes) -> str:
         """The text of the file, in the encoding that its first bytes show or that it declares, else UTF-8. As in other
         readers, a byte that this encoding does not have is replaced, with a note: most are in comments."""
-        zeros = tuple(k for k, byte in enumerate(content[:4]) if byte == 0)
-        name = next((name for mark, name in MARKS.items() if content.startswith(mark)), ZEROS.get(zeros))
-        if name is None:
-            declared = DECLARED.match(content)
-            name = declared[1].decode("ascii", "replace") if declared else "utf-8"
-            # What can be read byte by byte is not of two or four bytes a character, whatever it says.
-            name = "utf-8" if re.match(r"(?i)utf.?(16|32)|ucs", name) else name
+        declared = DECLARED.match(content)
+        name = declared[1].decode("ascii", "replace") if declared else "utf-8"
+        # What can be read byte by byte is not of two or four bytes a character, whatever it says.
+        name = "utf-8" if re.match(r"(?i)utf.?(16|32)|ucs", name) else name
+        name = next((shown for mark, shown in MARKS.items() if content.startswith(mark)), name)
         try:
             text = content.decode(name, "replace")
         except (LookupError, UnicodeError) as error:
@@ -123,7 +121,7 @@ class _Reader:
         return text
 
     def where(self, element: Element) -> str:
-        return f"{self.path}:{self.line[id(element)] + self.skipped}: <{element.tag}>"
+        return f"{self.path}:{self.line[id(element)]}: <{element.tag}>"
 
     def wrong(self, element: Element, fault: str, hint: str = "") -> SdfsimError:
         return SdfsimError(f"{self.where(element)} {fault}", hint)
@@ -179,27 +177,16 @@ class _Reader:
             if element.tag not in _ROOT:
                 self.left[f"<{element.tag}>"] += 1
         colors = {e.get("name", ""): self._rgb(e) for e in self.root.findall("material")}
-        elements: dict[str, Element] = {}
-        for element in self.root.findall("link"):
-            name = self.text(element, "name")
-            if name in elements:
-                first = self.line[id(elements[name])] + self.skipped
-                raise self.wrong(element, f"two links are called {name!r} (the first in line {first})")
-            elements[name] = element
+        elements = self._by_name("link", self.root.findall("link"))
         if not elements:
             raise self.wrong(self.root, "has no <link>")
         links = [self._link(name, element, colors) for name, element in elements.items()]
         number = {name: k for k, name in enumerate(elements)}
         by_child: dict[int, tuple[Element, int]] = {}
-        seen: dict[str, Element] = {}
-        for element in self.root.findall("joint"):
-            if element.find("parent") is None and element.find("child") is None and element.get("type") is None:
-                continue  # belongs to a transmission, but is written outside one
-            name = self.text(element, "name")
-            if name in seen:
-                first = self.line[id(seen[name])] + self.skipped
-                raise self.wrong(element, f"two joints are called {name!r} (the first in line {first})")
-            seen[name] = element
+        # One without ends and type belongs to a transmission, but is written outside it.
+        bare = [e for e in self.root.findall("joint") if e.find("parent") is e.find("child") is e.get("type") is None]
+        given = self._by_name("joint", [e for e in self.root.findall("joint") if e not in bare])
+        for name, element in given.items():
             ends = []
             for tag in ("parent", "child"):
                 end = self.child(element, tag)
@@ -214,26 +201,36 @@ class _Reader:
                 fault = f"link {links[child].name!r} is held by two joints: URDF supports trees only"
                 raise self.wrong(element, fault, "close loops in MJCF (equality connect), or in scene.yaml")
             by_child[child] = element, parent
+        try:
+            above = {k: [by_child[k][1]] if k in by_child else [] for k in range(len(links))}
+            order = list(TopologicalSorter(above).static_order())
+        except CycleError as error:
+            k = error.args[1][0]
+            fault = f"link {links[k].name!r} holds itself: URDF supports trees only"
+            raise self.wrong(by_child[k][0], fault) from error
         joints: list[LinkJoint] = []
-        roots = [k for k in range(len(links)) if k not in by_child]
-        order, children = list(roots), {k: [c for c, (_, p) in by_child.items() if p == k] for k in range(len(links))}
-        for k in order:  # grows
-            order += children[k]
-        if len(order) < len(links):
-            k = next(k for k in range(len(links)) if k not in order)
-            raise self.wrong(by_child[k][0], f"link {links[k].name!r} holds itself: URDF supports trees only")
-        for k in order[len(roots) :]:
-            element, parent = by_child[k]
-            links[k], made = self._joint(element, links, k, parent)
-            joints += made
-        for k in roots:
-            if fixed or links[k].name == WORLD:
+        for k in order:
+            if k in by_child:
+                links[k], made = self._joint(by_child[k][0], links, k, by_child[k][1])
+                joints += made
+            elif fixed or links[k].name == WORLD:
                 links[k] = replace(links[k], still=True)
         left = [f"{what} ({count})" for what, count in self.left.items()]
         return Robot(
             self.root.get("name", self.path.stem), tuple(links), tuple(joints),
             left_out=(*left, *self.missed), notes=tuple(self.notes),
         )  # fmt: skip
+
+    def _by_name(self, what: str, elements: Sequence[Element]) -> dict[str, Element]:
+        """Links or joints by their names, which differ."""
+        found: dict[str, Element] = {}
+        for element in elements:
+            name = self.text(element, "name")
+            if name in found:
+                first = self.line[id(found[name])]
+                raise self.wrong(element, f"two {what}s are called {name!r} (the first in line {first})")
+            found[name] = element
+        return found
 
     def _rgb(self, element: Element | None) -> tuple[int, int, int] | None:
         color = None if element is None else element.find("color")
@@ -337,7 +334,7 @@ class _Reader:
         except SdfsimError as error:
             if needed:
                 raise
-            self.missed.append(f"the visual at line {self.line[id(element)] + self.skipped}: {error.message}")
+            self.missed.append(f"the visual at line {self.line[id(element)]}: {error.message}")
             return None
         if not np.all(scale):
             raise self.wrong(element, f"scale must not be zero (got {element.get('scale')!r})")

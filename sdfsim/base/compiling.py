@@ -1,15 +1,21 @@
-"""Long compilations: announced, and done in another process so that results do not depend on them."""
+"""Compiled code: cached under a hash of its source. Long compilations are announced, and done in another process so
+that results do not depend on them."""
 
 import gc
+import hashlib
 import json
 import logging
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
+from pathlib import Path
 from threading import Lock
 from typing import Any
+
+from sdfsim.base.files import user_cache
 
 _log = logging.getLogger(__name__)
 _lock = Lock()
@@ -24,6 +30,30 @@ _CHILD = (
     "import sys, json; sys.path[:] = json.loads(sys.stdin.buffer.readline());"
     "from sdfsim.base.compiling import _compile_here; _compile_here(sys.stdin.buffer.read())"
 )
+
+
+def cache_of(sources: Iterable[Path]) -> Path:
+    """The folder in the user's cache for the compiled code of these files, named after a hash of them: numba checks
+    only the file that a function is in, and would use outdated code if another file changed."""
+    hashed = hashlib.sha256()
+    for file in sources:
+        hashed.update(file.read_bytes())
+    return user_cache("kernels") / hashed.hexdigest()[:16]
+
+
+@contextmanager
+def kept(cache: Path) -> Iterator[None]:
+    """Keep the compiled code of functions that are defined in the block in the folder `cache`, unless the user has set
+    numba's own: modules with such functions are imported inside the block."""
+    from numba.core import config
+
+    settings: Any = config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = before or str(cache)
+    try:
+        yield
+    finally:
+        settings.CACHE_DIR = before
 
 
 def compile_before(

@@ -1,7 +1,6 @@
 """Files that are complete or absent (written under a temporary name, then renamed), arrays without pickle, digests."""
 
 import hashlib
-import importlib
 import json
 import logging
 import os
@@ -12,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -146,50 +145,29 @@ def locked(folder: Path) -> Iterator[None]:
     The system lifts the lock when this process ends, however it ends. A folder made here is removed again if it stays
     empty. Raises SdfsimError if another run holds the folder, or if it cannot be written.
     """
-    path, made = folder / LOCK, not folder.exists()
+    from filelock import FileLock, Timeout  # comes with torch, which is all that training needs
+
+    made, lock = not folder.exists(), FileLock(folder / LOCK, timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = open(path, "a", encoding="utf-8")
+        lock.acquire()
+    except Timeout as error:
+        hint = "wait until it ends, or choose another folder"
+        raise SdfsimError(f"{folder}: another run is writing to this folder", hint) from error
     except OSError as error:
         raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another folder") from error
-    with file:
-        try:
-            _lock(file)
-            alone = os.path.samestat(os.fstat(file.fileno()), path.stat())
-        except (BlockingIOError, PermissionError, FileNotFoundError):  # the last: a run has just ended and removed it
-            alone = False
-        if not alone:
-            raise SdfsimError(
-                f"{folder}: another run is writing to this folder", "wait until it ends, or choose another folder"
-            )
+    try:
         for left in folder.glob(".*.part"):
             if left.is_file():
                 left.unlink(missing_ok=True)
-        try:
-            yield
-        finally:
-            try:
-                path.unlink(missing_ok=True)
-            except PermissionError:  # Windows does not remove an open file
-                file.close()
-                with suppress(PermissionError):  # another run has it by now
-                    path.unlink(missing_ok=True)
-            if made:
-                with suppress(OSError):  # not empty: the run has written something
-                    folder.rmdir()
-
-
-def _lock(file: IO[str]) -> None:
-    """Lock an open file until this process ends. Raises BlockingIOError or PermissionError if another process holds the
-    lock."""
-    try:
-        fcntl: Any = importlib.import_module("fcntl")
-    except ImportError:  # Windows
-        windows: Any = importlib.import_module("msvcrt")
-        file.seek(0)
-        windows.locking(file.fileno(), windows.LK_NBLCK, 1)
-        return
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        with suppress(OSError):  # Windows does not remove an open file, but does so when it is released
+            (folder / LOCK).unlink()
+        lock.release()
+        if made:
+            with suppress(OSError):  # not empty: the run has written something
+                folder.rmdir()
 
 
 def check_writable(folder: Path) -> None:

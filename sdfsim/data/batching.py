@@ -14,11 +14,12 @@ from sdfsim.learned.model import SOLVER, Model
 from sdfsim.physics.bodies import Bodies, State, Units
 from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import SUBSTEPS, Options
+from sdfsim.physics.steps import Frames
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.batch import placed, side_by_side
-from sdfsim.simulate.steppers import Frames, FreeFlight, Stepper, stepper_of
+from sdfsim.simulate.steppers import FreeFlight, Stepper, stepper_of
 
 if TYPE_CHECKING:
     from sdfsim.physics.solver.prepare import SharedShapes
@@ -140,8 +141,8 @@ def _rolled(
     """The predicted motions of trajectories that are simulated side by side."""
     bodies, start = merged(group, [0] * len(group), shapes, units, floor, plane)
     start = stepper.began(start, bodies, options)
-    _, carry = stepper.advance(start, stepper.init(bodies, start, options, shared), steps, keep=True)
-    frames = cast("Frames", carry.frames)
+    made = stepper.advance(start, stepper.init(bodies, start, options, shared), steps, keep=True)
+    frames = cast("Frames", made.frames)
     whole = Motion(*(np.concatenate([getattr(start, name)[None], getattr(frames, name)]) for name in MOTION))
     broken = (~np.isfinite(np.concatenate([whole.position, whole.orientation], -1)).all(-1)).sum(1)
     if broken.any():

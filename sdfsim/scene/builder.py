@@ -1,7 +1,6 @@
 """Scenes written in Python: the keys of scene.yaml as keyword arguments, and the same checks."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -13,47 +12,50 @@ from sdfsim.base.errors import SceneError, SdfsimError
 from sdfsim.base.files import path_from, write_text
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.bundled import find_scene
-from sdfsim.scene.document import NOTHING, Numeral, as_written
+from sdfsim.scene.document import NOTHING, Faults, Numeral, at
 from sdfsim.scene.keys import BodyKeys, JointKeys
-from sdfsim.scene.load import load_scene, read_scene
+from sdfsim.scene.load import checked, load_scene, read_scene, scene_of
 from sdfsim.scene.scene import WORLD, JointKind, Scene
-from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, ShapeTable, meant
+from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, ShapeTable, Table, meant
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
+_LISTED = ("version", "shapes", "bodies", "joints")  # the keys of the file that are no settings
 _PATHS = ("asset", "mesh")
-_ANY: dict[str, Any] = {"sphere": {"radius": 1.0}}  # for shapes that are not defined yet, as an entry is checked
-_BALL = {"shape": "a"}
-_HERE = "<scene>"  # the name of a scene without a file in messages
+_CONTEXT = {"folder": Path(), "allow_outside": True}  # paths start at the current folder
 
 
 class SceneBuilder:
     """A scene that is being written in Python. `print` shows it as the file that `save` writes. Settings are the
-    top-level keys of the file: gravity, duration, seed, model, effects. Raises SceneError for an unknown key."""
+    top-level keys of the file: gravity, duration, seed, model, effects. Raises SceneError for an unknown key.
+
+    Attributes:
+        settings, shapes, bodies, joints: what the file has, as dicts and lists of texts and numbers.
+    """
 
     def __init__(self, **settings: Any) -> None:
-        known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies", "joints")]
-        _check(settings, known, "a scene")
-        self._settings = _plain(settings)
-        body = {"name": "a", "plane": {}}
-        _refuse({"version": VERSION, **self._settings, "bodies": [body]}, "a scene", {(key,): "" for key in settings})
-        self._shapes: dict[str, dict[str, Any]] = {}
-        self._bodies: list[dict[str, Any]] = []
-        self._joints: list[dict[str, Any]] = []
+        _known(settings, [key for key in SceneTable.model_fields if key not in _LISTED], "a scene")
+        self.settings: dict[str, Any] = plain(settings)
+        validated(
+            "a scene", (SceneTable, {"version": VERSION, **self.settings, "bodies": [{"name": "a", "plane": {}}]})
+        )
+        self.shapes: dict[str, dict[str, Any]] = {}
+        self.bodies: list[dict[str, Any]] = []
+        self.joints: list[dict[str, Any]] = []
 
     @classmethod
     def read(cls, path: Path | str, *, allow_outside: bool = False) -> "SceneBuilder":
         """Read a scene file, or a sample by its name, to extend it: `Scene.read("arm.yaml").add(...)`. Raises
         SceneError as `load_scene` does, with one line for every fault."""
         path = find_scene(path)
-        document = read_scene(path, allow_outside=allow_outside)[1].data
+        document = plain(read_scene(path, allow_outside=allow_outside)[1].data)
         scene, home = cls(), path.parent
-        for key in ("shapes", "bodies", "joints"):
-            setattr(scene, f"_{key}", _values(document.pop(key, {} if key == "shapes" else [])))
-        scene._settings = {key: value for key, value in _values(document).items() if key != "version"}
-        for entry in scene._shapes.values():
+        scene.shapes, scene.bodies = document.get("shapes") or {}, document["bodies"]
+        scene.joints = document.get("joints") or []
+        scene.settings = {key: value for key, value in document.items() if key not in _LISTED}
+        for entry in scene.shapes.values():
             entry |= {key: str(home / entry[key]) for key in _PATHS if key in entry}
-        if str(scene._settings.get("model", "")).endswith(".safetensors"):
-            scene._settings["model"] = str(home / scene._settings["model"])
+        if str(scene.settings.get("model", "")).endswith(".safetensors"):
+            scene.settings["model"] = str(home / scene.settings["model"])
         return scene
 
     def add(self, name: str, **keys: Unpack[BodyKeys]) -> "SceneBuilder":
@@ -64,17 +66,16 @@ class SceneBuilder:
         shape of an earlier body, give shape="name of that body". Raises SceneError for an unknown key or an invalid
         value; `load` checks whether all of them fit together.
         """
-        _check(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], f"body {name!r}")
-        if any(body["name"] == name for body in self._bodies):
-            raise SceneError([f"body {name!r}: two bodies have this name"], "give each a name of its own")
-        shape = _plain({key: value for key, value in keys.items() if key in _OF_SHAPE})
-        body = _plain({"name": name, **({"shape": name} if shape else {}),
-                       **{key: value for key, value in keys.items() if key not in _OF_SHAPE}})  # fmt: skip
-        shapes = {name: shape} if shape else {key: self._shapes.get(key, _ANY) for key in [body.get("shape")] if key}
-        lone = {"version": VERSION, "shapes": shapes, "bodies": [_without(body, "collides_with", "avoids")]}
-        _refuse(lone, f"body {name!r}", {("shapes", name): "", ("bodies", 0): ""} if shape else {("bodies", 0): ""})
-        self._shapes |= {name: shape} if shape else {}
-        self._bodies.append(body)
+        what = f"body {name!r}"
+        _known(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], what)
+        if any(body["name"] == name for body in self.bodies):
+            raise SceneError([f"{what}: two bodies have this name"], "give each a name of its own")
+        shape = plain({key: value for key, value in keys.items() if key in _OF_SHAPE})
+        own = plain({key: value for key, value in keys.items() if key not in _OF_SHAPE})
+        body = {"name": name, **({"shape": name} if shape else {}), **own}
+        validated(what, *([(ShapeTable, shape)] if shape else []), (BodyTable, body))
+        self.shapes |= {name: shape} if shape else {}
+        self.bodies.append(body)
         return self
 
     def join(self, name: str, type: JointKind, *bodies: str, **keys: Unpack[JointKeys]) -> "SceneBuilder":
@@ -85,51 +86,48 @@ class SceneBuilder:
         Raises SceneError for an unknown key or an invalid value; `load` checks whether the bodies exist.
         """
         given = ("name", "type", "bodies")
-        _check(keys, [key for key in JointTable.model_fields if key not in given], f"joint {name!r}")
+        _known(keys, [key for key in JointTable.model_fields if key not in given], f"joint {name!r}")
         held = [*bodies, WORLD] if len(bodies) == 1 else list(bodies)
-        joint = _plain({"name": name, "type": type, "bodies": held, **keys})
-        own: list[dict[str, Any]] = [{"name": one, **_BALL} for one in dict.fromkeys(map(str, held)) if one != WORLD]
-        lone = {"version": VERSION, "shapes": {"a": _ANY}, "bodies": own or [{"name": "a", **_BALL}], "joints": [joint]}
-        _refuse(lone, f"joint {name!r}", {("joints", 0): ""})
-        self._joints.append(joint)
+        joint = plain({"name": name, "type": type, "bodies": held, **keys})
+        validated(f"joint {name!r}", (JointTable, joint))
+        self.joints.append(joint)
         return self
 
     def load(self, on_progress: Progress = silent) -> Scene:
         """The immutable scene that a simulator needs; `Simulator` calls this itself. Shapes are loaded or fitted as in
-        `load_scene`. Raises SceneError with one line for every fault; its line numbers are those of what `print`
-        shows."""
-        found = load_scene(Path(_HERE), on_progress, allow_outside=True, text=str(self))
-        return replace(found, path=None)
+        `load_scene`. Raises SceneError with one line for every fault."""
+        faults = Faults(self._document(None))
+        return scene_of(checked(faults, _CONTEXT), faults, on_progress)
 
     def save(self, path: Path | str) -> Path:
         """Write a scene.yaml, with paths relative to its folder. Nothing is checked: `load_scene` does that. Raises
         SdfsimError if the file cannot be written."""
         path = Path(path)
-        write_text(path, self._text(path.resolve().parent))
+        write_text(path, _text(self._document(path.resolve().parent)))
         return path
 
     def __str__(self) -> str:
-        return self._text(None)
+        return _text(self._document(None))
 
-    def _text(self, folder: Path | None) -> str:
-        """The text of the file, with paths relative to `folder`, or unchanged for None."""
+    def _document(self, folder: Path | None) -> dict[str, Any]:
+        """What the file has, with paths relative to `folder`, or unchanged for None."""
 
         def moved(path: Any) -> Any:
             return path_from(folder, path) if folder and isinstance(path, str) else path
 
-        document = {"version": VERSION, **self._settings}
+        document = {"version": VERSION, **self.settings}
         if str(document.get("model", "")).endswith(".safetensors"):
             document["model"] = moved(document["model"])
-        if self._shapes:
-            document["shapes"] = {
-                name: {key: moved(value) if key in _PATHS else value for key, value in entry.items()}
-                for name, entry in self._shapes.items()
-            }
-        if self._bodies:
-            document["bodies"] = self._bodies
-        if self._joints:
-            document["joints"] = self._joints
-        return yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=10**9)
+        shapes = {
+            name: {key: moved(value) if key in _PATHS else value for key, value in entry.items()}
+            for name, entry in self.shapes.items()
+        }
+        listed = {"shapes": shapes, "bodies": self.bodies, "joints": self.joints}
+        return document | {key: value for key, value in listed.items() if value}
+
+
+def _text(document: dict[str, Any]) -> str:
+    return yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=10**9)
 
 
 def loaded(scene: Any, on_progress: Progress = silent) -> Scene:
@@ -145,60 +143,37 @@ def loaded(scene: Any, on_progress: Progress = silent) -> Scene:
     raise SdfsimError(message)
 
 
-def _refuse(data: dict[str, Any], what: str, places: dict[tuple, str]) -> None:
-    """Raise SceneError with a line for every fault of a scene that lies below one of `places`; each line begins with
-    `what`."""
-    found = []
-    try:
-        SceneTable.model_validate(_numerals(data), context={"folder": Path(), "allow_outside": True})
-    except ValidationError as error:
-        for e in error.errors(include_url=False):
-            for place in places:
-                if e["loc"][: len(place)] == place:
-                    rest = e["loc"][len(place) :] if len(place) > 1 else e["loc"]
-                    where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in rest)[1:]
-                    found.append(f"{what}: {where}: {e['msg']}" if where else f"{what}: {e['msg']}")
+def validated(what: str, *parts: tuple[type[Table], dict[str, Any]]) -> list[Any]:
+    """The tables of these plain values. Raises SceneError with a line for every fault; each line begins with `what`."""
+    found: dict[str, None] = {}
+    made = []
+    for table, data in parts:
+        try:
+            made.append(table.model_validate(data, context=_CONTEXT))
+        except ValidationError as error:
+            found |= {f"{what}: {at(e['loc'], e['msg'])}": None for e in error.errors(include_url=False)}
     if found:
-        raise SceneError(list(dict.fromkeys(found)), "docs/scene.md has every key")
+        raise SceneError(list(found), "docs/scene.md has every key")
+    return made
 
 
-def _without(entry: dict[str, Any], *keys: str) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if key not in keys}
-
-
-def _numerals(value: Any) -> Any:
-    """Plain values in the form that the scene file parser gives."""
-    if isinstance(value, dict):
-        return {key: _numerals(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_numerals(entry) for entry in value]
-    return NOTHING if value is None else as_written(repr(value)) if isinstance(value, int | float) else value
-
-
-def _values(value: Any) -> Any:
-    """The inverse of `_numerals`."""
-    if isinstance(value, dict):
-        return {key: _values(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_values(entry) for entry in value]
-    if isinstance(value, Numeral):
-        return int(value) if value.lstrip("+-").isdigit() else float(value)
-    return {} if value is NOTHING else value
-
-
-def _check(keys: Mapping[str, Any], known: list[str], what: str) -> None:
+def _known(keys: Mapping[str, Any], known: list[str], what: str) -> None:
     wrong = [f"{what}: unknown key {key!r}{meant(key, known)}" for key in keys if key not in known]
     if wrong:
         raise SceneError(wrong, f"known keys: {', '.join(known)}")
 
 
-def _plain(value: Any) -> Any:
-    """A value as dicts, lists, strings and numbers only: arrays and tuples become lists, paths become strings, and True
-    and False become "on" and "off"."""
+def plain(value: Any) -> Any:
+    """A value of Python or of a document as dicts, lists, texts and numbers only: arrays and tuples become lists, paths
+    become texts, and True and False become "on" and "off"."""
     if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items() if entry is not None}
+        return {str(key): plain(entry) for key, entry in value.items() if entry is not None}
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return ("on" if value else "off") if isinstance(value, bool) else str(value) if isinstance(value, Path) else value
+        return [plain(entry) for entry in value]
+    if isinstance(value, Numeral):
+        return int(value) if value.lstrip("+-").isdigit() else float(value)
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return {} if value is NOTHING else str(value) if isinstance(value, Path) else value

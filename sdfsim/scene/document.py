@@ -33,7 +33,34 @@ def as_written(text: str) -> str:
 NOTHING = object()  # the value of a key that is followed by nothing, `~` or `null`
 
 
-class Document:
+def at(loc: Loc, text: str) -> str:
+    """A fault with its place below a table: `path[0].time: must be >= 0`."""
+    where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc).removeprefix(".")[:200]
+    return f"{where}: {text}" if loc else text
+
+
+class Faults:
+    """The faults that are found in the `data` of a scene, each with the body, joint or shape that it is about."""
+
+    def __init__(self, data: Any) -> None:
+        self.data = data
+        self._found: dict[tuple[int, str], None] = {}  # line and message; in the order of finding, each once
+
+    def wrong(self, loc: Loc, text: str) -> None:
+        """Record a fault of the value at `loc`."""
+        kinds = {"bodies": "body", "joints": "joint", "shapes": "shape"}
+        if len(loc) > 1 and loc[0] in kinds:
+            name = loc[1] if loc[0] == "shapes" else self.data[loc[0]][loc[1]]["name"]
+            text, loc = f"{kinds[loc[0]]} {name!r}: {at(loc[2:], text)}", ()
+        self._found[0, at(loc, text)] = None
+
+    def check(self) -> None:
+        """Raise SceneError with every fault, in the order of the file, if there is any."""
+        if self._found:
+            raise SceneError([text for _, text in sorted(self._found, key=lambda entry: entry[0])])
+
+
+class Document(Faults):
     """The YAML of a file, and the faults found in it, each with its line.
 
     `data` is made of dicts, lists, strings and `Numeral`s, and of `NOTHING` for keys without a value. Raises SceneError
@@ -42,9 +69,9 @@ class Document:
     """
 
     def __init__(self, path: Path, text: str | None = None) -> None:
+        super().__init__(None)
         self._path = path
         self._line: dict[Loc, int] = {}  # line of every key, and of every entry of a list
-        self._found: dict[tuple[int, str], None] = {}  # in the order in which they were found, each once
         root = _compose(path, _text_of(path) if text is None else text)
         self.data = self._read(root, (), root.start_mark.line + 1)
 
@@ -52,13 +79,7 @@ class Document:
         """Record a fault of the value at `loc`, with its own line or another."""
         if line is None:
             line = next(self._line[loc[:depth]] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
-        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:200]
-        self._found[line, f"{self._path}:{line}: {where}: {text}" if loc else f"{self._path}:{line}: {text}"] = None
-
-    def check(self) -> None:
-        """Raise SceneError with every fault, in the order of the file, if there is any."""
-        if self._found:
-            raise SceneError([text for _, text in sorted(self._found, key=lambda entry: entry[0])])
+        self._found[line, f"{self._path}:{line}: {at(loc, text)}"] = None
 
     def _read(self, node: yaml.Node, loc: Loc, line: int) -> Any:
         self._line[loc] = line

@@ -13,7 +13,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.base.warned import warn_once
 from sdfsim.scene.bundled import find_scene
-from sdfsim.scene.document import Document
+from sdfsim.scene.document import Document, Faults
 from sdfsim.scene.joints import joints_of
 from sdfsim.scene.scene import Body, Effects, Motion, Scene, Waypoints
 from sdfsim.scene.schema import FITTED, UNITS, BodyTable, SceneTable, ShapeTable
@@ -24,16 +24,22 @@ from sdfsim.shape.shape import Shape, centred, load_shape, with_nodes, with_sdf,
 def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
     """Read and check a scene file; nothing is loaded yet. Returns its tables, and the document, to which faults that
     show later can be added. Raises SceneError with every fault found."""
-    document, context = Document(path, text), {"folder": path.parent, "allow_outside": allow_outside}
+    document = Document(path, text)
+    return checked(document, {"folder": path.parent, "allow_outside": allow_outside}), document
+
+
+def checked(faults: Faults, context: dict[str, Any]) -> SceneTable:
+    """The tables of a scene's data. `context`: the `folder` at which its paths start, and whether they may lead out of
+    it (`allow_outside`). Raises SceneError with every fault found."""
     try:
-        table = SceneTable.model_validate(document.data, context=context)
+        table = SceneTable.model_validate(faults.data, context=context)
     except ValidationError as error:
         for e in error.errors(include_url=False):
-            document.wrong(e["loc"], e["msg"])
-        document.check()
+            faults.wrong(e["loc"], e["msg"])
+        faults.check()
         raise
-    document.check()
-    return table, document
+    faults.check()
+    return table
 
 
 def load_scene(
@@ -47,8 +53,12 @@ def load_scene(
     every fault found.
     """
     path = find_scene(path) if text is None else Path(path)
-    table, document = read_scene(path, allow_outside=allow_outside, text=text)
-    same, shapes = _load_shapes(table, document, on_progress)
+    return replace(scene_of(*read_scene(path, allow_outside=allow_outside, text=text), on_progress), path=path)
+
+
+def scene_of(table: SceneTable, faults: Faults, on_progress: Progress) -> Scene:
+    """The scene of its tables. Raises SceneError with every fault found."""
+    same, shapes = _load_shapes(table, faults, on_progress)
     number = {key: i for i, key in enumerate(dict.fromkeys(same.values()))}
     groups = {body.name: body.names() for body in table.bodies}
     bodies: list[Body] = []
@@ -56,15 +66,15 @@ def load_scene(
         shape = shapes[same[entry.shape]]
         made = _body(entry, number[same[entry.shape]], table.motion_of(entry), groups)
         if made.motion == "dynamic":
-            made = replace(made, mass=_mass(entry, shape, partial(document.wrong, ("bodies", i, "name"))))
+            made = replace(made, mass=_mass(entry, shape, partial(faults.wrong, ("bodies", i, "name"))))
             if entry.inertia_factor != 1.0 and made.mass > 0.0:
                 own = made.mass / shape.volume * shape.inertia * entry.scale**2
                 made = replace(made, inertia=entry.inertia_factor * own)
         for name, offset in zip(entry.names(), entry.offsets(), strict=True):
             way = made.path and replace(made.path, position=made.path.position + offset)
             bodies.append(replace(made, name=name, position=made.position + offset, path=way))
-    joints = joints_of(table.joints, bodies, document.wrong)
-    document.check()
+    joints = joints_of(table.joints, bodies, faults.wrong)
+    faults.check()
     loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
     notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", []))
@@ -81,7 +91,6 @@ def load_scene(
         seed=table.seed,
         model=table.model,
         effects=Effects(**dict(table.effects)),
-        path=path,
         missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
         notes=notes,
         caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
@@ -90,7 +99,7 @@ def load_scene(
 
 
 def _load_shapes(
-    table: SceneTable, document: Document, on_progress: Progress
+    table: SceneTable, faults: Faults, on_progress: Progress
 ) -> tuple[dict[str | None, str | None], dict[str | None, Shape]]:
     """Load the shapes in use. Returns for each key, in order of first use, the first key with the same entry (in Python
     every body may bring its own copy of a mesh), and the shapes of these first keys. The key None is the plane that all
@@ -117,8 +126,8 @@ def _load_shapes(
                 shapes[key] = _load_shape(key, table.shapes[key], scales[key], told)
             except SdfsimError as error:
                 hint = f" ({error.hint})" if error.hint else ""
-                document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
-        document.check()
+                faults.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
+        faults.check()
     return same, shapes
 
 

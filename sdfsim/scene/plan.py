@@ -1,10 +1,11 @@
 """The plan: which effects are on in a scene, and why. The simulator does not compute effects that are off."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.scene.collision_filter import PairCounts, count_pairs
+from sdfsim.scene.collision_filter import count_pairs
 from sdfsim.scene.scene import Scene
 
 
@@ -17,36 +18,11 @@ class Effect:
     field: str  # what to edit in the scene file to change it
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What the simulator has to do for one scene."""
-
-    gravity: Effect
-    free_flight: Effect
-    contact: Effect
-    scenery: Effect
-    kinematic: Effect
-    rotation: Effect
-    friction: Effect
-    restitution: Effect
-    joints: Effect
-    sleep: Effect
-    static: tuple[str, ...]  # names of the bodies that are static; the next two likewise
-    dynamic: tuple[str, ...]
-    kinematic_bodies: tuple[str, ...]
-    pairs: PairCounts  # numbers of pairs of bodies, by whether they may touch
-    nodes: int  # surface nodes of all bodies; infinite planes have none
-
-    def effects(self) -> dict[str, Effect]:
-        """Every decision by its name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, Effect)}
-
-
-def plan(scene: Scene) -> Plan:
+def plan(scene: Scene) -> dict[str, Effect]:
     """Decide every effect of a scene. `on` and `off` in the file win; `auto` is on if it can change the motion."""
-    names = {m: tuple(b.name for b in scene.bodies if b.motion == m) for m in ("static", "dynamic", "kinematic")}
+    many = Counter(body.motion for body in scene.bodies)
     pairs, asked = count_pairs(scene.bodies), scene.effects
-    size, moving = float(np.linalg.norm(scene.gravity)), len(names["dynamic"])
+    size, moving = float(np.linalg.norm(scene.gravity)), many["dynamic"]
     reasons_against = {
         "no body is dynamic": not moving,
         "no two bodies may touch": not pairs.possible,
@@ -57,7 +33,7 @@ def plan(scene: Scene) -> Plan:
     contact = Effect(against is None, why, "effects.contact, bodies[].collides_with, bodies[].motion")
 
     def of_kind(kind: str, what: str) -> Effect:
-        count = len(names[kind])
+        count = many[kind]
         return Effect(count > 0, f"{count} {kind} bodies, {what}" if count else f"no body is {kind}", "bodies[].motion")
 
     def of_pairs(choice: str, count: int, name: str, note: str = "") -> Effect:
@@ -77,24 +53,19 @@ def plan(scene: Scene) -> Plan:
     holding = f"{len(scene.joints)} joints hold bodies" if jointed else "the file says off"
     held = Effect(jointed, holding if scene.joints else "there are none", "effects.joints, joints")
     resting = contact.on or held.on
-    return Plan(
-        gravity=Effect(size > 0, f"{size:g} m/s^2" if size else "the file sets it to zero", "gravity"),
-        free_flight=of_kind("dynamic", "in closed form while they touch nothing"),
-        contact=contact,
-        scenery=of_kind("static", "never moved"),
-        kinematic=of_kind("kinematic", "on their paths, whatever they meet"),
-        rotation=Effect(asked.rotation != "off", turning, "effects.rotation"),
-        friction=of_pairs(asked.friction, pairs.frictional, "friction"),
-        restitution=of_pairs(asked.restitution, pairs.bouncy, "restitution", no_saving),
-        joints=held,
-        sleep=Effect(
+    return {
+        "gravity": Effect(size > 0, f"{size:g} m/s^2" if size else "the file sets it to zero", "gravity"),
+        "free_flight": of_kind("dynamic", "in closed form while they touch nothing"),
+        "contact": contact,
+        "scenery": of_kind("static", "never moved"),
+        "kinematic": of_kind("kinematic", "on their paths, whatever they meet"),
+        "rotation": Effect(asked.rotation != "off", turning, "effects.rotation"),
+        "friction": of_pairs(asked.friction, pairs.frictional, "friction"),
+        "restitution": of_pairs(asked.restitution, pairs.bouncy, "restitution", no_saving),
+        "joints": held,
+        "sleep": Effect(
             resting and asked.sleep != "off",
             sleep if resting else "contact is off: nothing can come to rest",
             "effects.sleep",
         ),
-        static=names["static"],
-        dynamic=names["dynamic"],
-        kinematic_bodies=names["kinematic"],
-        pairs=pairs,
-        nodes=sum(len(scene.shapes[b.shape].nodes) for b in scene.bodies),
-    )
+    }

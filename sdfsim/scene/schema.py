@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import (
@@ -44,23 +44,24 @@ def _shown(value: Any) -> str:
     if isinstance(value, str):
         text = str(value) if isinstance(value, Numeral) else repr(value)
         return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
-    return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
+    if isinstance(value, int | float):
+        return repr(value)
+    return "nothing" if value in (NOTHING, None) else "a list" if isinstance(value, list) else "a mapping"
 
 
-_LISTS = {"path": "have at least 2 poses", "bodies": "be 2 names", "joints": "be a list"}
-_LENGTHS = {"quat_xyzw": 4, "quat_wxyz": 4, "limits": 2, "limits_deg": 2, "grid": 3}
+def _holds(table: "type[Table]", name: str) -> str:
+    """How many entries a list of a table has, for a message."""
+    known = _schema(table, name)
+    what = "names" if known.get("items", {}).get("type") == "string" else "numbers"
+    return (
+        f"be {known['maxItems']} {what}" if "maxItems" in known else f"have at least {known.get('minItems', 0)} entry"
+    )
 
 
-def _numbers(name: str) -> str:
-    """What a list of numbers with this name holds; lists that are not named here are vectors."""
-    return f"{_LENGTHS.get(name, 3)} numbers"
-
-
-def _many(value: Any, name: str) -> str:
-    """How many entries a list with this name has."""
-    if name == "bodies" and not any(isinstance(entry, str) for entry in value):
-        return "have at least one body"
-    return _LISTS.get(name) or f"be {_numbers(name)}"
+def _schema(table: "type[Table]", name: str) -> dict[str, Any]:
+    """The JSON schema of a key; of one that may be left out, that of its values."""
+    known = table.model_json_schema()["properties"][name]
+    return {**next(iter(known.get("anyOf", [])), {}), **known}
 
 
 # Keys of other programs, and their names here.
@@ -102,22 +103,23 @@ def _message(error: Any, table: "type[Table]") -> str:
     got, allowed = _shown(error["input"]), limits.get("expected", "").replace("'", "").replace(" or ", ", ")
     if kind.startswith("int_"):
         return f"must be a whole number (got {got})"
+    holds = _holds(table, str(key)) if kind in ("too_short", "too_long", "list_type") else ""
     texts = {
         "number": f"must be a number{unit and ' in '}{unit} (got {got})",
         "greater_than": f"must be > {limits.get('gt', 0):g} (got {got}{unit and ' '}{unit})",
         "greater_than_equal": f"must be >= {limits.get('ge', 0):g} (got {got}{unit and ' '}{unit})",
         "less_than_equal": f"must be <= {limits.get('le', 0):g} (got {got}{unit and ' '}{unit})",
-        "too_short": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
-        "too_long": f"must {_many(error['input'], str(key))} (got {limits.get('actual_length')})",
+        "too_short": f"must {holds} (got {limits.get('actual_length')})",
+        "too_long": f"must {holds} (got {limits.get('actual_length')})",
         "literal_error": f"must be one of {allowed} (got {got})",
-        "list_type": f"must be {'a list' if key in _LISTS else _numbers(str(key))} (got {got})",
+        "list_type": f"must {holds if holds.startswith('be') else 'be a list'} (got {got})",
         "dict_type": f"must be a mapping (got {got})",
     }
     return texts.get(kind, f"must be a text (got {got})")
 
 
 def _numeral(value: Any) -> Any:
-    if not isinstance(value, Numeral):
+    if not isinstance(value, Numeral) and not (type(value) in (int, float) and math.isfinite(value)):
         raise PydanticCustomError("number", "not a number")
     return value
 
@@ -184,9 +186,10 @@ def _version(number: int) -> int:
     return number
 
 
-def key(what: str, default: Any = ..., unit: str = "", **limits: float) -> Any:
-    """A key of a table: its meaning, default, unit and limits."""
-    return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)  # type: ignore[arg-type]
+def key(what: str, default: Any = ..., unit: str = "", of: str = "", **limits: Any) -> Any:
+    """A key of a table: its meaning, default, unit, the kinds of entries that have it (if not all), and limits."""
+    extra: dict[str, Any] = {"unit": unit, "of": of}
+    return Field(default, description=what, json_schema_extra=extra, **limits)
 
 
 _THREE = Field(min_length=3, max_length=3)
@@ -552,15 +555,6 @@ class BreaksTable(Table):
             yield (), "force or torque is required"
 
 
-# Which keys belong to which joints, besides those that all joints have.
-_OF_JOINT: dict[str, tuple[str, ...]] = {
-    "hinge": ("axis", "limits_deg", "start_deg", "restitution", "damping", "friction", "spring", "motor"),
-    "slider": ("axis", "limits", "start", "restitution", "damping", "friction", "spring", "motor"),
-    "ball": ("axis", "cone_deg", "restitution", "damping", "friction"),
-    "fixed": (),
-    "distance": ("to", "rod", "rope", "restitution", "damping", "spring"),
-}
-_OF_ALL_JOINTS = ("name", "type", "bodies", "anchor", "frame", "breaks_at", "collide")
 _NEEDED = {"hinge": ("anchor", "axis"), "slider": ("axis",), "ball": ("anchor",), "distance": ("anchor", "to")}
 
 
@@ -589,41 +583,51 @@ class JointTable(Table):
         "the point that both share, or the end of a distance at the first body; required for hinges, balls, distances, "
         "for others by default the first body's origin", None, "m",
     )  # fmt: skip
-    to: Vector | None = key("end of a distance at the second body", None, "m")
-    axis: Direction | None = key("axis of a hinge, a slider or the cone of a ball; of any length", None)
+    to: Vector | None = key("end of a distance at the second body", None, "m", of="distance")
+    axis: Direction | None = key(
+        "axis of a hinge, a slider or the cone of a ball; of any length", None, of="hinge slider ball"
+    )
     frame: Text = key(
         f"frame of anchor, to and axis: `{WORLD}`, with bodies as they are at the start, or the name of one of the two "
         "bodies: relative to its shape's origin, along its axes",
         WORLD,
     )
-    start: Number = key("position of a slider at the start", 0.0, "m")
-    start_deg: Number = key("angle of a hinge at the start", 0.0, "degrees")
-    limits: Ends | None = key("lowest and highest position of a slider", None, "m")
-    limits_deg: Ends | None = key("lowest and highest angle of a hinge; full turns add up", None, "degrees")
+    start: Number = key("position of a slider at the start", 0.0, "m", of="slider")
+    start_deg: Number = key("angle of a hinge at the start", 0.0, "degrees", of="hinge")
+    limits: Ends | None = key("lowest and highest position of a slider", None, "m", of="slider")
+    limits_deg: Ends | None = key("lowest and highest angle of a hinge; full turns add up", None, "degrees", of="hinge")
     cone_deg: Number | None = key(
-        "for a ball: largest angle between the axes of the two bodies", None, "degrees", ge=0, le=180
+        "for a ball: largest angle between the axes of the two bodies", None, "degrees", ge=0, le=180, of="ball"
     )
-    rod: Number | None = key("the distance that the points keep; it must be that at the start", None, "m", gt=0)
-    rope: Number | None = key("the largest distance of the points", None, "m", gt=0)
-    restitution: Number = key("coefficient with which limits and ropes rebound", 0.0, ge=0, le=1)
-    damping: Number = key("in N m s/rad for hinges and balls, else in N s/m", 0.0, ge=0)
-    friction: Number = key("torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0)
-    spring: SpringTable | None = key("a spring that pulls back", None)
-    motor: MotorTable | None = key("a motor that drives it", None)
+    rod: Number | None = key(
+        "the distance that the points keep; it must be that at the start", None, "m", gt=0, of="distance"
+    )
+    rope: Number | None = key("the largest distance of the points", None, "m", gt=0, of="distance")
+    restitution: Number = key(
+        "coefficient with which limits and ropes rebound", 0.0, ge=0, le=1, of="hinge slider ball distance"
+    )
+    damping: Number = key(
+        "in N m s/rad for hinges and balls, else in N s/m", 0.0, ge=0, of="hinge slider ball distance"
+    )
+    friction: Number = key(
+        "torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0, of="hinge slider ball"
+    )
+    spring: SpringTable | None = key("a spring that pulls back", None, of="hinge slider distance")
+    motor: MotorTable | None = key("a motor that drives it", None, of="hinge slider")
     breaks_at: BreaksTable | None = key("load at which it breaks", None)
     collide: Literal["on", "off"] = key("whether the two bodies may touch each other", "off")
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
-        kind = data.get("type")
-        if kind not in _OF_JOINT:
+        kind, extra = str(data.get("type")), {name: field.json_schema_extra for name, field in cls.model_fields.items()}
+        if kind not in get_args(JointKind):
             return
+        fit = {name: str(own["of"]).split() for name, own in extra.items() if isinstance(own, dict) and own["of"]}
         for name in data:
-            if name in cls.model_fields and name not in (*_OF_JOINT[kind], *_OF_ALL_JOINTS):
-                fit = ", ".join(k for k, keys in _OF_JOINT.items() if name in keys)
+            if kind not in fit.get(name, [kind]):
                 other = name.removesuffix("_deg") if name.endswith("_deg") else f"{name}_deg"
-                other = f"; give {other}" if other in _OF_JOINT[kind] else ""
-                yield (name,), f"is for {fit} only (this is a {kind}{other})"
+                other = f"; give {other}" if kind in fit.get(other, ()) else ""
+                yield (name,), f"is for {', '.join(fit[name])} only (this is a {kind}{other})"
         for name in _NEEDED.get(kind, ()):
             if name not in data:
                 yield (name,), f"is required: this is a {kind}"
@@ -641,7 +645,7 @@ class JointTable(Table):
         for table, wrong in (("spring", ("rest", "rest_deg")), ("motor", ("position", "position_deg"))):
             inner = data.get(table)
             name = wrong[0 if kind == "hinge" else 1]
-            if isinstance(inner, dict) and name in inner and table in _OF_JOINT[kind]:
+            if isinstance(inner, dict) and name in inner and kind in fit[table]:
                 yield (table, name), f"is not for a {kind}: give {wrong[1 if kind == 'hinge' else 0]}"
 
     def check_values(self) -> Iterator[Fault]:
@@ -794,11 +798,11 @@ def reference() -> str:
         "`python -m sdfsim.scene.schema > docs/scene.md` writes this page.",
     ]
     for title, table in _SECTIONS.items():
-        schema = table.model_json_schema().get("properties", {})
         lines += ["", f"## {title}", "", table.__doc__ or ""]
-        lines += ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"] if schema else []
+        head = ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"]
+        lines += head if table.model_fields else []
         for key, field in table.model_fields.items():
-            known = {**next(iter(schema[key].get("anyOf", [])), {}), **schema[key]}
+            known = _schema(table, key)
             default = "required" if field.is_required() else known.get("default")
             default = "" if default is None or isinstance(default, dict) else str(default)
             cells = (f"`{key}`", known["description"], known["unit"], _allowed(known), default)

@@ -65,18 +65,10 @@ class JointHandle:
         u = self._simulator.units
         return self._state[PULL : PULL + 3] * u.mass * u.acceleration
 
-    @force.setter
-    def force(self, value: float) -> None:
-        raise SdfsimError(f"joint {self.name!r}: force is read-only", "set `effort` to drive it")
-
     @property
     def torque(self) -> np.ndarray:
         """[3] N m, world: likewise, the torque about the joint's anchor."""
         return self._state[TWIST : TWIST + 3] * self._simulator.units.energy
-
-    @torque.setter
-    def torque(self, value: float) -> None:
-        raise SdfsimError(f"joint {self.name!r}: torque is read-only", "set `effort` to drive it")
 
     @property
     def broken(self) -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from sdfsim.base.compiling import running, say_compiling
-from sdfsim.base.devices import check_device, pick_device
+from sdfsim.base.devices import check_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import Progress, parallel, silent, threads
 from sdfsim.base.version import __version__
@@ -21,24 +21,16 @@ from sdfsim.physics.joint_columns import TARGET
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
+from sdfsim.physics.steps import Frames, Steps
 from sdfsim.physics.units import inner_steps
 from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
-from sdfsim.scene.builder import loaded
+from sdfsim.scene.builder import loaded, plain, validated
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.schema import BodyTable
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
 from sdfsim.simulate.joint import JointHandle
-from sdfsim.simulate.steppers import (
-    COUNTS,
-    PHASES,
-    Carry,
-    Frames,
-    FreeFlight,
-    energies_of,
-    joint_frame,
-    stacked,
-    stepper_of,
-)
+from sdfsim.simulate.steppers import Carry, FreeFlight, energies_of, stacked, stepper_of
 
 if TYPE_CHECKING:
     from sdfsim.physics.solver.prepare import SharedShapes
@@ -46,11 +38,7 @@ if TYPE_CHECKING:
 
 GLANCE = 0.1  # s between two progress reports
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
-# what a variant may change: the length of the vector (0: a number), and the largest value of a number
-VARIED = {
-    "position": (3, np.inf), "quat_xyzw": (4, np.inf), "velocity": (3, np.inf), "angular_velocity": (3, np.inf),
-    "mass": (0, np.inf), "friction": (0, np.inf), "restitution": (0, 1.0),
-}  # fmt: skip
+VARIED = ("position", "quat_xyzw", "velocity", "angular_velocity", "mass", "friction", "restitution")
 CHUNKS = 16  # largest number of pieces that variants are cut into, so that all cores finish together
 
 
@@ -125,15 +113,14 @@ class Simulator(LiveScene):
         check_device(device)
         effects = plan(scene)
         model = model if model is not None else scene.model
-        jointed = effects.joints.on
-        asked = effects.contact.on or free_flight == "learned"
+        jointed = effects["joints"].on
+        asked = effects["contact"].on or free_flight == "learned"
         model = model if isinstance(model, Model) else load_model(model, weights=asked)
         self._asked = {"dt": dt, "free_flight": free_flight}
-        stepper = stepper_of(model, contact=effects.contact.on or jointed, free_flight=free_flight)
+        stepper = stepper_of(model, contact=effects["contact"].on or jointed, free_flight=free_flight, device=device)
         if not stepper.forces:
             _check_inputs(scene, model.name, joints=jointed)
-        self.device = str(pick_device(device)) if stepper.on_surfaces else "cpu"
-        self.model = model.to(self.device)
+        self.stepper, self.model, self.device = stepper, stepper.model, str(stepper.device)
         self.seed = scene.seed if seed is None else seed
         self.units = stepper.units(scene, dt)
         self.dt = self.model.dt * self.units.time
@@ -142,13 +129,12 @@ class Simulator(LiveScene):
         worked_on = replace(scene, shapes=surfaces, joints=scene.joints if jointed else ())
         check_nodes(worked_on)
         self.bodies, state = from_scene(worked_on, self.units)
-        if jointed and not effects.contact.on:
+        if jointed and not effects["contact"].on:
             self.bodies = replace(self.bodies, allowed=np.zeros_like(self.bodies.allowed))
         self._names = tuple(b.name for b in scene.bodies)
         self._joint_names = tuple(joint.name for joint in scene.joints)
         self._joint_unit = [1.0 if joint.kind in ("hinge", "ball") else self.units.length for joint in scene.joints]
         check_sizes(self.bodies, self._names, self.units.length)
-        self.stepper = replace(stepper, model=self.model)
         gravity = np.asarray(scene.gravity, dtype=np.float64) / self.units.acceleration
         self._carry: Carry | None = None
         self._shared: SharedShapes | None = None  # shared with simulators of other scenes
@@ -156,13 +142,13 @@ class Simulator(LiveScene):
         self._options = Options(
             gravity=gravity,
             dt=self.model.dt,
-            friction=effects.friction.on,
-            restitution=effects.restitution.on,
-            rotation=effects.rotation.on,
+            friction=effects["friction"].on,
+            restitution=effects["restitution"].on,
+            rotation=effects["rotation"].on,
             substeps=inner_steps(scene),
-            sleep=effects.sleep.on and stepper.sleeps,
+            sleep=effects["sleep"].on and stepper.sleeps,
         )
-        super().__init__(self.stepper.began(state, self.bodies, self._options))
+        super().__init__(stepper.began(state, self.bodies, self._options))
         dynamic = self.bodies.moves
         weight = self.bodies.mass[dynamic] * np.linalg.norm(gravity)
         lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
@@ -209,9 +195,9 @@ class Simulator(LiveScene):
         while made < count:
             some = min(some, count - made)
             started = running()
-            self._advance(some, keep=True)
+            kept = self._advance(some, keep=True).frames
             spent = running() - started
-            yield self._rollout(cast("Frames", self.carry.frames), 1e3 * spent / some)
+            yield self._rollout(cast("Frames", kept), 1e3 * spent / some)
             made += some
             if at_once is None:
                 some = max(1, min(2 * some, int(some * GLANCE / max(spent, 1e-6))))
@@ -336,19 +322,9 @@ class Simulator(LiveScene):
     def initial_rollout(self) -> Rollout:
         """The current state as a rollout of one frame. Raises as `steps` does."""
         self._accept()
-        state, (points, pairs, depth) = self._state, self.stepper.touching(self._state, self._carry)
-        counts = dict.fromkeys((*COUNTS, *PHASES), 0.0) if self._carry is None else self._carry.counts
-        frames = Frames(
-            **{name: getattr(state, name)[None] for name in MOTION},
-            energy=np.array([[*energies_of(self.bodies, state, self._options.gravity), 0.0]]),
-            depth=np.array([depth]),
-            touching=np.array([len(pairs)]),
-            pair=pairs,
-            point=points,
-            counts={name: np.array([value], float) for name, value in counts.items()},
-            joint=joint_frame(state)[None],
-        )
-        return self._rollout(frames, 0.0)
+        state, counts = self._state, {} if self._carry is None else self._carry.counts
+        one = state, 0.0, counts, self.stepper.touching(state, self._carry)
+        return self._rollout(stacked(state, [one], self.bodies, self._options), 0.0)
 
     def si_state(self) -> Moment:
         """Motion and time of the current state, in metres and seconds. To return to it later, keep `state` instead."""
@@ -366,16 +342,17 @@ class Simulator(LiveScene):
         moved = {name: changed[name] * unit for name, unit in u.motion.items() if name in changed}
         return self._si[1].with_rows(rows, moved, time=state.time * u.time)
 
-    def _advance(self, count: int, *, keep: bool = False) -> None:
+    def _advance(self, count: int, *, keep: bool = False) -> Steps:
         """Make `count` steps, in one call if the stepper can."""
         self._accept(keep=keep)
-        after, carry = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep)
-        self._state = self._good = after
-        self.steps_done += carry.done
+        made = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep)
+        self._state = self._good = made.state
+        self.steps_done += made.done
         if not keep:
-            self._given += carry.given
-        if carry.fault is not None:
-            raise self._broke(self._described(carry.fault), carry.frames if keep else None)
+            self._given += made.given
+        if made.fault is not None:
+            raise self._broke(self._described(made.fault), made.frames)
+        return made
 
     def _accept(self, *, keep: bool = False) -> None:
         """Check the user's changes before anything is computed from them, and announce them to the stepper. Raises
@@ -481,8 +458,8 @@ def differing_motion(state: State, other: State) -> np.ndarray:
 
 
 def varied(scene: Scene, variant: Variant) -> Scene:
-    """The scene with some of the fields `VARIED` changed, in SI units. A body's own inertia scales with its mass.
-    Raises SdfsimError for an unknown body or field, or an invalid value."""
+    """The scene with some of the fields `VARIED` changed, in SI units, with the limits of a scene file. A body's own
+    inertia scales with its mass. Raises SdfsimError for an unknown body or field, or an invalid value."""
     known = {body.name for body in scene.bodies}
     for name in variant:
         if name not in known:
@@ -491,29 +468,19 @@ def varied(scene: Scene, variant: Variant) -> Scene:
 
 
 def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
-    new: dict[str, Any] = {}
-    for name, given in fields.items():
-        where = f"variant: body {body.name!r}: {name}"
+    what = f"variant: body {body.name!r}"
+    for name in fields:
         if name not in VARIED:
-            raise SdfsimError(f"{where}: no such field{nearest(name, VARIED)}; fields are {', '.join(VARIED)}")
-        value, (count, most) = np.asarray(given, dtype=np.float64), VARIED[name]
-        if value.shape != ((count,) if count else ()) or not np.isfinite(value).all():
-            raise SdfsimError(f"{where}: must be {count or 1} finite numbers (got {given!r})")
-        if not count and not 0.0 <= value <= most:
-            raise SdfsimError(f"{where}: must be 0 to {most:g} (got {given!r})")
+            raise SdfsimError(f"{what}: {name}: no such field{nearest(name, VARIED)}; fields are {', '.join(VARIED)}")
         if body.motion != "dynamic" and name in ("velocity", "angular_velocity", "mass"):
-            raise SdfsimError(f"variant: body {body.name!r}: is {body.motion}, so it has no {name}")
+            raise SdfsimError(f"{what}: is {body.motion}, so it has no {name}")
         if body.path is not None and name in ("position", "quat_xyzw"):
-            message = f"variant: body {body.name!r}: is on a path, so its {name} cannot be changed"
-            raise SdfsimError(message, "change the path in the scene")
-        new[name] = value if count else float(value)
-    if "quat_xyzw" in new:
-        new["quat_xyzw"] = new["quat_xyzw"] / max(np.linalg.norm(new["quat_xyzw"]), 1e-300)
-    if "mass" in new:
-        if not new["mass"] > 0:
-            raise SdfsimError(f"variant: body {body.name!r}: mass: must be > 0")
-        if body.inertia is not None:
-            new["inertia"] = body.inertia * (new["mass"] / body.mass)
+            raise SdfsimError(f"{what}: is on a path, so its {name} cannot be changed", "change the path in the scene")
+    (table,) = validated(what, (BodyTable, plain({"name": body.name, "shape": "its own", **fields})))
+    values = {name: getattr(table, name) for name in fields}
+    new: dict[str, Any] = {name: np.array(v) if isinstance(v, list) else v for name, v in values.items()}
+    if "mass" in new and body.inertia is not None:
+        new["inertia"] = body.inertia * (new["mass"] / body.mass)
     return replace(body, **new)
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 import numpy as np
 
 from sdfsim.base.compiling import running
+from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.model import IMPULSE, SOLVER, Model
 from sdfsim.learned.training_ranges import outside_training
@@ -24,16 +25,15 @@ from sdfsim.physics.bodies import Bodies, State, Units, awake
 from sdfsim.physics.free_flight import driven, fly, with_history
 from sdfsim.physics.joint_columns import COORD, PULL, STATE
 from sdfsim.physics.joints import stored
-from sdfsim.physics.motion import MOTION, Motion
+from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import SUBSTEPS, Options
+from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.units import scene_units
-from sdfsim.physics.validity import NO_LIMITS, Fault, first_fault, limits
+from sdfsim.physics.validity import NO_LIMITS, first_fault, limits
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
 
 if TYPE_CHECKING:  # numba and torch are slow to load
-    import torch
-
     from sdfsim.learned.families import Family
     from sdfsim.learned.impulse import ImpulseNetwork
     from sdfsim.learned.near import Contacts
@@ -42,30 +42,6 @@ if TYPE_CHECKING:  # numba and torch are slow to load
 
 FreeFlight = Literal["exact", "learned"]
 LONGEST = 0.01  # s, the longest inner step of the contact solve that its laws were checked with
-COUNTS = {
-    "pairs": "pairs of bodies that the broad phase let through",
-    "contacts": "contact points in the solve",
-    "nodes": "nodes in the network's graph",
-    "edges": "edges in that graph",
-    "free": "dynamic bodies in free flight",
-    "active": "dynamic bodies awake that contacts moved",
-    "asleep": "dynamic bodies asleep",
-}
-PHASES = {"flight_ms": "free flight", "contact_ms": "contact solve", "network_ms": "network"}
-
-
-@dataclass(frozen=True)
-class Frames(Motion):
-    """The data that a recording keeps of each of K steps, model units."""
-
-    energy: np.ndarray  # [K, 3] kinetic and potential energy; work of pulls in the step
-    depth: np.ndarray  # [K] the deepest penetration
-    touching: np.ndarray  # [K] int64, number of points where bodies touch
-    pair: np.ndarray  # [sum(touching), 2] int64, the bodies that touch there
-    point: np.ndarray  # [sum(touching), 3]
-    counts: dict[str, np.ndarray]  # [K] each, see `COUNTS` and `PHASES`
-    # [K, J, 7] for each joint its angle, position or length; force and torque on its first body, at its anchor
-    joint: np.ndarray
 
 
 @dataclass
@@ -76,10 +52,6 @@ class Carry:
     options: Options
     checked: bool = False  # whether `advance` ends at an invalid state
     counts: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*COUNTS, *PHASES), 0.0))  # of the last step
-    done: int = 0  # steps that the latest `advance` has made
-    fault: Fault | None = None  # the fault of the state after these, if it is invalid
-    given: float = 0.0  # work of pulls in these steps, model units
-    frames: Frames | None = None  # frames of these steps, if they were asked for
     scene: Compiled | None = None  # the bodies for compiled code, if the stepper uses any
     # weights: a network on bodies, in double precision; tensors: the bodies, for a network on surface nodes. Both also
     # depend on the options.
@@ -114,6 +86,11 @@ class Stepper:
     def distances(self) -> bool:
         """Whether it uses the compiled distances of a scene."""
         return False
+
+    @property
+    def device(self) -> Any:
+        """Where it computes: "cpu", or the device of the network's weights."""
+        return "cpu"
 
     def units(self, scene: Scene, dt: float | None = None) -> Units:
         """Model units of a scene, see `scene_units`."""
@@ -151,29 +128,29 @@ class Stepper:
             scene.place(state)
         return state
 
-    def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
+    def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> Steps:
         """Make `n` steps, and `keep` their frames. A `checked` carry ends them at the first invalid state. The counts
         of the carry are those of the last step that is kept."""
-        bodies, dt, rows, frames = carry.bodies, carry.options.dt, carry.bodies.movers, []
-        carry.done, carry.fault, carry.given, carry.frames = 0, None, 0.0, None
+        bodies, dt, rows, kept = carry.bodies, carry.options.dt, carry.bodies.movers, []
+        done, fault, total = 0, None, 0.0
         for _ in range(n):
             known = carry.counts, carry.near, carry.touched
             carry.counts = dict.fromkeys(carry.counts, 0.0)
             after = self._step(driven(bodies, state, dt), carry)
             asleep = np.zeros(len(rows), bool) if after.touch is None else after.touch.rows_of("island", rows) >= 0
             if carry.checked:
-                carry.fault = first_fault(after, dt, rows[~asleep], state)
-                if carry.fault is not None:
+                fault = first_fault(after, dt, rows[~asleep], state)
+                if fault is not None:
                     carry.counts, carry.near, carry.touched = known
                     break
             carry.counts |= {"asleep": asleep.sum(), "free": len(rows) - asleep.sum() - carry.counts["active"]}
             given = _given(state, after, rows, dt)
-            carry.given, carry.done, state = carry.given + given, carry.done + 1, after
+            done, state, total = done + 1, after, total + given
             if keep:
-                frames.append((after, given, dict(carry.counts), self.touching(after, carry)))
-        if keep:
-            carry.frames = stacked(state, frames, bodies, carry.options)
-        return state, carry
+                kept.append((after, given, carry.counts, self.touching(after, carry)))
+        return Steps(
+            state, done, fault, total, carry.counts, stacked(state, kept, bodies, carry.options) if keep else None
+        )
 
     def touching(self, state: State, carry: Carry | None) -> tuple[np.ndarray, np.ndarray, float]:
         """Points [C, 3] where bodies touch, pairs of bodies [C, 2], and the deepest penetration, model units; before
@@ -212,26 +189,12 @@ class Solver(Stepper):
         found = contact_points(state)
         return found.point, found.pair, float((-found.gap).max(initial=0.0))
 
-    def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> tuple[State, Carry]:
+    def advance(self, state: State, carry: Carry, n: int = 1, *, keep: bool = False) -> Steps:
         """All steps in one call of compiled code."""
-        started = running()
         most = limits(carry.options.dt) if carry.checked else NO_LIMITS
         made = cast("Compiled", carry.scene).advance(state, carry.options, n, most, keep=keep)
-        spent = 1e3 * (running() - started) / max(n, 1)
-        carry.done, carry.fault, carry.given = made.done, made.fault, made.given
-        carry.frames = None
-        if made.done:
-            pairs, contacts, active, asleep = made.counts
-            carry.counts |= {"pairs": pairs, "contacts": contacts, "active": active, "asleep": asleep}
-            carry.counts |= {"free": len(carry.bodies.movers) - asleep - active, "contact_ms": spent}
-        if keep:
-            kept = {name: getattr(made.kept, name)[: made.done] for name in made.kept._fields}
-            pairs, contacts, active, asleep, touching = kept.pop("count").T
-            counts = {"pairs": pairs, "contacts": contacts, "active": active, "asleep": asleep}
-            counts |= {"free": len(carry.bodies.movers) - asleep - active, "contact_ms": np.full(made.done, spent)}
-            counts = {name: counts.get(name, np.zeros(made.done)).astype(float) for name in (*COUNTS, *PHASES)}
-            carry.frames = Frames(**kept, touching=touching, pair=made.pair, point=made.point, counts=counts)
-        return made.state, carry
+        carry.counts |= made.counts
+        return made
 
 
 class OnBodies(Stepper):
@@ -284,8 +247,7 @@ class OnSurfaces(Stepper):
         return self.contact and self.family.distances
 
     @property
-    def device(self) -> torch.device:
-        """The device of the network's weights."""
+    def device(self) -> Any:
         return next(iter(self.model.network.state_dict().values())).device
 
     def surface(self, shape: Shape) -> Shape:
@@ -386,7 +348,8 @@ def energies_of(bodies: Bodies, state: State, gravity: np.ndarray) -> tuple[floa
 
 
 def stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: Bodies, options: Options) -> Frames:
-    """The frames of single steps: for each the state after it, the work of pulls, counts, and where bodies touch."""
+    """The frames of single steps, as many as `kept` has: for each the state after it, the work of pulls, counts, and
+    where bodies touch."""
     states = [state for state, *_ in kept]
     arrays = {
         name: np.stack([getattr(s, name) for s in states]) if states else getattr(like, name)[None][:0]
@@ -394,7 +357,7 @@ def stacked(like: State, kept: list[tuple[State, float, dict, tuple]], bodies: B
     }
     energy = [(*energies_of(bodies, state, options.gravity), given) for state, given, *_ in kept]
     points, pairs, depths = zip(*(found for *_, found in kept), strict=True) if kept else ((), (), ())
-    counts = {name: np.array([counts[name] for _, _, counts, _ in kept], float) for name in (*COUNTS, *PHASES)}
+    counts = {name: np.array([counts.get(name, 0.0) for _, _, counts, _ in kept], float) for name in (*COUNTS, *PHASES)}
     return Frames(
         **arrays,
         energy=np.array(energy).reshape(-1, 3),
@@ -413,14 +376,19 @@ def joint_frame(state: State) -> np.ndarray:
     return np.concatenate([known[:, COORD, None], known[:, PULL : PULL + 6]], 1)
 
 
-def stepper_of(model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact") -> Stepper:
-    """The stepper of a model, for scenes with `contact` or without. Only networks on surface nodes have "learned" free
-    flight; raises SdfsimError for it with any other model."""
+def stepper_of(
+    model: Model, *, contact: bool = True, free_flight: FreeFlight = "exact", device: str | None = None
+) -> Stepper:
+    """The stepper of a model, for scenes with `contact` or without. Networks on surface nodes work on the `device`
+    (None: where their weights are), others on the CPU. Only networks on surface nodes have "learned" free flight;
+    raises SdfsimError for it with any other model."""
     learned, on_surfaces = free_flight == "learned", model.kind not in (SOLVER, IMPULSE)
     if learned and not on_surfaces:
         raise SdfsimError("only networks on surface nodes have free_flight 'learned'", "give a model of that kind")
     if not contact and not learned:
         return Stepper(model, mean=on_surfaces)
+    if device is not None:
+        model = model.to(str(pick_device(device)) if on_surfaces else "cpu")
     if on_surfaces:
         from sdfsim.learned.families import FAMILIES
 

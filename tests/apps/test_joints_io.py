@@ -12,14 +12,12 @@ from benchmarks.robots import poses
 from sdfsim import Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
-from sdfsim.apps.recording import ends, marks, save_rollout
+from sdfsim.apps.recording import ends, marks
 from sdfsim.base.errors import SdfsimError
-from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
 from tests.helpers.command import run
-from tests.helpers.runs import read
 
 LINK = """
   <link name="{0}">
@@ -308,17 +306,6 @@ def test_an_mjcf_hinge_of_more_than_a_turn_falls_as_in_mujoco(tmp_path: Path) ->
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")).key_qpos[0] == pytest.approx([0.0], abs=1e-9)
 
 
-def test_an_exported_motor_without_a_target_comes_back(tmp_path: Path) -> None:
-    built = SceneBuilder().add("arm", box={"size": (0.3, 0.1, 0.1)}, position=(0.15, 0, 1), mass=1.0)
-    built.join("pin", "hinge", "arm", anchor=(0, 0, 1), axis=(0, 1, 0), motor={"most": 7.0})
-    export(built.save(tmp_path / "scene.yaml"), tmp_path / "out.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-    assert model.nu == 1 and model.actuator_forcerange[0] == pytest.approx([-7, 7]) and not model.actuator_biasprm.any()
-    again, _ = imported(tmp_path / "out.xml")
-    motor = again.joints[0].motor
-    assert (motor.most, motor.position, motor.speed) == (pytest.approx(7.0), None, None)
-
-
 def test_what_other_readers_pass_over_is_passed_over(tmp_path: Path) -> None:
     text = "\n \n" + ARM.replace('xyz="0.01 0.02 0.25"', 'xyz="$(optenv NO_SUCH_VARIABLE 0.01 0.02 0.25)"')
     (tmp_path / "arm.urdf").write_bytes(text.encode() + b"\n\0")
@@ -334,9 +321,8 @@ def test_what_other_readers_pass_over_is_passed_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("encoding", "declared"),
     [
-        ("gb2312", "GB2312"), ("gbk", "gbk"), ("shift_jis", "Shift_JIS"), ("utf-16", "utf-16"), ("utf-16", ""),
-        ("utf-16-le", "UTF-16"), ("utf-16-be", ""), ("utf-32", "utf-32"), ("utf-8-sig", ""), ("utf-8-sig", "utf-8"),
-        ("utf-8", "utf-16"), ("utf-8", ""), ("iso2022_jp", "ISO-2022-JP"),
+        ("gb2312", "GB2312"), ("shift_jis", "Shift_JIS"), ("utf-16", "utf-16"), ("utf-32", ""), ("utf-8-sig", "utf-8"),
+        ("utf-8", "utf-16"), ("utf-8", ""),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("before", ["", "\n  "])
@@ -361,13 +347,6 @@ def test_bytes_of_another_encoding_are_told_and_unknown_encodings_refused(tmp_pa
     (tmp_path / "arm.urdf").write_text(f'<?xml version="1.0" encoding="klingon"?>{ARM}')
     with pytest.raises(SdfsimError, match=r"arm\.urdf:1: unknown encoding 'klingon'"):
         import_robot(tmp_path / "arm.urdf", tmp_path / "scene.yaml")
-
-
-def test_a_floor_is_under_the_lowest_link(tmp_path: Path) -> None:
-    scene, _ = imported(write(tmp_path, "arm.urdf", ARM), floor=True)
-    base = next(body for body in scene.bodies if body.name == "base")
-    assert base.position[2] == pytest.approx(0.1)  # half its height, of a frame in its middle
-    assert scene.bodies[0].name == "floor" and base.motion == "dynamic"
 
 
 def test_a_floor_carries_only_what_touches(tmp_path: Path) -> None:
@@ -521,46 +500,6 @@ def test_a_file_without_bodies_is_told_and_leaves_nothing(tmp_path: Path) -> Non
     with pytest.raises(SdfsimError, match=r"assets\.xml: describes no bodies"):
         import_robot(tmp_path / "assets.xml", tmp_path / "scene.yaml")
     assert [path.name for path in tmp_path.iterdir()] == ["assets.xml"]
-
-
-def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
-    scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
-    report = export(tmp_path / "scene.yaml", tmp_path / "out.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    for name, value in start_positions(scene).items():
-        # The elbow has the arm first, so MuJoCo's goes from the arm to the forearm about the other way of its axis.
-        assert data.joint(name).qpos[0] == pytest.approx(value, abs=1e-9), name
-    for body in scene.bodies:
-        shape = scene.shapes[body.shape]
-        assert data.body(body.name).xpos == pytest.approx(body.position, abs=1e-9)
-        if body.motion == "dynamic":
-            centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(body.scale * shape.com)
-            speed = np.zeros(6)
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(body.name).id, speed, 0)
-            assert data.body(body.name).xipos == pytest.approx(centre, abs=1e-9)
-    assert float(model.joint("shoulder").damping[0]) == pytest.approx(0.2)
-    assert model.joint("shoulder").range == pytest.approx(np.radians([-30, 70]))
-    assert data.ctrl[0] == pytest.approx(0.4) and model.actuator_forcerange[0] == pytest.approx([-20, 20])
-    assert data.ten_length[0] == pytest.approx(1.0) and model.tendon_range[0] == pytest.approx([0, 1.2])
-    # At other positions the arm is where the scene's joint puts it.
-    data.joint("shoulder").qpos[0] = 0.9
-    data.joint("elbow").qpos[0] = 0.3
-    mujoco.mj_forward(model, data)
-    post = next(body for body in scene.bodies if body.name == "post")
-    joint = next(joint for joint in scene.joints if joint.name == "shoulder")
-    own, theirs = (Rotation.from_quat(quat) for quat in joint.quat_xyzw)
-    axes = theirs * Rotation.from_rotvec([0.9, 0, 0]) * own.inv()
-    place = post.position + joint.anchor[1] - axes.apply(joint.anchor[0])
-    assert data.body("arm").xpos == pytest.approx(place, abs=1e-9)
-    assert data.body("arm").xmat.reshape(3, 3) == pytest.approx(axes.as_matrix(), abs=1e-9)
-    elbow = next(joint for joint in scene.joints if joint.name == "elbow")
-    arm, fore = (Rotation.from_matrix(data.body(name).xmat.reshape(3, 3)) for name in ("arm", "fore"))
-    frames = [turn * Rotation.from_quat(q) for turn, q in zip((arm, fore), elbow.quat_xyzw, strict=True)]
-    assert (frames[1].inv() * frames[0]).as_rotvec() == pytest.approx([0.3, 0, 0], abs=1e-9)
-    assert not any("elbow" in line for line in report["left_out"])
 
 
 def test_a_file_in_millimetres_moves_as_one_in_metres(tmp_path: Path) -> None:
@@ -733,24 +672,3 @@ def test_recordings_show_axes_and_limits_where_they_are(tmp_path: Path) -> None:
     assert ends([by_name["string"]], place, turns, scene)[0, 0] == pytest.approx(
         np.array([[1.4, 0.3, 1.4], [1.4, 0.3, 0.4]])
     )
-
-
-def test_a_recording_has_a_line_for_each_joint(tmp_path: Path) -> None:
-    scene = jointed().load()
-    shape = (3, len(scene.bodies))
-    still = Rollout(
-        time=np.arange(3) * 0.1,
-        position=np.tile([b.position for b in scene.bodies], (3, 1, 1)),
-        orientation=np.tile([b.quat_xyzw for b in scene.bodies], (3, 1, 1)),
-        velocity=np.zeros((*shape, 3)),
-        angular_velocity=np.zeros((*shape, 3)),
-        contact_count=np.zeros(3, np.int64),
-        contact_point=np.zeros((0, 3)),
-        contact_body=np.zeros((0, 2), np.int64),
-        names=tuple(b.name for b in scene.bodies),
-    )
-    save_rollout(scene, still, tmp_path / "rollout.rrd")
-    entities = set(read(tmp_path / "rollout.rrd"))
-    told = " ".join(sorted(map(str, entities)))
-    for joint in scene.joints:
-        assert f"joint\\ {joint.name}" in told, told

@@ -8,8 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.identify import Problem, Windows
-from sdfsim.apps.observed import cleaned, with_velocities
-from sdfsim.apps.observed_joints import flying_trees, held_together, jointed
+from sdfsim.apps.observed import cleaned, flying_trees, held_together, with_velocities
 from sdfsim.scene.builder import SceneBuilder
 
 ORIGIN, AXIS = np.array([0.05, 0.02, 0.0]), np.array([0.0, 0.6, 0.8])
@@ -186,16 +185,3 @@ def test_bodies_that_something_turns_in_a_flight_keep_what_is_seen_nearby() -> N
     poses = np.concatenate([place, (twist * turn).as_quat().reshape(count, 2, 4)], -1)
     (found,) = with_velocities([cleaned("twist", dt, poses, scene("hinge"))], scene("hinge"))
     assert not found.flying.any()
-
-
-def test_what_hangs_on_the_world_is_no_flying_tree() -> None:
-    made = SceneBuilder().add("floor", plane={})
-    for k in range(3):
-        made.add(f"link{k}", box={"size": [0.1, 0.05, 0.05]}, position=(0.1 * k, 0, 1), mass=1)
-    made.join("top", "hinge", "link0", anchor=(0, 0, 1), axis=(0, 1, 0))
-    made.join("next", "hinge", "link1", "link0", anchor=(0.05, 0, 1), axis=(0, 1, 0))
-    assert flying_trees(made.load()) == []
-
-
-def test_jointed_bodies_do_not_fly_freely() -> None:
-    assert jointed(scene("hinge")) == [True, True]

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from sdfsim.apps.plan import describe, plan_lines
-from sdfsim.learned.model import load_model
 from tests.helpers.scenes import tiny_model
 
 SCENE = """
@@ -52,12 +51,3 @@ def test_a_plan_reports_effects_pairs_and_costs(scene, model):
     lines = "\n".join(plan_lines(report))
     for word in ("off saves nothing", "[effects.sleep]", "excluded by collides_with"):
         assert word in lines
-
-
-def test_plan_reads_no_weights_where_the_run_would_not(scene, model, monkeypatch):
-    scene.write_text(SCENE.replace("restitution: off", "contact: off"))
-    monkeypatch.setattr("sdfsim.learned.model.new_network", lambda *_: pytest.fail("weights were read"))
-    report = told(scene, model)
-    assert not report["effects"]["contact"]["on"] and report["effects"]["friction"]["why"] == "contact is off"
-    assert report["step"]["edges"] == report["step"]["contacts"] == 0
-    assert load_model(model, weights=False).network is None

@@ -8,7 +8,6 @@ import pytest
 
 import sdfsim
 from sdfsim import Simulator
-from sdfsim.apps.beside import between
 from sdfsim.apps.recording import framed
 from sdfsim.apps.render import FRAMES, SIZE, Studio, eye_of, render
 from sdfsim.apps.run import ending_lines, summary
@@ -106,15 +105,6 @@ def test_a_texture_is_seen_where_its_places_are():
         seen = picture[middle[0] + off * (2 * row - 1), middle[1] + off * (2 * column - 1)].astype(int)
         strong = {"r": [1, 0, 0], "g": [0, 1, 0], "b": [0, 0, 1], "y": [1, 1, 0]}[str(color)]
         assert ((seen > 60) == np.array(strong, bool)).all()
-
-
-def test_poses_between_two_frames_are_on_the_way():
-    _, rollout = falling(position=(0, 0, 1), velocity=(1, 0, 0), angular_velocity=(0, 0, 3))
-    for time in (0.0, 0.123, 0.4, rollout.time[-1], 9.0):
-        place, turn = (p[0] for p in between(rollout.time, rollout.position, rollout.orientation, np.array([time])))
-        time = min(time, rollout.time[-1])
-        assert place[0] == pytest.approx((time, 0, 1 - 0.5 * 9.81 * time**2), abs=1e-3)
-        assert turn[0] == pytest.approx((0, 0, np.sin(1.5 * time), np.cos(1.5 * time)), abs=1e-4)
 
 
 def test_a_movie_has_its_frames_and_ends_as_the_picture_of_the_end(tmp_path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import threading
 import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,55 +61,10 @@ def test_a_folder_is_shown_by_the_recording_in_it(tmp_path, monkeypatch, name):
     opened: list[list[str]] = []
     ended = SimpleNamespace(poll=lambda: 0, wait=lambda: 0)
     monkeypatch.setattr(viewer.subprocess, "Popen", lambda command: opened.append(command) or ended)
-    with pytest.raises(SdfsimError, match="neither rollout"):
-        viewer.show(tmp_path, web=True)
     (tmp_path / name).write_bytes(b"RRF2")
     for place in (tmp_path, tmp_path / name):
         viewer.show(place, web=True)
         assert str(tmp_path / name) in opened.pop()
-
-
-SLOW = """\
-import sys, time
-from http.server import BaseHTTPRequestHandler, HTTPServer
-
-class Page(BaseHTTPRequestHandler):
-    def do_GET(self):
-        self.send_response(200)
-        self.end_headers()
-
-time.sleep(1.0)
-HTTPServer(("127.0.0.1", int(sys.argv[sys.argv.index("--web-viewer-port") + 1])), Page).serve_forever()
-"""
-
-
-def test_the_address_of_a_page_is_told_once_it_answers(tmp_path, monkeypatch):
-    """A viewer takes a while to start; who opens the address at once sees the page. Ctrl-C ends both, as it should."""
-    (tmp_path / "slow.py").write_text(SLOW)
-    (tmp_path / "a.rrd").write_bytes(b"RRF2")
-    real = viewer.subprocess.Popen
-    started: list[Any] = []
-    told: list[str] = []
-
-    def popen(command: list[str]) -> Any:
-        started.append(real([sys.executable, str(tmp_path / "slow.py"), *command[1:]]))
-        return started[0]
-
-    def say(line: str) -> None:
-        if line.startswith("watch it at "):
-            with urllib.request.urlopen(line.removeprefix("watch it at ").partition("?")[0], timeout=10) as answer:
-                assert answer.status == 200
-                told.append(line)
-            main = threading.main_thread().ident
-            threading.Timer(1.0, signal.pthread_kill, [main, signal.SIGINT]).start()
-
-    monkeypatch.setattr(viewer.subprocess, "Popen", popen)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background shells have it ignored
-    try:
-        viewer.show(tmp_path / "a.rrd", web=True, say=say)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert told and started[0].poll() is not None
 
 
 BALL = """
@@ -171,8 +125,10 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("command", ["view", "simulate"])
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [("view", signal.SIGTERM), pytest.param("simulate", signal.SIGHUP, marks=pytest.mark.slow)],
+)
 def test_a_page_lives_as_long_as_its_command_without_a_terminal(tmp_path, command, number):
     (tmp_path / "scene.yaml").write_text(BALL)
     simulate = ["simulate", str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "run")]

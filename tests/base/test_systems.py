@@ -1,6 +1,5 @@
 """What Windows and macOS do otherwise, as far as Linux can try it: consoles, locks, paths, what is not there."""
 
-import ast
 import ntpath
 import os
 import subprocess
@@ -14,98 +13,17 @@ import pytest
 from sdfsim import Scene, SdfsimError, load_scene
 from sdfsim.apps.export import plain_names
 from sdfsim.base import files
-from sdfsim.base.files import LOCK, locked, path_from
+from sdfsim.base.files import path_from
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = [
-    file
-    for folder in ("sdfsim", "pipeline", "samples", "scripts")
-    for file in sorted((ROOT / folder).rglob("*.py"))
-    if "__pycache__" not in file.parts
-] + [ROOT / "cli.py", ROOT / "setup.py"]
-UNIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
-UNIX_NAMES = {"fork", "forkpty", "getpgid", "getuid", "geteuid", "killpg", "mkfifo", "setsid", "uname", "SIGKILL"}
-UNIX_NAMES |= {"SIGHUP", "SIGALRM", "SIGUSR1", "SIGUSR2", "setitimer", "alarm", "sched_getaffinity", "fchmod"}
 
 
-def calls(tree: ast.AST) -> list[ast.Call]:
-    return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-
-
-def reads_text(call: ast.Call) -> bool:
-    """Whether a call opens a text file, and leaves its encoding to the system."""
-    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
-    given = {keyword.arg for keyword in call.keywords}
-    texts = [a.value for a in [*call.args, *(k.value for k in call.keywords)] if isinstance(a, ast.Constant)]
-    if "encoding" in given:
-        return False
-    if name == "read_text":
-        return not call.args
-    if name == "write_text":  # a method of paths takes one argument, our function two
-        return len(call.args) == 1
-    if isinstance(call.func, ast.Attribute) and call.args and not isinstance(call.args[0], ast.Constant):
-        return False  # of an archive or an image: the first argument of a path's is the mode
-    return name == "open" and not any(isinstance(text, str) and "b" in text and len(text) < 4 for text in texts)
-
-
-@pytest.mark.parametrize("file", SOURCES, ids=lambda f: str(f.relative_to(ROOT)))
-def test_code_takes_nothing_that_only_unix_has(file):
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names if alias.name in UNIX_MODULES]
-        if isinstance(node, ast.ImportFrom) and node.module in UNIX_MODULES:
-            found.append(node.module)
-        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") in ("os", "signal"):
-            found += [node.attr] if node.attr in UNIX_NAMES else []
-    found += [f"line {call.lineno}: shell" for call in calls(tree) if any(k.arg == "shell" for k in call.keywords)]
-    found += [f"line {call.lineno}: no encoding" for call in calls(tree) if reads_text(call)]
-    assert not found
-
-
-class Windows:
-    """Stands for msvcrt: a byte of a file that one handle has locked is locked to all others."""
-
-    LK_NBLCK = 2
-
-    def __init__(self) -> None:
-        self.taken: dict[int, int] = {}  # the handle by the file
-
-    def locking(self, handle: int, mode: int, count: int) -> None:
-        assert mode == self.LK_NBLCK and count == 1
-        if self.taken.setdefault(os.fstat(handle).st_ino, handle) != handle:
-            raise PermissionError(13, "Permission denied")
-
-
-def test_a_folder_is_locked_as_windows_locks(tmp_path, monkeypatch):
-    """Where `fcntl` is not there, and no file that is open can be removed."""
-    monkeypatch.setitem(sys.modules, "fcntl", None)
-    monkeypatch.setitem(sys.modules, "msvcrt", Windows())
-    real, opened = Path.unlink, []
-    real_open = open
-
-    def opening(path, *rest, **more):
-        file = real_open(path, *rest, **more)
-        opened.append(file)
-        return file
-
-    def unlink(path, missing_ok=False):
-        if any(not file.closed and Path(file.name) == path for file in opened):
-            raise PermissionError(13, "The process cannot access the file", str(path))
-        real(path, missing_ok=missing_ok)
-
-    monkeypatch.setattr(files, "open", opening, raising=False)
-    monkeypatch.setattr(Path, "unlink", unlink)
-    out = tmp_path / "out"
-    with locked(out):
-        with pytest.raises(SdfsimError, match="another run is writing"), locked(out):
-            pass
-        (out / "result").touch()
-    assert [path.name for path in out.iterdir()] == ["result"]
-    with pytest.raises(ValueError, match="broken"), locked(tmp_path / "other"):
-        raise ValueError("broken")
-    assert not (tmp_path / "other" / LOCK).exists()
+def test_text_files_are_opened_with_an_encoding():
+    """What only Unix has is refused by the linter's settings; this rule of it is not stable yet."""
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--preview", "--select", "PLW1514"]
+    folders = ["sdfsim", "pipeline", "samples", "scripts", "cli.py"]
+    done = subprocess.run([*command, *folders], cwd=ROOT, capture_output=True)
+    assert done.returncode == 0, done.stdout
 
 
 def test_paths_in_files_have_slashes_and_drives(monkeypatch):
@@ -130,6 +48,8 @@ def test_a_scene_that_names_files_with_backslashes_is_read(tmp_path):
 def test_no_exported_file_has_the_name_of_a_device():
     assert plain_names(["torus[0]", "torus[1]", "the ring", "!", "a_"]) == ["torus_0", "torus_1", "the_ring", "_", "a_"]
     assert plain_names(["con", "NUL", "com1", "cup"]) == ["con_1", "NUL_1", "com1_1", "cup"]
+    # Nor of another one, where case does not count.
+    assert plain_names(["a b", "a_b", "A.b", "world", "é"], True) == ["a_b", "a_b_1", "A_b_2", "world_1", "_"]
 
 
 def test_a_console_that_knows_few_characters_shows_the_others_escaped(tmp_path):

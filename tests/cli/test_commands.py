@@ -199,31 +199,6 @@ def test_budgets(text, seconds):
     assert seconds_of(text) == seconds
 
 
-@pytest.mark.slow
-def test_the_wheel_holds_everything(tmp_path):
-    import shutil
-    import zipfile
-
-    source = tmp_path / "source"
-    ignore = shutil.ignore_patterns(".*", "runs", "tests", "samples", "__pycache__", "*.egg-info", "build")
-    shutil.copytree(ROOT, source, ignore=ignore)
-    command = [sys.executable, "-m", "pip", "wheel", ".", "-q", "--no-deps", "-w", str(tmp_path)]
-    subprocess.run(command, cwd=source, check=True, capture_output=True)
-    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
-        names = set(wheel.namelist())
-        entry = wheel.read(next(n for n in names if n.endswith("entry_points.txt"))).decode()
-    ours = {str(p.relative_to(ROOT)) for room in ("sdfsim", "pipeline") for p in (ROOT / room).rglob("*.py")}
-    models = {
-        str(p.relative_to(ROOT)) for p in (ROOT / "sdfsim" / "models").iterdir() if p.suffix in (".safetensors", ".md")
-    }
-    assert {Path(name).suffix for name in models} == {".safetensors", ".md"}
-    ours |= models
-    assert ours | {"cli.py"} <= names
-    assert "sdfsim = cli:app" in entry
-    assert any(n.endswith("LICENSE") for n in names)
-    assert not any(n.startswith(("tests", "samples")) for n in names)
-
-
 def test_the_version_is_the_package_s():
     import sdfsim
 

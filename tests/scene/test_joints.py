@@ -137,8 +137,8 @@ def test_joints_written_in_python_are_those_of_the_file(load):
 
 def test_the_plan_knows_joints(load):
     text = f"{TOP}  - {{{HINGE}, bodies: [leaf, world]}}\n"
-    assert plan(load(text)).joints.on and not plan(load(TOP.replace("joints:\n", ""))).joints.on
-    off = plan(load(text.replace("version: 1", "version: 1\neffects: {joints: off}"))).joints
+    assert plan(load(text))["joints"].on and not plan(load(TOP.replace("joints:\n", "")))["joints"].on
+    off = plan(load(text.replace("version: 1", "version: 1\neffects: {joints: off}")))["joints"]
     assert not off.on and off.why == "the file says off"
 
 

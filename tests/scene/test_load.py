@@ -48,7 +48,7 @@ def test_a_wrong_body_is_reported_with_its_line(load, fields, fault):
 FILES = [
     ("", ["scene.yaml:1: the file is empty"]),
     ("- 1\n", ["scene.yaml:1: must be a mapping (got a list)"]),
-    ("version: 1\nbodies: []\n", ["scene.yaml:2: bodies: must have at least one body (got 0)"]),
+    ("version: 1\nbodies: []\n", ["scene.yaml:2: bodies: must have at least 1 entry (got 0)"]),
     ("bodies: [{name: a, plane: {}}]\n", ["scene.yaml:1: version: is required"]),
     ("version: 1\n", ["scene.yaml:1: bodies: is required"]),
     ("version: 1\nversion: 1\nbodies: []\n", ["scene.yaml:2: version: the key appears twice (first on line 1)"]),

@@ -1,6 +1,5 @@
 """Only what is in play is computed: stages that are off are never entered, and the network sees what touches."""
 
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +7,11 @@ import pytest
 import torch
 
 from sdfsim.geometry import primitives
-from sdfsim.learned import inference, near
+from sdfsim.learned import inference
 from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.graphs import sdf_sim_graph
-from sdfsim.learned.surfaces import compact, node_owner, predict
+from sdfsim.learned.surfaces import predict
 from sdfsim.learned.tensors import state_arrays
-from sdfsim.physics import free_flight
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape import contact_geometry
@@ -75,21 +73,6 @@ def test_no_weights_are_read_that_nothing_asks(dropped, tmp_path):
     assert Simulator(dropped, file).model.network.state_dict()
 
 
-def test_the_network_is_not_asked_before_a_pair_is_near(dropped, forbid):
-    far = replace(dropped, bodies=(dropped.bodies[0], dropped.bodies[3]))
-    forbid(inference, "stepped")
-    sim = Simulator(far, random_model("impulse"))
-    sim.run(steps=10)
-    assert sim.carry.counts["edges"] == 0 and sim.carry.counts["free"] == 1
-
-
-def test_without_a_dynamic_body_nothing_flies(dropped, forbid):
-    forbid(free_flight, "ballistic", "torque_free")
-    still = tuple(replace(b, motion="static", mass=0.0, velocity=np.zeros(3)) for b in dropped.bodies)
-    rollout = Simulator(replace(dropped, bodies=still), random_model("impulse")).run(steps=3)
-    assert (rollout.position == rollout.position[0]).all()
-
-
 @pytest.mark.parametrize("effect", ["friction", "restitution"])
 def test_an_effect_that_is_off_equals_a_scene_without_it(dropped, effect):
     model = random_model("impulse")
@@ -114,33 +97,6 @@ def test_scenery_far_away_is_never_asked(dropped, make):
     for name in ("pairs", "contacts", "nodes", "edges", "active", "free"):
         assert (one.counters[name] == other.counters[name]).all(), name
     assert one.counters["edges"].sum() > 0
-
-
-def allocated(simulator: Simulator) -> int:
-    """Bytes that a step holds at most beyond what was there before, the least of some: whoever goes over all bodies
-    makes an array."""
-    most = []
-    for k, _ in enumerate(simulator.steps(8)):
-        if k > 2:  # what is made once is there
-            most.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-        tracemalloc.start()
-    tracemalloc.stop()
-    return min(most)
-
-
-@pytest.mark.parametrize("way", ["solver", "impulse", "no contact", "led along"])
-def test_a_step_makes_no_array_of_all_scenery(dropped, way):
-    model = random_model("impulse") if way == "impulse" else "solver"
-    if way == "no contact":
-        dropped = replace(dropped, effects=replace(Effects(), contact="off"))
-    if way == "led along":
-        path = Waypoints(np.array([0.0, 9.0]), np.array([[5.0, 0, 1], [6, 0, 1]]), np.array([[0.0, 0, 0, 1]] * 2))
-        led = make_body("led", 0, [5, 0, 1], motion="kinematic", mass=0.0, path=path)
-        dropped = replace(dropped, bodies=(*dropped.bodies, led))
-    many = 5000
-    few, all_of_them = (allocated(Simulator(with_scenery(dropped, count), model)) for count in (10, many))
-    assert all_of_them < few + many  # not one byte each
 
 
 def seen_by(model) -> list:
@@ -196,24 +152,6 @@ def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(
     moving = rows[sim.bodies.moves[rows]]
     np.testing.assert_allclose(sim.state.position[moving], whole.position[moving], rtol=0, atol=1e-7)
     np.testing.assert_allclose(sim.state.angular_velocity[moving], whole.angular_velocity[moving], rtol=0, atol=1e-4)
-
-
-def test_with_everything_active_nothing_is_copied(dropped):
-    sim = Simulator(dropped, surface_model())
-    bodies, state, contacts = contact_edges(sim.bodies, sim.state, sim.options.gravity, sim.model.reach, sim.options.dt)
-    made = compact(bodies, state, contacts, torch.arange(len(bodies)))
-    assert made[0] is bodies and made[1] is state and made[2] is contacts
-    some = compact(bodies, state, contacts, torch.cat([contacts.owner, contacts.body]).unique())
-    place = node_owner(some[0])[some[2].node]
-    assert torch.equal(place, some[2].owner)
-    assert torch.equal(some[0].node[some[2].node], bodies.node[contacts.node])
-
-
-def test_learned_free_flight_needs_no_search_with_contact_off(dropped, forbid):
-    forbid(near, "nodes_near")
-    sim = Simulator(replace(dropped, effects=Effects(contact="off")), surface_model(), free_flight="learned")
-    rollout = sim.run(steps=3)
-    assert rollout.counters["active"][1:].tolist() == [3, 3, 3] and rollout.contact_count.sum() == 0
 
 
 def test_every_dynamic_body_is_counted_once_while_it_flies_touches_and_falls_asleep(dropped):

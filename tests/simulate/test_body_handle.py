@@ -10,7 +10,6 @@ from sdfsim import SdfsimError, Simulator, load_shape
 from sdfsim.physics.solver import prepare
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
-from sdfsim.simulate import simulator as simulator_module
 from sdfsim.simulate.simulator import run_all, varied
 from tests.helpers.scenes import ball, cube, make_body, random_model
 
@@ -23,17 +22,6 @@ def small(gravity=G, **fields) -> Scene:
     body = make_body("box", 0, [0.0, 0.0, 0.08], mass=0.2, **fields)
     floor = make_body("floor", 1, [0, 0, 0], motion="static", mass=0.0)
     return Scene((box, analytic_shape("plane")), (body, floor), gravity, 1.0)
-
-
-def test_reset_goes_back_to_the_start():
-    sim = Simulator(small())
-    first = sim.run(steps=40)
-    sim["box"].push((0.3, 0, 0))
-    sim.step(5)
-    sim.reset()
-    again = sim.run(steps=40)
-    for name in ("time", "position", "velocity", "contact_point"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
 
 
 def test_what_is_set_is_read_and_moves_the_body_in_metres_and_seconds():
@@ -202,15 +190,6 @@ def test_variants_run_with_the_options_of_their_simulator(free_flight):
     assert found.meta == alone.meta and found.meta["free_flight"] == free_flight and found.meta["seed"] == 7
 
 
-def test_variants_run_on_the_device_of_their_simulator(monkeypatch):
-    """A machine without a GPU shows it by what the jobs are told."""
-    sim, jobs = Simulator(small()), []
-    monkeypatch.setattr(simulator_module, "threads", lambda function, some: jobs.extend(some) or [(0, [None])])
-    sim.device = "cuda:0"
-    sim.rollouts([{}], steps=1)
-    assert jobs[0][2]["device"] == "cuda:0"
-
-
 def test_a_body_on_a_path_is_where_its_path_has_it():
     path = Waypoints(np.array([0.0, 1.0]), np.array([[0, 0, 0.5], [1, 0, 0.5]]), np.tile([0.0, 0, 0, 1], (2, 1)))
     scene = small()
@@ -228,8 +207,8 @@ def test_a_body_on_a_path_is_where_its_path_has_it():
         ({"bix": {}}, r"no body 'bix' \(did you mean 'box'\?\)"),
         ({"box": {"masss": 1}}, r"no such field \(did you mean 'mass'\?\); fields are position"),
         ({"box": {"mass": 0}}, "mass: must be > 0"),
-        ({"box": {"restitution": 1.5}}, "must be 0 to 1"),
-        ({"box": {"velocity": (1, 2)}}, "must be 3 finite numbers"),
+        ({"box": {"restitution": 1.5}}, "must be <= 1"),
+        ({"box": {"velocity": (1, 2)}}, "must be 3 numbers"),
         ({"floor": {"velocity": (1, 2, 3)}}, "is static, so it has no velocity"),
     ],
 )

@@ -49,23 +49,6 @@ def test_friction_holds_a_smaller_effort_and_a_slider_holds_its_weight():
     assert lift.joint("joint").force[2] == pytest.approx(MASS * 9.81)
 
 
-def test_torque_control_of_a_pendulum_is_a_spring_of_its_own():
-    """Every step an effort of -k x angle: the period is 2 pi sqrt(I / k)."""
-    stiffness, sim = 4.0, free("hinge")
-    joint = sim.joint("joint")
-    sim["box"].angular_velocity = (0, 0, 1.0)
-    turns, before = [], 0.0
-    for step in range(400):
-        joint.effort = -stiffness * joint.angle
-        sim.step()
-        if before < 0.0 <= joint.angle:
-            turns.append((step + 1 - joint.angle / (joint.angle - before)) * sim.dt)
-        before = joint.angle
-    period = 2.0 * np.pi * np.sqrt(INERTIA / stiffness)
-    assert len(turns) > 2
-    np.testing.assert_allclose(np.diff(turns), period, rtol=0.01)
-
-
 def test_a_motor_may_be_given_and_its_strength_changed():
     sim = free("hinge")
     joint = sim.joint("joint")
@@ -87,17 +70,6 @@ def test_a_motor_may_be_given_and_its_strength_changed():
     speed = joint.speed
     sim.step(10)
     assert joint.speed - speed == pytest.approx(3.0 / INERTIA * 10 * sim.dt, rel=1e-5)
-
-
-def test_a_motor_without_a_target_does_nothing_until_it_is_told():
-    sim = free("hinge", motor={"most": 20.0})
-    joint = sim.joint("joint")
-    sim["box"].angular_velocity = (0, 0, 0.7)
-    sim.step(20)
-    assert joint.speed == pytest.approx(0.7) and joint.target is None and joint.effort is None
-    joint.target = -0.4
-    sim.step(sim.steps_in(2.0))
-    assert joint.angle == pytest.approx(-0.4, abs=1e-4) and joint.target == pytest.approx(-0.4)
 
 
 def test_the_time_of_a_motor_is_that_in_which_the_way_shrinks_by_e():
@@ -129,15 +101,6 @@ def test_damping_and_friction_change_while_it_runs(kind, heft):
     assert joint.speed == pytest.approx(max(0.0, speed - 0.05 / heft * 20 * sim.dt), rel=1e-4, abs=1e-9)
 
 
-def test_reset_forgets_what_motors_were_told():
-    sim = free("hinge", motor={"most": 20.0})
-    joint = sim.joint("joint")
-    joint.most, joint.damping, joint.target = 5.0, 2.0, 1.0
-    sim.step(3)
-    sim.reset()
-    assert (joint.most, joint.damping, joint.target) == (pytest.approx(20.0), 0.0, None)
-
-
 def test_a_target_beyond_the_limits_is_told():
     sim = free("hinge", limits_deg=(-90, 90), motor={"most": 20.0})
     with pytest.warns(UserWarning, match=r"joint 'joint': target 2 is beyond the limits, -1\.571 to 1\.571"):
@@ -153,8 +116,6 @@ def test_a_target_beyond_the_limits_is_told():
         (lambda j: setattr(j, "most", -1), "most: must be a finite number of at least 0"),
         (lambda j: setattr(j, "time", -1), "time: must be a finite number of at least 0"),
         (lambda j: setattr(j, "friction", True), "friction: must be a finite number of at least 0"),
-        (lambda j: setattr(j, "torque", 2.0), "torque is read-only\nhint: set `effort`"),
-        (lambda j: setattr(j, "force", 2.0), "force is read-only\nhint: set `effort`"),
         (lambda j: j.position, "is a hinge, which has no position\nhint: read angle"),
     ],
 )

@@ -78,18 +78,6 @@ def test_act_save_step_restore_step_gives_the_same_bits(simulator, act, awake, t
     assert same(other.state, first)
 
 
-def test_a_door_that_slept_opens_once_more(simulator):
-    simulator.reset()
-    simulator.step(simulator.steps_in(2.0))
-    door = simulator.joint("door")
-    door.target = 1.2
-    kept = simulator.state
-    for _ in range(2):
-        simulator.restore(kept)
-        simulator.step(100)
-        assert door.target == pytest.approx(1.2) and door.angle == pytest.approx(1.2, abs=0.01)
-
-
 @pytest.mark.parametrize("what", ["load", "target"])
 def test_a_state_that_pulls_or_drives_otherwise_wakes_what_it_moves(simulator, what):
     simulator.reset()
@@ -131,22 +119,3 @@ def test_a_file_that_holds_no_state_is_refused(tmp_path):
         State.read(file)
     with pytest.raises(SdfsimError, match=r"none\.npz: no such file"):
         State.read(tmp_path / "none.npz")
-
-
-def test_a_step_of_which_all_sleep_looks_at_nobody_and_changes_nothing(simulator):
-    simulator.reset()
-    simulator.step(simulator.steps_in(2.0))
-    before, work = simulator.state, simulator.carry.scene.work
-    looked_at = [work.matrix, work.low, work.high, work.ways, work.change, work.free]
-    for array in looked_at:
-        array[:] = np.nan
-    after = simulator.run(steps=5)
-    assert all(np.isnan(array).all() for array in looked_at)
-    now, then = simulator.state.arrays(), before.arrays()
-    assert now.pop("time") > then.pop("time") and same_arrays(now, then)
-    assert (after.counters["asleep"] == 3).all() and not after.counters["pairs"].any()
-    assert (after.contact_count == after.contact_count[0]).all() and after.contact_count[0] > 0
-    simulator["box"].push((4.0, 0, 0))
-    simulator.step(2)
-    assert not simulator["box"].asleep and simulator["leaf"].asleep
-    assert np.isfinite(simulator.state.position).all() and simulator["box"].velocity[0] > 1.0

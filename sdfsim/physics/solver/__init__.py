@@ -1,44 +1,21 @@
 """The contact solve: preparation of scenes (`prepare`), and the compiled step (all other files).
 
-Compiled code is cached in the user's cache folder, under a hash of all files: numba checks only the file that a
-function is in, and would use outdated code if another file changed.
+Compiled code is cached in the user's cache folder, under a hash of all these files.
 """
 
-from __future__ import annotations
-
-import hashlib
-import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from numba.core import config
+from sdfsim.base.compiling import cache_of, kept
 
 
 def _cache() -> Path:
-    hashed = hashlib.sha256()
+    """The folder of the compiled step, named after a hash of its source."""
     here = Path(__file__).parent
-    for file in [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]:
-        if file.name != "prepare.py":
-            hashed.update(file.read_bytes())
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return home / "sdfsim" / "kernels" / hashed.hexdigest()[:16]
-
-
-@contextmanager
-def kept() -> Iterator[None]:
-    """Cache the compiled code of functions that are defined in the block: modules with such functions are imported
-    inside it."""
-    settings: Any = config
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = before or str(_cache())
-    try:
-        yield
-    finally:
-        settings.CACHE_DIR = before
+    files = [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]
+    return cache_of(file for file in files if file.name != "prepare.py")
 
 
 def _without_blas() -> None:
@@ -57,5 +34,5 @@ def _without_blas() -> None:
 
 
 _without_blas()
-with kept():
+with kept(_cache()):
     from sdfsim.physics.solver import run as run

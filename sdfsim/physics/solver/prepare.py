@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 
 import numba
 import numpy as np
 
-from sdfsim.base.compiling import compile_before
+from sdfsim.base.compiling import compile_before, running
 from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
@@ -26,7 +26,8 @@ from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows,
 from sdfsim.physics.solver.manifold import scratch_room
 from sdfsim.physics.solver.run import HELD, SURFACES, THREADS, Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
-from sdfsim.physics.validity import NO_LIMITS, Fault, fault_of
+from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
+from sdfsim.physics.validity import NO_LIMITS, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactGeometry, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
@@ -123,7 +124,8 @@ class Compiled:
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make `steps` steps of the contact solve from `state`, or fewer if one leads to a state beyond the limits
-        `most` (see `survey.broken`). `keep`: keep of each what a recording needs."""
+        `most` (see `survey.broken`), and `keep` their frames."""
+        started = running()
         if state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
@@ -145,15 +147,19 @@ class Compiled:
         manifolds, counts, done, body, wrong, before, given, pair, point, kept = self.run(
             motion, self._manifolds, rules, steps, script, most, keep=keep
         )
-        fault = None
+        spent, frames = 1e3 * (running() - started) / max(steps, 1), None
+        if keep:
+            arrays = {name: getattr(kept, name)[:done] for name in kept._fields}
+            known = arrays.pop("count")
+            numbers = self._counts(known[:, :4], spent)
+            frames = Frames(**arrays, touching=known[:, 4], pair=pair, point=point, counts=numbers)
         if body >= 0:
             found = Motion(motion.position, motion.orientation, motion.velocity, motion.angular)
             fault = fault_of(body, wrong, found, np.array(before), options.dt)
             if not done:
-                return Steps(state, (0, 0, 0, 0), 0, fault, 0.0, kept, pair, point)
+                return Steps(state, 0, fault, 0.0, {}, frames)
             # The motion is one step beyond the last good state: repeat all steps but the last.
-            again = self.advance(state, options, done, NO_LIMITS)
-            return replace(again, fault=fault, kept=kept, pair=pair, point=point)
+            return replace(self.advance(state, options, done, NO_LIMITS), fault=fault, frames=frames)
         self._manifolds, rows = manifolds, self.world.going
         assert self._before.touch is not None
         touch = self._before.touch.with_rows(
@@ -171,8 +177,17 @@ class Compiled:
             known = self.held.each.state.copy()
             known[:, joint_columns.TARGET] = state.joints[:, joint_columns.TARGET]  # as `driven` received it
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
-        asleep = int((motion.island[rows] >= 0).sum())
-        return Steps(self._latest, (*counts, asleep), done, fault, given, kept, pair, point)
+        last = self._counts(np.array([[*counts, (motion.island[rows] >= 0).sum()]]), spent) if done else {}
+        return Steps(self._latest, done, None, given, {name: float(value[0]) for name, value in last.items()}, frames)
+
+    def _counts(self, known: np.ndarray, spent: float) -> dict[str, np.ndarray]:
+        """[K] each of `COUNTS` and `PHASES`, for K steps of `spent` ms: from [K, 4] pairs tested, contacts, bodies that
+        contacts moved, and sleeping ones."""
+        pairs, contacts, active, asleep = known.T.astype(float)
+        free = len(self.bodies.movers) - asleep - active
+        counts = {"pairs": pairs, "contacts": contacts, "active": active, "asleep": asleep, "free": free}
+        counts["contact_ms"] = np.full(len(known), spent)
+        return {name: counts.get(name, np.zeros(len(known))) for name in (*COUNTS, *PHASES)}
 
 
 def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool) -> None:
@@ -182,20 +197,6 @@ def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool) -> 
     what = "the contact step" + (f" for scenes with {', '.join(given)}" if given else "")
     missing = {HELD: not joints, SURFACES: not surfaces, THREADS: not threads}
     compile_before(run_steps, arguments, what, "two minutes" if joints else "a minute", missing)
-
-
-@dataclass(frozen=True)
-class Steps:
-    """The result of several steps of the contact solve."""
-
-    state: State  # the last good one
-    counts: tuple[int, ...]  # of the last step: pairs tested, contacts, bodies that contacts moved, sleeping bodies
-    done: int  # how many steps were made
-    fault: Fault | None  # fault of the state after them, which is not kept
-    given: float  # work of pulls
-    kept: Kept  # data of each step
-    pair: np.ndarray  # [C, 2] int64, bodies that touched in the kept steps, one step after the other
-    point: np.ndarray  # [C, 3] the points where they touched
 
 
 def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
