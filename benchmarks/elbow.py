@@ -1,6 +1,6 @@
 """Errors of engines on real tosses of an elbow, two links on a hinge, each engine with its own best parameters.
 
-    python -m benchmarks elbow TOSSES -o DIR [--rounds N]
+    python -m benchmarks elbow TOSSES -o DIR
 
 TOSSES holds `elbow.npz`: tosses of two printed links onto a table, tracked at 148 Hz (dair_pll). `sdfsim identify`
 finds our parameters on 60 tosses. A search like that of `benchmarks/reality.py` for the cube finds the same number of
@@ -12,19 +12,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.results import progress
+from benchmarks.records import Cell, Out, progress, write_record
 from benchmarks.tosses import (
     CLEAR,
+    FIT,
     FLIGHT,
     FRAMES,
     ROUNDS,
     SOFT,
     SOLID,
+    TEST,
     Bounds,
     Engine,
     Motion,
@@ -39,13 +40,13 @@ from benchmarks.tosses import (
     read_tosses,
     recorded,
     searched,
+    with_interval,
 )  # fmt: skip
 from sdfsim.apps.identify import identify, write_scene
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
-from sdfsim.base.files import read_arrays, write_json, write_text
-from sdfsim.data.public_tosses import ARM, ELBOW, LINK, PIVOT, Links, links_of, lowest, upright
-from sdfsim.evaluation.harness import markdown, one_thread
-from sdfsim.evaluation.metrics import interval
+from sdfsim.base.files import read_arrays, write_text
+from sdfsim.data.public_tosses import ELBOW, LINK, Links, links_of, lowest, upright
+from sdfsim.evaluation.harness import number, one_thread
 from sdfsim.physics.motion import MOTION
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -130,111 +131,20 @@ def errors(found: Motion, truth: Motion) -> np.ndarray:
     return np.stack([far, np.degrees(angle.mean((1, 2))), np.degrees(hinge.mean(1))])
 
 
-# --- what recordings say without any engine ---
-
-CORNERS = 0.5 * LINK * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-ALONE, AWAY = 0.008, 0.003  # m: how much lower an impact's corner is than the next; how high all corners are after it
-BEFORE, AFTER = 9, 6  # frames for the velocities before and after an impact
-
-
-class Moving(NamedTuple):
-    """Both links at one time: turns, and places [2, 3] and velocities [2, 3] about their mass centre, which moves with
-    `speed` [3]."""
-
-    turns: tuple[Rotation, Rotation]
-    place: np.ndarray  # m
-    velocity: np.ndarray  # m/s
-    spin: np.ndarray  # rad/s
-    speed: np.ndarray  # m/s
-
-    def corner(self, link: int, corner: int) -> np.ndarray:
-        """[3] m, about the mass centre."""
-        return self.place[link] + self.turns[link].apply(CORNERS[corner])
-
-    def velocity_of(self, link: int, point: np.ndarray) -> np.ndarray:
-        return self.speed + self.velocity[link] + np.cross(self.spin[link], point - self.place[link])
-
-    def turning(self) -> np.ndarray:
-        """[3] N m s, the angular momentum of solid links about the mass centre."""
-        inertia = (turn.as_matrix() @ np.diag(EVEN) @ turn.as_matrix().T for turn in self.turns)
-        own = sum(i @ w for i, w in zip(inertia, self.spin, strict=True))
-        return own + MASS * np.cross(self.place, self.velocity).sum(0)
+COLUMNS = (
+    "engine", "position, % of a link", "rotation, degrees", "hinge, degrees",
+    "sdfsim minus it, position", "sdfsim minus it, rotation", "sdfsim minus it, hinge",
+    "position on the 60", "rotation on the 60", "hinge on the 60",
+)  # fmt: skip
 
 
-def moving(toss: Links, frames: np.ndarray, at: float, dt: float, gravity: np.ndarray) -> Moving:
-    """By parabolas through these frames, at the time `at` in frames."""
-    time = dt * (frames - at)[:, None]
-    powers = time ** np.arange(3)
-    one, two = (Rotation.from_quat(toss.quat_xyzw[frames, k]) for k in (0, 1))
-    turn, rate = np.linalg.lstsq(powers, (one * one[0].inv()).as_rotvec(), rcond=None)[0][:2]
-    first, tiny = Rotation.from_rotvec(turn) * one[0], 1e-5
-    spin = (Rotation.from_rotvec(turn + tiny * rate) * Rotation.from_rotvec(turn).inv()).as_rotvec() / tiny
-    bent = np.linalg.lstsq(powers, np.unwrap((one.inv() * two).as_rotvec()[:, 1]), rcond=None)[0]
-    second = first * Rotation.from_rotvec([0.0, bent[0], 0.0])
-    spins = np.stack([spin, spin + bent[1] * first.apply([0.0, 1.0, 0.0])])
-    arms = first.apply(PIVOT), second.apply(ARM)
-    apart, fast = sum(arms), sum(np.cross(w, arm) for w, arm in zip(spins, arms, strict=True))
-    middle = toss.position[frames].mean(1) - 0.5 * time**2 * gravity
-    speed = np.linalg.lstsq(powers[:, :2], middle, rcond=None)[0][1]
-    half = 0.5 * np.array([[-1.0], [1.0]])
-    return Moving((first, second), half * apart, half * fast, spins, speed)
-
-
-def impacts(tosses: Sequence[Links], dt: float, gravity: np.ndarray) -> dict[str, list[float]]:
-    """Quartiles, with the number of impacts, over first impacts of one corner with no contact for a while after:
-    restitution of that corner, impulse along the table over that across it, and the share of the change of angular
-    momentum that an impulse at that corner does not explain."""
-    found: dict[str, list[float]] = {}
-    for toss in tosses:
-        first = flight(toss)
-        turns = Rotation.from_quat(toss.quat_xyzw.reshape(-1, 4)).as_matrix().reshape(-1, 2, 3, 3)
-        height = (toss.position[:, :, None] + np.einsum("tkij,cj->tkci", turns, CORNERS))[..., 2].reshape(-1, 16)
-        low = height.min(1)
-        if first < BEFORE + 1 or first + 2 >= len(low):
-            continue
-        at = first - 1 + int(np.argmin(low[first - 1 : first + 2]))
-        after = np.arange(at + 1, at + 1 + AFTER)
-        if after[-1] >= len(low) or low[after[1:]].min() < AWAY or np.diff(np.sort(height[at])[:2])[0] < ALONE:
-            continue
-        # Between frames: a fifth of one before the lowest.
-        a, b = (moving(toss, k, at - 0.2, dt, gravity) for k in (np.arange(first - BEFORE - 1, first - 1), after))
-        link, corner = divmod(int(height[at].argmin()), 8)
-        push, arm = 2.0 * MASS * (b.speed - a.speed), a.corner(link, corner)
-        if push[2] < 0.3:  # N s; the least impulse of the table
-            continue
-        turned = b.turning() - a.turning()
-        came, went = (one.velocity_of(link, one.corner(link, corner))[2] for one in (a, b))
-        told = -went / came, np.hypot(*push[:2]) / push[2]
-        left = np.linalg.norm(turned - np.cross(arm, push)) / np.linalg.norm(turned)
-        names = "restitution", "impulse along over across", "angular momentum that is left"
-        for name, value in zip(names, (*told, left), strict=True):
-            found.setdefault(name, []).append(float(value))
-    return {name: [*np.percentile(values, [25, 50, 75]).tolist(), len(values)] for name, values in found.items()}
-
-
-def growth(found: Motion, truth: Motion, flights: Sequence[int]) -> dict[int, tuple[float, float]]:
-    """By frames since the last one before the first impact: medians of the links' errors in position, mm, and rotation,
-    degrees."""
-    way, angle = apart(found, truth)
-    way, angle = 1e3 * np.sqrt(np.square(way).mean(-1)), np.degrees(angle.mean(-1))
-    told = {}
-    for frame in (0, 1, 2, 4, 8, 16, 32):
-        rows = [(k, n - 2 + frame) for k, n in enumerate(flights) if 0 <= n - 2 + frame < FRAMES]  # poses from 1 on
-        told[frame] = tuple(float(np.median([of[row] for row in rows])) for of in (way, angle))
-    return told
-
-
-def table(result: dict[str, tuple[np.ndarray, np.ndarray]]) -> str:
-    """The table of each engine's errors [3, B] on the tosses of its fit, and on the others; best first."""
-    heads = "position, % of a link", "rotation, degrees", "hinge, degrees", "sdfsim minus it", "the same on the 60"
-    rows: list[tuple[str, ...]] = [("", *heads)]
+def rows_of(result: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[tuple[Cell, ...]]:
+    """Each engine's errors [3, B] on the tosses of its fit, and on the others; best first."""
+    rows: list[tuple[Cell, ...]] = []
     for name, (fitted, judged) in sorted(result.items(), key=lambda item: item[1][1][0].mean()):
-        cells = [f"{np.mean(e):.1f} +- {interval(e)[1] - np.mean(e):.1f}" for e in judged]
-        less = judged if name == "sdfsim" or "sdfsim" not in result else result["sdfsim"][1] - judged
-        apart = " / ".join("{:.1f} [{:.1f}, {:.1f}]".format(np.mean(e), *interval(e)) for e in less)
-        known = ", ".join(f"{np.mean(e):.1f}" for e in fitted)
-        rows.append((name, *cells, "" if less is judged else apart, known))
-    return markdown(rows)
+        less = [""] * 3 if name == "sdfsim" else map(with_interval, result["sdfsim"][1] - judged)
+        rows.append((name, *map(with_interval, judged), *less, *(float(e.mean()) for e in fitted)))
+    return rows
 
 
 HINGE = {"drag": (0.0, 0.05), "damping_of_hinge": (0.0, 0.005), "inertia": (0.7, 2.0), "friction": (0.05, 0.6)}
@@ -243,11 +153,10 @@ ENGINES: dict[str, tuple[Engine, Bounds]] = {
     "MuJoCo": (partial(mujoco, THING), SOFT | HINGE),
     "PyBullet": (partial(bullet, THING), SOLID | HINGE),
 }
-ALL = ["sdfsim", *ENGINES]
 
 
 @one_thread()
-def main(tosses: Path, *, out: Path, rounds: int = ROUNDS, only: list[str] = ALL) -> None:
+def main(tosses: Path, *, out: Out) -> None:
     dt, known = load_tosses(tosses)
     out.mkdir(parents=True, exist_ok=True)
     gravity = gravity_of(known, dt)
@@ -257,30 +166,19 @@ def main(tosses: Path, *, out: Path, rounds: int = ROUNDS, only: list[str] = ALL
     (fit, fit_truth), (test, test_truth) = (
         ([start_of(r) for _, r in group], recorded([toss for toss, _ in group])) for group in groups
     )
-    flights = [flight(toss) for toss, _ in groups[1]]
-    result: dict[str, Any] = {}
-    for name, (low, middle, high, count) in impacts(known, dt, gravity).items():
-        print(f"first impacts of one corner, {name}: {middle:.3f} ({low:.3f} to {high:.3f}), {count:.0f} of them")
-    for k, name in enumerate(only):
-        if name == "sdfsim":
-            progress(0.0, "sdfsim: identify")
-            own = identify([r for _, r in groups[0]], scene, on_progress=progress)
-            write_scene(own, out / "scene.yaml", out / "identified.yaml")
-            found = load_scene(out / "identified.yaml")
-            values = {"bodies": own.scene_values, "joints": own.joint_values}
-            moved = [ours(starts, dt, found) for starts in (fit, test)]
-            print("sdfsim, mm and degrees by frames from the first impact:", growth(moved[1], test_truth, flights))
-            write_json(out / "identified.json", own.report())
-        else:
-            engine, bounds = ENGINES[name]
-            progress(k / len(only), f"{name}: {rounds} rounds of a search over {len(bounds)} parameters")
-            values = searched(
-                lambda v, engine=engine: cost(errors(engine(fit, dt, gravity, v), fit_truth)[:2]), bounds, rounds
-            )
-            moved = [engine(starts, dt, gravity, values) for starts in (fit, test)]
-        result[name] = values, *(errors(m, t) for m, t in zip(moved, (fit_truth, test_truth), strict=True))
-    kept = {n: {"values": v, "fit": f.tolist(), "test": j.tolist()} for n, (v, f, j) in result.items()}
-    write_json(out / f"elbow-{'-'.join(result)}.json", kept)
-    for name, (values, *_) in result.items():
-        print(name, values)
-    print(table({name: (fitted, judged) for name, (_, fitted, judged) in result.items()}))
+    progress(0.0, "sdfsim: identify")
+    own = identify([r for _, r in groups[0]], scene, on_progress=progress)
+    write_scene(own, out / "scene.yaml", out / "identified.yaml")
+    found = load_scene(out / "identified.yaml")
+    moved, notes = {"sdfsim": [ours(starts, dt, found) for starts in (fit, test)]}, []
+    for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
+        progress(k / (len(ENGINES) + 1), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
+        values = searched(lambda v, engine=engine: cost(errors(engine(fit, dt, gravity, v), fit_truth)[:2]), bounds)
+        moved[name] = [engine(starts, dt, gravity, values) for starts in (fit, test)]
+        notes.append(f"- {name}: {', '.join(f'{of} {number(value)}' for of, value in values.items())}")
+    result = {name: (errors(fitted, fit_truth), errors(judged, test_truth)) for name, (fitted, judged) in moved.items()}
+    measured = (
+        f"Parameters are from {FIT} tosses of an elbow, errors from {TEST} others, over the first {FRAMES} frames from "
+        "the same starts: means with 95 % intervals. Differences between engines are paired by toss."
+    )
+    write_record("elbow", "python -m benchmarks elbow TOSSES -o DIR", measured, COLUMNS, rows_of(result), notes)

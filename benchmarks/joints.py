@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.results import ROOT, write_section
+from benchmarks.records import ROOT, write_record
 from sdfsim import Scene, Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.base.lazy import optional
 from sdfsim.evaluation.engines import timed
-from sdfsim.evaluation.harness import markdown, one_thread
+from sdfsim.evaluation.harness import one_thread
 
 ROWS = {"hinge": 5, "slider": 5, "ball": 3, "fixed": 6, "distance": 1}
 SECONDS, ROUNDS = 2.0, 7
@@ -58,13 +58,14 @@ def costs(file: Path, folder: Path) -> tuple[float, float, float]:
 
 @one_thread()
 def main() -> None:
-    rows = [("scene", "joints", "rows", "inner step", "ms a second", "MuJoCo's", "us a row", "MuJoCo's")]
+    rows = []
     with tempfile.TemporaryDirectory() as scratch:
         for name, file in {"chain of 100": chain(Path(scratch)), "ragdoll": ROOT / "samples" / "ragdoll.yaml"}.items():
             joints = load_scene(file).joints
             held = sum(ROWS[joint.kind] for joint in joints)
             *taken, inner = costs(file, Path(scratch))
             each = [1e3 * took / (held * 1e3 / inner) for took in taken]
-            counts = (str(len(joints)), str(held), f"{inner:.2f} ms")
-            rows.append((name, *counts, *(f"{took:.0f}" for took in taken), *(f"{us:.2f}" for us in each)))
-    write_section("joints", "python -m benchmarks joints", markdown(rows))
+            rows.append((name, len(joints), held, inner, *taken, *each))
+    columns = ("scene", "joints", "rows", "inner step, ms", "ms per s", "ms per s in MuJoCo")
+    measured = f"Processor time on one thread, medians of {ROUNDS} alternating runs."
+    write_record("joints", "python -m benchmarks joints", measured, (*columns, "us a row", "us a row in MuJoCo"), rows)

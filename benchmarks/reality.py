@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from benchmarks.results import progress, write_section
+from benchmarks.records import Cell, Out, progress, write_record
 from benchmarks.tosses import (
     BODY,
     CLEAR,
@@ -49,15 +49,15 @@ from benchmarks.tosses import (
     read_tosses,
     recorded,
     searched,
+    with_interval,
 )  # fmt: skip
 from sdfsim.apps.identify import identify, write_scene
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import write_json, write_text
+from sdfsim.base.files import write_text
 from sdfsim.base.lazy import NotInstalled, optional
 from sdfsim.data.public_tosses import CUBE
-from sdfsim.evaluation.harness import Line, Panel, draw, markdown, number, one_thread
-from sdfsim.evaluation.metrics import interval
+from sdfsim.evaluation.harness import Line, Panel, draw, number, one_thread
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 
@@ -227,9 +227,8 @@ ENGINES: dict[str, tuple[Engine, Bounds]] = {
 
 
 @one_thread()
-def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
-    """Fit and test every engine; write the section of the page, `reality.json` with every toss's errors, the identified
-    scene, and pictures."""
+def main(tosses: Path, *, out: Out, gravity: float = GRAVITY) -> None:
+    """Fit and test every engine; write the record, the identified scenes, and pictures."""
     known = load_tosses(tosses)
     groups = split(known)
     (fit, fit_truth), (test, test_truth) = (
@@ -251,7 +250,6 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
             "side": cube["scale"], "inertia": cube["inertia_factor"] * EVEN / INERTIA,
         }  # fmt: skip
         moved[name] = found, ours(fit, dt, known_by_it), ours(test, dt, known_by_it)
-    scene = load_scene(out / "identified.yaml")
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
         progress(k / (len(ENGINES) + 1), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
         try:
@@ -268,80 +266,41 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     every = [*fit, *test]
     off = 1e3 * np.median([start.off for start in every])
     turned_off = np.degrees(np.median([start.turned_off for start in every]))
-    seen = shown(recordings_of(known, scene))
-    kept = {"gravity": gravity, "fall": [falls, sure], "shown": seen, "engines": _plain(result)}
-    write_json(out / "reality.json", kept)
     pictures(moved, test_truth, dt, out)
-    text = (
+    measured = (
         f"Parameters are from {FIT} tosses, errors from {TEST} others (seed {SEED}), over the first {FRAMES} frames: "
         "means over tosses with 95 % intervals. Differences between engines are paired by toss. The starts fit the "
         f"free flight to {off:.2f} mm "
         f"and {turned_off:.2f} degrees (medians of root mean squares); recorded cubes fall with {falls:.3f} +- "
-        f"{sure:.3f} m/s^2.\n\n{markdown(table_of(result))}"
+        f"{sure:.3f} m/s^2."
     )
-    write_section("reality", COMMAND, text)
+    write_record("reality", COMMAND, measured, COLUMNS, rows_of(result))
 
 
 OURS, FEWER = "sdfsim", f"sdfsim, found on {FEW} tosses"
 COMMAND = "python -m benchmarks reality TOSSES -o DIR"
 
 
-def shown(recordings: Sequence[Recording]) -> dict[str, list[float]]:
-    """Facts on contacts from recordings without any engine, each as quartiles with their number: for first impacts of
-    one corner (the next one a centimetre higher) the restitution, the impulse along the table over that across it, and
-    the change of the spin over that of a rigid corner; for stretches of 8 frames in which a face slides, the
-    deceleration over gravity, by speed."""
-    corners = 0.5 * SIDE * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    found: dict[str, list[float]] = {}
-    for r in recordings:
-        fly, speed, spin = r.flying[:, 0], r.velocity[:, 0], r.angular_velocity[:, 0]
-        for t in range(len(fly) - 3):
-            t2 = next((u for u in (t + 1, t + 2, t + 3) if fly[t] and fly[u] and (speed[u] - speed[t])[2] > 0.0), 0)
-            if not t2:
-                continue
-            at, after = (Rotation.from_quat(r.orientation[u, 0]).apply(corners) for u in (t, t2))
-            low = int(at[:, 2].argmin())
-            push = MASS * (speed[t2] - speed[t] + (t2 - t) * r.dt * np.array([0.0, 0.0, GRAVITY]))
-            turn = np.cross(at[low], push) / INERTIA
-            came = (speed[t] + np.cross(spin[t], at[low]))[2]
-            if came < -0.2 and np.sort(at[:, 2])[1] - at[low, 2] > 0.01:
-                went = (speed[t2] + np.cross(spin[t2], after[low]))[2]
-                found.setdefault("restitution", []).append(-went / came)
-                found.setdefault("impulse along over across", []).append(np.hypot(*push[:2]) / push[2])
-                found.setdefault("spin over a rigid corner's", []).append(turn @ (spin[t2] - spin[t]) / (turn @ turn))
-            break
-        slides = r.known & ~fly & (np.linalg.norm(spin, axis=1) < 1.0) & (np.abs(speed[:, 2]) < 0.03)
-        for t in (t for t in range(len(fly) - 7) if slides[t : t + 8].all()):
-            fast = float(np.linalg.norm(speed[t + 3 : t + 5].mean(0)))
-            name = next((f"friction up to {end} m/s" for end in (0.2, 0.4, 0.7) if 0.1 < fast < end), "")
-            if name:
-                slow = np.linalg.norm(speed[t + 7] - speed[t]) / (7 * r.dt * GRAVITY)
-                found.setdefault(name, []).append(float(slow))
-    return {name: [*np.percentile(values, [25, 50, 75]).tolist(), len(values)] for name, values in found.items()}
+COLUMNS = (
+    "engine", "position, % of the side", "rotation, degrees", "sdfsim minus it, position", "sdfsim minus it, rotation",
+    "position on the 60", "rotation on the 60", "parameters",
+)  # fmt: skip
 
 
-def table_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
+def rows_of(result: dict[str, Any]) -> list[tuple[Cell, ...]]:
     """Engines better than ours come first, then ours, then the others."""
-    head = (
-        "engine",
-        "position, % of the side",
-        "rotation, degrees",
-        "sdfsim minus it",
-        "the same on the 60",
-        "parameters",
-    )
 
     def lost(name: str) -> float:
         return float(np.mean(result[name]["test"][0]) - np.mean(result[OURS]["test"][0]))
 
-    rows: list[tuple[str, ...]] = [head]
+    rows: list[tuple[Cell, ...]] = []
     for name in sorted(result, key=lambda name: (lost(name), name != OURS)):
         one = result[name]
         change = [own - its for own, its in zip(result[OURS]["test"], one["test"], strict=True)]
-        less = "" if name == OURS else " / ".join(map(_told, change))
         found = ", ".join(f"{of} {number(value)}" for of, value in one["values"].items())
-        own = " / ".join(number(error.mean()) for error in one["fit"])
-        rows.append((name, *map(_told, one["test"]), less, own, found))
+        own = [float(error.mean()) for error in one["fit"]]
+        less = ["", ""] if name == OURS else map(with_interval, change)
+        rows.append((name, *map(with_interval, one["test"]), *less, *own, found))
     return rows
 
 
@@ -362,15 +321,3 @@ def pictures(moved: dict[str, tuple], truth: Motion, dt: float, out: Path) -> No
     side = [Line(name, (p[:, :2] @ along).tolist(), p[:, 2].tolist()) for name, p in place.items()]
     height = [Line(name, time, p[:, 2].tolist()) for name, p in place.items()]
     draw([Panel("a typical toss", "m along it", "m", side), Panel("", "s", "height, m", height)], out / "toss.png")
-
-
-def _told(error: np.ndarray) -> str:
-    low, high = map(number, interval(error))
-    return f"{number(float(error.mean()))} [{low}, {high}]"
-
-
-def _plain(result: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: {"values": one["values"], **{of: [error.tolist() for error in one[of]] for of in ("fit", "test")}}
-        for name, one in result.items()
-    }

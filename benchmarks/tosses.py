@@ -17,6 +17,7 @@ from sdfsim.base.files import read_arrays
 from sdfsim.base.lazy import optional
 from sdfsim.data.public_tosses import ARM, PIVOT, links_of
 from sdfsim.data.pybullet_sim import import_pybullet
+from sdfsim.evaluation.metrics import interval
 from sdfsim.scene.scene import Scene
 
 FRAMES = 75  # compared: half a second
@@ -107,6 +108,11 @@ def cost(errors: Iterable[np.ndarray]) -> float:
     """Sum of the mean errors [B] of tosses, % and degrees. Errors are capped, because otherwise the few cubes that come
     to rest on another face by chance would dominate the fit."""
     return float(sum(np.minimum(error, FAR).mean() for error in errors))
+
+
+def with_interval(errors: np.ndarray) -> list[float]:
+    """The mean over tosses [B], and its 95 % interval."""
+    return [float(errors.mean()), *interval(errors)]
 
 
 def searched(loss: Callable[[dict[str, float]], float], bounds: Bounds, rounds: int = ROUNDS) -> dict[str, float]:

@@ -8,14 +8,13 @@ DATA is a MOVi-B dataset; DIR keeps the results of the command, which this scrip
 import shutil
 from pathlib import Path
 
-from benchmarks.results import ROOT, progress, write_section
+from benchmarks.records import ROOT, Out, progress, write_record
 from sdfsim.evaluation import tradeoff as study
-from sdfsim.evaluation.harness import markdown
 
 
-def main(data: Path, *, out: Path) -> None:
+def main(data: Path, *, out: Out) -> None:
     report = study.tradeoff(data, out, on_progress=lambda _, fraction, message: progress(fraction, message))
     rows, notes = study.report_table(report)
     shutil.copyfile(out / "tradeoff.png", ROOT / "docs" / "images" / "tradeoff.png")
-    text = f"{markdown(rows)}\n{notes[0]}.\n\n![Error against time](../images/tradeoff.png)"
-    write_section("tradeoff", "python -m benchmarks tradeoff DATA -o DIR", text)
+    measured = f"{report['trajectories']} test trajectories of MOVi-B."
+    write_record("tradeoff", "python -m benchmarks tradeoff DATA -o DIR", measured, rows[0], rows[1:], [f"{notes[0]}."])
