@@ -10,7 +10,6 @@ same starts.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,6 @@ from benchmarks.tosses import (
     Engine,
     Motion,
     Start,
-    Thing,
     apart,
     bullet,
     cost,
@@ -148,10 +146,9 @@ def rows_of(result: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[tuple[Cell
 
 
 HINGE = {"drag": (0.0, 0.05), "damping_of_hinge": (0.0, 0.005), "inertia": (0.7, 2.0), "friction": (0.05, 0.6)}
-THING = Thing(LINK, MASS, EVEN, hinged=True)
 ENGINES: dict[str, tuple[Engine, Bounds]] = {
-    "MuJoCo": (partial(mujoco, THING), SOFT | HINGE),
-    "PyBullet": (partial(bullet, THING), SOLID | HINGE),
+    "MuJoCo": (mujoco, SOFT | HINGE),
+    "PyBullet": (bullet, SOLID | HINGE),
 }
 
 
@@ -173,8 +170,8 @@ def main(tosses: Path, *, out: Out) -> None:
     moved, notes = {"sdfsim": [ours(starts, dt, found) for starts in (fit, test)]}, []
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
         progress(k / (len(ENGINES) + 1), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
-        values = searched(lambda v, engine=engine: cost(errors(engine(fit, dt, gravity, v), fit_truth)[:2]), bounds)
-        moved[name] = [engine(starts, dt, gravity, values) for starts in (fit, test)]
+        values = searched(lambda v, engine=engine: cost(errors(engine(scene, EVEN, fit, dt, v), fit_truth)[:2]), bounds)
+        moved[name] = [engine(scene, EVEN, starts, dt, values) for starts in (fit, test)]
         notes.append(f"- {name}: {', '.join(f'{of} {number(value)}' for of, value in values.items())}")
     result = {name: (errors(fitted, fit_truth), errors(judged, test_truth)) for name, (fitted, judged) in moved.items()}
     measured = (

@@ -12,22 +12,19 @@ DIR keeps results.
 
 import importlib.util
 import inspect
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.engines.drake import drake
-from benchmarks.engines.newton import newton
-from benchmarks.engines.rapier import rapier
+from benchmarks.engines import bullet, drake, mujoco, newton, rapier
 from benchmarks.records import Out, progress, write_record
 from benchmarks.rivals import in_pieces
+from sdfsim.apps import mujoco_world
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import SUBSTEPS
 from sdfsim.evaluation import engines, everyday
@@ -43,12 +40,15 @@ from sdfsim.shape.shape import own_pieces
 OURS, DRAKE, NEWTON = "sdfsim", "Drake", "Newton"
 ENGINES: dict[str, tuple[str, Engine | None]] = {  # package and runner of each
     OURS: ("sdfsim", None),
-    "PyBullet": ("pybullet", engines.bullet),
-    "MuJoCo": ("mujoco", partial(engines.mujoco, elliptic=True)),
+    "PyBullet": ("pybullet", bullet),
+    "MuJoCo": ("mujoco", mujoco),
     "Rapier": ("rapier3d", rapier),
     DRAKE: ("pydrake", drake),
     NEWTON: ("newton", newton),
 }
+
+
+OTHERS = drake, newton, rapier  # with modules of their own
 
 
 class NotRun(SdfsimError):
@@ -207,13 +207,9 @@ def table(results: Results) -> tuple[list[tuple[str, ...]], list[str]]:
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
     content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday)]
-    how = dict.fromkeys(ENGINES, "")
-    for name, (_, engine) in ENGINES.items():
-        if engine is not None:
-            module = getattr(engine, "func", engine).__module__
-            how[name] = inspect.getsource(engines) + inspect.getsource(sys.modules[module])
+    how = [inspect.getsource(module) for module in (engines, mujoco_world, *map(inspect.getmodule, OTHERS)) if module]
     jobs = [
-        Job(row, name, [content, how[name]], counted, (row, at, name, out / "scenes"))
+        Job(row, name, [content, "" if name == OURS else how], counted, (row, at, name, out / "scenes"))
         for name in ENGINES
         if is_installed(name)
         for row in rows

@@ -11,10 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.engines.drake import drake
+from benchmarks.engines import drake, mujoco
 from benchmarks.records import ROOT, Out, progress, write_record
 from sdfsim.base.files import read_json, write_json
-from sdfsim.evaluation.engines import mujoco
 from sdfsim.evaluation.hard_cases import GROUPS
 from sdfsim.evaluation.stress import (
     LEGEND,

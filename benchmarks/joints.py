@@ -15,8 +15,7 @@ import numpy as np
 
 from benchmarks.records import ROOT, write_record
 from sdfsim import Scene, Simulator, load_scene
-from sdfsim.apps.export import export
-from sdfsim.base.lazy import optional
+from sdfsim.apps.mujoco_world import MujocoWorld
 from sdfsim.evaluation.engines import timed
 from sdfsim.evaluation.harness import one_thread
 
@@ -34,23 +33,18 @@ def chain(folder: Path, count: int = 100) -> Path:
     return built.save(folder / "chain.yaml")
 
 
-def costs(file: Path, folder: Path) -> tuple[float, float, float]:
+def costs(file: Path) -> tuple[float, float, float]:
     """Processor milliseconds per simulated second for ours and for MuJoCo, and the inner step in ms."""
-    engine, scene = optional("mujoco", "MuJoCo", "bench"), load_scene(file)
+    scene = load_scene(file)
     simulator = Simulator(scene)
     inner = simulator.dt / simulator.options.substeps
-    export(file, folder / "scene.xml")
-    model = engine.MjModel.from_xml_path(str(folder / "scene.xml"))
-    model.opt.timestep, model.opt.integrator = inner, engine.mjtIntegrator.mjINT_IMPLICITFAST
-    if scene.effects.contact == "off":
-        model.opt.disableflags |= engine.mjtDisableBit.mjDSBL_CONTACT
-    data = engine.MjData(model)
+    world = MujocoWorld(scene, inner)
     taken = []
     for _ in range(ROUNDS):
         simulator.reset()
         ours = timed(simulator.step, simulator.steps_in(SECONDS)).cpu_ms / simulator.dt
-        engine.mj_resetDataKeyframe(model, data, 0)
-        theirs = timed(lambda count: engine.mj_step(model, data, count), math.ceil(SECONDS / inner)).cpu_ms / inner
+        world.reset()
+        theirs = timed(world.advance, math.ceil(SECONDS / inner)).cpu_ms / inner
         taken.append((ours, theirs))
     ours, theirs = np.median(taken, axis=0).tolist()
     return ours, theirs, 1e3 * inner
@@ -63,7 +57,7 @@ def main() -> None:
         for name, file in {"chain of 100": chain(Path(scratch)), "ragdoll": ROOT / "samples" / "ragdoll.yaml"}.items():
             joints = load_scene(file).joints
             held = sum(ROWS[joint.kind] for joint in joints)
-            *taken, inner = costs(file, Path(scratch))
+            *taken, inner = costs(file)
             each = [1e3 * took / (held * 1e3 / inner) for took in taken]
             rows.append((name, len(joints), held, inner, *taken, *each))
     columns = ("scene", "joints", "rows", "inner step, ms", "ms per s", "ms per s in MuJoCo")

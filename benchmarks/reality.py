@@ -28,7 +28,6 @@ from benchmarks.tosses import (
     FIT,
     FLIGHT,
     FRAMES,
-    INNER,
     ROUNDS,
     SEED,
     SOFT,
@@ -38,12 +37,11 @@ from benchmarks.tosses import (
     Engine,
     Motion,
     Start,
-    Thing,
     apart,
     bullet,
     cost,
+    drake,
     drawn,
-    half_a_step_ago,
     mujoco,
     ours,
     read_tosses,
@@ -55,15 +53,15 @@ from sdfsim.apps.identify import identify, write_scene
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
-from sdfsim.base.lazy import NotInstalled, optional
+from sdfsim.base.lazy import NotInstalled
 from sdfsim.data.public_tosses import CUBE
 from sdfsim.evaluation.harness import Line, Panel, draw, number, one_thread
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 
 SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as published
-THING = Thing(np.full(3, SIDE), MASS, np.full(3, INERTIA))
 GRAVITY = 9.81  # m/s^2
+EACH = np.full(3, INERTIA)
 FEW = 16  # first tosses, for a second fit of ours
 
 
@@ -170,54 +168,16 @@ def recordings_of(tosses: Sequence[Toss], scene: Scene) -> list[Recording]:
     return with_velocities([cleaned(str(k), tosses[k].dt, one, scene) for k, one in enumerate(poses)], scene)
 
 
-def drake(starts: Sequence[Start], dt: float, gravity: np.ndarray, values: dict[str, float]) -> Motion:
-    """Drake's discrete point contact, the cubes far apart on one half space; its contacts have no rebound, but a
-    stiffness and a dissipation."""
-    lib: Any = optional("pydrake.all", "Drake", "rivals")
-    step, apart, cubes = dt / INNER, 20.0, []
-    plant, _ = lib.AddMultibodyPlantSceneGraph(builder := lib.DiagramBuilder(), step)
-    plant.mutable_gravity_field().set_gravity_vector(gravity)
-    table = lib.ProximityProperties()
-    lib.AddContactMaterial(0.0, 1e9, lib.CoulombFriction(1.0, 1.0), table)
-    ground = lib.RigidTransform([0.0, 0.0, values["height"]])
-    plant.RegisterCollisionGeometry(plant.world_body(), ground, lib.HalfSpace(), "table", table)
-    # Drake combines two coefficients a, b to 2 a b / (a + b): with 1 for the table this value gives the wanted
-    # friction.
-    mu = values["friction"] / (2.0 - values["friction"])
-    touch = lib.ProximityProperties()
-    lib.AddContactMaterial(values["dissipation"], 10.0 ** values["stiffness"], lib.CoulombFriction(mu, mu), touch)
-    side, inertia = values["side"] * SIDE, values["inertia"] * INERTIA
-    for k in range(len(starts)):
-        unit = lib.UnitInertia(*[inertia / MASS] * 3)
-        body = plant.AddRigidBody(f"cube{k}", lib.SpatialInertia(MASS, np.zeros(3), unit))
-        plant.RegisterCollisionGeometry(body, lib.RigidTransform(), lib.Box(side, side, side), f"box{k}", touch)
-        cubes.append(body)
-    plant.Finalize()
-    simulator = lib.Simulator(builder.Build())
-    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    shift = np.array([[apart * k, 0.0, 0.0] for k in range(len(starts))])
-    speeds = plant.GetVelocities(context)
-    for cube, start, to in zip(cubes, starts, shift, strict=True):
-        turn = lib.RotationMatrix(Rotation.from_quat(start.quat_xyzw).as_matrix())
-        plant.SetFreeBodyPose(context, cube, lib.RigidTransform(turn, start.position + to))
-        first = cube.floating_velocities_start_in_v()
-        speeds[first : first + 3] = start.angular_velocity
-        speeds[first + 3 : first + 6] = half_a_step_ago(start, step, gravity)
-    plant.SetVelocities(context, speeds)
-    place, turns = np.empty((len(starts), FRAMES, 3)), np.empty((len(starts), FRAMES, 4))
-    for frame in range(FRAMES):
-        simulator.AdvanceTo((frame + 1) * dt)
-        for k, cube in enumerate(cubes):
-            found = plant.EvalBodyPoseInWorld(context, cube)
-            place[k, frame] = found.translation() - shift[k]
-            turns[k, frame] = Rotation.from_matrix(found.rotation().matrix()).as_quat()
-    return Motion(place, turns)
+def cube(gravity: float, folder: Path) -> Scene:
+    """The cube above the table, which is also written to `scene.yaml` in a folder."""
+    write_text(folder / "scene.yaml", CUBE.format(gravity=-gravity, factor=INERTIA / EVEN))
+    return load_scene(folder / "scene.yaml")
 
 
 ENGINES: dict[str, tuple[Engine, Bounds]] = {
-    "MuJoCo, elliptic cone": (partial(mujoco, THING), SOFT),
-    "MuJoCo, pyramidal cone": (partial(mujoco, THING, elliptic=False), SOFT),
-    "PyBullet": (partial(bullet, THING), SOLID),
+    "MuJoCo, elliptic cone": (mujoco, SOFT),
+    "MuJoCo, pyramidal cone": (partial(mujoco, cone="pyramidal"), SOFT),
+    "PyBullet": (bullet, SOLID),
     # stiffness in powers of ten of N/m
     "Drake": (drake, BODY | {"stiffness": (3.5, 6.0), "dissipation": (0.0, 2.0)}),
 }
@@ -234,30 +194,29 @@ def main(tosses: Path, *, out: Out, gravity: float = GRAVITY) -> None:
     (fit, fit_truth), (test, test_truth) = (
         ([fitted_start(toss, gravity) for toss in group], recorded(group)) for group in groups[:2]
     )
-    dt, down = known[0].dt, np.array([0.0, 0.0, -gravity])
+    dt = known[0].dt
     out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "scene.yaml", CUBE.format(gravity=-gravity, factor=INERTIA / EVEN))
-    scene = load_scene(out / "scene.yaml")
+    thing = cube(gravity, out)
     moved = {}
     for name, count, file in ((FEWER, FEW, "identified-few.yaml"), (OURS, FIT, "identified.yaml")):
         progress(0.0, f"{name}: identify")
-        own = identify(recordings_of(groups[0][:count], scene), scene)
+        own = identify(recordings_of(groups[0][:count], thing), thing)
         write_scene(own, out / "scene.yaml", out / file)
         known_by_it = load_scene(out / file)
-        table, cube = own.scene_values["table"], own.scene_values["cube"]
+        table, thrown = own.scene_values["table"], own.scene_values["cube"]
         found = {
-            "friction": cube["friction"], "restitution": cube["restitution"], "height": table["position"][2],
-            "side": cube["scale"], "inertia": cube["inertia_factor"] * EVEN / INERTIA,
+            "friction": thrown["friction"], "restitution": thrown["restitution"], "height": table["position"][2],
+            "side": thrown["scale"], "inertia": thrown["inertia_factor"] * EVEN / INERTIA,
         }  # fmt: skip
         moved[name] = found, ours(fit, dt, known_by_it), ours(test, dt, known_by_it)
     for k, (name, (engine, bounds)) in enumerate(ENGINES.items(), 1):
         progress(k / (len(ENGINES) + 1), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
         try:
-            values = searched(lambda v, engine=engine: cost(errors(engine(fit, dt, down, v), fit_truth)), bounds)
+            values = searched(lambda v, engine=engine: cost(errors(engine(thing, EACH, fit, dt, v), fit_truth)), bounds)
         except NotInstalled as error:
             progress(k / (len(ENGINES) + 1), f"{name} is left out: {error.message}")
             continue
-        moved[name] = values, engine(fit, dt, down, values), engine(test, dt, down, values)
+        moved[name] = values, *(engine(thing, EACH, some, dt, values) for some in (fit, test))
     result = {
         name: {"values": values, "fit": errors(fitted, fit_truth), "test": errors(judged, test_truth)}
         for name, (values, fitted, judged) in moved.items()

@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.engines.drake import drake
-from benchmarks.engines.newton import newton
+from benchmarks.engines import bullet, drake, mujoco, mujoco_sdf, newton
 from benchmarks.records import Cell, Out, in_turn, progress, spread, write_record
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
@@ -33,7 +32,6 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_arrays, write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
@@ -52,9 +50,9 @@ from sdfsim.simulate.simulator import Simulator
 
 ENGINES: dict[str, Engine | None] = {
     "sdfsim": None,
-    "PyBullet, pieces": engines.bullet,
-    "MuJoCo, pieces": engines.mujoco,
-    "MuJoCo, SDF": partial(engines.mujoco, pieces=False),
+    "PyBullet, pieces": bullet,
+    "MuJoCo, pieces": mujoco,
+    "MuJoCo, SDF": mujoco_sdf,
     "Drake, hydroelastic": drake,
     "Newton, XPBD": newton,
 }

@@ -28,12 +28,13 @@ import numpy as np
 import torch
 from numba import njit
 
+from benchmarks.engines import bullet, mujoco
 from benchmarks.records import ROOT, Out, progress, write_record
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation.engines import Engine, Ran, bullet, mujoco, scene_rollout, start_of_scene
+from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory, why_failed

@@ -11,6 +11,7 @@ its 75 frames, from the same starts.
 
 import contextlib
 import io
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.reality import GRAVITY, SIDE, THING, errors, fitted_start, load_tosses, split
+from benchmarks.reality import EACH, GRAVITY, SIDE, cube, errors, fitted_start, load_tosses, split
 from benchmarks.records import write_record
 from benchmarks.tosses import FRAMES, SOFT, mujoco, recorded, with_interval
 from sdfsim.base.errors import SdfsimError
@@ -36,7 +37,8 @@ def main(tosses: Path) -> None:
         raise SdfsimError("MuJoCo's sysid is not installed", "pip install 'mujoco[sysid]'")
     known = load_tosses(tosses)
     groups = split(known)[:2]
-    dt, down = known[0].dt, np.array([0.0, 0.0, -GRAVITY])
+    with tempfile.TemporaryDirectory() as folder:
+        dt, thing = known[0].dt, cube(GRAVITY, Path(folder))
     (fit, fit_truth), (test, test_truth) = (
         ([fitted_start(toss, GRAVITY) for toss in group], recorded(group)) for group in groups
     )
@@ -50,7 +52,7 @@ def main(tosses: Path) -> None:
             columns = []
             for point in np.atleast_2d(x.T):
                 runs[0] += 1
-                found = mujoco(THING, fit, dt, down, dict(zip(SOFT, point, strict=True)))
+                found = mujoco(thing, EACH, fit, dt, dict(zip(SOFT, point, strict=True)))
                 turned = (Rotation.from_quat(found.quat_xyzw.reshape(-1, 4)) * turns.inv()).as_rotvec()
                 away = np.concatenate(
                     [(found.position - fit_truth.position) / SIDE, turned.reshape(found.position.shape)], -1
@@ -67,7 +69,7 @@ def main(tosses: Path) -> None:
         spent = time.process_time() - began
         values = dict(zip(SOFT, made.as_vector().tolist(), strict=True))
         name = f"MuJoCo, `mujoco.sysid` on the first {horizon} frames"
-        judged = errors(mujoco(THING, test, dt, down, values), test_truth)
+        judged = errors(mujoco(thing, EACH, test, dt, values), test_truth)
         rows.append((name, *map(with_interval, judged), spent))
         found = ", ".join(f"{of} {value:.4g}" for of, value in values.items())
         notes.append(f"- {horizon} frames, {runs[0]} runs of all tosses: {found}")

@@ -11,11 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reality import (
+    EACH,
     ENGINES,
     GRAVITY,
     OURS,
     SIDE,
     Toss,
+    cube,
     errors,
     fall,
     fitted_start,
@@ -106,7 +108,7 @@ def test_errors_are_those_of_a_shift_and_a_turn():
 
 def moved(name: str, starts: list[Start], height: float, folder: Path) -> Motion:
     if name != OURS:
-        return ENGINES[name][0](starts, DT, np.array([0.0, 0.0, -GRAVITY]), VALUES | {"height": height})
+        return ENGINES[name][0](cube(GRAVITY, folder), EACH, starts, DT, VALUES | {"height": height})
     text = CUBE.format(gravity=-GRAVITY, factor=1.0)
     (folder / "scene.yaml").write_text(text.replace("plane: {}", f"plane: {{offset: {height}}}"))
     return ours(starts, DT, load_scene(folder / "scene.yaml"))
