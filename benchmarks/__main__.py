@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 ALONE = ("contact_step", "effects")  # measured on one thread
-SHARED = ("baselines", "records", "tosses")  # modules that the benchmarks share
+SHARED = ("baselines", "records")  # modules that the benchmarks share
 
 if __name__ == "__main__":
     name = sys.argv[1] if len(sys.argv) > 1 else ""

@@ -4,7 +4,7 @@ docs/identify.md.
     pip install 'mujoco[sysid]'
     python -m benchmarks sysid TOSSES
 
-MuJoCo's least squares (`mujoco.sysid.optimize`) fit the parameters of benchmarks/reality.py, from the middle of their
+MuJoCo's least squares (`mujoco.sysid.optimize`) fit the parameters of benchmarks/tosses.py, from the middle of their
 bounds, to the first frames of 60 tosses. Errors are measured on the 100 other tosses of that benchmark, over
 its 75 frames, from the same starts.
 """
@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.reality import EACH, GRAVITY, SIDE, cube, errors, fitted_start, load_tosses, split
 from benchmarks.records import write_record
-from benchmarks.tosses import FRAMES, SOFT, mujoco, recorded, with_interval
+from benchmarks.tosses import A_CUBE, FRAMES, SIDE, SOFT, drawn, errors, mujoco, recorded, with_interval
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.lazy import optional
 from sdfsim.evaluation.harness import one_thread
@@ -35,12 +34,12 @@ def main(tosses: Path) -> None:
     toolbox: Any = optional("mujoco.sysid", "MuJoCo's sysid", "bench")
     if not hasattr(toolbox, "optimize"):  # it hides import errors
         raise SdfsimError("MuJoCo's sysid is not installed", "pip install 'mujoco[sysid]'")
-    known = load_tosses(tosses)
-    groups = split(known)[:2]
+    dt, known = A_CUBE.tosses(tosses)
     with tempfile.TemporaryDirectory() as folder:
-        dt, thing = known[0].dt, cube(GRAVITY, Path(folder))
+        thing = A_CUBE.load(Path(folder))
     (fit, fit_truth), (test, test_truth) = (
-        ([fitted_start(toss, GRAVITY) for toss in group], recorded(group)) for group in groups
+        ([r for _, r in group], recorded([toss for toss, _ in group]))
+        for group in drawn(A_CUBE.begun(known, dt, thing))[:2]
     )
     turns = Rotation.from_quat(fit_truth.quat_xyzw.reshape(-1, 4))
     rows, notes = [], []
@@ -52,7 +51,7 @@ def main(tosses: Path) -> None:
             columns = []
             for point in np.atleast_2d(x.T):
                 runs[0] += 1
-                found = mujoco(thing, EACH, fit, dt, dict(zip(SOFT, point, strict=True)))
+                found = mujoco(thing, A_CUBE.inertia, fit, dt, dict(zip(SOFT, point, strict=True)))
                 turned = (Rotation.from_quat(found.quat_xyzw.reshape(-1, 4)) * turns.inv()).as_rotvec()
                 away = np.concatenate(
                     [(found.position - fit_truth.position) / SIDE, turned.reshape(found.position.shape)], -1
@@ -69,7 +68,7 @@ def main(tosses: Path) -> None:
         spent = time.process_time() - began
         values = dict(zip(SOFT, made.as_vector().tolist(), strict=True))
         name = f"MuJoCo, `mujoco.sysid` on the first {horizon} frames"
-        judged = errors(mujoco(thing, EACH, test, dt, values), test_truth)
+        judged = errors(mujoco(thing, A_CUBE.inertia, test, dt, values), test_truth, SIDE)
         rows.append((name, *map(with_interval, judged), spent))
         found = ", ".join(f"{of} {value:.4g}" for of, value in values.items())
         notes.append(f"- {horizon} frames, {runs[0]} runs of all tosses: {found}")
