@@ -5,17 +5,26 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import typer
+
 ALONE = ("contact_step", "effects")  # measured on one thread
-SHARED = ("results", "tosses", "baselines")  # modules that the benchmarks share
+SHARED = ("baselines", "records")  # modules that the benchmarks share
 
 if __name__ == "__main__":
-    if sys.argv[1:2] and sys.argv[1] in ALONE:
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name in ALONE:
         os.environ["NUMBA_NUM_THREADS"] = "1"  # before the first import of numba
-    from benchmarks.results import script
+    from sdfsim.base.errors import run_main
 
     here = sorted(file.stem for file in Path(__file__).parent.glob("[a-z]*.py") if file.stem not in SHARED)
-    if not set(sys.argv[1:2]) & set(here):
+    if name not in here:
         sys.exit(f"usage: python -m benchmarks NAME ...   (NAME: {', '.join(here)})")
-    module = import_module(f"benchmarks.{sys.argv[1]}")
-    sys.argv[:2] = [f"benchmarks {sys.argv[1]}"]
-    script(module.__doc__, *getattr(module, "COMMANDS", None) or [module.main])
+    module = import_module(f"benchmarks.{name}")
+    app = typer.Typer(
+        help=module.__doc__, no_args_is_help=False, add_completion=False, pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )  # fmt: skip
+    for command in getattr(module, "COMMANDS", None) or [module.main]:
+        app.command(help=command.__doc__ or module.__doc__)(command)
+    del sys.argv[1]
+    run_main(lambda: app(prog_name=f"python -m benchmarks {name}"))

@@ -3,10 +3,10 @@
     python -m benchmarks contact_step DATA [--repeats 5]
     python -m benchmarks contact_step --check
 
-Writes its section of RESULTS.md, and the ratios into contact_step_ratchet.json. A slow test runs --check, which fails
-if a ratio has become worse. DATA is a MOVi-B dataset; without it the row is left out. Times are processor times of one
-thread, which other programs change less, except for many scenes in a call, which have wall-clock times. PyBullet and
-the solve alternate, each through its own API; every figure is the median of the repeats. PyBullet collides convex
+Writes its record, and ratios that have improved into contact_step_ratchet.json. A slow test runs --check, which fails
+if a ratio is worse than there. DATA is a MOVi-B dataset; without it the row is left out. Times are processor times of
+one thread, which other programs change less, except for many scenes in a call, which have wall-clock times. PyBullet
+and the solve alternate, each through its own API; every figure is the median of the repeats. PyBullet collides convex
 pieces (144 for the bowl), the solve those or baked distances; both make five inner steps per step. Loading and the
 recording of a simulator are not included.
 """
@@ -17,10 +17,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 
-from benchmarks.results import in_turn, write_section
+from benchmarks.records import in_turn, table, write_record
 from benchmarks.scale import apart, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.base.errors import SdfsimError
@@ -29,7 +31,7 @@ from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene, timed
 from sdfsim.evaluation.evaluate import load_recorded
-from sdfsim.evaluation.harness import markdown, number, one_thread
+from sdfsim.evaluation.harness import one_thread
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -151,20 +153,25 @@ def slipped_back(found: dict[str, float], kept: dict[str, float]) -> list[str]:
     ]
 
 
-def main(data: Path | None = None, *, check: bool = False, repeats: int = 5) -> None:
+COLUMNS = ("a step", "first", "ms of the first", "second", "ms of the second", "second / first")
+
+
+def main(data: Annotated[Path | None, typer.Argument()] = None, *, check: bool = False, repeats: int = 5) -> None:
     if not data and not check:
         raise SdfsimError("give a MOVi-B dataset, or --check")
-    rows, ratios = [("a step", "of", "ms", "of", "ms", "second / first")], {}
+    rows, ratios = [], {}
     with tempfile.TemporaryDirectory() as scratch:
         for name, (one, other, call) in pairs(data, Path(scratch)).items():
             times = in_turn([call], repeats)[:, 0]
             first, second = np.median(times, axis=0)
             ratios[name] = round(float(np.median(times[:, 1] / times[:, 0])), 3)
-            rows.append((name, one, number(first), other, number(second), f"{ratios[name]:.2f}"))
+            rows.append((name, one, first, other, second, ratios[name]))
+    kept = read_json(RATCHET)
     if not check:
-        write_section("contact step", "python -m benchmarks contact_step DATA", markdown(rows))
-        write_json(RATCHET, ratios)
+        measured = f"ms a step on the same scenes: medians of {repeats} repeats, of pairs that alternate."
+        write_record("contact_step", "python -m benchmarks contact_step DATA", measured, COLUMNS, rows)
+        write_json(RATCHET, {name: min(ratio, kept.get(name, ratio)) for name, ratio in ratios.items()})
         return
-    print(markdown(rows))
-    if worse := slipped_back(ratios, read_json(RATCHET)):
+    print(table(COLUMNS, rows))
+    if worse := slipped_back(ratios, kept):
         raise SdfsimError("slipped back: " + "; ".join(worse))

@@ -10,9 +10,9 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from benchmarks.results import ROOT, write_section
+from benchmarks.records import ROOT, write_record
 from sdfsim.evaluation.engines import timed_rollout
-from sdfsim.evaluation.harness import markdown, number, one_thread
+from sdfsim.evaluation.harness import number, one_thread
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -34,16 +34,18 @@ def cost(scene: Scene) -> tuple[float, np.ndarray]:
 
 
 def main() -> None:
-    rows = [("scene", "off", "ms a step", "relative to all on", "where bodies end")]
+    rows = []
     for name in SCENES:
         scene = load_scene(ROOT / "samples" / f"{name}.yaml")
         size = min(largest_extent(scene.shapes[b.shape]) * b.scale for b in scene.bodies if b.motion == "dynamic")
         with one_thread():
             usual, there = cost(scene)
-            rows.append((name, "nothing", number(usual), "1", ""))
+            rows.append((name, "nothing", usual, 1, ""))
             for effect in (field.name for field in fields(scene.effects)):
                 ms, end = cost(replace(scene, effects=replace(scene.effects, **{effect: "off"})))
                 away = float(np.linalg.norm(end - there, axis=1).max()) / size
                 shift = "the same" if away < 0.01 else f"up to {number(away, 2)} sizes away"
-                rows.append((name, effect, number(ms), number(ms / usual, 2), shift))
-    write_section("effects", "python -m benchmarks effects", markdown(rows))
+                rows.append((name, effect, ms, ms / usual, shift))
+    columns = ("scene", "off", "ms a step", "relative to all on", "where bodies end")
+    measured = f"Samples with one effect off at a time, {STEPS} steps on one thread, medians of {REPEATS} runs."
+    write_record("effects", "python -m benchmarks effects", measured, columns, rows)

@@ -12,28 +12,25 @@ DIR keeps results.
 
 import importlib.util
 import inspect
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.engines.drake import drake
-from benchmarks.engines.newton import newton
-from benchmarks.engines.rapier import rapier
-from benchmarks.results import progress, write_section
+from benchmarks.engines import bullet, drake, mujoco, newton, rapier
+from benchmarks.records import Out, progress, write_record
 from benchmarks.rivals import in_pieces
+from sdfsim.apps import mujoco_world
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import SUBSTEPS
 from sdfsim.evaluation import engines, everyday
 from sdfsim.evaluation.engines import LONGEST, Engine, Ran, Runner, TooSlow, by_engine, by_model, still
 from sdfsim.evaluation.everyday import ROWS, Check, Setting, checks
-from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
+from sdfsim.evaluation.harness import Job, Results, measure, one_thread
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -43,12 +40,15 @@ from sdfsim.shape.shape import own_pieces
 OURS, DRAKE, NEWTON = "sdfsim", "Drake", "Newton"
 ENGINES: dict[str, tuple[str, Engine | None]] = {  # package and runner of each
     OURS: ("sdfsim", None),
-    "PyBullet": ("pybullet", engines.bullet),
-    "MuJoCo": ("mujoco", partial(engines.mujoco, elliptic=True)),
+    "PyBullet": ("pybullet", bullet),
+    "MuJoCo": ("mujoco", mujoco),
     "Rapier": ("rapier3d", rapier),
     DRAKE: ("pydrake", drake),
     NEWTON: ("newton", newton),
 }
+
+
+OTHERS = drake, newton, rapier  # with modules of their own
 
 
 class NotRun(SdfsimError):
@@ -181,9 +181,9 @@ def cell(result: dict[str, Any] | None) -> str:
     return ", ".join(filter(None, [shown, f"{absent} not run" if absent else ""]))
 
 
-def table(results: Results) -> str:
-    """One row per kind of scene, first those in which ours misses most checks that others pass; then the checks that
-    ours misses, and those not run."""
+def table(results: Results) -> tuple[list[tuple[str, ...]], list[str]]:
+    """Rows with their head first, and lines: a row per kind of scene, first those in which ours misses most checks that
+    others pass; then the checks that ours misses, and those not run."""
     there = [row for row in ROWS if (row, OURS) in results]
     rows = sorted(there, key=lambda row: losses(results, row), reverse=True)
     lines = [("checks that hold, of those run", *ENGINES)]
@@ -195,28 +195,21 @@ def table(results: Results) -> str:
             kept = {key: [one for found in mine for one in found[key]] for key in ("held", "missed")}
             sums[name] = kept | {"not_run": sum((Counter(found["not_run"]) for found in mine), Counter())}
     lines.append(("all", *(cell(sums.get(name)) for name in ENGINES)))
-    parts = [markdown(lines)]
     lost = []
     for row in rows:
         for check in results[row, OURS].get("missed", ()):
             by = held_by(results, row, check)
             lost.append(f"- {check.rpartition(' [')[0]}: passed by {', '.join(by) or 'no other engine'}")
-    parts.append("\n".join(["Checks that sdfsim misses:", "", *(lost or ["- nothing"])]) + "\n")
+    notes = ["Checks that sdfsim misses:", "", *(lost or ["- nothing"])]
     absent = [f"- {name}: {why}, {n} checks" for name, one in sums.items() for why, n in one["not_run"].items()]
-    if absent:
-        parts.append("\n".join(["Not run:", "", *absent]) + "\n")
-    return "\n".join(parts)
+    return lines, [*notes, *(["", "Not run:", "", *absent] if absent else [])]
 
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
     content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday)]
-    how = dict.fromkeys(ENGINES, "")
-    for name, (_, engine) in ENGINES.items():
-        if engine is not None:
-            module = getattr(engine, "func", engine).__module__
-            how[name] = inspect.getsource(engines) + inspect.getsource(sys.modules[module])
+    how = [inspect.getsource(module) for module in (engines, mujoco_world, *map(inspect.getmodule, OTHERS)) if module]
     jobs = [
-        Job(row, name, [content, how[name]], counted, (row, at, name, out / "scenes"))
+        Job(row, name, [content, "" if name == OURS else how], counted, (row, at, name, out / "scenes"))
         for name in ENGINES
         if is_installed(name)
         for row in rows
@@ -224,9 +217,12 @@ def compared(rows: list[str], at: Setting, out: Path) -> Results:
     return measure(jobs, out / "results", on_progress=progress)
 
 
-def main(*, out: Path, full: bool = False) -> None:
+def main(*, out: Out, full: bool = False) -> None:
     results = compared(list(ROWS), Setting(full=full), out)
     for name in ENGINES:
         took = sum(found.get("s", 0.0) for (_, other), found in results.items() if other == name)
         print(f"{name}: {took:.0f} s of the processor")
-    write_section("everyday", f"python -m benchmarks everyday -o DIR{' --full' if full else ''}", table(results))
+    (columns, *rows), notes = table(results)
+    command = f"python -m benchmarks everyday -o DIR{' --full' if full else ''}"
+    measured = "Checks that hold, of those run, on everyday scenes at 10 cm."
+    write_record("everyday", command, measured, columns, rows, notes)

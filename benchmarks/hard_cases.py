@@ -1,9 +1,9 @@
-"""The table and pictures of docs/stability.md, and the ratchet for later models.
+"""The records and pictures of docs/stability.md, and the ratchet for later models.
 
     python -m benchmarks hard_cases -o DIR [--quick]
 
-Runs the hard cases in DIR (their short form in DIR/quick) that have no results there yet; then writes the table and the
-pictures of docs/stability.md, and benchmarks/hard_cases_ratchet.json from the short form, which the slow test runs.
+Runs the hard cases in DIR (their short form in DIR/quick) that have no results there yet; then writes the records and
+the pictures of docs/stability.md, and benchmarks/hard_cases_ratchet.json from the short form, which the slow test runs.
 With --quick the table is that of the short form too.
 """
 
@@ -11,15 +11,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.engines.drake import drake
-from benchmarks.results import ROOT, progress, write_section
+from benchmarks.engines import drake, mujoco
+from benchmarks.records import ROOT, Out, progress, write_record
 from sdfsim.base.files import read_json, write_json
-from sdfsim.evaluation.engines import mujoco
 from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import USUAL, Study, draw_group, figures, loss_lines, stress, table, write_report
+from sdfsim.evaluation.stress import (
+    LEGEND,
+    TEACHER,
+    USUAL,
+    Study,
+    draw_group,
+    figures,
+    losses,
+    rows,
+    stress,
+    write_report,
+)
 
 ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
-DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
 SPREADS = 3.0  # standard deviations that count as noise
 SHARE = 0.05  # of a figure: possible change by another machine's rounding if repetitions agree
@@ -54,7 +63,7 @@ def slipped_back(study: Study, file: Path) -> list[str]:
     return worse
 
 
-def main(*, out: Path, quick: bool = False) -> None:
+def main(*, out: Out, quick: bool = False) -> None:
     study = stress(out / "quick", quick=True, engines=ENGINES, on_progress=progress)
     write_report(study, out / "quick")
     write_json(RATCHET, accepted(study))
@@ -62,9 +71,16 @@ def main(*, out: Path, quick: bool = False) -> None:
         study = stress(out, engines=ENGINES, on_progress=progress)
         write_report(study, out)
     command = f"python -m benchmarks hard_cases -o DIR{' --quick' if quick else ''}"
-    pictures = "\n".join(f"![{GROUPS[group].title}](images/{name})" for group, name in PICTURES.items())
-    write_section("hard cases", command, f"{table(study)}\n{pictures}", DOCUMENT)
-    write_section("hard cases", command, "\n".join(f"- {line}" for line in loss_lines(study)))
+    measured, who = f"The hard cases{' in their short form' if quick else ''}", losses(study)
+    write_record(
+        "hard_cases_counts", command, f"{measured}: figures that are judged.",
+        ("", *who[TEACHER]), [(name, *lost.values()) for name, lost in who.items()],
+    )  # fmt: skip
+    found = []
+    for case in study.cases:
+        head, *lines = rows(replace(study, cases=[case]), {"missed": "**", "behind": "*"})
+        found += [(GROUPS[case.group].title, case.title, *line[1:]) for line in lines]
+    write_record("hard_cases", command, f"{measured}.", ("group", *head), found, [f"- {line}" for line in LEGEND])
     # Engines without restitution would set the scale of the plots.
     others = replace(study, engines=list(USUAL))
     for group, name in PICTURES.items():

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.results import ROOT, write_section
+from benchmarks.records import ROOT, write_record
 from sdfsim import Scene, Simulator, load_scene
-from sdfsim.apps.export import export
-from sdfsim.base.lazy import optional
+from sdfsim.apps.mujoco_world import MujocoWorld
 from sdfsim.evaluation.engines import timed
-from sdfsim.evaluation.harness import markdown, one_thread
+from sdfsim.evaluation.harness import one_thread
 
 ROWS = {"hinge": 5, "slider": 5, "ball": 3, "fixed": 6, "distance": 1}
 SECONDS, ROUNDS = 2.0, 7
@@ -34,23 +33,18 @@ def chain(folder: Path, count: int = 100) -> Path:
     return built.save(folder / "chain.yaml")
 
 
-def costs(file: Path, folder: Path) -> tuple[float, float, float]:
+def costs(file: Path) -> tuple[float, float, float]:
     """Processor milliseconds per simulated second for ours and for MuJoCo, and the inner step in ms."""
-    engine, scene = optional("mujoco", "MuJoCo", "bench"), load_scene(file)
+    scene = load_scene(file)
     simulator = Simulator(scene)
     inner = simulator.dt / simulator.options.substeps
-    export(file, folder / "scene.xml")
-    model = engine.MjModel.from_xml_path(str(folder / "scene.xml"))
-    model.opt.timestep, model.opt.integrator = inner, engine.mjtIntegrator.mjINT_IMPLICITFAST
-    if scene.effects.contact == "off":
-        model.opt.disableflags |= engine.mjtDisableBit.mjDSBL_CONTACT
-    data = engine.MjData(model)
+    world = MujocoWorld(scene, inner)
     taken = []
     for _ in range(ROUNDS):
         simulator.reset()
         ours = timed(simulator.step, simulator.steps_in(SECONDS)).cpu_ms / simulator.dt
-        engine.mj_resetDataKeyframe(model, data, 0)
-        theirs = timed(lambda count: engine.mj_step(model, data, count), math.ceil(SECONDS / inner)).cpu_ms / inner
+        world.reset()
+        theirs = timed(world.advance, math.ceil(SECONDS / inner)).cpu_ms / inner
         taken.append((ours, theirs))
     ours, theirs = np.median(taken, axis=0).tolist()
     return ours, theirs, 1e3 * inner
@@ -58,13 +52,14 @@ def costs(file: Path, folder: Path) -> tuple[float, float, float]:
 
 @one_thread()
 def main() -> None:
-    rows = [("scene", "joints", "rows", "inner step", "ms a second", "MuJoCo's", "us a row", "MuJoCo's")]
+    rows = []
     with tempfile.TemporaryDirectory() as scratch:
         for name, file in {"chain of 100": chain(Path(scratch)), "ragdoll": ROOT / "samples" / "ragdoll.yaml"}.items():
             joints = load_scene(file).joints
             held = sum(ROWS[joint.kind] for joint in joints)
-            *taken, inner = costs(file, Path(scratch))
+            *taken, inner = costs(file)
             each = [1e3 * took / (held * 1e3 / inner) for took in taken]
-            counts = (str(len(joints)), str(held), f"{inner:.2f} ms")
-            rows.append((name, *counts, *(f"{took:.0f}" for took in taken), *(f"{us:.2f}" for us in each)))
-    write_section("joints", "python -m benchmarks joints", markdown(rows))
+            rows.append((name, len(joints), held, inner, *taken, *each))
+    columns = ("scene", "joints", "rows", "inner step, ms", "ms per s", "ms per s in MuJoCo")
+    measured = f"Processor time on one thread, medians of {ROUNDS} alternating runs."
+    write_record("joints", "python -m benchmarks joints", measured, (*columns, "us a row", "us a row in MuJoCo"), rows)

@@ -6,36 +6,37 @@
 
 Runs all stages on samples/photos/table_vase, which is `room` of samples/photos/make.py, or on `patches`, rendered into
 DIR-patches (or takes an existing result in the folder), moves the result onto the true cameras by a similarity, and
-prints pose errors, surface errors, their relation to the run's uncertainty, how deep a ball falls into the vase, and
-times. A folder of photos without `transforms.json` and `truth.ply` gets only the report.
+records pose errors, surface errors, their relation to the run's uncertainty, how deep a ball falls into the vase, and
+times.
 
     python -m benchmarks reconstruct touching -o DIR
     python -m benchmarks reconstruct shelf -o DIR [--kind clicks]
 
 render a set with known truth from tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies,
 without masks (`plain`) and with one clicked place for each body (`clicks`: the middle of the body in the photo that
-shows most of it), or in one of these ways, and print the errors of every body.
+shows most of it), or in one of these ways, and record the errors of every body.
 
     python -m benchmarks reconstruct hinged -o DIR
     python -m benchmarks reconstruct sliding -o DIR
 
 render a cupboard with its door shut and open by 50 degrees, or a chest with its drawer in and out by 20 cm, reconstruct
-both states with `--joint`, and print the errors of the joint.
+both states with `--joint`, and record the errors of the joint.
 """
 
 import json
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 import yaml
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "samples" / "photos"))
 
-from benchmarks.results import ROOT
+from benchmarks.records import ROOT, Cell, Out, write_record
 from pipeline.cameras import Similarity, View, load_views
 from pipeline.field.training import load_field
 from pipeline.mesh.meshing import read_parts
@@ -52,7 +53,7 @@ from sdfsim.simulate.simulator import Simulator
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
 RENDERED = ("touching", "shelf")
-KINDS = ("masks", "plain", "clicks")
+WAYS = {"masks": "masks", "plain": "no masks", "clicks": "one place each, from stereo"}
 JOINTS = {"hinged": 50.0, "sliding": 0.2}  # degrees, and m, from the first state to the second
 NEAR_FLOOR = 0.03  # m: below this a surface belongs to the floor
 BALL = 0.02  # m, the radius of the ball that is dropped into the vase; the neck's is 4.6 cm
@@ -118,7 +119,14 @@ def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str,
 
     def add(name: str, chosen: np.ndarray, ends: list[float] | None) -> None:
         median, p90 = 1000 * np.quantile(error[chosen], [0.5, 0.9], weights=area[chosen], method="inverted_cdf")
-        rows.append({"part": name, "uncertainty_mm": ends, "error_median_mm": median, "error_p90_mm": p90})
+        rows.append(
+            {
+                "part": name,
+                "uncertainty_mm": ends and "{:.2g} to {:.2g}".format(*ends),
+                "error_median_mm": median,
+                "error_p90_mm": p90,
+            }
+        )
 
     area, uncertainty, error = measured("shown.ply")
     known = np.isfinite(uncertainty)
@@ -346,30 +354,32 @@ def clicked(photos: Path) -> dict[str, list[str]]:
     return found
 
 
-def rendered(name: str, out: Path, kind: str | None, **options: Any) -> dict[str, Any]:
-    """Renders a set of `photo_sets` and reconstructs it in each way, or in one; notes and errors of the bodies."""
+def rendered(name: str, out: Path, kind: str | None, **options: Any) -> list[tuple[Cell, ...]]:
+    """Renders a set of `photo_sets` and reconstructs it in each way, or in one: rows with the errors of the bodies."""
     from pipeline.stages import reconstruct
     from tests.pipeline import photo_sets
 
-    photos, result = out / "photos", {}
+    photos, rows = out / "photos", []
     if not photos.exists():
         photo_sets.shoot_bodies(photos, getattr(photo_sets, name))
         shutil.copytree(photos / "images", out / "plain")
-    for way in KINDS if kind is None else [kind]:
+    for way in WAYS if kind is None else [kind]:
         given = photos / "images" if way == "masks" else out / "plain"
         run = out / f"run_{way}"
         if way == "clicks":
             options["body"] = clicked(photos)
             if (out / "run_plain").exists() and not run.exists():
                 shutil.copytree(out / "run_plain", run)  # only the last stage differs
-        report = reconstruct(given, run, until_stage="mesh", **options)
-        result[way] = {"notes": report["notes"], "bodies": body_errors(run, photos), "seconds": report["seconds"]}
-    return result
+        reconstruct(given, run, until_stage="mesh", **options)
+        for body, found in body_errors(run, photos).items():
+            sides = ", ".join(f"{side:+.1f}" for side in found["sides_percent"])
+            rows.append((WAYS[way], f"{body}: {found['truth']}", sides, found["volume_percent"], found["mean_mm"]))
+    return rows
 
 
-def joint_of(name: str, out: Path, **options: Any) -> dict[str, Any]:
-    """Renders both states of an object, reconstructs them together, and returns the errors of the joint: of the axis in
-    degrees, of its position in % of the size of the cupboard or chest, and of the travel of the part."""
+def joint_of(name: str, out: Path, **options: Any) -> list[tuple[Cell, ...]]:
+    """Renders both states of an object and reconstructs them together: rows with the errors of the joint, of its axis
+    and position, and the travel of the part."""
     from pipeline.mesh.joint import load_held
     from pipeline.states import reconstruct_states
     from tests.pipeline import photo_sets
@@ -390,49 +400,84 @@ def joint_of(name: str, out: Path, **options: Any) -> dict[str, Any]:
     still = load_mesh(states[0] / "truth" / "still.ply")
     thing = still.vertices[still.vertices[:, 0] < 0.3]  # without the crate next to it
     size = float(np.linalg.norm(np.ptp(thing, axis=0)))
-    result: dict[str, Any] = {
-        "found": held.line(), "kind": found.kind,
-        "axis_degrees": float(np.degrees(np.arccos(min(1.0, float(found.axis @ axis))))),
-    }  # fmt: skip
+    degrees = np.degrees(np.arccos(min(1.0, float(found.axis @ axis))))
+    rows: list[tuple[Cell, ...]] = [("kind", found.kind), ("error of the axis, degrees", float(degrees))]
     if found.kind == "hinge":
         apart = found.anchor - photo_sets.HINGE
         apart = float(np.linalg.norm(apart - axis * (apart @ axis)))
-        result |= {"place_mm": 1000 * apart, "place_percent_of_size": 100 * apart / size,
-                   "travel_degrees": float(np.degrees(found.travel)), "travel_error_degrees":
-                   float(np.degrees(found.travel)) - travel}  # fmt: skip
+        rows += [("error of its place, mm", 1000 * apart), ("error of its place, % of the size", 100 * apart / size)]
+        rows.append(("travel, degrees", float(np.degrees(found.travel))))
     else:
-        result |= {"travel_mm": 1000 * found.travel, "travel_error_mm": 1000 * (found.travel - travel),
-                   "travel_error_percent_of_size": 100 * (found.travel - travel) / size}  # fmt: skip
-    return result | {"size_m": size, "notes": report["notes"], "seconds": report["seconds"]}
+        rows.append(("travel, mm", 1000 * found.travel))
+    return [*rows, ("what the command says", held.line())]
+
+
+def figures(found: dict[str, Any], report: dict[str, Any]) -> list[tuple[Cell, ...]]:
+    """Rows with the errors of a run, from `evaluate`, and its times."""
+    surface, steps = found["surface_percent_of_table_width"], report["stages"]["distill"]
+    rows: list[tuple[Cell, ...]] = [
+        ("camera positions, largest error, % of their distance", found["poses"]["center_error_worst_percent"])
+    ]
+    for key, name in (
+        ("surface", "reconstructed surface to the true one"),
+        ("object", "the same of the table and what stands on it"),
+        ("missing", "true surface to the reconstructed one"),
+    ):
+        rows += [(f"{name}, median", surface[key]["median"]), (f"{name}, 90 %", surface[key]["p90"])]
+    rows.append(("share of the true surface found within 1 %", surface["complete_percent"]))
+    truth = surface["vase"].pop("truth")["hollow_cm"]
+    for name, size in surface["vase"].items():
+        below = found["ball"][name]["below_rim_cm"]
+        rows.append((f"hollow of the vase, cm (truth: {truth:.0f})", size["hollow_cm"]))
+        rows.append((f"middle of a ball of {100 * BALL:g} cm radius dropped into it, cm below its rim", below))
+    rows += [("error of the scale, %", surface["scale_error_percent"]), ("steps", steps.get("iterations"))]
+    rows += [("training of the field with stereo, min", report["seconds"]["distill"] / 60)]
+    rows.append(("in all, min", sum(report["seconds"].values()) / 60))
+    return [*rows, ("PSNR of held-out photos, dB", report["psnr"])]
+
+
+TRUST = ("part", "uncertainty, mm", "error, median, mm", "error, 90 % below, mm")
+FIGURE = ("figure", "value")
+BODIES = ("given", "body", "sides, %", "volume, %", "mean distance, mm")
+PERCENT = "In % of the table's width where nothing else is said."
 
 
 def main(
-    photos: Path = PHOTOS,
+    photos: Annotated[Path, typer.Argument()] = PHOTOS,
     *,
-    out: Path,
+    out: Out,
     capture: str | None = None,
     kind: str | None = None,
     preset: str = "quick",
     size: float | None = None,
-    distance: list[str] | None = None,
+    distance: tuple[str, str, float] | None = None,
     budget: float | None = None,
 ) -> None:
     from pipeline.stages import reconstruct
 
     options: dict[str, Any] = {"preset": preset, "budget": None if budget is None else 60 * budget}
-    with Session(as_json=True) as session:
-        if str(photos) in RENDERED:
-            if kind not in (None, *KINDS):
-                raise SdfsimError(f"--kind: {kind}: is none of {', '.join(KINDS)}")
-            session.report(rendered(str(photos), out, kind, **options, progress=session.stage_progress))
+    name = "room" if photos == PHOTOS else str(photos)
+    command = " ".join(["python -m benchmarks reconstruct", *sys.argv[1:]]).replace(str(out), "DIR")
+    with Session() as session:
+        options["progress"] = session.stage_progress
+        if name in RENDERED:
+            if kind not in (None, *WAYS):
+                raise SdfsimError(f"--kind: {kind}: is none of {', '.join(WAYS)}")
+            measured = f"A rendered set, *{preset}*: errors of the sides of its bodies' boxes and of their volumes."
+            write_record(f"reconstruct_{name}", command, measured, BODIES, rendered(name, out, kind, **options))
             return
-        if str(photos) in JOINTS:
-            session.report(joint_of(str(photos), out, **options, progress=session.stage_progress))
+        if name in JOINTS:
+            measured = f"A rendered object in two states, 30 photos of each, *{preset}*."
+            write_record(f"reconstruct_{name}", command, measured, FIGURE, joint_of(name, out, **options))
             return
-        options |= {"size": size, "distance": distance and [*distance[:2], float(distance[2])]}
         photos = drawn(photos, out)
+        if not (photos / "truth.ply").exists():
+            raise SdfsimError(f"{photos}: no set with a known truth", f"{', '.join([*RENDERED, *JOINTS])} are others")
         given = captured(capture, out, photos) if capture else photos
-        report = reconstruct(given, out, **options, progress=session.stage_progress)
-        if (photos / "truth.ply").exists():
-            report["truth"] = evaluate(out, photos)
-        session.report(report)
+        report = reconstruct(given, out, size=size, distance=distance and list(distance), **options)
+        parts = [name, capture, preset, f"{budget:g}_minutes" if budget else None]
+        name = "_".join(["reconstruct", *filter(None, parts)])
+        found = evaluate(out, photos)
+        write_record(name, command, f"{photos.name}, *{preset}*. {PERCENT}", FIGURE, figures(found, report))
+        measured = "Distances of the reconstructed surface to the true one, by area and by the run's own uncertainty."
+        write_record(f"{name}_trust", command, measured, TRUST, [tuple(row.values()) for row in found["trust"]])

@@ -24,20 +24,18 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.engines.drake import drake
-from benchmarks.engines.newton import newton
-from benchmarks.results import in_turn, progress, spread, write_section
+from benchmarks.engines import bullet, drake, mujoco, mujoco_sdf, newton
+from benchmarks.records import Cell, Out, in_turn, progress, spread, write_record
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_arrays, write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
-from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
+from sdfsim.evaluation.harness import Job, Results, measure, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
 from sdfsim.geometry.mesh import Mesh, clean
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
@@ -52,9 +50,9 @@ from sdfsim.simulate.simulator import Simulator
 
 ENGINES: dict[str, Engine | None] = {
     "sdfsim": None,
-    "PyBullet, pieces": engines.bullet,
-    "MuJoCo, pieces": engines.mujoco,
-    "MuJoCo, SDF": partial(engines.mujoco, pieces=False),
+    "PyBullet, pieces": bullet,
+    "MuJoCo, pieces": mujoco,
+    "MuJoCo, SDF": mujoco_sdf,
     "Drake, hydroelastic": drake,
     "Newton, XPBD": newton,
 }
@@ -282,7 +280,7 @@ def lost(case: str, run: Ran, size: float) -> int:
     return int((gone | (height < 1.2)).sum() if case == "mugs on pegs" else gone.sum())
 
 
-def compared(cases: list[str], data: Path | None, out: Path) -> Results:
+def compared(cases: list[str], data: Path | None, out: Out) -> Results:
     for case in set(cases) & set(LARGE):
         CASES[case](out / "scenes")  # settles it here, so that the measured process does not contain that memory
     content = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION]
@@ -298,12 +296,13 @@ def why_not(result: dict[str, Any]) -> str:
     return result.get("failed") or "; ".join(result["broken"].values())
 
 
-def shapes(data: Path, *, out: Path) -> None:
+def shapes(data: Path, *, out: Out) -> None:
     """Hard shapes: a row for each case and engine at the usual inner step, with the time for equal depth."""
-    rows: list[tuple[str, ...]] = [(
+    columns = (
         "case", "engine", "ms per s at 4 ms", "depth, %", "away from itself at 1 ms, %", "lost",
         f"ms per s where depth is at most {100 * DEEP:g} %", "prepared in, s", "MiB",
-    )]  # fmt: skip
+    )  # fmt: skip
+    rows: list[tuple[Cell, ...]] = []
     for (case, name), result in compared(SHAPES, data, out).items():
         usual = result.get("inner", {}).get(str(USUAL))
         if usual is None:
@@ -311,11 +310,11 @@ def shapes(data: Path, *, out: Path) -> None:
             continue
         equal = [one["ms"] for one in result["inner"].values() if one["deep"] <= DEEP and not one["lost"]]
         rows.append((
-            case, name, number(usual["ms"]), number(100 * usual["deep"], 2),
-            number(100 * usual.get("away", np.nan), 2), str(usual["lost"]),
-            number(min(equal)) if equal else "none", number(result["prepare_s"], 2), number(result["mib"]),
+            case, name, usual["ms"], 100 * usual["deep"], 100 * usual.get("away", np.nan), usual["lost"],
+            min(equal, default="none"), result["prepare_s"], result["mib"],
         ))  # fmt: skip
-    write_section("rivals", "python -m benchmarks rivals shapes DATA -o DIR", markdown(rows))
+    measured = f"{STEPS} steps of every engine with inner steps of 10, 4, 2 and 1 ms, in processor time of one thread."
+    write_record("rivals", "python -m benchmarks rivals shapes DATA -o DIR", measured, columns, rows)
 
 
 def enough(result: dict[str, Any]) -> int:
@@ -326,10 +325,10 @@ def enough(result: dict[str, Any]) -> int:
 
 
 @one_thread()
-def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
+def turns(data: Path, *, out: Out, rounds: int = 7) -> None:
     """The fast engines at equal depth in alternating runs, so that other work on the machine slows all of them
     alike."""
-    rows: list[tuple[str, ...]] = [("case, ms per s", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
+    rows: list[tuple[Cell, ...]] = []
     found = compared(SHAPES, data, out)
     for k, case in enumerate(SHAPES):
         scenes, inner = scenes_of(case, data, out / "scenes"), {name: enough(found[case, name]) for name in FAST}
@@ -339,23 +338,30 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
 
         taken = in_turn([partial(mean, name) for name in FAST], rounds)
         progress((k + 1) / len(SHAPES), case)
-        cells = [f"{20 // inner[name]} ms: {spread(times)}" for name, times in zip(FAST, taken.T, strict=True)]
-        rows.append((case, *cells, *map(spread, (taken[:, :1] / taken[:, 1:]).T)))
-    write_section("rivals in turn", "python -m benchmarks rivals turns DATA -o DIR", markdown(rows))
+        took = [cell for name, times in zip(FAST, taken.T, strict=True) for cell in (20 // inner[name], spread(times))]
+        rows.append((case, *took, *map(spread, (taken[:, :1] / taken[:, 1:]).T)))
+    columns = [f"{name}: {what}" for name in FAST for what in ("inner step, ms", "ms per s")]
+    columns += [f"sdfsim / {name}" for name in FAST[1:]]
+    measured = (
+        f"ms per simulated second at equal depth: medians and ranges over {rounds} alternating rounds, and of the "
+        "ratio in each round."
+    )
+    write_record("rivals_in_turn", "python -m benchmarks rivals turns DATA -o DIR", measured, ("case", *columns), rows)
 
 
-def large(*, out: Path) -> None:
-    """Large scenes: a row for each case, with time, memory and depth by engine."""
-    rows: dict[str, list[str]] = {case: [case] for case in LARGE}
-    for (case, _), result in compared(LARGE, None, out).items():
-        if usual := result.get("inner", {}).get(str(USUAL)):
-            figures = number(usual["ms"]), number(result["mib"]), number(100 * usual["deep"], 2)
-            gone = f", {usual['lost']} lost" if usual["lost"] else ""
-            rows[case].append(f"{' / '.join(figures)}{gone}")
+def large(*, out: Out) -> None:
+    """Large scenes: a row for each case and engine, with time, memory and depth."""
+    rows: list[tuple[Cell, ...]] = []
+    for (case, name), result in compared(LARGE, None, out).items():
+        usual = result.get("inner", {}).get(str(USUAL))
+        if usual:
+            gone = f"{usual['lost']} lost" if usual["lost"] else ""
+            rows.append((case, name, usual["ms"], result["mib"], 100 * usual["deep"], gone))
         else:
-            rows[case].append(why_not(result))
-    table = markdown([("ms a simulated second / MiB / depth, %", *ENGINES), *rows.values()])
-    write_section("large rivals", "python -m benchmarks rivals large -o DIR", table)
+            rows.append((case, name, None, None, None, why_not(result)))
+    measured = f"The first {HEAP_STEPS} steps of large scenes, inner steps of 4 ms, in processor time of one thread."
+    columns = ("case", "engine", "ms per s", "MiB", "depth, %", "not finished, or lost")
+    write_record("rivals_large", "python -m benchmarks rivals large -o DIR", measured, columns, rows)
 
 
 COMMANDS = (shapes, turns, large)

@@ -1,6 +1,6 @@
 """Imports the robots in PyBullet's data, and compares the poses of their links with MuJoCo's.
 
-    python -m benchmarks robots [--files FILE ...]     # else all of pybullet_data but its random solids
+    python -m benchmarks robots [FILE ...]     # else all of pybullet_data but its random solids
 
 For each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
 scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
@@ -11,16 +11,17 @@ import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 from xml.etree import ElementTree
 
 import numpy as np
+import typer
 from scipy.spatial.transform import Rotation
 
-from benchmarks.results import progress
+from benchmarks.records import Cell, progress, write_record
 from sdfsim import load_scene
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.base.errors import SdfsimError
-from sdfsim.evaluation.harness import markdown, number
 from sdfsim.scene.scene import Joint, Scene
 
 TRIES = 20
@@ -161,10 +162,10 @@ def _bare(source: Path) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def main(*, files: list[Path] | None = None) -> None:
-    """Print a row for each URDF or MJCF file; by default for those of pybullet_data."""
-    counts = {"imported": 0, "judged": 0, "refused": 0}
-    rows = [("file", "bodies", "joints", "links judged", "apart, mm", "turned, degrees", "mass", "")]
+def main(files: Annotated[list[Path] | None, typer.Argument()] = None) -> None:
+    """A row for each URDF or MJCF file; by default for those of pybullet_data. Those that are refused come first."""
+    refused: list[tuple[Cell, ...]] = []
+    rows: list[tuple[Cell, ...]] = []
     files = files or _all()
     for k, file in enumerate(files):
         progress(k / len(files), file.name)
@@ -173,21 +174,18 @@ def main(*, files: list[Path] | None = None) -> None:
                 import_robot(file, Path(folder) / "scene.yaml")
                 scene = load_scene(Path(folder) / "scene.yaml")
             except SdfsimError as error:
-                counts["refused"] += 1
-                rows.append((file.name, *[""] * 6, error.message.replace(f"{file.parent}/", "")[:150]))
+                refused.append((file.name, *[""] * 6, error.message.replace(f"{file.parent}/", "")[:150]))
                 continue
-        counts["imported"] += 1
-        found, why = None, ""
+        counts = (file.name, len(scene.bodies), len(scene.joints))
         try:
             found = judge(file, scene)
         except ValueError as error:
-            why = f"MuJoCo: {str(error).splitlines()[0][:100]}"
-        counts["judged"] += found is not None
-        figures = [""] * 4
-        if found is not None:
-            figures = [str(found.links), *map(number, (1e3 * found.apart, math.degrees(found.turned), found.mass))]
-        rows.append((file.name, str(len(scene.bodies)), str(len(scene.joints)), *figures, why))
-    print(f"{markdown(rows)}\n{len(files)} files: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
+            refused.append((*counts, *[""] * 4, f"MuJoCo: {str(error).splitlines()[0][:100]}"))
+            continue
+        rows.append((*counts, found.links, 1e3 * found.apart, math.degrees(found.turned), found.mass, ""))
+    columns = ("file", "bodies", "joints", "links compared", "apart, mm", "turned, degrees", "masses, relative")
+    measured = f"Largest differences from MuJoCo's models, over the start and {TRIES} random joint configurations."
+    write_record("robots", "python -m benchmarks robots", measured, (*columns, "refused"), [*refused, *rows])
 
 
 def _all() -> list[Path]:

@@ -28,15 +28,16 @@ import numpy as np
 import torch
 from numba import njit
 
-from benchmarks.results import ROOT, progress, write_section
+from benchmarks.engines import bullet, mujoco
+from benchmarks.records import ROOT, Out, progress, write_record
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation.engines import Engine, Ran, bullet, mujoco, scene_rollout, start_of_scene
+from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
-from sdfsim.evaluation.harness import Job, cells, markdown, measure, number, one_thread, peak_memory
+from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory, why_failed
 from sdfsim.evaluation.penetration import depths
 from sdfsim.learned.model import load_model
 from sdfsim.physics.options import Options
@@ -143,11 +144,15 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
     return jobs
 
 
-def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None:
+def growth(*, out: Out, sdf_sim: str | None = None, largest: int = 512) -> None:
     results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=progress)
-    rows = [("case", "with", *COLUMNS.values(), "")]
-    rows += [(*key, *cells(found, COLUMNS)) for key, found in results.items()]
-    write_section("growth", "python -m benchmarks scale growth -o DIR", markdown(rows))
+    rows = [(*key, *map(found.get, COLUMNS), why_failed(found)) for key, found in results.items()]
+    measured = (
+        "200 steps of spheres in a bowl (10 of *sdf-sim*), 30 of boxes, 100 of knots; each row is a process on one "
+        "thread, in processor time."
+    )
+    columns = ("case", "with", *COLUMNS.values(), "not finished")
+    write_record("growth", "python -m benchmarks scale growth -o DIR", measured, columns, rows)
 
 
 def to_the_end(name: str, home: Path) -> dict[str, Any]:
@@ -174,14 +179,14 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
     }
 
 
-def large(*, out: Path) -> None:
+def large(*, out: Out) -> None:
     jobs = [Job("to the end", name, [name], to_the_end, (name, out)) for name in HEAPS]
     results = measure(jobs, out / "large", where="fresh", on_progress=progress)
     titles = {"bodies": "bodies", "nodes": "nodes", "steps": "steps", "s": "s from command to recording", "mib": "MiB",
               "worst": "deepest, mm", "lost": "below the floor"}  # fmt: skip
-    rows = [("", *titles.values())]
-    rows += [(name, *(number(results["to the end", name][k]) for k in titles)) for name in HEAPS]
-    write_section("large scenes", "python -m benchmarks scale large -o DIR", markdown(rows))
+    rows = [(name, *(results["to the end", name].get(k) for k in titles)) for name in HEAPS]
+    measured = "The command `simulate` with its recording, on all cores, by wall clock."
+    write_record("large_scenes", "python -m benchmarks scale large -o DIR", measured, ("scene", *titles.values()), rows)
 
 
 def simulated(scenes: list[Scene], steps: int) -> None:
@@ -190,14 +195,14 @@ def simulated(scenes: list[Scene], steps: int) -> None:
 
 
 def many(data: Path, *, scenes: int = 1000) -> None:
-    """Write the section: scenes a second by workers."""
+    """Scenes a second by workers."""
     from distributed import LocalCluster
 
     recorded, shapes = load_recorded(data, "validation", most=DISTINCT)
     distinct = [scene_of([t], [0], shapes, conditions_of(data).floor)[0] for t in recorded]
     repeated = [distinct[k % len(distinct)] for k in range(scenes)]
     jobs = [(repeated[k : k + CHUNK], STEPS) for k in range(0, scenes, CHUNK)]
-    rows, first = [("workers", "scenes a second", "times one worker")], 0.0
+    rows, first = [], 0.0
     for workers in range(1, (os.cpu_count() or 1) + 1):
         local: Any = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="")
         with local:
@@ -207,8 +212,10 @@ def many(data: Path, *, scenes: int = 1000) -> None:
                 deque(parallel(simulated, jobs), maxlen=0)
                 rate = scenes / (time.perf_counter() - began)
         first = first or rate
-        rows.append((str(workers), number(rate), f"{rate / first:.2f}"))
-    write_section("many scenes", f"python -m benchmarks scale many DATA --scenes {scenes}", markdown(rows))
+        rows.append((workers, rate, rate / first))
+    command = f"python -m benchmarks scale many DATA --scenes {scenes}"
+    measured = f"Scenes of a MOVi-B dataset, {STEPS} steps each, on Dask workers of one thread."
+    write_record("many_scenes", command, measured, ("workers", "scenes a second", "times one worker"), rows)
 
 
 # Operations (a product, a sum, a comparison or a root each) and bytes of one distance, one contact and one row, counted
@@ -222,11 +229,10 @@ PLACES, ROWS, ISLAND, SWEEPS, BOXES, AGAIN = 200_000, 4096, 64, 50, 60, 50
 
 
 def roofline() -> None:
-    """Write the section of docs/scale.md: the machine's bandwidth and arithmetic on one thread, and ours."""
+    """The machine's bandwidth and arithmetic on one thread, and ours."""
     flops, bandwidth, latency = arithmetic(), memory(), chain()
-    rows: list[tuple[str, ...]] = [
-        ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "share of arithmetic", "share of bandwidth")
-    ]
+    columns = ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "share of arithmetic", "share of bandwidth")
+    rows = []
     for name, (operations, moved), seconds in (
         ("machine: matrix products", (1, 0), 1 / flops),
         ("machine: dependent sums", (1, 0), latency),
@@ -238,9 +244,10 @@ def roofline() -> None:
     ):
         rate, speed = operations / seconds, moved / seconds
         told = ((operations, rate / 1e9, rate / flops), (moved, speed / 1e9, speed / bandwidth))
-        first, second = ([number(v) for v in some] if some[0] else ["-"] * 3 for some in told)
-        rows.append((name, first[0], second[0], number(1e9 * seconds), first[1], second[1], first[2], second[2]))
-    write_section("roofline", "python -m benchmarks scale roofline", markdown(rows), ROOT / "docs" / "scale.md")
+        first, second = (some if some[0] else [None] * 3 for some in told)
+        rows.append((name, first[0], second[0], 1e9 * seconds, first[1], second[1], first[2], second[2]))
+    measured = "Processor times on one thread, the least of seven."
+    write_record("roofline", "python -m benchmarks scale roofline", measured, columns, rows)
 
 
 def best(call: Callable[[], object], rounds: int = 7) -> float:

@@ -4,7 +4,7 @@
 
 MESH_FOLDER holds NAME/visual_geometry.obj for each shape; `kubasic` downloads Kubric's. Each is fitted with our recipe
 and the paper's at equal time, with other widths of the network, and with smaller budgets; then queries of one shape are
-timed. Fits in DIR are not made again. Writes DIR/table.md and DIR/sdf.png.
+timed. Fits in DIR are not made again. Writes two records, and DIR/sdf.png.
 """
 
 import time
@@ -17,11 +17,10 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-from benchmarks.results import in_turn, progress
+from benchmarks.records import Out, in_turn, progress, write_record
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import write_text
 from sdfsim.data.public_shapes import public_folder
-from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, machine, markdown, measure, number
+from sdfsim.evaluation.harness import Job, Panel, draw, line, machine, measure, why_failed
 from sdfsim.geometry.mesh_io import load_mesh
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.fit import FIT_VERSION, Recipe
@@ -92,7 +91,7 @@ def queries(file: Path, default: Path, paper: Path) -> dict:
     }
 
 
-def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
+def main(meshes: Path, *, out: Out, seconds: float = 60.0) -> None:
     files = {file.parent.name: file for file in sorted(public_folder(meshes).glob("*/visual_geometry.obj"))}
     if not files:
         raise SdfsimError(f"{meshes}: no NAME/visual_geometry.obj")
@@ -115,11 +114,14 @@ def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
         lines = [line(name, [fits[name, method] for method in ours], "seconds", key) for name in files]
         panels.append(Panel(key.replace("_", " "), "seconds", "of the largest extent", lines, "xy", EXACT[key]))
     draw(panels, out / "sdf.png")
-    # Errors are relative to the largest extent; the last column has the limits of the certificate that a fit missed.
-    table = [("shape", "fit", *ERRORS, "updates", "s", "missed")]
-    table += [(*key, *cells(found, (*ERRORS, "steps", "seconds"))) for key, found in fits.items()]
-    rows = [("", f"s per million points of {first}", "bytes")]
-    rows += [(name, number(found["seconds"]), f"{found['bytes']:,}") for name, found in timed.items()]
-    text = f"{markdown(table)}\n{markdown(rows)}"
-    write_text(out / "table.md", text)
-    print(text)
+    command = "python -m benchmarks sdf MESHES -o DIR"
+    rows = [(*key, *map(found.get, (*ERRORS, "steps", "seconds")), why_failed(found)) for key, found in fits.items()]
+    times = [(name, found["seconds"], found["bytes"]) for name, found in timed.items()]
+    write_record(
+        "sdf_fits", command, "Errors relative to the largest extent, and what a fit missed of its certificate.",
+        ("shape", "fit", *ERRORS, "updates", "s", "missed"), rows,
+    )  # fmt: skip
+    write_record(
+        "sdf_queries", command, f"Value and gradient at points around {first}, medians of {REPEATS} alternating runs.",
+        ("", "s per million points", "bytes"), times,
+    )  # fmt: skip

@@ -14,9 +14,8 @@ import tempfile
 
 import numpy as np
 
-from benchmarks.results import ROOT, in_turn, write_section
+from benchmarks.records import ROOT, in_turn, write_record
 from sdfsim.base.errors import SdfsimError
-from sdfsim.evaluation.harness import markdown, number
 
 OURS = """
 import sdfsim
@@ -77,7 +76,7 @@ def main(*, rounds: int = 7) -> None:
             for sample, name in FIRST.items()
         }  # fmt: skip
         found = np.median(in_turn([lambda some=some: ended(some) for some in cases.values()], rounds), axis=0)
-    rows = [("cold start", "s", "processor s", "MiB")]
     results = compiled | dict(zip(cases, found, strict=True))
-    rows += [(name, *map(number, values)) for name, values in results.items()]
-    write_section("start", "python -m benchmarks start", markdown(rows))
+    measured = f"Separate processes that alternate, medians of {rounds}; the first three ran once, after an install."
+    rows = [(name, *values) for name, values in results.items()]
+    write_record("start", "python -m benchmarks start", measured, ("cold start", "s", "processor s", "MiB"), rows)

@@ -1,6 +1,6 @@
 """Results for photos, meshes and recordings that were not used for tuning: one line each.
 
-    python -m benchmarks strangers FOLDER -o DIR [--preset quick] [--longest 1800] [--page]
+    python -m benchmarks strangers FOLDER -o DIR [--preset quick] [--longest 1800]
 
 Finds the inputs below FOLDER by their kind: folders of at least three photos (without a mesh next to them, whose
 textures they would be), photo folders of COLMAP models, videos and captures of phones; mesh files; run folders, and CSV
@@ -8,9 +8,8 @@ or npz files of poses with their scene next to them, `NAME.yaml` for one file or
 the commands that a user would run: `reconstruct` for photos and `simulate` for the scene; `fit` for a mesh (with --cap,
 if it is refused as open), which is then scaled to 20 cm and dropped from half its size onto a floor, with `sdf: grid`
 if the fit misses its certificate; `identify` for recordings. Commands run in separate processes, none for longer than
-`--longest` seconds, so that one input cannot stop the others. Writes DIR/table.md and DIR/table.json, failures first,
-and with `--page` the tables of docs/notes/strangers.md, one for each kind that was found. A second run with the same
-DIR continues: inputs that are in its table.json are not repeated.
+`--longest` seconds, so that one input cannot stop the others. Writes DIR/table.json, and a record for each kind that
+was found, failures first. A second run with the same DIR continues: inputs that are in its table.json are not repeated.
 """
 
 import json
@@ -25,16 +24,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.results import ROOT, write_section
+from benchmarks.records import ROOT, Cell, Out, write_record
 from pipeline.inputs.captures import ARCHIVES
 from pipeline.inputs.sources import MIN_PHOTOS, VIDEOS, photos_in
 from sdfsim import Scene, load_shape
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import visible, write_json, write_text
-from sdfsim.evaluation.harness import markdown, number
+from sdfsim.base.files import visible, write_json
+from sdfsim.evaluation.harness import number
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 
-PAGE = ROOT / "docs" / "notes" / "strangers.md"
 SIZE, SECONDS = 0.2, 5.0  # m, width of a dropped mesh; s, time limit for coming to rest
 PROGRAM = "from cli import app; app()"
 HEAD = ("input", "kind", "result", "s", "error", "at rest", "faults")
@@ -62,9 +60,9 @@ class Row:
     wrong: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # only in table.json
 
-    def cells(self) -> tuple[str, ...]:
+    def cells(self) -> tuple[Cell, ...]:
         told = "; ".join(self.wrong).replace("|", "/").replace("\n", " ")
-        return (f"`{self.name}`", self.kind, self.became, f"{self.seconds:.0f}", self.exact, self.rests, told)
+        return (f"`{self.name}`", self.kind, self.became, round(self.seconds), self.exact, self.rests, told)
 
 
 class Failed(Exception):
@@ -205,7 +203,7 @@ def named(found: Found, folder: Path) -> str:
     return name if len(found.files) == 1 else f"{name} and {len(found.files) - 1} more"
 
 
-def judged(found: Found, folder: Path, out: Path, preset: str, longest: float) -> Row:
+def judged(found: Found, folder: Path, out: Out, preset: str, longest: float) -> Row:
     """The row of an input, including any failure."""
     row = Row(named(found, folder), found.kind)
     place = out / found.files[0].relative_to(folder)
@@ -233,17 +231,17 @@ def judged(found: Found, folder: Path, out: Path, preset: str, longest: float) -
 # --- telling ---
 
 
-def table(rows: list[Row]) -> str:
-    """The table in Markdown: first inputs without a result, then those with faults, then the others."""
-    ordered = sorted(rows, key=lambda row: (row.became != "nothing", not row.wrong, row.kind, row.name))
+def recorded(kind: str, rows: list[Row]) -> None:
+    """Write the record of a kind: first inputs without a result, then those with faults, then the others."""
+    ordered = sorted(rows, key=lambda row: (row.became != "nothing", not row.wrong, row.name))
     good = sum(not row.wrong and row.became != "nothing" for row in rows)
-    count = {kind: sum(row.kind == kind for row in rows) for kind in ("photos", "mesh", "recordings")}
-    told = ", ".join(f"{number} of {kind}" for kind, number in count.items() if number)
-    return f"{markdown([HEAD, *(row.cells() for row in ordered)])}\n{good} of {len(rows)} without a fault; {told}.\n"
+    command, measured = "python -m benchmarks strangers FOLDER -o DIR", f"Public {kind} that were not used for tuning."
+    told = [f"{good} of {len(rows)} without a fault."]
+    write_record(f"strangers_{kind}", command, measured, HEAD, [row.cells() for row in ordered], told)
 
 
-def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 1800.0, page: bool = False) -> None:
-    """Print a line for each input, and write the table to DIR, with `page` also to docs/notes."""
+def main(folder: Path, *, out: Out, preset: str = "quick", longest: float = 1800.0) -> None:
+    """Print a line for each input, and write a record for each kind."""
     if not folder.is_dir():
         raise SdfsimError(f"{folder}: no such folder", "give the folder that holds photos, meshes or recordings")
     folder, out = folder.resolve(), out.resolve()  # commands run in another folder
@@ -258,7 +256,5 @@ def main(folder: Path, *, out: Path, preset: str = "quick", longest: float = 180
         rows.append(judged(found, folder, out, preset, longest))
         print(" | ".join(filter(None, rows[-1].cells())), flush=True)
         write_json(done, [asdict(row) for row in rows])  # the rows so far
-    write_text(out / "table.md", table(rows))
-    for kind in sorted({row.kind for row in rows}) if page else ():
-        of_kind = table([row for row in rows if row.kind == kind])
-        write_section(f"strangers {kind}", "python -m benchmarks strangers FOLDER -o DIR --page", of_kind, PAGE)
+    for kind in sorted({row.kind for row in rows}):
+        recorded(kind, [row for row in rows if row.kind == kind])

@@ -8,14 +8,17 @@ DATA is a MOVi-B dataset; DIR keeps the results of the command, which this scrip
 import shutil
 from pathlib import Path
 
-from benchmarks.results import ROOT, progress, write_section
+from benchmarks.engines import mujoco, mujoco_sdf
+from benchmarks.records import ROOT, Out, progress, write_record
 from sdfsim.evaluation import tradeoff as study
-from sdfsim.evaluation.harness import markdown
 
 
-def main(data: Path, *, out: Path) -> None:
-    report = study.tradeoff(data, out, on_progress=lambda _, fraction, message: progress(fraction, message))
+def main(data: Path, *, out: Out) -> None:
+    report = study.tradeoff(
+        data, out, engines={"MuJoCo": mujoco, "MuJoCo mesh SDF": mujoco_sdf},
+        on_progress=lambda _, fraction, message: progress(fraction, message),
+    )  # fmt: skip
     rows, notes = study.report_table(report)
     shutil.copyfile(out / "tradeoff.png", ROOT / "docs" / "images" / "tradeoff.png")
-    text = f"{markdown(rows)}\n{notes[0]}.\n\n![Error against time](../images/tradeoff.png)"
-    write_section("tradeoff", "python -m benchmarks tradeoff DATA -o DIR", text)
+    measured = f"{report['trajectories']} test trajectories of MOVi-B."
+    write_record("tradeoff", "python -m benchmarks tradeoff DATA -o DIR", measured, rows[0], rows[1:], [f"{notes[0]}."])

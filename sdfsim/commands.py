@@ -370,11 +370,17 @@ def tradeoff(
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
 ) -> None:
     """What accuracy costs in time: settings, models and engines on the same scenes. -o keeps what was measured."""
+    from sdfsim.apps.mujoco_world import MujocoWorld
     from sdfsim.base.lazy import pyplot
     from sdfsim.evaluation import tradeoff as study
+    from sdfsim.evaluation.engines import run_world
 
     pyplot()  # before minutes of work
-    report = study.tradeoff(source, out, models=model or [], quick=quick, on_progress=session.stage_progress)
+    meshes = partial(MujocoWorld, collide="sdf")
+    report = study.tradeoff(
+        source, out, models=model or [], quick=quick, on_progress=session.stage_progress,
+        engines={"MuJoCo": partial(run_world, MujocoWorld), "MuJoCo mesh SDF": partial(run_world, meshes)},
+    )  # fmt: skip
     rows, notes = study.report_table(report)
     session.report(report, [*columns(rows), *notes])
 

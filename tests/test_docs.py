@@ -1,4 +1,5 @@
-"""The documents: examples run, the functions that they name exist, links lead somewhere, the README stays short."""
+"""The documents: examples run, the functions that they name exist, links lead somewhere, numbers are those of records,
+the README stays short."""
 
 import re
 import shutil
@@ -7,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.results import section as measured
-from benchmarks.summary import cells_of, summary
+from benchmarks import render
+from benchmarks.records import RECORDS
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import load_shape
-from tests.helpers.everyday import COUNTS, MISSED
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -21,9 +21,6 @@ PAGES = [
     ROOT / "benchmarks" / "RESULTS.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-RESULTS = "benchmarks/RESULTS.md"
-
-
 OURS = re.compile(r"(?<![\w./-])(?:sdfsim|pipeline|benchmarks|tests|samples)/[\w/]+\.py\b")
 
 
@@ -117,201 +114,17 @@ def test_links_lead_to_files_and_headings(page):
     ]
 
 
-def test_results_are_short_and_every_table_says_when_and_how():
-    text = (ROOT / RESULTS).read_text(encoding="utf-8")
-    assert text.count("\n") <= 250
-    for file in PAGES:
-        for found in re.finditer(r"<!-- (?!end of )(.+) -->\n\n(.*)\n", file.read_text(encoding="utf-8")):
-            known = re.fullmatch(r"    (python .+?)        # (\d+ \w+ 20\d\d)(, .+)?", found[2])
-            assert known, f"{file.name}: {found[1]}: no command and day"
-
-
-def test_the_first_lists_of_results_are_what_the_tables_say():
-    """Run `python -m benchmarks summary` after any table was measured again."""
-    assert measured("summary").partition("\n\n")[2].strip() == summary().strip()
+def test_rendering_changes_nothing():
+    """`python -m benchmarks render` has written all tables and numbers of pages, and every record is on one of them."""
+    texts = [page.read_text(encoding="utf-8") for page in render.PAGES]
+    assert [render.rendered(text) for text in texts] == texts
+    shown = {mark[1] for text in texts for mark in render.MARK.finditer(text)}
+    assert shown == {file.stem for file in RECORDS.glob("*.json")}
 
 
 def test_the_readme_is_short():
     """With its pictures, three ways in and the readers' pages it needs more than the 5,000 bytes of a bare one."""
     assert (ROOT / "README.md").stat().st_size <= 6500
-
-
-# --- numbers and names that stand in two places ---
-
-
-def page(name: str) -> str:
-    return (ROOT / name).read_text(encoding="utf-8")
-
-
-def cells(text: str, first: str) -> list[str]:
-    """The other cells of the row of a table whose first cell begins so."""
-    found = [line for line in text.splitlines() if line.startswith(f"| {first}")]
-    assert found, first
-    return [cell.strip() for cell in found[0].strip("|").split("|")[1:]]
-
-
-def numbers(text: str) -> list[float]:
-    return [float(found.replace(",", "")) for found in re.findall(r"\d[\d,]*\.?\d*", text)]
-
-
-@pytest.mark.parametrize(
-    ("row", "other"),
-    [("`solver`", "`solver`"), ("`gnn`", "`gnn`"), ("the physics engine again", "the engine again, starts 1e-3")],
-)
-def test_the_readmes_errors_are_the_results(row, other):
-    """To the digits that the README has; it leaves out the intervals."""
-    shown = [numbers(cell) for cell in cells(page("README.md"), row)]
-    told = [numbers(cell)[0] for cell in cells(measured("MOVi-B"), other)]
-    assert len(shown) == 2
-    for (metres, degrees), (true_metres, true_degrees) in zip(shown, [told[:2], told[2:]], strict=True):
-        assert metres == pytest.approx(true_metres, abs=0.0006)
-        assert degrees == pytest.approx(true_degrees, abs=0.06)
-
-
-@pytest.mark.parametrize("engine", ["sdfsim", "MuJoCo", "Drake", "PyBullet"])
-def test_the_readmes_errors_on_real_tosses_are_the_results(engine):
-    """MuJoCo's with its better cone."""
-    name = "MuJoCo, elliptic" if engine == "MuJoCo" else f"{engine} |"
-    told = [numbers(cell)[0] for cell in cells(measured("reality"), name)[:2]]
-    at = cells(page("README.md"), "mean error").index(engine)
-    shown = [cells(page("README.md"), row)[at] for row in ("position, % of its side", "rotation, degrees")]
-    assert [float(cell) for cell in shown] == told
-
-
-def test_errors_on_movi_b_are_the_results_on_every_page():
-    table = measured("MOVi-B")
-    short, turn, long, further = (numbers(cell)[0] for cell in cells(table, "`solver`"))
-    assert f"the contact solve as users run it {short:g} m, {turn:g}°" in page("docs/paper.md")
-    for name in ("gnn", "sdf-sim"):
-        told = [numbers(cell)[0] for cell in cells(page(f"sdfsim/models/{name}.md"), "`solver` on the same")]
-        assert told == [short, turn, long, further][: len(told)] and len(told) >= 3
-
-
-def test_errors_on_real_tosses_are_the_same_everywhere():
-    """On the page about them to the digits that it has; `identify` found on all of them, and on a few."""
-    rows = {row[0]: row[1:] for row in cells_of(measured("reality"))[1:]}
-    text, identify = page("docs/reality.md").partition("## The table")[2], page("docs/identify.md")
-    for name, row in rows.items():
-        if "found on" in name:
-            few = [numbers(cell)[0] for cell in row[:2]]
-            continue
-        first, second, less, *_ = cells(text, "Drake, point contact" if name == "Drake" else name)
-        for told, true in zip((first, second), row[:2], strict=True):
-            assert numbers(told)[0] == pytest.approx(numbers(true)[0], rel=6e-3)
-        assert numbers(less) == pytest.approx(numbers(row[2]), abs=6e-3)
-    place, turn = (numbers(cell)[0] for cell in rows["sdfsim"][:2])
-    told = [numbers(cell) for cell in cells(identify, "`sdfsim identify`, its own solve")[:2]]
-    assert [one[0] for one in told] == [place, turn]
-    assert f"where those of all 60 come to {place:.2f} and {turn:.2f}" in identify
-    assert f"{few[0]:.2f} % of the side and {few[1]:.2f}" in " ".join(identify.split())
-    mujoco = [numbers(cell)[0] for cell in rows["MuJoCo, elliptic cone"][:2]]
-    assert f"came to {mujoco[0]:g} and {mujoco[1]:g}" in " ".join(identify.split())
-
-
-# What the numbers are, and where on each page they stand; the groups of all pages are alike.
-SAME = {
-    "how deep the demo's vase is hollow": {
-        "README.md": r"a hollow 32 cm deep is reconstructed (\d+) cm deep",
-        RESULTS: r"a body of its own, hollow by \| (\d+) cm",
-        "docs/photos.md": r"\| vase, hollow below its rim \(the true one: 32 cm\) \| [\d.]+ cm \| (\d+) cm",
-    },
-    "errors of the network that is bundled as sdf-sim": {
-        "docs/paper.md": r"bundled as `sdf-sim`\): (0\.\d+) m \((0\.\d+) to (0\.\d+)\), ([\d.]+)°",
-        "docs/gpu.md": r"(0\.\d+) m \[(0\.\d+), (0\.\d+)\], ([\d.]+)° and 1\.\d+ m",
-        "sdfsim/models/sdf-sim.md": r"\| this model \| (0\.\d+) \((0\.\d+) to (0\.\d+)\) \| ([\d.]+) \|",
-    },
-    "how long seventeen fits take": {
-        RESULTS: r"in (\d+) to (\d+) s on one core, median (\d+) s",
-        "docs/sdf.md": r"(\d+) to (\d+) s each on its core, (\d+) s in the median",
-    },
-    "the paper's errors": {
-        "README.md": r"SDF-Sim, the paper's network, on its own recordings \| (0\.160) m, (18)\.0",
-        "docs/paper.md": r"SDF-Sim (0\.160) m, (18)\.0°",
-        "sdfsim/models/sdf-sim.md": r"published network has (0\.160) m and (18)\.0 degrees",
-    },
-}
-
-
-@pytest.mark.parametrize("places", SAME.values(), ids=list(SAME))
-def test_numbers_are_the_same_on_every_page(places):
-    found = {name: re.search(pattern, " ".join(page(name).split())) for name, pattern in places.items()}
-    assert all(found.values()), found
-    assert len({one.groups() for one in found.values() if one}) == 1, found
-
-
-def test_times_and_errors_of_large_scenes_are_the_same_everywhere():
-    paper = page("docs/paper.md")
-    seconds = {row[0]: float(numbers(row[4])[0]) for row in cells_of(measured("large scenes"))[1:]}
-    told = "{:.0f}, {:.0f} and {:.0f} s from command".format(*(seconds[n] for n in ("shoes", "knots", "heaps")))
-    assert told in paper
-    steps = {row[0]: numbers(row[5])[0] for row in cells_of(measured("contact step"))[1:]}
-    simulator = page("docs/simulator.md")
-    assert 0.55 < steps["a MOVi-B step"] < 0.78 and "about two thirds of PyBullet's time" in simulator
-    assert 0.8 < steps["16 spheres in a bowl"] < 1.2 and steps["512 spheres in a bowl"] < 0.5
-    assert "spheres in a bowl take about as long in both, 512 less than half of the time in ours" in simulator
-
-
-def test_what_far_scenery_costs_is_the_same_everywhere():
-    solver = numbers(cells(measured("contact step"), "the same with all of `Simulator`, solver")[-1])[0]
-    assert solver <= 1.1 and "costs the same beside 10,000 static bodies as beside 10" in page("docs/scale.md")
-
-
-def test_how_many_everyday_checks_hold_is_the_same_everywhere():
-    totals = [sum(count) for count in zip(*COUNTS.values(), strict=True)]
-    of = {kind: totals[kind != "analytic"] for kind in MISSED}
-    held = {kind: f"{of[kind] - len(missed)} of {of[kind]}" for kind, missed in MISSED.items()}
-    row = cells(measured("everyday"), "all")[0]
-    assert row == held["analytic"].replace("of", "/")
-    stability, readme = (" ".join(page(name).split()) for name in ("docs/stability.md", "README.md"))
-    assert f"{held['analytic']} checks hold" in stability
-    assert f"With meshes {held['mesh']} hold, with grids {held['grid']}." in stability
-    told = f"hold with closed forms, {held['mesh']} with meshes and {held['grid']} with sampled grids"
-    assert f"{held['analytic']} {told}" in readme
-
-
-def test_errors_of_reconstructions_name_one_direction():
-    """*quick* has the same figures, for the same direction, on both pages."""
-    results, photos = page(RESULTS), page("docs/photos.md").partition("## Depth from photos alone")[2]
-    for here, there in (
-        ("error, median", "reconstructed surface to the true one"), ("missing, median", "true surface to the"),
-        ("share of the true surface", "share of the true surface"), ("its vase, 32 cm hollow", "vase, hollow below"),
-    ):  # fmt: skip
-        assert cells(results, here)[0] == cells(photos, there)[1]
-    whole = re.search(r"whole in (\d+) s on two cores", results)
-    assert whole and f"two cores it took {whole[1]} s" in photos
-    said = [re.findall(r"PSNR of ([\d.]+) dB at 480 px", text) for text in (results, photos)]
-    assert len(said[0]) == 1 and said[0] == said[1]
-
-
-def test_steps_in_documents_are_those_of_the_presets():
-    from pipeline.field.training import PRESETS
-
-    text = page("benchmarks/RESULTS.md").partition("## Reconstruction\n")[2]
-    assert f"*quick*, {PRESETS['quick'].iterations:,} steps" in text
-    assert f"the preset has {PRESETS['standard'].iterations:,}" in page("docs/photos.md")
-    assert f"now it stops at {PRESETS['quick'].iterations:,}" in page("docs/tradeoff.md")
-    sides = [f"{PRESETS[name].long_side // 3} px" for name in ("quick", "standard")]
-    assert all(side in page("docs/tradeoff.md") for side in sides) and sides[0] in page("docs/notes/photos.md")
-
-
-def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
-    """The tutorial's commands and the card's make as many trajectories as the file of the model knows."""
-    from sdfsim.learned.model import load_model
-
-    made = [known["trajectories"] for known in load_model("gnn").card["data"]]
-    loops = re.findall(r"for split in (.*?); do.*\n.*?-o (\S+)", page("docs/tutorial.md"))
-    tutorial = {out: dict(pair.split(":") for pair in splits.split()) for splits, out in loops}
-    card = page("sdfsim/models/gnn.md")
-    for counts, out, name in zip(made, ("data", "data-v"), ("MOVI-B", "VARIED"), strict=True):
-        for split in ("train", "validation"):
-            assert int(tutorial[out][split]) == counts[split]
-            assert f"'{split}': {counts[split]}" in card, name
-
-
-def test_hard_cases_are_summed_up_alike():
-    lines = re.findall(r"^- .* 0 cases.*$|^- \w+: \d+ figures.*$", measured("hard cases"), re.M)
-    assert len(lines) == 4
-    assert all(line in measured("hard cases", ROOT / "docs" / "stability.md") for line in lines)
 
 
 def test_presets_and_recipes_in_documents_exist():

@@ -1,6 +1,7 @@
-"""Drake, with hydroelastic contact of tetrahedra from fTetWild."""
+"""Drake, with hydroelastic contact of tetrahedra from fTetWild, and boxes with point contact."""
 
 import tempfile
+from collections.abc import Sequence
 from contextlib import chdir
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from sdfsim.data.pybullet_sim import SUBSTEPS
 from sdfsim.evaluation.engines import Start, Timing, engine_motion, form_of
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import wavefront
+from sdfsim.scene.scene import Scene
 
 MODULUS = 1e7  # Pa, of compliant bodies: Drake's own default
 TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
@@ -89,13 +91,60 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
     simulator.Initialize()
 
     def state() -> tuple[np.ndarray, ...]:
-        places = [plant.EvalBodyPoseInWorld(context, body) for _, body, _ in bodies]
-        speeds = [plant.EvalBodySpatialVelocityInWorld(context, body) for _, body, _ in bodies]
-        quat = np.roll([place.rotation().ToQuaternion().wxyz() for place in places], -1, axis=-1)
-        velocities = (np.array([getattr(v, of)() for v in speeds]) for of in ("translational", "rotational"))
-        return np.array([place.translation() for place in places]), quat, *velocities
+        return _state(plant, context, [body for _, body, _ in bodies])
 
     return engine_motion(t, steps, lambda: simulator.AdvanceTo(round(context.get_time() / t.dt + 1) * t.dt), state)
+
+
+class DrakeWorld:
+    """Boxes of a scene above a plane of friction 1, by Drake's discrete point contact: its contacts have no rebound,
+    but a stiffness, N/m, and a dissipation, s/m. Raises NotInstalled."""
+
+    def __init__(self, scene: Scene, step: float, stiffness: float, dissipation: float) -> None:
+        lib = optional("pydrake.all", "Drake", "rivals")
+        self.plant, _ = lib.AddMultibodyPlantSceneGraph(builder := lib.DiagramBuilder(), step)
+        self.plant.mutable_gravity_field().set_gravity_vector(scene.gravity)
+        ground, *boxes = scene.bodies
+        table = lib.ProximityProperties()
+        lib.AddContactMaterial(0.0, 1e9, lib.CoulombFriction(1.0, 1.0), table)
+        place = lib.RigidTransform(ground.position)
+        self.plant.RegisterCollisionGeometry(self.plant.world_body(), place, lib.HalfSpace(), "table", table)
+        self.boxes, self.step, self.made = [], step, 0
+        for box in boxes:
+            form: Any = scene.shapes[box.shape].sdf
+            # Drake combines two coefficients a, b to 2 a b / (a + b): with 1 for the table this value gives the wanted
+            # friction.
+            mu = box.friction / (2.0 - box.friction)
+            touch = lib.ProximityProperties()
+            lib.AddContactMaterial(dissipation, stiffness, lib.CoulombFriction(mu, mu), touch)
+            unit = lib.UnitInertia(*(np.diagonal(box.inertia) / box.mass))
+            body = self.plant.AddRigidBody(box.name, lib.SpatialInertia(box.mass, np.zeros(3), unit))
+            sides = lib.Box(*(2.0 * box.scale * np.array(form.half)))
+            self.plant.RegisterCollisionGeometry(body, lib.RigidTransform(), sides, box.name, touch)
+            self.boxes.append(body)
+        self.plant.Finalize()
+        self.simulator = lib.Simulator(builder.Build())
+        self.context = self.plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+        for body, box in zip(self.boxes, boxes, strict=True):
+            pose = lib.RigidTransform(lib.Quaternion(np.roll(box.quat_xyzw, 1)), box.position)
+            self.plant.SetFreeBodyPose(self.context, body, pose)
+            speed = lib.SpatialVelocity(box.angular_velocity, box.velocity)
+            self.plant.SetFreeBodySpatialVelocity(context=self.context, body=body, V_JpJc=speed)
+
+    def advance(self, count: int) -> None:
+        self.made += count
+        self.simulator.AdvanceTo(self.made * self.step)
+
+    def state(self) -> tuple[np.ndarray, ...]:
+        return _state(self.plant, self.context, self.boxes)
+
+
+def _state(plant: Any, context: Any, bodies: Sequence[Any]) -> tuple[np.ndarray, ...]:
+    places = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
+    speeds = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
+    quat = np.roll([place.rotation().ToQuaternion().wxyz() for place in places], -1, axis=-1)
+    velocities = (np.array([getattr(v, of)() for v in speeds]) for of in ("translational", "rotational"))
+    return np.array([place.translation() for place in places]), quat, *velocities
 
 
 def _tetrahedra(mesh: Mesh, beside: Path) -> str:

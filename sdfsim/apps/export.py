@@ -114,7 +114,7 @@ Written = tuple[list[Path], list[str]]  # the files of an export, and what is le
 
 
 def export(
-    source: Path | str,
+    source: Path | str | Scene,
     out: Path | str,
     *,
     scene_file: Path | str | None = None,
@@ -123,8 +123,8 @@ def export(
     allow_outside: bool = False,
     on_progress: StageProgress = silent_stages,
 ) -> dict[str, Any]:
-    """Write a run (folder or rollout.npz), a scene.yaml, a sample by its name or a Shape folder in the format given by
-    the ending of `out` (see `FORMATS`).
+    """Write a run (folder or rollout.npz), a scene (loaded, a scene.yaml, or a sample by its name) or a Shape folder in
+    the format given by the ending of `out` (see `FORMATS`).
 
     Args:
         scene_file: the scene of a run; None: the one that it was made from.
@@ -136,7 +136,8 @@ def export(
         pieces, or a file that cannot be written.
     """
     wanted = 'export reads files: scene.save("scene.yaml") or rollout.save("run.npz") first'
-    source, out = _path("source", source, wanted), _path("out", out, "its ending names the format")
+    source = source if isinstance(source, Scene) else _path("source", source, wanted)
+    out = _path("out", out, "its ending names the format")
     scene_file = _path("scene_file", scene_file, wanted) if scene_file else None
     kind = out.suffix.lower()
     if kind not in FORMATS:
@@ -176,12 +177,15 @@ def _path(what: str, given: Any, wanted: str) -> Path:
 
 
 def _read(
-    source: Path, scene_file: Path | None, write: Callable, allow_outside: bool, on_progress: StageProgress
+    source: Path | Scene, scene_file: Path | None, write: Callable, allow_outside: bool, on_progress: StageProgress
 ) -> Take:
     """What to export, with names and shapes as the function `write` needs them."""
-    progress = of_stage(on_progress, "shapes")
-    run, source = None, source if source.exists() else find_scene(source, or_run=True)
-    if source.suffix == ".npz" or (source / "rollout.npz").is_file():
+    progress, run = of_stage(on_progress, "shapes"), None
+    if isinstance(source, Path) and not source.exists():
+        source = find_scene(source, or_run=True)
+    if isinstance(source, Scene):
+        scene = source
+    elif source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=progress)
     elif scene_file is not None:
         raise SdfsimError(f"{source}: --scene belongs to a run", "leave out --scene")

@@ -1,7 +1,6 @@
-"""PyBullet and MuJoCo, run from the start of a recording or of a scene; and runs of scenes by them or by our models.
+"""Engines, run from the start of a recording or of a scene; and runs of scenes by them or by our models.
 
-Both collide convex pieces; MuJoCo also collides a mesh as an SDF (in its own octree). Spheres, boxes, cylinders and
-capsules are exact.
+They collide convex pieces, or meshes; spheres, boxes, cylinders and capsules are exact.
 """
 
 import re
@@ -10,19 +9,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
-from sdfsim.base.lazy import NotInstalled, optional
+from sdfsim.base.lazy import NotInstalled
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_urdf
 from sdfsim.data.shape_assets import decompose
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.geometry.mesh_io import load_pieces, wavefront
+from sdfsim.geometry.mesh_io import wavefront
 from sdfsim.learned.model import SOLVER, Model
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.motion import MOTION
@@ -33,7 +32,6 @@ from sdfsim.shape.shape import Shape, own_pieces
 from sdfsim.simulate.simulator import SimulationError, Simulator
 
 SAME_INERTIA = 1e-3  # relative
-SOFTEST = 3.0  # MuJoCo: period of a contact's spring over 2 pi, in steps of the engine; stable from 2 upwards
 LONGEST = 60.0  # s of processor time that an engine may take for a motion
 
 SI = Units(1.0, 1.0, 1.0)
@@ -50,6 +48,7 @@ class Start:
     floor: tuple[float, float] | None  # friction and restitution of the floor z = 0, or None for no floor
     own_inertia: bool = False  # bodies get the inertias of `motion`; else the engine's own must agree
     meshes: dict[str, Mesh] = field(default_factory=dict)  # about centres of mass, for engines that collide surfaces
+    scene: Scene | None = None  # with these units and starts, for engines that are given scenes
 
 
 @dataclass(frozen=True)
@@ -93,12 +92,23 @@ def start_of_scene(scene: Scene, folder: Path, units: Units = SI) -> Start:
     shapes = {name: scene.shapes[int(name)] for name in sorted(set(motion.shape.tolist()))}
     urdfs = {name: shape_urdf(shape, folder) for name, shape in shapes.items()}
     floor = (planes[0].friction, planes[0].restitution) if planes else None
-    return Start(motion, urdfs, floor, True, {name: centred_mesh(shape) for name, shape in shapes.items()})
+    meshes = {name: Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces) for name, shape in shapes.items()}
+    below = planes[0].position[2] if planes else 0.0
+    return Start(motion, urdfs, floor, True, meshes, in_units(scene, units, np.array([0.0, 0.0, below])))
 
 
-def centred_mesh(shape: Shape) -> Mesh:
-    """A shape's surface, relative to its centre of mass."""
-    return Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces)
+def in_units(scene: Scene, units: Units, origin: np.ndarray) -> Scene:
+    """A scene in other units than SI, around a point [3] m. Joints are kept as they are, in SI."""
+    bodies = tuple(
+        replace(
+            b, scale=b.scale / units.length, position=(b.position - origin) / units.length,
+            velocity=b.velocity / units.velocity, angular_velocity=b.angular_velocity * units.time,
+            mass=b.mass / units.mass,
+            inertia=None if b.inertia is None else b.inertia / (units.mass * units.length**2),
+        )
+        for b in scene.bodies
+    )  # fmt: skip
+    return replace(scene, bodies=bodies, gravity=scene.gravity / units.acceleration)
 
 
 def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
@@ -161,85 +171,24 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
     return replace(t, **{name: np.concatenate([first[name][:1], rest[name]]) for name in MOTION}), timing
 
 
-# --- MuJoCo ---
+# --- engines that are given scenes ---
 
 
-def mujoco(
-    start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool = True, elliptic: bool = False
+class World(Protocol):
+    """A scene in an engine."""
+
+    def advance(self, count: int) -> None: ...
+
+    def state(self) -> tuple[np.ndarray, ...]: ...
+
+
+def run_world(
+    make: Callable[[Scene, float], World], start: Start, steps: int, substeps: int = SUBSTEPS
 ) -> tuple[Trajectory, Timing]:
-    """MuJoCo's motion with the same masses, inertias and starts; with the same convex pieces, or with meshes as SDFs;
-    with its usual friction pyramid, or with a cone.
-
-    MuJoCo takes the larger of two coefficients of friction, PyBullet their product. So geoms that meet the floor have
-    the product with the floor's, and those that meet other bodies have their square. Those of static bodies take
-    priority, and have the product with the median body's, which is exact if all dynamic bodies are of one material.
-    MuJoCo's contacts are soft: a damped spring gives the wanted restitution.
-
-    Raises:
-        SdfsimError: MuJoCo is not installed, a shape's engine file cannot be read, or the motion is unstable.
-    """
-    engine = optional("mujoco", "MuJoCo", "bench")
-    t, step, spec = start.motion, start.motion.dt / substeps, engine.MjSpec()
-    spec.option.timestep, spec.option.gravity = step, t.gravity
-    spec.memory = 2**31
-    if elliptic:
-        spec.option.cone = engine.mjtCone.mjCONE_ELLIPTIC
-    if start.floor:
-        ground = spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0])
-        ground.contype, ground.conaffinity, ground.friction[0], ground.solmix = 0, 1, 0.0, 1e-6
-    usual = tuple(np.median(values[~t.static]) if (~t.static).any() else 1.0 for values in (t.friction, t.restitution))
-    forms = {name: _forms(engine, urdf, None if pieces else start.meshes[name]) for name, urdf in start.urdfs.items()}
-    for i, name in enumerate(t.shape):
-        body = spec.worldbody.add_body(name=f"b{i}")
-        if t.static[i]:
-            body.pos, body.quat = t.position[0, i], np.roll(t.orientation[0, i], 1)
-        else:
-            body.add_freejoint()
-            body.explicitinertial = True
-            body.mass, body.inertia, body.ipos = float(t.mass[i]), t.inertia[i], np.zeros(3)
-        met = usual if t.static[i] else (t.friction[i], t.restitution[i])
-        for k, (kind, form) in enumerate(forms[str(name)]):
-            shape: dict[str, Any] = {"type": kind}
-            if not isinstance(form, dict):
-                shape["size"] = t.scale[i] * form
-            else:
-                shape["meshname"] = f"{name}_{t.scale[i]:.9g}_{k}"
-                if spec.mesh(shape["meshname"]) is None:
-                    scaled = {"uservert": (form["uservert"] * t.scale[i]).ravel()}
-                    spec.add_mesh(name=shape["meshname"], **form | scaled)
-            # One geom that meets the floor, and one that meets other bodies.
-            for kinds, other in (((1, 0), start.floor), ((2, 2), met)):
-                if other is None:
-                    continue
-                geom = body.add_geom(**shape)
-                geom.contype, geom.conaffinity = kinds
-                geom.priority = int(t.static[i])
-                geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
-                bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
-                damping = max(-np.log(bounce) / np.hypot(np.pi, np.log(bounce)), 1e-3)
-                geom.solref = [SOFTEST * step / damping, damping]  # the spring's frequency is one over their product
-    model = spec.compile()
-    data: Any = engine.MjData(model)
-    moving = np.flatnonzero(~t.static)
-    place, speed = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
-    place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.orientation[0, moving], 1, axis=-1)
-    turned = Rotation.from_quat(t.orientation[0, moving])
-    speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
-
-    def state() -> tuple[np.ndarray, ...]:
-        quat = np.roll(place[:, 3:], -1, axis=-1)
-        return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
-
-    engine.set_mju_user_warning(lambda message: None)  # by default they go to a file in the working directory
-    kinds = engine.mjtWarning
-    unstable = [data.warning[int(kind)] for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
-
-    def advance() -> None:
-        engine.mj_step(model, data, substeps)
-        if any(warning.number for warning in unstable):
-            raise SdfsimError("MuJoCo found the motion unstable and reset it")
-
-    return engine_motion(t, steps, advance, state)
+    """The motion of a world that is made of the start's scene and of the engine's step, s."""
+    assert start.scene is not None
+    world = make(start.scene, start.motion.dt / substeps)
+    return engine_motion(start.motion, steps, lambda: world.advance(substeps), world.state)
 
 
 def engine_motion(
@@ -267,23 +216,6 @@ def engine_motion(
     for name, found in zip(MOTION, zip(*frames, strict=True), strict=True):
         motion[name][:, ~start.static] = found
     return replace(start, **motion), timing
-
-
-def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.ndarray | dict[str, Any]]]:
-    """MuJoCo's kinds of geoms, each with its size [3] m or the arguments of its mesh: one geom for each convex piece,
-    or an SDF of `mesh`."""
-    kind, sizes = form_of(urdf)
-    if kind == "sphere":
-        return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([*sizes, 0.0, 0.0]))]
-    if kind == "box":
-        return [(engine.mjtGeom.mjGEOM_BOX, 0.5 * sizes)]
-    if kind in ("cylinder", "capsule"):
-        round_about = engine.mjtGeom.mjGEOM_CYLINDER if kind == "cylinder" else engine.mjtGeom.mjGEOM_CAPSULE
-        return [(round_about, np.array([sizes[0], 0.5 * sizes[1], 0.0]))]
-    if mesh is not None:
-        return [(engine.mjtGeom.mjGEOM_SDF, {"uservert": mesh.vertices, "userface": mesh.faces.ravel()})]
-    pieces = load_pieces(urdf.with_suffix(".obj"))
-    return [(engine.mjtGeom.mjGEOM_MESH, {"uservert": piece.vertices}) for piece in pieces]
 
 
 # --- the engine's files ---

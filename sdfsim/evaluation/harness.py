@@ -122,10 +122,9 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
 
 
-def cells(found: dict[str, Any], columns: Iterable[str]) -> tuple[str, ...]:
-    """Cells of a table: these figures of a result; the last cell says why it failed, if it did."""
-    why = next((found[key] for key in ("failed", "broken") if found.get(key)), "")
-    return (*(number(found.get(key)) for key in columns), why)
+def why_failed(found: dict[str, Any]) -> str:
+    """Why a result failed; empty if it did not."""
+    return next((found[key] for key in ("failed", "broken") if found.get(key)), "")
 
 
 def front(time: Sequence[float], error: Sequence[float]) -> list[int]:

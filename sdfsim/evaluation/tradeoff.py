@@ -4,10 +4,9 @@ import csv
 import io
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,7 @@ from sdfsim.base.version import __version__
 from sdfsim.data.batching import every, first_frames, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, at_instants, check_alike, conditions_of, engine_substep
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
-from sdfsim.evaluation import engines
-from sdfsim.evaluation.engines import Engine, Start, Timing, centred_mesh, dataset_urdf, start_of_scene, timed
+from sdfsim.evaluation.engines import Engine, Start, Timing, bullet, dataset_urdf, start_of_scene, timed
 from sdfsim.evaluation.evaluate import load_recorded, perturbed
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
@@ -50,12 +48,7 @@ EXPLODED = 1.0  # energy gain relative to the energy at the start, beyond which 
 OFF = 1e-3  # m/s: difference of the chaos floor's starts from the recorded ones
 HORIZON = 50  # steps over which the drawn errors are taken
 FAR = 4.0  # times our largest time or error: points farther away are not drawn
-ENGINES: dict[str, Engine] = {
-    "PyBullet": engines.bullet,
-    "MuJoCo": engines.mujoco,
-    "MuJoCo mesh SDF": partial(engines.mujoco, pieces=False),
-}
-# Steps of the engine in a recorded step.
+# Engines by name, with steps of the engine in a recorded step.
 INNER = {"PyBullet": (5, 4, 3, 2, 1), "MuJoCo": (10, 5, 2), "MuJoCo mesh SDF": (5, 2)}
 INNER_QUICK = {"PyBullet": (5, 1), "MuJoCo": (5,)}
 TRUTH = f"PyBullet {1e3 * SUBSTEP:.3g} ms"  # it made the recordings, so it has no error of its own
@@ -140,7 +133,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     # The engine's bodies fly as if their velocities were ahead by half an inner step of gravity.
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
-    recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
+    recorded, _ = bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
     solids = exact_solids(folder, shapes)
     return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, units.length, units.time)
 
@@ -260,19 +253,17 @@ def _time_simulator(variant: Variant, model: Model, shapes: dict[str, Shape], ca
     return Timing(taken.first_ms, taken.wall_ms / variant.stride, taken.cpu_ms / variant.stride)
 
 
-def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
+def measure_engine(name: str, run: Engine, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
     """Errors and times of an engine with `substeps` steps in a recorded step; starts differ by `off` m/s."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
-    run = ENGINES[name]
     if lacking := sorted({str(n) for t in cases.recorded for n in t.shape} - set(cases.urdfs)):
         raise SdfsimError(f"no engine file of {', '.join(lacking)}")
-    meshes = {name: centred_mesh(shape) for name, shape in cases.shapes.items()}
-    recorded = cases.recorded if name == "PyBullet" else cases.starts
-    starts = [
-        Start(perturbed(t, off, [0, k]), cases.urdfs, cases.floor, cases.own_inertia, meshes)
-        for k, t in enumerate(recorded)
-    ]
+    starts = []
+    for k, t in enumerate(cases.recorded if name == "PyBullet" else cases.starts):
+        motion = perturbed(t, off, [0, k])
+        scene = scene_of([motion], [0], cases.shapes, cases.floor)[0]
+        starts.append(Start(motion, cases.urdfs, cases.floor, cases.own_inertia, scene=scene))
     with peak_memory() as memory:
         motions = [run(start, cases.steps, substeps)[0] for start in starts]
     times = _times(lambda: run(starts[cases.timed], min(TIMED, cases.steps), substeps)[1], cases)
@@ -324,8 +315,9 @@ def _times(run: Callable[[], Timing], cases: Cases) -> dict[str, Any]:
 
 
 def tradeoff(
-    source: Path | None, out: Path, *, models: Sequence[str] = (), quick: bool = False, on_progress: StageProgress
-) -> dict[str, Any]:
+    source: Path | None, out: Path, *, models: Sequence[str] = (), quick: bool = False,
+    engines: Mapping[str, Engine], on_progress: StageProgress,
+) -> dict[str, Any]:  # fmt: skip
     """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
 
     Args:
@@ -333,6 +325,7 @@ def tradeoff(
         out: folder to write; results in it are kept.
         models: names or paths (empty: the solver and the bundled networks on it).
         quick: fewer variants on fewer, shorter scenes.
+        engines: those of `INNER` besides PyBullet, which is always there.
 
     Returns:
         The content of report.json: `points`, each with its label, its kind ("ours", "engine", "floor", "baseline"),
@@ -360,12 +353,13 @@ def tradeoff(
             families[variant.label] = variant.family
             weights = load_model(variant.model) if variant.contact else None
             jobs.append(Job("cases", variant.label, [content, variant, weights], measure_ours, (variant, cases)))
-        for name, counts in (INNER_QUICK if quick else INNER).items():
-            for substeps in counts:
+        known = {"PyBullet": bullet, **engines}
+        for name, run in known.items():
+            for substeps in (INNER_QUICK if quick else INNER).get(name, ()):
                 label = f"{name} {1e3 * DT / substeps:.3g} ms"
                 kinds[label], families[label] = "engine", f"{name}: step"
-                jobs.append(Job("cases", label, [content, label], measure_engine, (name, substeps, 0.0, cases)))
-        jobs.append(Job("cases", FLOOR_LABEL, [content, OFF], measure_engine, ("PyBullet", 5, OFF, cases)))
+                jobs.append(Job("cases", label, [content, label], measure_engine, (name, run, substeps, 0.0, cases)))
+        jobs.append(Job("cases", FLOOR_LABEL, [content, OFF], measure_engine, ("PyBullet", bullet, 5, OFF, cases)))
         results = measure(jobs, out / "results", on_progress=lambda f, m: on_progress("measure", f, m))
         points = [{"label": label, "kind": kinds[label], **result} for (_, label), result in results.items()]
         usual = float(np.median([p["default_ms"] for p in points if "default_ms" in p] or [np.nan]))

@@ -7,13 +7,11 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from benchmarks.engines.drake import drake
-from benchmarks.engines.newton import newton
-from benchmarks.engines.rapier import rapier
+from benchmarks.engines import bullet, drake, mujoco, newton, rapier
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.evaluation import hard_cases
-from sdfsim.evaluation.engines import bullet, by_engine, mujoco, shape_urdf, start_of_scene
+from sdfsim.evaluation.engines import by_engine, shape_urdf, start_of_scene
 from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene

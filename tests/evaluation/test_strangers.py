@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from benchmarks import strangers
-from benchmarks.strangers import Failed, Found, Row, command, found_in, main, table
+from benchmarks import records, strangers
+from benchmarks.records import read_record
+from benchmarks.strangers import Failed, Found, Row, command, found_in, main, recorded
 from sdfsim.base.errors import SdfsimError
 
 SCENE = """version: 1
@@ -58,15 +59,17 @@ def test_inputs_are_taken_for_what_they_are(tmp_path):
     }  # fmt: skip
 
 
-def test_what_failed_comes_first_and_then_what_is_faulty():
+def test_what_failed_comes_first_and_then_what_is_faulty(tmp_path, monkeypatch):
     rows = [
         Row("fine.obj", "mesh", "fitted"),
         Row("bad.obj", "mesh", wrong=["not a | mesh"]),
         Row("odd.obj", "mesh", "fitted", wrong=["left the scene"]),
     ]
-    text = table(rows)
-    assert text.index("bad.obj") < text.index("odd.obj") < text.index("fine.obj")
-    assert "not a / mesh" in text and "1 of 3 without a fault; 3 of mesh." in text
+    monkeypatch.setattr(records, "RECORDS", tmp_path)
+    recorded("mesh", rows)
+    record = read_record("strangers_mesh")
+    assert [row[0] for row in record.rows] == ["`bad.obj`", "`odd.obj`", "`fine.obj`"]
+    assert record.rows[0][-1] == "not a / mesh" and record.notes == ["1 of 3 without a fault."]
 
 
 def test_a_command_that_dies_or_hangs_says_how(monkeypatch):
@@ -105,6 +108,7 @@ def test_a_folder_of_all_kinds(tmp_path, monkeypatch):
     slide(folder / "slide" / "way.csv")
     (folder / "slide" / "scene.yaml").write_text(SCENE)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(records, "RECORDS", tmp_path)
     main(Path("in"), out=Path("out"), longest=600.0)
     rows = {row["name"]: row for row in json.loads((tmp_path / "out" / "table.json").read_text())}
     assert rows.keys() == {"box.stl", "ring.ply", "open.obj", "bad.obj", "slide/way.csv"}
@@ -115,7 +119,7 @@ def test_a_folder_of_all_kinds(tmp_path, monkeypatch):
     assert "windows repeated" in rows["slide/way.csv"]["became"]
     (off, *_), _ = (part.split() for part in rows["slide/way.csv"]["exact"].split(";"))
     assert float(off) < 2.0  # % of the size, of a motion that is known in closed form
-    assert "4 of 5 without a fault" in (tmp_path / "out" / "table.md").read_text()
+    assert read_record("strangers_mesh").notes == ["3 of 4 without a fault."]
 
 
 def test_a_mesh_that_no_cap_closes_became_nothing(tmp_path, monkeypatch):

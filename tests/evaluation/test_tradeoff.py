@@ -81,11 +81,10 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     def absent(*_, **__):
         raise SdfsimError("MuJoCo is not installed")
 
-    monkeypatch.setitem(study.ENGINES, "MuJoCo", absent)
     before = torch.get_num_threads()
 
     def run():
-        return study.tradeoff(cube_data, tmp_path, quick=True, on_progress=lambda *_: None)
+        return study.tradeoff(cube_data, tmp_path, quick=True, engines={"MuJoCo": absent}, on_progress=lambda *_: None)
 
     report = run()
     by_label = {p["label"]: p for p in report["points"]}
