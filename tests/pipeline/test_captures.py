@@ -2,23 +2,20 @@
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cameras import PosedPhotos, Similarity, Sparse, View, load_views
+from pipeline.cameras import PosedPhotos, Sparse, View, load_views
 from pipeline.field.supervision import depth_points, depth_scale
 from pipeline.inputs.captures import UP, DepthFile, load_capture, read_depth, spread
 from pipeline.inputs.known_cameras import lens_of, posed
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
-from pipeline.mesh.placement import Up, place
 from pipeline.sfm.poses import solve
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.mesh import Mesh
 from tests.helpers.photos import noise
 from tests.pipeline.photo_sets import SAMPLES, TABLE_VASE
 
@@ -192,16 +189,6 @@ def test_a_long_recording_is_thinned_along_its_way_to_its_sharpest_frames(tmp_pa
     assert len(chosen) == 5 and chosen[0] <= 23 and chosen == sorted(set(chosen))
     assert all(number % 4 == 3 for number in chosen)
     assert spread(photos, cameras, most=40) == photos
-
-
-def test_scale_and_gravity_come_from_the_capture():
-    plane = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
-    views = [replace(camera("a", 0.0), translation=np.array([0.0, 0, 3.0]))]
-    up = np.array([0.0, np.sin(0.2), np.cos(0.2)])  # A ramp: the only plane is not level.
-    placement = place(plane, views, (0.5, "metres of an app"), up=Up(up, "gravity of an app", 1.0))
-    np.testing.assert_allclose(placement.to_metres.rotation @ up, [0, 0, 1], atol=1e-12)
-    assert placement.to_metres.scale == 0.5 and placement.up_within == 1.0
-    assert isinstance(placement.to_metres, Similarity)
 
 
 def test_what_is_no_capture_is_reported(tmp_path):

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from pipeline.cameras import PosedPhotos, Sparse
-from pipeline.field import rendering
 from pipeline.field.grid_field import FieldSize, GridField, laplace_density
-from pipeline.field.rendering import EPSILON, bounded_samples, distance_bound, draw, opacity_bound, sdf_cache, worst
+from pipeline.field.rendering import EPSILON, bounded_samples, draw, opacity_bound, sdf_cache
 from pipeline.field.supervision import (
     CLEARANCE,
     FILLED,
@@ -24,7 +23,6 @@ from pipeline.field.supervision import (
     stereo_points,
     supervision_of,
 )
-from pipeline.field.training import PRESETS
 from pipeline.stereo.depth import DepthMap
 from tests.helpers.sparse import NOTHING
 from tests.helpers.surfaces import ring
@@ -47,21 +45,6 @@ def ball(origins: torch.Tensor, direction: torch.Tensor, distance: torch.Tensor,
 def chord(origins: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     half = (1 - origins[:, 0] ** 2).sqrt()
     return 3 - half, 3 + half
-
-
-def test_nothing_is_nearer_than_the_bound():
-    """Of 2,000 random pieces of rays past a ball, the true least distance is never less, and often equal."""
-    rng = torch.Generator().manual_seed(0)
-    start = torch.randn(2000, 3, generator=rng, dtype=DOUBLE)
-    along = torch.randn(2000, 3, generator=rng, dtype=DOUBLE)
-    along = along / along.norm(dim=1, keepdim=True)
-    length = torch.rand(2000, 1, generator=rng, dtype=DOUBLE) * 2
-    steps = torch.linspace(0, 1, 400, dtype=DOUBLE)
-    true = ((start[:, None] + (length * steps)[..., None] * along[:, None]).norm(dim=-1) - 0.3).abs().amin(1)
-    ends = torch.stack([start, start + length * along], 1).norm(dim=-1) - 0.3
-    bound = distance_bound(ends, length)[:, 0]
-    assert (bound <= true + 1e-9).all()
-    assert (bound > 0.5 * true).double().mean() > 0.3
 
 
 def test_the_bound_holds_for_every_ray_and_number_of_samples():
@@ -108,13 +91,6 @@ def test_rays_converge_one_by_one(beta):
     assert sum(calls[1:]) < 0.8 * len(origins) * 128 * max(1, len(calls) - 1)
 
 
-def test_samples_gather_where_a_ray_becomes_opaque():
-    distance, _, origins = run(0.003)
-    hit = origins[:, 0] < 0.15
-    surface = 3 - (0.2**2 - origins[hit, :1] ** 2).sqrt()
-    assert ((distance[hit] - surface).abs() < 0.05).double().mean() > 0.8
-
-
 def test_opacity_from_the_samples_is_right():
     """What the samples are for: the opacity of rays, from 64 of them, is that of 20,000."""
     distance, _, origins = run(0.01)
@@ -132,17 +108,6 @@ def test_draws_follow_their_density():
     drawn = draw(distance, torch.tensor([[1.0, 0.0, 3.0]]), torch.full((1, 4000), 0.5))
     counts = torch.histogram(drawn[0], torch.tensor([0.0, 1.0, 2.0, 4.0])).hist
     assert counts.tolist() == pytest.approx([1000, 0, 3000], abs=5)
-
-
-def test_more_samples_bound_the_error_more_tightly():
-    origins, direction = rays()
-    enter, leave = chord(origins)
-    bounds = []
-    for count in (64, 128, 256):
-        distance = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, count, dtype=DOUBLE)
-        sdf = ball(origins, direction, distance)
-        bounds.append(float(worst(distance, sdf, torch.tensor([[0.05]], dtype=DOUBLE)).max()))
-    assert bounds[0] > bounds[1] > bounds[2]
 
 
 def ball_cache(radius: float, n: int = 65) -> torch.Tensor:
@@ -296,28 +261,3 @@ def test_a_filled_hollow_is_emptied_by_its_lines_of_sight(radius):
         loss.backward()
         optimizer.step()
     assert (field.sdf(inside) > 0).all()
-
-
-@pytest.mark.parametrize(
-    ("preset", "side", "reads"), [("quick", 129, 96), ("standard", 129, 96), ("fine", 225, 168), ("volsdf", 125, 93)]
-)
-def test_a_field_is_sampled_as_finely_as_it_has_detail(preset, side, reads, monkeypatch):
-    """At least once in each cell of the finest grid that is everywhere; three times in four cells along a ray."""
-    size, asked = PRESETS[preset].size, []
-    ball = SimpleNamespace(device=torch.device("cpu"), sdf=lambda points: points.norm(dim=1) - 0.5)
-    cache = sdf_cache(ball, size.sampling)  # type: ignore[arg-type]
-    assert cache.shape == (side, side, side, 1) and 2 / (side - 1) <= size.sampling
-    plain = rendering.interpolate
-    monkeypatch.setattr(rendering, "interpolate", lambda grid, points: asked.append(len(points)) or plain(grid, points))
-    rendering.choose_samples(
-        cache, torch.tensor([[0.0, 0, -3]]), torch.tensor([[0.0, 0, 1]]), 0.01, torch.full((1, 32), 0.5)
-    )
-    assert asked == [reads]
-
-
-def test_lengths_are_in_cells_of_what_a_field_can_follow():
-    """Of *quick* in the unit sphere: half as long as when its finest grid had cells twice as wide."""
-    cell = PRESETS["quick"].size.finest
-    known = {GAP: 0.0075, CLEARANCE: 0.01, FILLED: -0.002, JUST_EMPTY: 0.001}
-    assert [cells * cell for cells in known] == pytest.approx(list(known.values()), rel=1e-12)
-    assert GAP * PRESETS["fine"].size.finest < 0.6 * GAP * cell

@@ -60,16 +60,6 @@ def cloud() -> Sparse:
     return Sparse(points, np.zeros((60, 3), np.uint8), np.full(60, 0.5), point_of, view_of)
 
 
-def test_training_leaves_renders_and_scores(tmp_path):
-    photos(tmp_path, 16)
-    settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
-    report = train(PosedPhotos(views(16), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
-    assert report["held_out_photos"] == ["IMG_4.JPG", "IMG_12.JPG"]
-    assert len(report["psnr_each"]) == 2 and report["psnr"] == pytest.approx(np.mean(report["psnr_each"]), abs=0.01)
-    for name in ("4.jpg", "12.jpg"):
-        assert Image.open(tmp_path / "held_out" / name).size == (SIDE, SIDE)
-
-
 class Ball:
     """A trainer whose field is a red ball of radius 0.5, opaque within a thousandth."""
 
