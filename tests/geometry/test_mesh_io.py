@@ -121,13 +121,11 @@ def test_a_texture_that_a_ply_names_colours_its_vertices(tmp_path: Path) -> None
     Image.fromarray(image).save(tmp_path / "paint.png")
     rows = "".join(f"{len(c)} {' '.join(map(str, c))} {2 * len(c)} {' '.join(len(c) * ['0.5 0.9'])}\n" for c in MIXED)
     text = text_ply(rows, len(MIXED), "property list uchar float texcoord\n").replace(
-        "element vertex", "comment TextureFile paint.png\nelement vertex"
+        "element vertex", "comment TextureFile paint.png\ncomment TextureFile other.png\nelement vertex"
     )
     (tmp_path / "a.ply").write_text(text)
-    mesh = load_mesh(tmp_path / "a.ply")
-    assert mesh.colors is not None and (mesh.colors == [250, 20, 30]).all()
-    (tmp_path / "a.ply").write_text(text.replace("element vertex", "comment TextureFile other.png\nelement vertex"))
     loaded = load_textured(tmp_path / "a.ply")
+    assert loaded.mesh.colors is not None and (loaded.mesh.colors == [250, 20, 30]).all()
     assert loaded.notes == ("it names 2 textures: only paint.png is used",)
 
 
@@ -135,21 +133,16 @@ def test_a_texture_that_a_ply_names_colours_its_vertices(tmp_path: Path) -> None
 @pytest.mark.parametrize("kind", ["ply", "off", "obj"])
 def test_polygons_that_are_not_convex_bound_what_they_should(tmp_path: Path, outline, area: float, kind: str) -> None:
     places, polygons = prism(outline)
-    path = tmp_path / f"a.{kind}"
-    if kind == "ply":
-        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(places)}\nproperty double x\n"
-        header += f"property double y\nproperty double z\nelement face {len(polygons)}\n"
-        content = (header + "property list int int vertex_indices\nend_header\n").encode()
-        content += np.array(places, "<f8").tobytes()
-        content += b"".join(np.array([len(p), *p], "<i4").tobytes() for p in polygons)
-        path.write_bytes(content)
-    elif kind == "obj":
-        rows = ["v " + " ".join(map(str, p)) for p in places]
-        path.write_text("\n".join([*rows, *("f " + " ".join(f"{k + 1}//1" for k in p) for p in polygons)]))
-    else:
-        rows = ["OFF", f"{len(places)} {len(polygons)} 0", *(" ".join(map(str, p)) for p in places)]
-        path.write_text("\n".join([*rows, *(" ".join(map(str, [len(p), *p])) for p in polygons)]))
-    mesh = load_mesh(path)
+    head = {
+        "ply": f"ply\nformat ascii 1.0\nelement vertex {len(places)}\nproperty double x\nproperty double y\n"
+        f"property double z\nelement face {len(polygons)}\nproperty list int int vertex_indices\nend_header\n",
+        "off": f"OFF\n{len(places)} {len(polygons)} 0\n", "obj": "",
+    }[kind]  # fmt: skip
+    vertex, first = ("v {} {} {}\n", 1) if kind == "obj" else ("{} {} {}\n", 0)
+    rows = [" ".join(str(k + first) for k in corners) for corners in polygons]
+    body = [f"{'f' if kind == 'obj' else len(row.split())} {row}\n" for row in rows]
+    (tmp_path / f"a.{kind}").write_text(head + "".join(vertex.format(*place) for place in places) + "".join(body))
+    mesh = load_mesh(tmp_path / f"a.{kind}")
     assert is_closed(mesh) and signed_volume(mesh) == pytest.approx(area)
     solid = solidify(mesh)
     assert solid.simple and solid.mass_properties()[0] == pytest.approx(area)

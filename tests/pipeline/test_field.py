@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
@@ -122,24 +121,14 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
     assert_resumes(trainer, 4, tmp_path / "c.safetensors")
 
 
-@pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "no numbers", "a tensor less", "another field"])
+@pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "another field"])
 def test_a_checkpoint_that_cannot_be_read_is_reported_and_leaves_nothing_behind(tmp_path, damage, one_thread):
     path, before, run, untouched = tmp_path / "c.safetensors", trainer(), trainer(), trainer()
     before.step()
     before.save(path)
-    with safetensors.safe_open(str(path), "pt") as file:
-        about, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}
-    if damage == "no checkpoint":
-        path.write_bytes(b"not a checkpoint")
-    elif damage == "cut short":
-        path.write_bytes(path.read_bytes()[:-100])
-    elif damage == "no numbers":
-        safetensors.torch.save_file(tensors, path)
-    elif damage == "a tensor less":
-        del tensors["field.background.levels.0"]
-        safetensors.torch.save_file(tensors, path, metadata=about)
-    else:
-        safetensors.torch.save_file(tensors, path, metadata={"about": about["about"].replace("levels", "heights")})
+    whole = path.read_bytes()
+    other = whole.replace(b"levels", b"heights", 1).replace(b" ", b"", 1)  # of the same length
+    path.write_bytes({"no checkpoint": b"not a checkpoint", "cut short": whole[:-100], "another field": other}[damage])
     with pytest.raises(SdfsimError, match="cannot be read") as caught:
         run.load(path)
     assert "\n" not in caught.value.message
@@ -305,20 +294,8 @@ def test_a_run_that_goes_on_has_the_bricks_of_an_undisturbed_one(tmp_path, one_t
                            iterations=20, surface_points=32)  # fmt: skip
         return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), 0, fused=ball_fused())
 
-    whole, first, second = started(), started(), started()
-    for _ in range(20):
-        whole.step()
-    for _ in range(killed):
-        first.step()
-    first.save(tmp_path / "c.safetensors")
-    assert second.load(tmp_path / "c.safetensors") and second.refined == (killed > 16)
-    for _ in range(20 - killed):
-        second.step()
-    assert whole.refined and isinstance(whole.field, GridField)
-    level = whole.field.bricks[0]
-    assert isinstance(level, Bricks) and len(level.places) >= len(ball_fused().bricks)
-    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
-        assert torch.equal(a, b)
+    run = assert_resumes(started, killed, tmp_path / "c.safetensors", 20 - killed)
+    assert run.refined and run.field.bricks[0].started and run.exposure is not None and run.exposure.change.any()
 
 
 def test_threads_change_nothing():
