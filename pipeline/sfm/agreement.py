@@ -90,6 +90,6 @@ def own_errors(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     Barath et al., 2020): no poses can be much better, whatever the focal length. Zeros if no form is found."""
     import cv2
 
-    pixels = (np.ascontiguousarray(part, float) for part in (first, second))
-    form = cv2.findFundamentalMat(*pixels, cv2.USAC_MAGSAC, 1.0, 0.999, 5000)[0]
+    p, q = (np.ascontiguousarray(pixels, float) for pixels in (first, second))
+    form = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, 1.0, 0.999, 5000)[0]
     return np.zeros(len(first)) if form is None else sampson(form, first, second)

@@ -295,7 +295,8 @@ def test_a_run_that_goes_on_has_the_bricks_of_an_undisturbed_one(tmp_path, one_t
         return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), 0, fused=ball_fused())
 
     run = assert_resumes(started, killed, tmp_path / "c.safetensors", 20 - killed)
-    assert run.refined and run.field.bricks[0].started and run.exposure is not None and run.exposure.change.any()
+    assert run.refined and run.field.bricks[0].started
+    assert run.exposure is not None and run.exposure.change.any()
 
 
 def test_threads_change_nothing():

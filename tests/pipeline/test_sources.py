@@ -108,7 +108,7 @@ def test_an_ideal_fisheye_is_straightened_though_its_coefficients_are_all_zero(t
 
 @pytest.mark.parametrize("fisheye", [{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}])
 def test_a_fisheye_may_be_told_in_each_frame(tmp_path, fisheye):
-    given = write_transforms(tmp_path, **FISHEYE)
+    given = write_transforms(tmp_path, NAMES, **FISHEYE)
     about = json.loads(given.read_text())
     about["frames"] = [{**frame, **fisheye} for frame in about["frames"]]
     given.write_text(json.dumps(about))
