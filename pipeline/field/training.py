@@ -39,8 +39,8 @@ from pipeline.field.supervision import (
     supervision_of,
     unit_sphere_of,
 )
-from pipeline.inputs.images import BACKDROP, reduced
-from pipeline.inputs.photos import load_photos
+from pipeline.inputs.images import BACKDROP
+from pipeline.inputs.photos import load_photos, open_mask, open_photo
 from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
 from pipeline.stereo.fusion import Fused, fuse
 from sdfsim.base.errors import SdfsimError
@@ -157,22 +157,12 @@ def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor
 
 
 def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
-    """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. If some views have masks, a view
-    without a mask counts as all object. Raises SdfsimError if a photo is missing."""
+    """Reads the photos of `views` (in normalised space), downscaled to `long_side` px, and their masks. Raises
+    SdfsimError if a photo or a mask is missing."""
     rgb, mask, view_of, pixel, intrinsics, sizes = [], [], [], [], [], []
     for index, view in enumerate(views):
-        try:
-            with Image.open(Path(photos_folder) / "images" / view.name) as image:
-                image.load()
-                size = reduced(image.size, long_side)
-                pixels = np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX))
-            shade = None
-            file = Path(photos_folder) / "masks" / (view.name + ".png")
-            if masks and file.exists():
-                with Image.open(file) as image:
-                    shade = np.asarray(image.convert("L").resize(size, Image.Resampling.BOX))
-        except OSError as error:
-            raise SdfsimError(f"{photos_folder}: cannot read {view.name}", "run the photos stage again") from error
+        pixels = np.asarray(open_photo(photos_folder, view, long_side=long_side))
+        size = pixels.shape[1::-1]
         sx, sy = size[0] / view.width, size[1] / view.height
         intrinsics.append([view.focal * (sx + sy) / 2, view.cx * sx, view.cy * sy, view.k])
         sizes.append(size)
@@ -183,7 +173,8 @@ def load_rays(views: Sequence[View], photos_folder: Path, long_side: int, *, mas
         # Rays that miss the sphere carry no information about its inside.
         meets = ((view.center**2).sum() - along**2 < 0.998) & (along > 0)
         rgb.append(pixels.reshape(-1, 3)[meets])
-        mask.append(shade.reshape(-1)[meets] if shade is not None else np.full(meets.sum(), 255, np.uint8))
+        if masks:
+            mask.append(open_mask(photos_folder, view, size).reshape(-1)[meets])
         view_of.append(np.full(meets.sum(), index, np.int16))
         pixel.append(np.stack([column[meets], row[meets]], 1).astype(np.int16))
     return Rays(

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -157,8 +156,8 @@ def _images_of(cameras: Path) -> Path:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks the files of a zipped capture. Raises SdfsimError if it is damaged or not a zip, too large once unpacked,
-    or has names that lead out of the folder."""
+    """Unpacks the files of a zipped capture, all into the folder, whatever their names. Raises SdfsimError if it is
+    damaged or not a zip, or too large once unpacked."""
     try:
         with zipfile.ZipFile(archive) as file:
             entries = [
@@ -168,13 +167,8 @@ def unpack(archive: Path, folder: Path) -> None:
             if sum(entry.file_size for entry in entries) > LARGEST:
                 raise SdfsimError(f"{archive}: more than {LARGEST >> 30} GiB unpacked", "export fewer frames")
             for entry in entries:
-                place = folder / entry.filename.replace("\\", "/")  # as some programs on Windows write them
-                if not place.resolve().is_relative_to(folder.resolve()):
-                    message = f"{archive}: {entry.filename} would lie outside of the capture"
-                    raise SdfsimError(message, "export it again")
-                place.parent.mkdir(parents=True, exist_ok=True)
-                with file.open(entry) as packed, open(place, "wb") as out:
-                    shutil.copyfileobj(packed, out)
+                entry.filename = entry.filename.replace("\\", "/")  # as some programs on Windows write them
+                file.extract(entry, folder)
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise SdfsimError(f"{archive}: cannot be unpacked: {error}", "export the capture again") from error
 

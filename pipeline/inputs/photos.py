@@ -13,7 +13,17 @@ from pydantic import TypeAdapter
 from pipeline.cameras import View, save_views
 from pipeline.inputs.bit_depth import common_white
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
-from pipeline.inputs.images import BLURRED, DARK, ReadPhoto, brightness, is_panorama, read_photo, sharpness, whiteness
+from pipeline.inputs.images import (
+    BLURRED,
+    DARK,
+    ReadPhoto,
+    brightness,
+    is_panorama,
+    read_photo,
+    reduced,
+    sharpness,
+    whiteness,
+)
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
@@ -186,10 +196,26 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
     return notes
 
 
-def open_photo(folder: Path, view: View, mode: str = "RGB") -> Image.Image:
-    """The prepared photo of a view, in one of PIL's modes."""
-    with Image.open(Path(folder) / "images" / view.name) as image:
-        return image.convert(mode)
+def open_photo(folder: Path, view: View, mode: str = "RGB", long_side: float = np.inf) -> Image.Image:
+    """The prepared photo of a view, in one of PIL's modes, reduced to `long_side` px. Raises SdfsimError if it cannot
+    be read."""
+    image = _opened(Path(folder) / "images" / view.name)
+    return image.convert(mode).resize(reduced(image.size, long_side), Image.Resampling.BOX)
+
+
+def open_mask(folder: Path, view: View, size: tuple[int, int]) -> np.ndarray:
+    """The mask [H, W] uint8 of a view at a size (width, height), px. Raises SdfsimError if it cannot be read."""
+    image = _opened(Path(folder) / "masks" / f"{view.name}.png")
+    return np.asarray(image.convert("L").resize(size, Image.Resampling.BOX))
+
+
+def _opened(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except OSError as error:
+        raise SdfsimError(f"{path}: cannot be read", "run the photos stage again") from error
 
 
 def save_photos(photos: list[Photo], folder: Path) -> None:

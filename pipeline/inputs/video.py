@@ -1,7 +1,5 @@
 """A video -> its sharpest frames, spread evenly over the motion of the camera."""
 
-import itertools
-import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -16,44 +14,17 @@ STEP = 0.07  # of the picture's width: motion from one chosen frame to the next
 FEWEST, MOST = 24, 100
 STILLS = {"image2", "tty"}  # formats of the decoder
 LEAST_MOTION = 0.5  # picture widths in total: less is not a walk around an object
-# Without this the decoder prints messages about damaged files, past Python.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
-def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
-    """The frames of a video, upright RGB [H, W, 3] uint8, and their number per second, from the first decoder that has
-    any: OpenCV's is faster, PyAV's knows more, such as AV1. Raises SdfsimError if the video is unreadable."""
-    for decoder in (_by_opencv, _by_pyav):
-        frames, rate = decoder(path)
-        if (first := next(frames, None)) is not None:
-            return itertools.chain([first], frames), rate
-    raise SdfsimError(f"{path}: cannot be decoded as a video", "convert it to MP4 (H.264)")
-
-
-def _by_opencv(path: Path) -> tuple[Iterator[np.ndarray], float]:
-    import cv2
-
-    video = cv2.VideoCapture(str(path))
-
-    def read() -> Iterator[np.ndarray]:
-        while (found := video.read())[0]:
-            yield found[1][..., ::-1]
-
-    return read(), float(video.get(cv2.CAP_PROP_FPS)) or 30.0
-
-
-def _by_pyav(path: Path) -> tuple[Iterator[np.ndarray], float]:
+def frames_of(path: Path) -> Iterator[np.ndarray]:
+    """The frames of a video, upright RGB [H, W, 3] uint8; none if it cannot be decoded. A damaged end ends the film."""
     import av
     from av.error import FFmpegError
 
-    def read() -> Iterator[np.ndarray]:
-        with suppress(FFmpegError), av.open(str(path)) as film:  # a damaged end ends the film
-            for frame in film.decode(video=0):
-                yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
-
     with suppress(FFmpegError, IndexError), av.open(str(path)) as film:
-        return read(), float(film.streams.video[0].average_rate or 30.0)
-    return iter(()), 30.0
+        film.streams.video[0].thread_type = "AUTO"
+        for frame in film.decode(video=0):
+            yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
 
 
 def is_film(path: Path) -> bool:
@@ -74,16 +45,15 @@ def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """First pass: how far the picture has moved up to each frame [F], in picture widths, and how sharp each is [F].
 
     Motion is the median displacement of corners that Lucas-Kanade tracking finds again; if most are lost, it is one
-    step.
+    step. Raises SdfsimError if the video cannot be decoded.
     """
     import cv2
 
     def shrunk(frame: np.ndarray, longest: int) -> np.ndarray:
         return cv2.resize(frame, reduced(frame.shape[1::-1], longest), interpolation=cv2.INTER_AREA)
 
-    frames, _ = frames_of(path)
     before, moved, sharp = None, [], []
-    for frame in frames:
+    for frame in frames_of(path):
         frame = shrunk(frame, MIDDLE)
         sharp.append(sharpness(frame))
         grey = cv2.cvtColor(shrunk(frame, SMALL), cv2.COLOR_RGB2GRAY)
@@ -97,6 +67,8 @@ def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 step = float(np.median(shift)) / grey.shape[1] if kept.mean() > 0.4 else STEP
         moved.append((moved[-1] if moved else 0.0) + step)
         before = grey
+    if not moved:
+        raise SdfsimError(f"{path}: cannot be decoded as a video", "convert it to MP4 (H.264)")
     return np.array(moved), np.array(sharp)
 
 
@@ -112,11 +84,12 @@ def choose_frames(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
 def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
     """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError if the video
     cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
-    import cv2
+    import av
 
     moved, sharp = follow(path)
+    with av.open(str(path)) as film:
+        rate, told = float(film.streams.video[0].average_rate or 30.0), film.streams.video[0].frames
     if len(sharp) < FEWEST:
-        told = int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT))
         if len(sharp) >= 0.9 * told:  # the file is complete, but short
             message = f"{path}: a clip of only {len(sharp)} frames (at least {FEWEST} are needed)"
             raise SdfsimError(message, "film for longer: half a minute, all the way around the object")
@@ -127,8 +100,7 @@ def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
         raise SdfsimError(message, "walk around the object while filming", exit_code=EXIT_QUALITY)
     wanted = choose_frames(moved, sharp)
     left = set(wanted)
-    frames, rate = frames_of(path)
-    for index, frame in enumerate(frames):
+    for index, frame in enumerate(frames_of(path)):
         if index in left:
             left.remove(index)
             yield f"{path.name} at {index / rate:.2f} s", frame, 1 - len(left) / len(wanted)

@@ -86,23 +86,10 @@ def sampson(form: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarr
 
 
 def own_errors(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Sampson distances [M], px, of matched pixels [M, 2] from the lines of the bilinear form that fits them best: no
-    poses can be much better, whatever the focal length. The eight-point algorithm, with weights that give distances in
-    pixels and little influence to far matches."""
+    """Sampson distances [M], px, of matched pixels [M, 2] from the lines of the bilinear form that fits best (MAGSAC++,
+    Barath et al., 2020): no poses can be much better, whatever the focal length. Zeros if no form is found."""
+    import cv2
 
-    def normal(pixels: np.ndarray) -> np.ndarray:
-        middle = pixels.mean(0)
-        scale = np.sqrt(2) / max(float(np.linalg.norm(pixels - middle, axis=1).mean()), 1e-9)
-        return np.array([[scale, 0, 0], [0, scale, 0], [-scale * middle[0], -scale * middle[1], 1]])
-
-    p, q = (np.hstack([pixels, np.ones((len(pixels), 1))]).astype(float) for pixels in (first, second))
-    forward, backward = normal(p[:, :2]), normal(q[:, :2])
-    products = ((q @ backward)[:, :, None] * (p @ forward)[:, None, :]).reshape(len(p), 9)
-    weights, best = np.ones(len(p)), np.full(len(p), np.inf)
-    for _ in range(4):
-        form = backward @ np.linalg.eigh((products * weights[:, None]).T @ products)[1][:, 0].reshape(3, 3) @ forward.T
-        errors = sampson(form, p[:, :2], q[:, :2])
-        best = min(best, errors, key=np.median)
-        slope = np.maximum(((p @ form.T)[:, :2] ** 2).sum(1) + ((q @ form)[:, :2] ** 2).sum(1), 1e-30)
-        weights = slope.mean() / slope / (1 + (errors / (3 * max(float(np.median(errors)), FINEST))) ** 2)
-    return best
+    p, q = (np.ascontiguousarray(pixels, float) for pixels in (first, second))
+    form = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, 1.0, 0.999, 5000)[0]
+    return np.zeros(len(first)) if form is None else sampson(form, first, second)

@@ -15,11 +15,12 @@ MAX_MEAN_ERROR = 2.0  # px
 MIN_TRIANGULATION = 2.0  # degrees, of the median point; mapping leaves out points below 1.5
 FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, ENOUGH, 30, 6
 FOCAL_OFF = 1.5  # times the focal length of EXIF: beyond this the lens is a different one
-# Of the matches. Right poses have up to 0.1, with looser matches 0.2; those of repeating textures two thirds and more.
+# Of the matches. Right poses have up to 0.1, with looser matches 0.2; those of repeating textures two thirds and more,
+# in the drawn sets of the tests and a few real ones; the limit is between them.
 MANY_CONTRADICTIONS = 0.35
 # Largest excess (see `excess`): right poses have up to 1.4, those of a wrong focal length or of two zooms treated as
 # one 2.8 and more. Single photos with right poses have up to 1.9, and a few may exceed that.
-MOST_EXCESS, FEW_ASTRAY = 2.0, 0.1
+MOST_EXCESS, FEW_ASTRAY = 2.0, 0.1  # on the sets of `DOUBTFUL` in `worker.py`
 # Fewer photos, or neighbours that stand farther apart (degrees, as seen from the scene), are doubtful.
 GOOD_PHOTOS, WIDE_STEP = 20, 18.0
 HALF = 0.5  # share of a photo that is white: from here on it may be what is wrong with it

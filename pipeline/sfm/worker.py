@@ -23,13 +23,13 @@ from pipeline.cameras import FOV_RANGE, Sparse, triangulation_angle, view_of
 from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
 from sdfsim.base.files import write_arrays, write_json
 
-# Chosen by hand on the photo sets of the project; nothing derives these numbers, and other sets may want others.
-# For known cameras that are refined:
+# Chosen by hand; nothing derives these numbers, and other photos may want others.
+# For known cameras that are refined, on the bundled set as captures of phones with made-up errors of tracking:
 REFINE_PIXELS = (16.0, 6.0)  # px that a point may be off, at first and then
 REFINE_POINTS = 30  # points that a camera needs to be moved
-SUPPORTED = 70  # points that most cameras need for any to be moved: with fewer, a dozen photos became worse
-TRACKED = 0.02  # m, error of a phone's tracked position
-# For poses that are estimated:
+SUPPORTED = 70  # points that most cameras need for any to be moved: with fewer, a dozen photos of that set became worse
+TRACKED = 0.02  # m, error of a phone's tracked position: twice the centimetre to which a phone tracks
+# For poses that are estimated, on the bundled set, also with every second or fifth photo zoomed, and a few real sets:
 DOUBTFUL = 1.8  # excess of a photo above which other focal lengths are tried; right poses had 1.0 to 1.8
 HOPELESS = 0.5  # of all matches contradicting the poses: no focal length fixes that
 # Ratio of a focal length to the next shorter one above which they are two zooms; among photos of one zoom, each posed

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from scipy import ndimage
 
 from pipeline.cameras import PosedPhotos, View, focus
-from pipeline.inputs.images import reduced, stacked
+from pipeline.inputs.images import stacked
+from pipeline.inputs.photos import open_mask, open_photo
 from pipeline.stereo.compiled import agreeing, sweep
-from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent, threads
 
 COARSE = 320  # px of the longer side while planes are swept
@@ -133,11 +132,8 @@ def only(poses: PosedPhotos, index: Sequence[int]) -> PosedPhotos:
 
 def outside_mask(depth: DepthMap, photos_folder: Path) -> DepthMap:
     """The same for a masked object: pixels outside the photo's mask are empty space, infinitely far."""
-    try:
-        with Image.open(Path(photos_folder) / "masks" / f"{depth.view.name}.png") as image:
-            mask = np.asarray(image.convert("L").resize(depth.inverse.shape[::-1], Image.Resampling.BOX))
-    except OSError as error:
-        raise SdfsimError(f"{photos_folder}: no mask of {depth.view.name}", "run the photos stage again") from error
+    rows, columns = depth.inverse.shape
+    mask = open_mask(photos_folder, depth.view, (columns, rows))
     empty = np.logical_not(ndimage.binary_dilation(mask > 0, iterations=2))
     inverse = np.where(empty, np.float32(BEYOND), np.where(mask > 127, depth.inverse, 0))
     return replace(depth, inverse=inverse, certain=np.where(empty, np.float32(1), depth.certain))
@@ -171,13 +167,8 @@ def straightened(view: View, photos_folder: Path, long_side: int, mode: str) -> 
     if it is missing."""
     import cv2
 
-    try:
-        with Image.open(Path(photos_folder) / "images" / view.name) as image:
-            size = reduced(image.size, long_side)
-            pixels = np.asarray(image.convert(mode).resize(size, Image.Resampling.BOX))
-    except OSError as error:
-        raise SdfsimError(f"{photos_folder}: cannot read {view.name}", "run the photos stage again") from error
-    pixels = pixels.astype(np.float32) if mode == "L" else pixels
+    pixels = np.asarray(open_photo(photos_folder, view, mode, long_side))
+    pixels, size = pixels.astype(np.float32) if mode == "L" else pixels, pixels.shape[1::-1]
     sx, sy = size[0] / view.width, size[1] / view.height
     matrix = np.array([[view.focal * sx, 0, view.cx * sx - 0.5], [0, view.focal * sy, view.cy * sy - 0.5], [0, 0, 1]])
     if view.k:

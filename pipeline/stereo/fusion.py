@@ -24,16 +24,16 @@ from sdfsim.base.parallel import Progress, silent, threads
 BACK = 2.0  # cells in front of and behind a surface within which its distance counts
 # A place is empty if photos that see past it have more than this share of the weight of those that see a surface there.
 # Their distances are not part of the mean: a few wrong ones would move the surface.
-OUTVOTED = 0.5
+OUTVOTED = 0.5  # a majority
 # What lies behind one surface may lie in front of another: the air in the neck of a vase. A place more than `DEEP`
 # cells behind a surface is empty if more than a share `FACING` of the `NEAREST` nearest points of surfaces face it. So
 # many, because the very nearest points to the middle of a thin wall are near only because they are wrong. Less than
 # half, because fewer points are known of the inside of a vase than of its outside.
-DEEP, NEAREST, FACING = 0.5, 96, 0.4
+DEEP, NEAREST, FACING = 0.5, 96, 0.4  # chosen of six pairs on one vase, the bundled set's, and on one drawn thin board
 SURFACE_POINTS = 30_000  # per photo, for this search
-SEEN = 0.3  # weight above which a place is known; one certain pixel has 1
-EDGE = 0.05  # largest relative difference of inverse depth between neighbouring pixels on one surface
-LEAST_TILT = 0.15  # cosine of the flattest angle that counts
+SEEN = 0.3  # weight above which a place is known; one certain pixel has 1. Set by hand
+EDGE = 0.05  # largest relative difference of inverse depth between neighbouring pixels on one surface; by hand
+LEAST_TILT = 0.15  # cosine of the flattest angle that counts; by hand
 BATCH = 1 << 18  # places per batch
 
 

@@ -26,8 +26,6 @@ KINDS = {
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")
 PLACES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-# Number of corners of a polygon from which a fan is tried.
-TRIED = 64
 # A triangle of a fan may be turned over by at most this part of its polygon's area.
 FLAT = 1e-9
 # Pillow starts other programs for some of the other formats.
@@ -63,12 +61,6 @@ class FileMesh(NamedTuple):
     # Parts, each with an image or a plain colour, None if a part has neither; empty if no part has an image
     painted: tuple[Painted | None, ...] = ()
     notes: tuple[str, ...] = ()  # what is lost on reading, one line each
-
-    def vertex_colors(self) -> np.ndarray | None:
-        """[V, 3] uint8."""
-        if self.colors is None or self.colors.ndim == 2:
-            return self.colors
-        return averaged(self.colors, self.faces, len(self.vertices))
 
     def corner_colors(self) -> np.ndarray | None:
         """[F, 3, 3] uint8."""
@@ -361,8 +353,8 @@ def triangles(length: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> 
     """Cut polygons into triangles [F, 3] of indices into `corners`. The polygons have `length` [P] corners, which
     follow one another in `corners` [sum]. Raises ValueError for corners that are not in `vertices` [V, 3].
 
-    Each becomes a fan around the first corner from which no triangle lies outside the polygon. If there is no such
-    corner, its ears are cut off one by one.
+    Each becomes a fan around its first corner, or if a triangle of that lies outside the polygon, its ears are cut off
+    one by one.
     """
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(vertices)):
         raise ValueError(f"face indices out of range (0 to {len(vertices) - 1} allowed)")
@@ -372,40 +364,17 @@ def triangles(length: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> 
     cuts = np.empty((int(np.maximum(length - 2, 0).sum()), 3), dtype=np.int64)
     for count in np.unique(length[length > 2]).tolist():
         some = np.flatnonzero(length == count)
-        apex = np.zeros(len(some), dtype=np.int64)
+        fan = np.stack([np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
+        cuts[before[some][:, None] + np.arange(count - 2)] = start[some][:, None, None] + fan
         if count > 3:
             points = vertices[corners[start[some][:, None] + np.arange(count)]]
-            apex, fine = _apexes(points)
-            for polygon, where in zip(points[~fine], some[~fine], strict=True):
-                cuts[before[where] + np.arange(count - 2)] = start[where] + _ears(polygon)
-            some, apex = some[fine], apex[fine]
-        fan = np.stack([np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
-        turned = (fan + apex[:, None, None]) % count
-        cuts[before[some][:, None] + np.arange(count - 2)] = start[some][:, None, None] + turned
+            legs = points[:, 1:] - points[:, :1]
+            normals = np.cross(legs[:, :-1], legs[:, 1:])
+            along = np.einsum("pfi,pi->pf", normals, normals.sum(1))
+            outside = along < -FLAT * np.square(normals.sum(1)).sum(1, keepdims=True)
+            for k in np.flatnonzero(outside.any(1)):
+                cuts[before[some[k]] + np.arange(count - 2)] = start[some[k]] + _ears(points[k])
     return cuts
-
-
-def _apexes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each polygon [P, N, 3] the corner [P] around which its fan is drawn, and whether there is one [P]."""
-
-    def crosses(some: np.ndarray) -> np.ndarray:
-        legs = some[:, 1:] - some[:, :1]
-        return np.cross(legs[:, :-1], legs[:, 1:])
-
-    best = np.zeros(len(points), dtype=np.int64)
-    normal = crosses(points).sum(1)
-    least = -FLAT * np.square(normal).sum(1)
-    todo = np.arange(len(points))
-    for apex in range(min(points.shape[1], TRIED)):
-        along = np.einsum("pfi,pi->pf", crosses(np.roll(points[todo], -apex, axis=1)), normal[todo])
-        fine = (along >= least[todo][:, None]).all(1)
-        best[todo[fine]] = apex
-        todo = todo[~fine]
-        if not len(todo):
-            break
-    found = np.ones(len(points), dtype=bool)
-    found[todo] = False
-    return best, found
 
 
 def _ears(points: np.ndarray) -> np.ndarray:

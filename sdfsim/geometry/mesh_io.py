@@ -118,7 +118,7 @@ def read_mesh(path: Path) -> Mesh:
     damaged."""
     with _reading(path):
         found = ply_surface(path.read_bytes())
-        mesh = Mesh(found.vertices, found.faces, found.vertex_colors())
+        mesh = Mesh(found.vertices, found.faces, found.colors)
         require_whole(mesh)
     return mesh
 

@@ -19,25 +19,6 @@ def rotation(seed: int) -> np.ndarray:
     return q * np.linalg.det(q)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
-        ("nan.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
-        ("range.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", ""),
-        ("notes.txt", TETRAHEDRON, "not a mesh file"),
-    ],
-)
-def test_a_bad_file_is_one_clear_line_with_its_name(tmp_path: Path, name: str, content: str, message: str) -> None:
-    path = tmp_path / name
-    path.write_text(content)
-    with pytest.raises(SdfsimError) as error:
-        load_mesh(path)
-    assert name in str(error.value)
-    assert message in str(error.value)
-    assert "\n" not in error.value.message
-
-
 def test_what_is_missing_or_of_another_kind_comes_with_a_way_out(tmp_path: Path) -> None:
     (tmp_path / "vase.obj").write_text(TETRAHEDRON)
     with pytest.raises(SdfsimError, match=r"vaze\.obj: no such mesh file \(did you mean 'vase\.obj'\?\)") as error:

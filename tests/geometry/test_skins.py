@@ -104,21 +104,6 @@ def test_a_chessboard_on_a_box_stays_a_chessboard(tmp_path: Path, ending: str) -
     assert (got.mean(1) > 128).mean() == pytest.approx(0.5, abs=0.1)
 
 
-def test_an_exported_box_shows_its_texture_and_keeps_its_edges(tmp_path: Path) -> None:
-    import trimesh
-
-    sides(chessboard()).export(tmp_path / "box.glb")
-    shape = shape_from_mesh(tmp_path / "box.glb", tmp_path / "cache", sdf="grid", resolution=16, units=0.01)
-    shape.save(tmp_path / "shape")
-    report = export(tmp_path / "shape", tmp_path / "out.glb")
-    assert not any("texture" in line for line in report["left_out"])
-    found = next(iter(trimesh.load_scene(tmp_path / "out.glb", process=False).geometry.values()))
-    assert found.visual.material.baseColorTexture.size == (CELLS * PIXELS,) * 2
-    np.testing.assert_allclose(np.ptp(found.vertices, axis=0), 0.01, rtol=1e-5)
-    flat = np.abs(found.vertex_normals).max(1)
-    np.testing.assert_allclose(flat, 1.0, atol=1e-5)
-
-
 def test_parts_with_images_of_their_own_share_one_and_repeat_as_often_as_they_did(tmp_path: Path) -> None:
     import trimesh
 

@@ -6,10 +6,9 @@ import pytest
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
-from sdfsim.geometry.bvh import Crossings
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, sample_surface, signed_volume
 from sdfsim.geometry.mesh_io import load_mesh
-from sdfsim.geometry.solidify import face_areas, no_longer_than, solidify
+from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf
 from sdfsim.sdf.reference import MeshDistance
 
@@ -296,10 +295,9 @@ def prism_of(sides: int, across: float = 1.0) -> Mesh:
     )
 
 
-@pytest.mark.parametrize("sides", [255, pytest.param(719, marks=pytest.mark.slow)])
-def test_long_thin_triangles_take_no_time(sides: int) -> None:
+def test_long_thin_triangles_take_no_time() -> None:
+    sides = 255
     mesh = prism_of(sides)
-    assert len(mesh.faces) in (1020, 2876)
     solidify(prism_of(8))  # loads what is slow to load
     began = time.process_time()
     solid = solidify(mesh)
@@ -317,34 +315,6 @@ def test_long_thin_triangles_take_no_time(sides: int) -> None:
     stub = np.trapezoid(2 * np.sqrt(0.0625 - y**2) * 2 * (0.75 - np.sqrt(0.25 - y**2)), y)
     assert union.mass_properties()[0] == pytest.approx(np.pi / 4 + stub, rel=3e-3)
     assert not union.simple and any("left out" in note for note in union.notes)
-
-
-def test_cutting_keeps_area_and_edges_that_match() -> None:
-    mesh = prism_of(40)
-    corners = mesh.vertices[mesh.faces]
-    for length in (0.3, 0.05):
-        pieces = no_longer_than(corners, length)
-        sides = np.linalg.norm(pieces - np.roll(pieces, 1, axis=1), axis=2)
-        assert sides.max() <= length
-        # Strips, where halves of halves of needles were three to the power of their halvings.
-        assert len(pieces) < len(corners) * 3 * 2 ** np.ceil(np.log2(np.sqrt(2) / length))
-        np.testing.assert_allclose(face_areas(pieces).sum(), face_areas(corners).sum())
-        _, label = np.unique(pieces.reshape(-1, 3).round(9), axis=0, return_inverse=True)
-        assert is_closed(Mesh(pieces.reshape(-1, 3), label.reshape(-1, 3)))
-
-
-def test_rays_count_how_often_a_surface_goes_around_a_point() -> None:
-    inner = primitives.box((0.4, 0.4, 0.4))
-    nested = both(CUBE, inner, moved(prism_of(100), 0.6, 0.0, 0.0))
-    points = query()
-    truth = sum((box_distance(points, half) < 0).astype(int) for half in ((0.5, 0.5, 0.5), (0.2, 0.2, 0.2)))
-    truth += (np.hypot(points[:, 0] - 0.6, points[:, 1]) < 0.4997) & (np.abs(points[:, 2]) < 0.5)
-    for direction in range(3):
-        assert np.mean(Crossings(nested)(points, direction) != truth) < 3e-3  # between the prism's sides and the circle
-        np.testing.assert_allclose(Crossings(inverted(inner))(np.zeros((1, 3)), direction), -1)
-        # Faces on each other, which one hierarchy takes for one.
-        twice = 2 * (box_distance(points) < 0)
-        assert np.mean(Crossings(both(CUBE, finer_cube(3)))(points, direction) != twice) < 0.02
 
 
 @pytest.mark.parametrize(

@@ -35,18 +35,6 @@ def cup(radius: float, wall: float, depth: float, height: float) -> Distance:
     return distance
 
 
-def bowl(radius: float, wall: float, height: float) -> Distance:
-    """The same for a bowl: the part below `height` of a hollow ball of this radius around (0, 0, `height`), on a plane
-    that flattens its bottom."""
-
-    def distance(points: np.ndarray) -> np.ndarray:
-        away = np.linalg.norm(points - [0, 0, height], axis=-1)
-        shell = np.maximum(away - radius, radius - wall - away)
-        return np.minimum(np.maximum(shell, points[..., 2] - height), points[..., 2])
-
-    return distance
-
-
 def crate(sides: tuple[float, float], wall: float, depth: float, height: float) -> Distance:
     """The same for a box with these sides, hollow from its rim down by `depth`, on a plane."""
 

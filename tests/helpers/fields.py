@@ -32,19 +32,21 @@ def toy_rays(count: int = 2000) -> Rays:
     )  # fmt: skip
 
 
-def assert_resumes(make: Callable[[], Trainer], steps: int, checkpoint: Path) -> None:
-    """A run that is left after some steps and goes on from a checkpoint ends as an undisturbed one, to the bit."""
+def assert_resumes(make: Callable[[], Trainer], steps: int, checkpoint: Path, more: int | None = None) -> Trainer:
+    """A run that is left after some steps and goes on from a checkpoint for as many, or so many `more`, ends as an
+    undisturbed one, to the bit: all that is learned. Returns it."""
     whole, first, second = make(), make(), make()
-    for _ in range(2 * steps):
-        whole.step()
-    for _ in range(steps):
-        first.step()
+    more = steps if more is None else more
+    for run, count in ((whole, steps + more), (first, steps)):
+        for _ in range(count):
+            run.step()
     first.save(checkpoint)
     assert second.load(checkpoint)
-    for _ in range(steps):
+    for _ in range(more):
         second.step()
-    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
+    for a, b in zip(whole._parameters(), second._parameters(), strict=True):
         assert torch.equal(a, b)
+    return second
 
 
 def posed_noise(folder: Path) -> PosedPhotos:

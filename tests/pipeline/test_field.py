@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
@@ -28,17 +27,15 @@ from pipeline.field.supervision import supervision_of
 from pipeline.field.training import (
     BACKGROUND_RATE,
     PRESETS,
-    Trained,
     Trainer,
     camera_rays,
     load_rays,
-    save_field,
     train,
 )
 from pipeline.grids.interpolation import WHOLE, by_rows, interpolate, interpolate_bricks, near_bricks, places_of
 from pipeline.stereo.fusion import Fused
 from sdfsim.base.errors import SdfsimError
-from tests.helpers.fields import SMALL, UNIT, assert_resumes, posed_noise, toy_rays
+from tests.helpers.fields import SMALL, assert_resumes, posed_noise, toy_rays
 from tests.helpers.sparse import NOTHING
 
 
@@ -58,14 +55,6 @@ def test_transmittance_in_front_of_a_plane_matches_the_integral():
     optical = 0.5 * (np.exp(0.0) - np.exp(-1 / beta))
     assert left.item() == pytest.approx(np.exp(-optical), rel=1e-6)
     assert weights.sum().item() + left.item() == pytest.approx(1.0, rel=1e-12)
-
-
-def test_weights_peak_at_the_plane():
-    beta, t = 0.01, torch.linspace(0, 2, 4001, dtype=torch.float64)
-    middle = (t[1:] + t[:-1]) / 2
-    weights, _ = render_weights(laplace_density(1 - middle, beta)[None], (t[1:] - t[:-1])[None])
-    depth = (weights[0] * middle).sum().item() / weights.sum().item()
-    assert abs(depth - 1) < 2 * beta
 
 
 def test_sphere_interval_closed_form():
@@ -128,35 +117,18 @@ def trainer() -> Trainer:
     return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), 0)
 
 
-def test_batches_depend_on_seed_and_iteration_only():
-    rays = toy_rays()
-    assert torch.equal(rays.batch(16, 1, 5), rays.batch(16, 1, 5))
-    assert not torch.equal(rays.batch(16, 1, 5), rays.batch(16, 1, 6))
-    assert not torch.equal(rays.batch(16, 1, 5), rays.batch(16, 2, 5))
-
-
 def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
     assert_resumes(trainer, 4, tmp_path / "c.safetensors")
 
 
-@pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "no numbers", "a tensor less", "another field"])
+@pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "another field"])
 def test_a_checkpoint_that_cannot_be_read_is_reported_and_leaves_nothing_behind(tmp_path, damage, one_thread):
     path, before, run, untouched = tmp_path / "c.safetensors", trainer(), trainer(), trainer()
     before.step()
     before.save(path)
-    with safetensors.safe_open(str(path), "pt") as file:
-        about, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}
-    if damage == "no checkpoint":
-        path.write_bytes(b"not a checkpoint")
-    elif damage == "cut short":
-        path.write_bytes(path.read_bytes()[:-100])
-    elif damage == "no numbers":
-        safetensors.torch.save_file(tensors, path)
-    elif damage == "a tensor less":
-        del tensors["field.background.levels.0"]
-        safetensors.torch.save_file(tensors, path, metadata=about)
-    else:
-        safetensors.torch.save_file(tensors, path, metadata={"about": about["about"].replace("levels", "heights")})
+    whole = path.read_bytes()
+    other = whole.replace(b"levels", b"heights", 1).replace(b" ", b"", 1)  # of the same length
+    path.write_bytes({"no checkpoint": b"not a checkpoint", "cut short": whole[:-100], "another field": other}[damage])
     with pytest.raises(SdfsimError, match="cannot be read") as caught:
         run.load(path)
     assert "\n" not in caught.value.message
@@ -218,20 +190,6 @@ def test_train_writes_and_reads_back(tmp_path):
         assert torch.equal(trained.field.sdf(p), again.field.sdf(p))
     assert not (tmp_path / "checkpoint.safetensors").exists()
     assert len(load_rays(poses.moved(trained.to_unit).views, tmp_path, 40, masks=False)) > 0
-
-
-def test_a_full_disk_is_one_clear_line(tmp_path):
-    import resource
-
-    trained = Trained(GridField(SMALL), 0.01, UNIT, {})
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # Writing fails as it does on a full disk.
-    try:
-        with pytest.raises(SdfsimError, match=r"field\.safetensors: cannot be written"):
-            save_field(trained, tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert list(tmp_path.iterdir()) == []
 
 
 def twin(grid: Tensor, points: Tensor) -> Tensor:
@@ -336,20 +294,9 @@ def test_a_run_that_goes_on_has_the_bricks_of_an_undisturbed_one(tmp_path, one_t
                            iterations=20, surface_points=32)  # fmt: skip
         return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), 0, fused=ball_fused())
 
-    whole, first, second = started(), started(), started()
-    for _ in range(20):
-        whole.step()
-    for _ in range(killed):
-        first.step()
-    first.save(tmp_path / "c.safetensors")
-    assert second.load(tmp_path / "c.safetensors") and second.refined == (killed > 16)
-    for _ in range(20 - killed):
-        second.step()
-    assert whole.refined and isinstance(whole.field, GridField)
-    level = whole.field.bricks[0]
-    assert isinstance(level, Bricks) and len(level.places) >= len(ball_fused().bricks)
-    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
-        assert torch.equal(a, b)
+    run = assert_resumes(started, killed, tmp_path / "c.safetensors", 20 - killed)
+    assert run.refined and run.field.bricks[0].started
+    assert run.exposure is not None and run.exposure.change.any()
 
 
 def test_threads_change_nothing():
@@ -366,16 +313,6 @@ def test_threads_change_nothing():
         torch.set_num_threads(before)
     for one, two in zip(found[1], found[2], strict=True):
         assert torch.equal(one, two)
-
-
-def test_a_linear_function_of_x_y_z_is_itself():
-    line = torch.linspace(-1, 1, 9, dtype=torch.float64)
-    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-    points = torch.rand(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
-    found = interpolate((x + 10 * y + 100 * z)[..., None], points)[:, 0]
-    torch.testing.assert_close(
-        found, points @ torch.tensor([1.0, 10.0, 100.0], dtype=torch.float64), rtol=0, atol=1e-12
-    )
 
 
 def test_nothing_asked_is_nothing_found():

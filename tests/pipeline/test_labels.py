@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import Image
 
 from pipeline.inputs.labels import UNKNOWN, load_labels, load_names
 from pipeline.inputs.photos import prepare_photos
@@ -56,20 +56,6 @@ def test_label_images_keep_their_numbers_as_names(tmp_path, kind):
     found = load_labels(tmp_path, "0001.jpg")
     assert found is not None and found.shape == (45, 60)
     assert [found[y, 3] for y in (5, 25, 40)] == [1, 2, 0] and set(np.unique(found)) == {0, 1, 2}
-
-
-def test_labels_turn_with_their_photo(tmp_path):
-    folder = noise(tmp_path / "in", NAMES)
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    with Image.open(folder / "0.jpg") as image:
-        image.save(folder / "0.jpg", exif=exif)
-    upright = np.zeros((120, 90), np.uint8)
-    upright[:30] = 1
-    (folder / "labels").mkdir()
-    Image.fromarray(upright).save(folder / "labels" / "0.png")
-    prepare_photos(folder, tmp_path)
-    np.testing.assert_array_equal(load_labels(tmp_path, "0000.jpg"), upright)
 
 
 def test_labels_are_straightened_with_the_lens(tmp_path):

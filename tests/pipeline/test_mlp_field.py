@@ -54,12 +54,6 @@ def test_gradients_are_those_of_differences():
     assert torch.allclose(gradient, slow, atol=1e-6)
 
 
-def test_without_gradients_nothing_is_kept():
-    with torch.no_grad():
-        sdf, features, more = MlpField(TINY).geometry_at(points(10))
-    assert not (sdf.requires_grad or features.requires_grad or more.requires_grad)
-
-
 def trainer(**changes) -> MlpTrainer:
     small = {"size": TINY, "rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3}
     settings = replace(VOLSDF, **{**small, **changes})
@@ -79,17 +73,10 @@ def falls(run: Trainer, steps: int, name: str, part: int) -> float:
 
 def test_training_lowers_the_loss_and_keeps_a_distance():
     run = trainer()
+    before = run.beta.item()
     assert falls(run, 60, "color", 8) < 0.4
-    assert run.converged > 0.5
+    assert run.converged > 0.5 and 0 < run.beta.item() != before
     assert torch.isfinite(sdf_cache(run.field, 2 / 8)).all()
-
-
-def test_beta_is_learned():
-    run = trainer()
-    before = run.beta
-    for _ in range(5):
-        run.step()
-    assert run.beta != before and run.beta > 0
 
 
 def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
@@ -103,10 +90,3 @@ def test_the_field_is_read_back(tmp_path):
     assert isinstance(again.field, MlpField) and again.field.finest == field.finest
     with torch.no_grad():
         assert torch.equal(field.sdf(points(50)), again.field.sdf(points(50)))
-
-
-@pytest.mark.slow
-def test_the_papers_preset_learns_on_the_cpu():
-    """The full 8 x 256 network, some hundred steps of few rays."""
-    run = trainer(size=MlpSize(), rays=32, samples=24, iterations=300, surface_points=64, rate=VOLSDF.rate)
-    assert falls(run, 300, "color", 20) < 0.3

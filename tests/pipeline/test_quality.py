@@ -5,7 +5,6 @@ import pytest
 from PIL import Image, ImageFilter
 
 from pipeline.inputs.images import sharpness
-from pipeline.inputs.photos import prepare_photos
 from tests.pipeline.photo_sets import TABLE_VASE
 
 
@@ -32,14 +31,3 @@ def test_an_object_in_focus_before_a_soft_background_is_sharp(photo):
 
 def test_a_plain_photo_has_no_sharpness():
     assert sharpness(np.full((80, 80, 3), 90, np.uint8)) == 0.0
-
-
-def test_blurred_photos_are_named(tmp_path, photo):
-    folder = tmp_path / "in"
-    folder.mkdir()
-    for k in range(4):
-        photo.save(folder / f"good{k}.png")
-    photo.filter(ImageFilter.GaussianBlur(3)).save(folder / "soft.png")
-    photos, notes = prepare_photos(folder, tmp_path)
-    assert {p.source: p.fault for p in photos if p.fault} == {"soft.png": "blurred"}
-    assert notes == ["1 of 5 photos are blurred, take them again: soft.png"]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.inputs import video
 from pipeline.inputs.photos import prepare_photos
 from pipeline.inputs.sources import find_source
 from pipeline.inputs.video import FEWEST, choose_frames, follow, frames_of
@@ -28,13 +27,6 @@ def film(path: Path, places: np.ndarray, blurred: np.ndarray | None = None) -> N
             frame = cv2.GaussianBlur(frame, (0, 0), 4)
         writer.write(np.ascontiguousarray(frame))
     writer.release()
-
-
-def test_motion_is_measured_in_picture_widths(tmp_path):
-    film(tmp_path / "a.mp4", np.arange(60) * 8)
-    moved, _ = follow(tmp_path / "a.mp4")
-    assert len(moved) == 60 and frames_of(tmp_path / "a.mp4")[1] == 25
-    assert moved[-1] == pytest.approx(59 * 8 / WIDTH, rel=0.1)
 
 
 def test_frames_follow_the_motion_not_the_time():
@@ -67,14 +59,6 @@ def test_a_short_clip_is_told_to_be_short(tmp_path):
     with pytest.raises(SdfsimError, match="a clip of only 12 frames") as caught:
         prepare_photos(tmp_path / "a.mp4", tmp_path)
     assert "film for longer" in caught.value.hint and "convert" not in caught.value.hint
-
-
-def test_a_folder_with_a_video_alone_names_the_command(tmp_path):
-    (tmp_path / "shots").mkdir()
-    (tmp_path / "shots" / "walk.MOV").write_bytes(b"x")
-    with pytest.raises(SdfsimError, match="photos found: 0") as caught:
-        prepare_photos(tmp_path / "shots", tmp_path)
-    assert f"sdfsim reconstruct {tmp_path / 'shots' / 'walk.MOV'} -o" in caught.value.hint
 
 
 def test_what_is_no_video_is_named(tmp_path, capfd):
@@ -118,13 +102,13 @@ def test_what_can_be_decoded_is_a_film(tmp_path, name, codec, container):
 
 
 @pytest.mark.parametrize("turned", [0, 90, 180, -90])
-def test_pyav_shows_what_opencv_shows(tmp_path, turned):
-    """Upright as well: phones store films as the sensor lies."""
+def test_films_are_upright_as_opencv_shows_them(tmp_path, turned):
+    """Phones store films as the sensor lies."""
+    import cv2
+
     encode(tmp_path / "a.mp4", "libx264", "mp4", turned=turned)
-    (one, rate), (other, same) = (decoder(tmp_path / "a.mp4") for decoder in (video._by_opencv, video._by_pyav))
-    pairs = list(zip(one, other, strict=True))
-    assert len(pairs) == 40 and rate == same == 25
-    assert max(np.abs(a.astype(int) - b).mean() for a, b in pairs) < 3
+    wanted = cv2.VideoCapture(str(tmp_path / "a.mp4")).read()[1][..., ::-1]
+    assert np.abs(next(frames_of(tmp_path / "a.mp4")).astype(int) - wanted).mean() < 3
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "song.mp3", "lens.xml"])
