@@ -5,13 +5,14 @@ They are drawn with the ray caster and the textures of samples/photos/make.py, s
 
 import importlib.util
 import json
+import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from sdfsim.geometry.primitives import torus
 
@@ -114,6 +115,17 @@ def good(folder: Path, count: int = 24, seed: int = 1) -> None:
     shoot(make, still_life(make, seed), orbit(count), folder)
 
 
+def blank_wall(folder: Path, count: int = 30) -> None:
+    """A white wall, with nothing but a camera's noise on it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(count):
+        rng = np.random.default_rng(number)
+        shade = 205 + 12 * np.linspace(-1, 1, 480)[None, :, None] * np.cos(number) + np.zeros((360, 480, 3))
+        Image.fromarray((shade + rng.normal(0, 1.5, shade.shape)).clip(0, 255).astype(np.uint8)).save(
+            folder / f"{number:03d}.jpg", quality=90
+        )
+
+
 def two_sets(folder: Path, larger: int = 18, smaller: int = 10) -> None:
     """Photos of two things that have nothing to do with each other, mixed in one folder."""
     make = studio()
@@ -129,6 +141,17 @@ def one_spot(folder: Path, count: int = 20) -> None:
     ahead = [np.array([np.cos(a), np.sin(a), -0.25 - 0.1 * (k % 2)]) for k, a in enumerate(angles)]
     poses = [look(center, center + step) for step in ahead]
     shoot(make, still_life(make, 1), poses, folder)
+
+
+def half_blurred(folder: Path, source: Path = TABLE_VASE / "images", every: int = 2) -> None:
+    """The bundled set with every second photo out of focus."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, path in enumerate(sorted(source.glob("*.jpg"))):
+        if number % every:
+            with Image.open(path) as image:
+                image.filter(ImageFilter.GaussianBlur(6)).save(folder / path.name, quality=92)
+        else:
+            shutil.copy(path, folder / path.name)
 
 
 def repeating(folder: Path, count: int = 24) -> None:

@@ -27,6 +27,19 @@ def failure(folder: Path, work: Path) -> str:
     return caught.value.message
 
 
+def test_three_photos_of_different_sides(tmp_path):
+    (tmp_path / "in").mkdir()
+    for number in (15, 19, 23):
+        shutil.copy(photo_sets.TABLE_VASE / "images" / f"{number:03d}.jpg", tmp_path / "in")
+    assert "3 photos are too few" in failure(tmp_path / "in", tmp_path)
+
+
+def test_a_blank_wall(tmp_path):
+    photo_sets.blank_wall(tmp_path / "in")
+    message = failure(tmp_path / "in", tmp_path)
+    assert "only 0 of 30 photos" in message and "there is too little to see" in message and "blank wall" in message
+
+
 def test_two_sets_in_one_folder(tmp_path):
     photo_sets.two_sets(tmp_path / "in")
     verdict = posed(tmp_path / "in", tmp_path)
@@ -41,6 +54,16 @@ def test_all_photos_from_one_spot(tmp_path):
     photo_sets.one_spot(tmp_path / "in")
     message = failure(tmp_path / "in", tmp_path)
     assert "taken from one spot" in message and "step sideways" in message
+
+
+def test_every_second_photo_blurred(tmp_path):
+    photo_sets.half_blurred(tmp_path / "in")
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path)
+    assert [p.fault for p in photos] == ["", "blurred"] * 24
+    assert any(note.startswith("24 of 48 photos are blurred, take them again: 001.jpg, 003.jpg") for note in notes)
+    verdict = solve(photos, tmp_path, tmp_path)
+    assert verdict["posed"] >= 24
+    assert all(entry["kind"] in ("fault", "features") for entry in verdict["left_out"])
 
 
 def test_a_repeating_texture(tmp_path):

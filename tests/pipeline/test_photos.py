@@ -407,3 +407,26 @@ def test_wide_photos_are_no_panoramas(tmp_path):
         tall = pixels[100:300] if k else np.concatenate([np.full((100, 400, 3), 200, np.uint8), pixels[150:250, :400]])
         Image.fromarray(tall[:200, :400]).save(tmp_path / f"{k}.png")
     assert len(prepare_photos(tmp_path, tmp_path / "out")[0]) == 3
+
+
+def test_transparency_that_only_some_photos_have_is_grey_and_no_mask(tmp_path):
+    fill(tmp_path / "in", 3)
+    picture(seed=9).convert("RGBA").save(tmp_path / "in" / "opaque.png")
+    Image.new("RGBA", (120, 80), (255, 0, 0, 0)).save(tmp_path / "in" / "z.png")
+    _, notes = prepare_photos(tmp_path / "in", tmp_path, long_side=120)
+    assert np.abs(np.asarray(Image.open(tmp_path / "images" / "0004.jpg")).astype(int) - 128).max() <= 2
+    assert notes[0].endswith("what is transparent in 1 photos is grey")
+
+
+def test_cmyk_palette_and_grey_show_what_they_show(tmp_path):
+    image = Image.fromarray(EIGHT.astype(np.uint8))
+    ink = np.dstack([255 - EIGHT, np.zeros((80, 120))]).astype(np.uint8)
+    Image.fromarray(ink, "CMYK").save(tmp_path / "cmyk.jpg", quality=98, subsampling=0)
+    image.quantize(256).save(tmp_path / "palette.png")
+    image.convert("L").save(tmp_path / "grey.jpg", quality=98)
+    image.convert("LA").save(tmp_path / "grey.png")
+    grey = EIGHT @ [0.299, 0.587, 0.114]
+    for name, wanted, close in (("cmyk.jpg", EIGHT, 3), ("palette.png", EIGHT, 8), ("grey.jpg", grey[..., None], 3),
+                                ("grey.png", grey[..., None], 1)):  # fmt: skip
+        assert np.abs(shown(tmp_path / name) - wanted).mean() < close, name
+        assert read_photo(tmp_path / name, 120).mask is None

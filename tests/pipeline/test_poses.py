@@ -1,6 +1,7 @@
 """The ladder of attempts, the child process, and what a killed run leaves."""
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -561,3 +562,41 @@ def test_a_lens_of_another_kind_is_refused_and_named(monkeypatch, tmp_path):
     assert "all photos are off by the same 0.6 px" in checks["error"] and "the lens is a fisheye" in checks["error"]
     for usual in ([0.55, 0.2], [0.2, 0.5]):
         assert check({**result(10, 10), "lens": usual}, PHOTOS)["failures"] == []
+
+
+def test_cameras_too_close_together_fail():
+    verdict = check(result(10, 10, span=1.0), PHOTOS)
+    assert "too close together" in verdict["failures"][0]
+
+
+@pytest.mark.slow
+def test_photos_in_no_order_are_matched_by_what_they_show(tmp_path, monkeypatch):
+    """Their names tell nothing: a quarter of the pairs is matched, and all are posed, the loop around the table
+    closed."""
+    from pipeline.cameras import load_views
+
+    shuffled = np.random.default_rng(4).permutation(48)
+    (tmp_path / "in").mkdir()
+    for number, path in zip(shuffled, sorted((TABLE_VASE / "images").iterdir()), strict=True):
+        shutil.copyfile(path, tmp_path / "in" / f"{number:03d}.jpg")
+    photos, _ = prepare_photos(tmp_path / "in", tmp_path, long_side=640)
+    monkeypatch.setattr(poses, "PARTNERS", (10, 10))
+    checks = solve(photos, tmp_path, tmp_path)
+    listed = (tmp_path / "try_ordinary" / "pairs.txt").read_text().splitlines()
+    assert 200 < len(listed) < 48 * 10 * 0.7
+    assert checks["posed"] == 48 and checks["span_degrees"] > 300
+    assert [view.focal for view in load_views(tmp_path)] == pytest.approx([620.0] * 48, rel=0.005)
+
+
+@pytest.mark.slow
+def test_poses_of_the_rendered_set(tmp_path):
+    sys.path.insert(0, str(ROOT))
+    from benchmarks.reconstruct import pose_errors
+    from pipeline.cameras import load_views
+
+    photos, _ = prepare_photos(TABLE_VASE, tmp_path, long_side=640)
+    solve(photos, tmp_path, tmp_path)
+    report, _ = pose_errors(load_views(tmp_path), TABLE_VASE)
+    assert report["posed"] == 48
+    assert report["center_error_worst_percent"] < 0.5
+    assert report["focal_error_percent"] < 0.5
