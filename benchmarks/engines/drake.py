@@ -117,6 +117,7 @@ class DrakeWorld:
             mu = box.friction / (2.0 - box.friction)
             touch = lib.ProximityProperties()
             lib.AddContactMaterial(dissipation, stiffness, lib.CoulombFriction(mu, mu), touch)
+            assert box.inertia is not None
             unit = lib.UnitInertia(*(np.diagonal(box.inertia) / box.mass))
             body = self.plant.AddRigidBody(box.name, lib.SpatialInertia(box.mass, np.zeros(3), unit))
             sides = lib.Box(*(2.0 * box.scale * np.array(form.half)))
