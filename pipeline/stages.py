@@ -11,9 +11,9 @@ import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
-from pipeline.options import COMMAND, OptionKeys, Options, options_of, read_config, write_config
+from pipeline.options import COMMAND, Options, options_of, read_config, write_config
 from pipeline.report import write_report
 from sdfsim.base.compiling import say_compiling
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
@@ -156,7 +156,7 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
     "poses": Stage(do_poses, "poses", version=8),
     "distill": Stage(do_distill, "distill", version=13),
-    "mesh": Stage(do_mesh, "mesh", version=16),
+    "mesh": Stage(do_mesh, "mesh", version=17),
     "fit": Stage(do_fit, "assets", version=3),
     "scene": Stage(do_scene, "scene", version=7),
 }
@@ -164,7 +164,7 @@ STAGES = {
 
 def reconstruct(
     photos: str | Path, out: str | Path, *, from_stage: str | None = None, until_stage: str | None = None,
-    progress: StageProgress | None = None, **options: Unpack[OptionKeys],
+    progress: StageProgress | None = None, **options: Any,
 ) -> dict:  # fmt: skip
     """Photos -> a scene, by all stages; see `pipeline.states.reconstruct`."""
     say_compiling()
