@@ -68,23 +68,41 @@ class Doubt:
 
 
 @dataclass(frozen=True)
-class FoundJoint:
-    """A joint between a moving part and the static rest, in the frame of the first state."""
+class Joint:
+    """A joint between a moving part and the static rest."""
 
     kind: Literal["hinge", "slider"]
     anchor: np.ndarray  # [3] m, a point of a hinge's axis, in the middle of the part; of a slider the part's middle
     axis: np.ndarray  # [3] unit vector, along which the second state is at a positive angle or position
     travel: float  # rad or m, from the first state to the second
-    motion: Similarity  # of the part, at scale 1
-    moving: np.ndarray  # [F] bool, moving faces of the first state
     off: float  # m, mean distance of the part, moved, from the second state
     doubt: Doubt
     follows: float  # share of the moving surface that follows this motion, or that the other state's photos do not show
-    seen: tuple[np.ndarray, np.ndarray]  # [P, 3] m of the part's surface in the first and in the second state
+    size: float  # m, of the compared surfaces
 
-    def line(self, size: float) -> str:
-        """What it found."""
-        return _told(self, size)
+    def line(self) -> str:
+        """What was found, in words."""
+        axis = ", ".join(f"{value:.3f}" for value in self.axis)
+        where = ", ".join(f"{value:.4g}" for value in self.anchor)
+        doubt = f"the uncertainty of the axis is {math.degrees(self.doubt.axis):.2g} degrees"
+        way = f"slides by {self.travel:.3g} m along"
+        if self.kind == "hinge":
+            way = f"turns by {math.degrees(self.travel):.1f} degrees about"
+            doubt += f" and {self.doubt.place:.2g} m"
+        rest = (
+            f"; {1 - self.follows:.0%} of the moved surface does not follow the motion" if self.follows < SURE else ""
+        )
+        fit = f"the two states fit to {100.0 * self.off / self.size:.2g} % of the size"
+        return f"{self.kind}: a part {way} ({axis}) through ({where}) m; {fit}; {doubt}{rest}"
+
+
+@dataclass(frozen=True)
+class FoundJoint(Joint):
+    """A joint in the frame of the first state."""
+
+    motion: Similarity  # of the part, at scale 1
+    moving: np.ndarray  # [F] bool, moving faces of the first state
+    seen: tuple[np.ndarray, np.ndarray]  # [P, 3] m of the part's surface in the first and in the second state
 
 
 Empty = Callable[[np.ndarray], np.ndarray]  # whether points [P, 3] m are where a state's photos see through, [P] bool
@@ -188,10 +206,10 @@ def find_joint(
         for away, hidden in [surfaces.carried(points, way, k)]
     )
     moving = _faces(one, motion, on[1], near)
-    return FoundJoint(kind, anchor, axis, travel, motion, moving, rated.off, doubt, rated.follows, seen)  # type: ignore[arg-type]
+    return FoundJoint(kind, anchor, axis, travel, rated.off, doubt, rated.follows, size, motion, moving, seen)  # type: ignore[arg-type]
 
 
-def scene_keys(found: FoundJoint | HeldPart) -> dict[str, Any]:
+def scene_keys(found: Joint) -> dict[str, Any]:
     """The joint as keys of scene.yaml, the limits from the two states, of which the first is the start."""
     keys: dict[str, Any] = {"anchor": found.anchor.tolist(), "axis": found.axis.tolist()}
     if found.kind == "hinge":
@@ -200,26 +218,14 @@ def scene_keys(found: FoundJoint | HeldPart) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class HeldPart:
-    """A joint between two states, in the world of the state from which the scene is made."""
+class HeldPart(Joint):
+    """A joint in the world of the state from which the scene is made."""
 
-    kind: Literal["hinge", "slider"]
-    anchor: np.ndarray  # [3] on the axis
-    axis: np.ndarray  # [3] unit
-    travel: float  # rad, or a length, from the first state to the second
     turn: np.ndarray  # [3, 3] and shift [3]: from the part in the scene's meshes to the first state
     shift: np.ndarray
     metres: float  # a unit of this world in metres
     size_from: str  # its source, in words
     size_assumed: bool
-    off: float  # as of `FoundJoint`, and so are the next two
-    doubt: Doubt
-    follows: float
-    size: float  # of the compared surfaces
-
-    def line(self) -> str:
-        """What was found."""
-        return _told(self, self.size)
 
     def moved(self, move: Similarity) -> HeldPart:
         """The same in another world."""
@@ -246,21 +252,6 @@ def load_held(path: Path) -> HeldPart | None:
         return HeldPart(**{**plainly, **arrays, "doubt": Doubt(**known["doubt"])})
     except (ValueError, KeyError, TypeError) as error:
         raise SdfsimError(f"{path}: damaged", "run `sdfsim reconstruct --joint` again") from error
-
-
-def _told(joint: FoundJoint | HeldPart, size: float) -> str:
-    """The result in words; the compared surfaces have a size, m."""
-    axis = ", ".join(f"{value:.3f}" for value in joint.axis)
-    where = ", ".join(f"{value:.4g}" for value in joint.anchor)
-    doubt = f"the uncertainty of the axis is {math.degrees(joint.doubt.axis):.2g} degrees"
-    if joint.kind == "hinge":
-        way = f"turns by {math.degrees(joint.travel):.1f} degrees about"
-        doubt += f" and {joint.doubt.place:.2g} m"
-    else:
-        way = f"slides by {joint.travel:.3g} m along"
-    rest = f"; {1 - joint.follows:.0%} of the moved surface does not follow the motion" if joint.follows < SURE else ""
-    fit = f"the two states fit to {100.0 * joint.off / size:.2g} % of the size"
-    return f"{joint.kind}: a part {way} ({axis}) through ({where}) m; {fit}; {doubt}{rest}"
 
 
 def _shift(way: np.ndarray) -> Similarity:

@@ -19,7 +19,7 @@ from sdfsim.geometry.bvh import Winding
 from sdfsim.geometry.mass import mass_properties
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from tests.helpers.sparse import NOTHING, sparse_of
-from tests.helpers.surfaces import TABLE, TOP, WALL, both, box, cup, table
+from tests.helpers.surfaces import TABLE, TOP, WALL, both, box, table
 
 FINEST = 0.02
 NO_POINTS = np.zeros((0, 3))
@@ -144,19 +144,6 @@ def test_a_small_thing_that_stands_beside_a_body_is_no_crumb():
 
     parts = parts_of(scene)
     assert len(parts.bodies) == 2
-
-
-def test_several_bodies_are_named_from_the_largest_down():
-    def scene(p: np.ndarray) -> np.ndarray:
-        things = cup(p), cup(p, (-0.25, 0.1), 0.1, 0.2), box(p, (-0.3, 0.0, -0.4), (0.08, 0.08, 0.1))
-        return np.minimum.reduce([table(p), *things])
-
-    parts = parts_of(scene)
-    heights = [np.ptp(mesh.vertices[:, 2]) for mesh in parts.bodies.values()]
-    assert list(parts.bodies) == ["object1", "object2", "object3"]
-    np.testing.assert_allclose(heights, [0.3, 0.2, 0.2], atol=0.3 * FINEST)
-    # The third stands on the floor, below the table.
-    assert parts.bodies["object3"].vertices[:, 2].min() == pytest.approx(-0.5, abs=0.1 * FINEST)
 
 
 def hidden(points: np.ndarray) -> np.ndarray:
