@@ -171,21 +171,18 @@ def write_scene(
         holder = holder_of(solids[PART], {name: mesh for name, mesh in everything.items() if name != PART})
     text_of = partial(scene_text, placement, origins, scenery=parts["scenery"], drop=drop, materials=materials,
                       seed=seed, floor=floor, held=held, holder=holder)  # fmt: skip
-    text, slab = text_of(None), None
-    scene = load_scene(scene_file, text=text, allow_outside=True)
-    if moved := cleared(scene, closed):
-        text = text_of(None, moved=moved)
+    slab = None
+    scene = load_scene(scene_file, text=text_of(None), allow_outside=True)
+    moved = cleared(scene, closed)
     if drop != "none":  # onto bodies where they start
         shifts = {name: one.shift for name, one in moved.items()}
         whole = joined([replace(m, vertices=m.vertices + shifts.get(name, 0)) for name, m in everything.items()])
         slab = choose_slab(whole if shown is None else shown, whole)
         if slab.slope > LEVEL:
             notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
-        text = text_of(slab, moved=moved)
-        scene = load_scene(scene_file, text=text, allow_outside=True)
-        if (dropped := cleared(scene, closed).get(drop)) is not None:
-            moved[drop] = dropped
-            text = text_of(slab, moved=moved)
+        scene = load_scene(scene_file, text=text_of(slab, moved=moved), allow_outside=True)
+        moved |= {name: one for name, one in cleared(scene, closed).items() if name == drop}
+    text = text_of(slab, moved=moved)
     notes += [moved_line(name, one, LAYER * parts["cell"]) for name, one in moved.items()]
     names = [body.name for body in scene.bodies]
     for name in materials:

@@ -18,6 +18,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +169,7 @@ def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path)
     on_progress(0.3, "looking for the part that has moved")
     try:
         found = find_joint(one.visible, other.visible, seed=own.options.seed, near=near,
-                           empty=(one.empty, other.empty), paired=alike(one, other))  # fmt: skip
+                           empty=(one.empty, other.empty), paired=partial(alike, one, other))  # fmt: skip
     except SdfsimError as error:
         raise SdfsimError(f"joint: {error.message}", error.hint, exit_code=EXIT_QUALITY) from error
     shown = [len(np.unique(np.floor(points / near), axis=0)) for points in found.seen]

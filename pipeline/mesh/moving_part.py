@@ -3,7 +3,7 @@ alike, and which pixels show the part."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -135,16 +135,12 @@ def matched(first: Landmarks, second: Landmarks) -> tuple[np.ndarray, np.ndarray
     return np.concatenate(here), np.concatenate(over)
 
 
-def alike(one: State, other: State) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """A function that gives points [K, 3] that look alike, near points [P, 3] that move in the first and in the second
-    state; some pairs are wrong."""
-
-    def paired(part: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if not len(part) or not len(there):
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        return matched(landmarks(one, part), landmarks(other, there))
-
-    return paired
+def alike(one: State, other: State, part: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points [K, 3] that look alike, near points [P, 3] that move in the first and in the second state; some pairs are
+    wrong."""
+    if not len(part) or not len(there):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    return matched(landmarks(one, part), landmarks(other, there))
 
 
 def tie(state: State, onto: State) -> tuple[Similarity, int]:

@@ -15,22 +15,19 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
-from pipeline.inputs.images import stacked
 from pipeline.inputs.photos import open_photo
 from pipeline.mesh.visibility import FAIR, Visibility
 from sdfsim.base.parallel import threads
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
-from sdfsim.physics import solver as kernels
 
-with kernels.kept():
-    from pipeline.mesh.patch_kernel import read_patches
-
-# Chosen by hand on the rendered sets, mostly `shelf`; other sets may need other values.
+# Set by hand on `shelf` (a torus, a box and a jug) and the table with a vase, except where a comment says otherwise.
 LONG_SIDE = 640  # px; larger photos are reduced, because otherwise the right place would lie too many pixels away
 # Photos in which a patch is compared, those with the best viewing angle; and how many have to agree: any two do.
+# Of a drawn ball with an obstacle before three cameras, six photos are better than five and as good as eight.
 PHOTOS, FEWEST = 6, 3
-HALF = 3  # px from a patch's middle to its sides
+PATCH = np.stack(np.mgrid[-3:4, -3:4], -1).reshape(-1, 2).astype(np.float32)  # [G, 2] px from a patch's middle
+NOISE = 4.0  # grey levels squared: variance that is no texture
 PLACES = 25  # tried along the normal
 # Largest move of vertices per round, in cells of the field's finest grid, and rounds; half as far in the last.
 REACH, ROUNDS = 1.3, 3
@@ -47,7 +44,7 @@ NEAR, EVEN = 8, 0.3
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
 AROUND, KNOWN = 20, 0.1 / EVERY  # edges, and mean trust within them, below which vertices stay
 SMOOTHED = 4  # times after each round
-STEPS = 300  # of conjugate gradients; after these the equations count as not solved
+STEPS = 300  # of conjugate gradients; after these the equations count as not solved (not tuned)
 WALL = 0.25  # of the distance to the opposite surface, inside or outside, that a vertex may move in a round
 
 
@@ -59,12 +56,19 @@ class GreyPhoto:
     scale: float  # of the pixels of `grey` to those
     grey: np.ndarray  # [H, W] float32
 
-    @property
-    def camera(self) -> np.ndarray:
-        """[16] its row for `read_patches`."""
-        middle = self.scale * np.array([self.view.cx, self.view.cy]) - 0.5
-        return np.concatenate([self.view.rotation.ravel(), self.view.translation, [self.view.focal * self.scale],
-                               middle, [self.view.k]])  # fmt: skip
+    def levels(self, middles: np.ndarray, sides: np.ndarray) -> np.ndarray:
+        """Its grey levels [S, M, G] float32, with mean 0 and length 1, at patches with steps `sides` [S, 2, 3] around
+        middles [S, M, 3]; so small patches are affine in the photo."""
+        import cv2
+
+        ends = np.stack([middles, middles + sides[:, None, 0], middles + sides[:, None, 1]])
+        pixels = self.scale * self.view.project(ends.reshape(-1, 3))[0]
+        at, right, down = pixels.reshape(3, -1, 1, 2).astype(np.float32)
+        pixels = at - np.float32(0.5) + PATCH[:, :1] * (right - at) + PATCH[:, 1:] * (down - at)
+        grey = cv2.remap(self.grey, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        grey -= grey.mean(1, keepdims=True)
+        grey /= np.sqrt((grey**2).sum(1, keepdims=True) + NOISE * len(PATCH))
+        return grey.reshape(*middles.shape[:2], len(PATCH))
 
 
 def load_grey_photos(views: Sequence[View], photos_folder: Path) -> list[GreyPhoto]:
@@ -164,14 +168,15 @@ def patch_correlation(
     pixel = np.array([1 / (picture.view.focal * picture.scale) for picture in pictures])[chosen[0]]
     pixel = pixel * np.linalg.norm(centers - sight.vertices, axis=1)
     sides = pixel[:, None, None] * frame_of(normal)[:, :2]
-    greys, sizes = stacked([picture.grey for picture in pictures])
-    cameras = np.array([picture.camera for picture in pictures])
     result = np.full((len(normal), len(moves)), -1.0)
 
     def compare(part: np.ndarray) -> None:
         number = np.where(shown[:, part], chosen[:, part], -1)
-        found = np.zeros((len(part), len(moves), len(number), (2 * HALF + 1) ** 2), np.float32)
-        read_patches(greys, sizes, cameras, sight.vertices[part], normal[part], sides[part], moves, number, HALF, found)
+        middles = sight.vertices[part, None] + moves[:, None] * normal[part, None]  # [S, M, 3]
+        found = np.zeros((len(part), len(moves), len(number), len(PATCH)), np.float32)
+        for k in np.unique(number[number >= 0]):
+            slot, which = np.nonzero(number == k)
+            found[which, :, slot] = pictures[k].levels(middles[which], sides[part[which]])
         alike = found @ found.swapaxes(2, 3)  # [S, M, PHOTOS, PHOTOS]
         alike[:, :, range(len(number)), range(len(number))] = -1
         result[part] = np.sort(alike, 3)[..., -(FEWEST - 1) :].mean(3).max(2)

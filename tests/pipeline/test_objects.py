@@ -174,15 +174,6 @@ def test_what_is_no_body_stays_scenery(scene, seen, why):
     )
 
 
-def test_without_scenery_every_component_is_a_body():
-    pair = lambda p: np.minimum(box(p, (0.3, 0, 0), (0.1, 0.2, 0.1)), box(p, (-0.4, 0, 0), (0.3, 0.2, 0.2)))  # noqa: E731
-    surface = surface_of(pair)
-    parts = split(surface, pair, FINEST, NOTHING, Path(), np.array([0.0, 0, 1]), alone=True)
-    assert parts.solid is None and parts.shown is None
-    volumes = [signed_volume(mesh) for mesh in parts.bodies.values()]
-    np.testing.assert_allclose(volumes, [0.6 * 0.4 * 0.4, 0.2 * 0.4 * 0.2], rtol=0.05)
-
-
 def test_what_seams_split_off_inside_of_a_body_is_no_body(monkeypatch):
     """A block on a table, which seams divide in two halves and a core that no photo sees: two bodies, no core left."""
     low, half = np.array([0.1, -0.05, TOP + 0.15]), 0.15

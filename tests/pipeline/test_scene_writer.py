@@ -65,12 +65,6 @@ def test_a_flat_place_is_preferred_to_a_bumpy_one_in_the_middle():
     assert choose_slab(rough, rough).position[0] > 0.05 + 0.03
 
 
-def test_where_nothing_is_level_the_flattest_place_is_taken():
-    dome = terrain(lambda x, y: -2.0 * (x - 0.2) - 1.0 * y)
-    drop = choose_slab(dome, dome)
-    assert drop.slope == pytest.approx(np.degrees(np.arctan(np.hypot(2, 1))), abs=0.5)
-
-
 def test_matter_that_no_photo_shows_is_not_landed_on():
     import trimesh
 
@@ -272,11 +266,6 @@ def test_shapes_without_a_fit_are_samples_of_their_meshes(meshes, tmp_path):
     assert shape.volume == pytest.approx(0.2**3, rel=1e-6) and len(shape.nodes)
     block = load_shape(tmp_path / "assets" / "scene")
     assert isinstance(block.sdf, GridSdf) and block.sdf.resolution == samples_of(scenery(), 0.02)
-
-
-@pytest.mark.parametrize(("side", "cell", "samples"), [(1.0, 0.01, 161), (1.0, 0.025, 113), (0.1, 0.02, 65)])
-def test_a_grid_has_two_samples_a_cell_within_limits(side, cell, samples):
-    assert samples_of(cube(side, (0, 0, 0)), cell) == samples
 
 
 def sheet(height: float, side: float = 1.0) -> Mesh:
