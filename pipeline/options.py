@@ -1,9 +1,9 @@
 """The options of a reconstruction: one model from which commands, stages and config.yaml take them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
@@ -168,6 +168,24 @@ class Options(BaseModel):
         """The representation of shapes' distances: a grid for the preset quick, else a network; a network too if a
         recipe is given."""
         return self.sdf or ("grid" if self.preset == "quick" and self.recipe is None else "mlp")
+
+
+class OptionKeys(TypedDict, total=False):
+    """The same options as arguments, for type checkers; a test checks that both have the same names."""
+
+    preset: Preset
+    size: float | None
+    budget: float | None
+    seed: int
+    device: Literal["auto", "cpu", "cuda"]
+    recipe: Literal["quick", "default", "paper"] | None
+    sdf: Literal["grid", "mlp"] | None
+    distance: tuple[str, str, float] | None
+    crop: Sequence[float] | None
+    up: str | None
+    body: Mapping[str, Sequence[str]]
+    drop: Literal["box", "ball", "none"]
+    material: Mapping[str, str]
 
 
 def form_of(name: str) -> dict[str, Any]:

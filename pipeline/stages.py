@@ -11,9 +11,9 @@ import uuid
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-from pipeline.options import COMMAND, Options, options_of, read_config, write_config
+from pipeline.options import COMMAND, OptionKeys, Options, options_of, read_config, write_config
 from pipeline.records import FitReport, MeshReport, PhotosReport, SceneReport, read, written
 from pipeline.report import write_report
 from sdfsim.base.compiling import say_compiling
@@ -175,7 +175,7 @@ STAGES = {
 
 def reconstruct(
     photos: str | Path, out: str | Path, *, from_stage: str | None = None, until_stage: str | None = None,
-    progress: StageProgress | None = None, **options: Any,
+    progress: StageProgress | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
     """Photos -> a scene, by all stages; see `pipeline.states.reconstruct`."""
     say_compiling()

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from PIL import Image
@@ -33,7 +33,7 @@ from pipeline.inputs.photos import load_photos
 from pipeline.mesh.joint import JOINT, PART, HeldPart, find_joint
 from pipeline.mesh.moving_part import CELLS, alike, label_images, load_state, tie, which_move
 from pipeline.mesh.placement import check_distance, load_placement
-from pipeline.options import options_of
+from pipeline.options import OptionKeys, options_of
 from pipeline.records import PhotosReport, read
 from pipeline.stages import RECORD, Instead, Project, Record, check_apart, read_record, run_all, wanted_stages
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
@@ -46,7 +46,7 @@ WITHOUT = ("crop", "body", "up")  # options that refer to one state's meshes
 
 def reconstruct(
     photos: str | Path, out: str | Path, *, joint: str | Path | None = None, from_stage: str | None = None,
-    until_stage: str | None = None, progress: StageProgress | None = None, **options: Any,
+    until_stage: str | None = None, progress: StageProgress | None = None, **options: Unpack[OptionKeys],
 ) -> dict:  # fmt: skip
     """Photos -> a scene that can be simulated.
 
@@ -55,7 +55,7 @@ def reconstruct(
 
     `joint` are photos of the same object in another state, for example with its door open: the moving part becomes a
     separate body, called `part`, on a hinge or a slider. `options` are those of `sdfsim reconstruct --help` with the
-    same names, and `seed` and `recipe` (see `Options`); `from_stage` and `until_stage` are its --from and --until.
+    same names, and `seed` and `recipe` (see `OptionKeys`); `from_stage` and `until_stage` are its --from and --until.
     `progress` is called with the stage, its finished share, and a line.
 
     Writes one folder per stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md`

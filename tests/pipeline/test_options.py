@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from pipeline.options import Options, options_of, read_config, write_config
+from pipeline.options import OptionKeys, Options, options_of, read_config, write_config
 from sdfsim.base.errors import SdfsimError
 from tests.helpers.command import run as command
 
@@ -110,3 +110,7 @@ def test_corners_on_the_command_line(photos, tmp_path, calls, monkeypatch, given
         assert not (tmp_path / "out").exists()
     else:
         assert read_config(tmp_path / "out").crop == (0, 0, 0, 1, 2, 3)
+
+
+def test_type_checkers_know_the_options():
+    assert set(OptionKeys.__annotations__) == set(Options.model_fields) - {"photos"}
