@@ -6,7 +6,7 @@ import pytest
 from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, camera_up
 from pipeline.field.supervision import unit_sphere_of
 from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
-from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
+from pipeline.mesh.placement import Scale, find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
@@ -157,7 +157,7 @@ def test_placement_turns_gravity_down_and_sets_the_size(tmp_path):
     np.testing.assert_allclose(load_placement(tmp_path).mesh(turned).vertices, placed.vertices)
     assert found.up_from == "plane" and found.up_within < 1 and found.up_confidence == "high"
     assert place(turned, views).size_assumed and not found.size_assumed
-    known = place(turned, views, (10.0, "a ruler"), size=3.0)
+    known = place(turned, views, Scale(10.0, "a ruler"), size=3.0)
     assert known.size_from == "a ruler" and np.ptp(known.mesh(turned).vertices, axis=0).max() == pytest.approx(6.0)
 
 
