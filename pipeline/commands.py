@@ -112,15 +112,12 @@ def joint(
     ],
 ) -> None:
     """Meshes of one object in two states -> its hinge or slider."""
-    import numpy as np
-
     from pipeline.mesh.joint import find_joint, scene_keys
     from sdfsim.geometry.mesh_io import load_mesh
 
-    first = load_mesh(one)
-    found = find_joint(first, load_mesh(other))
+    found = find_joint(load_mesh(one), load_mesh(other))
     told = {"type": found.kind, **scene_keys(found), "moving_faces": int(found.moving.sum()), "off_m": found.off}
-    session.report(told, [found.line(float(np.linalg.norm(np.ptp(first.vertices, axis=0))))])
+    session.report(told, [found.line()])
 
 
 @command

@@ -1,6 +1,6 @@
 """The reports of a run: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from pipeline.inputs.photos import load_photos
 from pipeline.materials import SCENERY
 from pipeline.mesh.hollows import hollow_line
 from pipeline.options import Options
+from pipeline.records import BodyReport, FitReport, MeshReport, PhotosReport, SceneReport, read
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json, write_text
 
@@ -30,13 +31,13 @@ GUESSED_SHARE = 0.01  # of a body's surface: from here on a note reports it
 
 
 def write_report(
-    folder: Path, options: Options, records: dict[str, dict], failed: tuple[str, SdfsimError] | None = None
+    folder: Path, options: Options, records: Mapping[str, Any], failed: tuple[str, SdfsimError] | None = None
 ) -> dict:
-    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, with the
-    error."""
-    stages = {stage: known["report"] for stage, known in records.items()}
-    seconds = {stage: round(known["seconds"], 1) for stage, known in records.items()}
-    fit = stages.get("fit", {})
+    """Writes report.json and report.md from the stages' `Record`s; returns the former. `failed` is the stage that ended
+    in an error, with the error."""
+    stages = {stage: known.report for stage, known in records.items()}
+    seconds = {stage: round(known.seconds, 1) for stage, known in records.items()}
+    fit = read(FitReport, stages.get("fit"))
     poses = stages.get("poses", {})
     if failed and not poses:
         with suppress(SdfsimError):
@@ -46,7 +47,7 @@ def write_report(
         "seconds_total": round(sum(seconds.values()), 1),
         "psnr": stages.get("distill", {}).get("psnr"), "stages": stages, "poses": poses, "notes": notes(stages),
         "photos": photo_rows(folder, stages, poses),
-        "failed_checks": [f"fit: {fit.get('reason') or 'certificate missed'}"] if fit.get("passed") is False else [],
+        "failed_checks": [] if fit.passed else [f"fit: {fit.reason or 'certificate missed'}"],
     }  # fmt: skip
     if failed:
         stage, error = failed
@@ -91,10 +92,10 @@ def improvements(report: dict, options: Options) -> list[str]:
     if report["psnr"] is not None and report["psnr"] < LOW_PSNR:
         lines.append(f"held-out photos have a PSNR of only {report['psnr']:.1f} dB: {options.longer()}, "
                      "and keep light and exposure the same in all photos")  # fmt: skip
-    for number, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1):
-        place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
-        lines.append(f"{number}. of the photos that would help most: {photo['words']} (camera at {place} m, aimed at "
-                     f"{target} m); it improves {photo['gain']:.0%} of the weak surface")  # fmt: skip
+    for number, photo in enumerate(read(MeshReport, stages.get("mesh")).next_photos, start=1):
+        place, target = (", ".join(f"{x:.2f}" for x in at) for at in (photo.position, photo.looking_at))
+        lines.append(f"{number}. of the photos that would help most: {photo.words} (camera at {place} m, aimed at "
+                     f"{target} m); it improves {photo.gain:.0%} of the weak surface")  # fmt: skip
     if report["failed_checks"]:
         lines.append("fit for longer (a larger --budget), or repair the mesh: a shape is not usable")
     return lines
@@ -102,70 +103,65 @@ def improvements(report: dict, options: Options) -> list[str]:
 
 def notes(stages: dict[str, dict]) -> list[str]:
     """Notes for users about a run: what was skipped, assumed or is uncertain; one line each."""
-    poses, scene = stages.get("poses", {}), stages.get("scene", {})
-    lines = [*stages.get("photos", {}).get("notes", []), *poses.get("warnings", [])]
+    poses, scene = stages.get("poses", {}), read(SceneReport, stages.get("scene"))
+    lines = [*read(PhotosReport, stages.get("photos")).notes, *poses.get("warnings", [])]
     lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in poses.get("left_out", [])[:NAMED]]
     lines += stages.get("distill", {}).get("notes", [])
-    lines += mesh_notes(stages.get("mesh", {}))
-    lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
-    lines += [f"{name}: {material_line(body)}" for name, body in scene.get("bodies", {}).items()]
-    if scene.get("joint"):
-        lines.insert(0, f"joint: {scene['joint']}")
-    return lines + scene.get("notes", [])
+    lines += mesh_notes(read(MeshReport, stages["mesh"])) if "mesh" in stages else []
+    lines += [f"usable, not exact: {caveat}" for caveat in read(FitReport, stages.get("fit")).caveats]
+    lines += [f"{name}: {material_line(body)}" for name, body in scene.bodies.items()]
+    return [f"joint: {scene.joint}"] * bool(scene.joint) + lines + scene.notes
 
 
-def mesh_notes(mesh: dict) -> list[str]:
-    """The notes of the mesh stage, from its report."""
+def mesh_notes(mesh: MeshReport) -> list[str]:
+    """The notes of the mesh stage."""
     lines = []
-    if mesh.get("up_from") == "cameras":
+    if mesh.up_from == "cameras":
         lines.append("no level plane found: up comes from the cameras and may be off by some degrees")
-    if mesh.get("up_confidence") == "low":
-        lines.append(f"up is uncertain, within {mesh['up_within_degrees']:.0f} degrees: check it before simulating")
-    if mesh.get("size_assumed"):
-        lines.append(f"size {mesh['size']} (give --size or --distance)")
-    if mesh.get("objects"):
-        lines.append(f"separate bodies: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
+    if mesh.up_confidence == "low":
+        lines.append(f"up is uncertain, within {mesh.up_within_degrees:.0f} degrees: check it before simulating")
+    if mesh.size_assumed:
+        lines.append(f"size {mesh.size} (give --size or --distance)")
+    if mesh.objects:
+        lines.append(f"separate bodies: {', '.join(mesh.objects)} (mesh/objects.png shows which is which)")
     how = {
         "masks": "split where their masks end",
         "clicks": "split where photos show a border between your places",
         "shape": "split along a seam by shape; give masks to be sure",
     }
-    lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
-    lines += [f"no body was found for {name}, which {by} name" for by in ("masks", "places")
-              for name in mesh.get(f"{by}_without_surface", [])]  # fmt: skip
-    lines += [f"{name}: its surface was not fully refined by photos: {why}"
-              for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
-    lines += [hollow_line(name, found) for name, found in mesh.get("hollows", {}).items()]
-    if "smallest_object_m" in mesh:
-        lines.append(f"pieces lower than {mesh['smallest_object_m']:.2g} m stay part of their support")
+    lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.touching]
+    lines += [f"no body was found for {name}, which masks name" for name in mesh.masks_without_surface]
+    lines += [f"no body was found for {name}, which places name" for name in mesh.places_without_surface]
+    lines += [f"{name}: its surface was not fully refined by photos: {why}" for name, why in mesh.unrefined.items()]
+    lines += [hollow_line(name, found) for name, found in mesh.hollows.items()]
+    if mesh.smallest_object_m:
+        lines.append(f"pieces lower than {mesh.smallest_object_m:.2g} m stay part of their support")
     lines += [f"{area:.2g} m^2 of a level surface without texture were completed as a plane from the visible surface "
-              "around: nothing measured its height there" for area in mesh.get("completed_m2", [])]  # fmt: skip
-    if mesh.get("left_out_m"):
-        largest = max(mesh["left_out_m"])
-        lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
-    for name, part in mesh.get("trust", {}).items():
-        if part["guessed"] > GUESSED_SHARE and name != SCENERY:
-            lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
-    if "weak" in mesh:
-        more = "" if mesh["next_photos"] else "; no single photo would help much"
-        lines.append(f"{mesh['weak']:.1%} of the surface that photos could show is weak: fewer than three photos see "
+              "around: nothing measured its height there" for area in mesh.completed_m2]  # fmt: skip
+    if mesh.left_out_m:
+        largest = max(mesh.left_out_m)
+        lines.append(f"{len(mesh.left_out_m)} loose pieces were left out, the largest {largest:.2g} m long")
+    lines += [f"{name}: {part.guessed:.0%} of its surface is guessed, fewer than two photos see it"
+              for name, part in mesh.trust.items() if part.guessed > GUESSED_SHARE and name != SCENERY]  # fmt: skip
+    if mesh.weak is not None:
+        more = "" if mesh.next_photos else "; no single photo would help much"
+        lines.append(f"{mesh.weak:.1%} of the surface that photos could show is weak: fewer than three photos see "
                      f"it, or all from nearly one direction{more}")  # fmt: skip
     return lines
 
 
-def material_line(body: dict) -> str:
-    """A line with a body's material and mass, from an entry of `bodies_of`."""
-    line = f"{body['material']}, friction {body['friction']:g}, restitution {body['restitution']:g}"
-    if "mass" not in body:
+def material_line(body: BodyReport) -> str:
+    """A line with a body's material and mass."""
+    line = f"{body.material}, friction {body.friction:g}, restitution {body.restitution:g}"
+    if body.mass is None:
         return line
-    thick = f" in a wall of {1000 * body['wall']:g} mm" if body["wall"] else ""
-    return f"{line}, {body['mass']:.3g} kg ({body['volume']:.3g} m^3{thick}, {body['density']:g} kg/m^3)"
+    thick = f" in a wall of {1000 * body.wall:g} mm" if body.wall else ""
+    return f"{line}, {body.mass:.3g} kg ({body.volume:.3g} m^3{thick}, {body.density:g} kg/m^3)"
 
 
 def page(report: dict, folder: Path) -> str:
     """The report as Markdown; its pictures are files of the run."""
     poses, stages = report["poses"], report["stages"]
-    mesh = stages.get("mesh", {})
     lines = [f"# Reconstruction of {Path(report['options']['photos']).name}", ""]
     if "error" in report:
         error = report["error"]
@@ -188,22 +184,23 @@ def page(report: dict, folder: Path) -> str:
     if report["psnr"] is not None:
         side = stages["distill"].get("psnr_px", "a third of the trained")  # absent in older runs
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB at {side} px"))
-    if mesh:
+    if "mesh" in stages:
+        mesh = read(MeshReport, stages["mesh"])
         rows += [
-            ("extent", " x ".join(f"{side:.3g}" for side in mesh["extent_m"]) + " m"), ("scale", mesh["size"]),
-            ("up", f"from the {mesh['up_from']}, within {mesh['up_within_degrees']:.1f}°"),
+            ("extent", " x ".join(f"{side:.3g}" for side in mesh.extent_m) + " m"), ("scale", mesh.size),
+            ("up", f"from the {mesh.up_from}, within {mesh.up_within_degrees:.1f}°"),
         ]  # fmt: skip
-        for name, part in mesh.get("trust", {}).items():
-            seen = " / ".join(f"{share:.1%}" for share in part["seen_by"])
-            sure = part["uncertainty_m"]
+        for name, part in mesh.trust.items():
+            seen = " / ".join(f"{share:.1%}" for share in part.seen_by)
+            sure = part.uncertainty_m
             middle = "all guessed" if sure is None else f"median uncertainty {1000 * sure:.2g} mm"
             rows.append((f"{name}: seen by 0 / 1 / 2 / 3 or more photos", f"{seen}; {middle}"))
-    for name, certificate in stages.get("fit", {}).get("shapes", {}).items():
+    for name, certificate in read(FitReport, stages.get("fit")).shapes.items():
         bad = f"not usable: {certificate['reason']}"
         rows.append((f"shape {name}", certificate["caveat"] or "exact" if certificate["passed"] else bad))
     rows += [(f"seconds: {stage}", seconds) for stage, seconds in report["seconds"].items()]
     lines += ["## Numbers", "", "| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows), ""]
-    if (folder / "mesh" / "objects.png").exists() and mesh:
+    if (folder / "mesh" / "objects.png").exists() and "mesh" in stages:
         lines += ["## What was found", "", "![bodies by name](mesh/objects.png)", ""]
     held = [photo for photo in report["photos"] if photo["state"] == "held out"]
     if held:

@@ -21,6 +21,7 @@ from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held, scene_keys
 from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
 from pipeline.mesh.visibility import heights
+from pipeline.records import BodyReport, FitReport, SceneReport
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.files import write_text
 from sdfsim.base.parallel import Progress, share_of, silent
@@ -48,10 +49,9 @@ GAP = 0.3  # of the fall, as a share of the side
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default",
               sdf: Literal["grid", "mlp"] = "mlp", seed: int = 0, device: str = "cpu",
-              on_progress: Progress = silent) -> dict:  # fmt: skip
+              on_progress: Progress = silent) -> FitReport:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body within the budget, s, or samples their distances on a grid;
-    each is a Shape folder in `out`, named by `folder_of`, and existing ones are kept. Returns a certificate for each of
-    `shapes`, and `passed`, `reason` and `caveats` for all of them."""
+    each is a Shape folder in `out`, named by `folder_of`, and existing ones are kept."""
     from sdfsim.sdf.baked_grid import grid_certificate
     from sdfsim.shape.make import fit_mesh, mesh_shape
     from sdfsim.shape.shape import load_shape
@@ -89,7 +89,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         certificates[name] = shape.certificate
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
-    return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+    return FitReport(certificates, not missed, "; ".join(missed), caveats)
 
 
 def onto(sdf: Sdf, mesh: Mesh, reach: float) -> Mesh:
@@ -144,8 +144,8 @@ def origin_of(mesh: Mesh) -> np.ndarray:
 def write_scene(
     mesh_folder: Path, scene_file: Path, *, drop: str = "box", materials: dict[str, Choice] | None = None,
     written: str | None = None, seed: int = 0,
-) -> dict:  # fmt: skip
-    """Writes scene.yaml for the meshes of a mesh folder and the shapes next to it; returns the stage's report.
+) -> SceneReport:  # fmt: skip
+    """Writes scene.yaml for the meshes of a mesh folder and the shapes next to it.
 
     A file that the user has changed (its hash differs from `written`, the hash of this function's last output) is kept
     as `scene.yaml.bak`. Raises SdfsimError if a material names an unknown body.
@@ -171,21 +171,18 @@ def write_scene(
         holder = holder_of(solids[PART], {name: mesh for name, mesh in everything.items() if name != PART})
     text_of = partial(scene_text, placement, origins, scenery=parts["scenery"], drop=drop, materials=materials,
                       seed=seed, floor=floor, held=held, holder=holder)  # fmt: skip
-    text, slab = text_of(None), None
-    scene = load_scene(scene_file, text=text, allow_outside=True)
-    if moved := cleared(scene, closed):
-        text = text_of(None, moved=moved)
+    slab = None
+    scene = load_scene(scene_file, text=text_of(None), allow_outside=True)
+    moved = cleared(scene, closed)
     if drop != "none":  # onto bodies where they start
         shifts = {name: one.shift for name, one in moved.items()}
         whole = joined([replace(m, vertices=m.vertices + shifts.get(name, 0)) for name, m in everything.items()])
         slab = choose_slab(whole if shown is None else shown, whole)
         if slab.slope > LEVEL:
             notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
-        text = text_of(slab, moved=moved)
-        scene = load_scene(scene_file, text=text, allow_outside=True)
-        if (dropped := cleared(scene, closed).get(drop)) is not None:
-            moved[drop] = dropped
-            text = text_of(slab, moved=moved)
+        scene = load_scene(scene_file, text=text_of(slab, moved=moved), allow_outside=True)
+        moved |= {name: one for name, one in cleared(scene, closed).items() if name == drop}
+    text = text_of(slab, moved=moved)
     notes += [moved_line(name, one, LAYER * parts["cell"]) for name, one in moved.items()]
     names = [body.name for body in scene.bodies]
     for name in materials:
@@ -199,13 +196,11 @@ def write_scene(
         scene_file.rename(kept)
         notes.append(f"{scene_file.name} had been changed by hand: kept as {kept.name}")
     write_text(scene_file, text)
-    return {
-        "objects": list(solids), "bodies": bodies_of(scene, materials), "size": placement.size_from,
-        "moved": {name: {"by": one.shift.tolist(), "out_of": one.into, "left": one.left}
-                  for name, one in moved.items()},
-        "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
-        "scene_sha256": made, "joint": None if held is None else held.line(),
-    }  # fmt: skip
+    overlaps = {name: {"by": one.shift.tolist(), "out_of": one.into, "left": one.left} for name, one in moved.items()}
+    return SceneReport(
+        list(solids), bodies_of(scene, materials), placement.size_from, overlaps,
+        {"shape": drop, **(asdict(slab) if slab else {})}, notes, made, None if held is None else held.line(),
+    )  # fmt: skip
 
 
 def moved_line(name: str, one: Cleared, unsure: float) -> str:
@@ -246,16 +241,15 @@ def floor_height(shown: Mesh) -> float:
     return min(float(lowest), 0.0) - BELOW * width
 
 
-def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
-    """The report's entry for each body that can move or has a material: `material`, `friction`, `restitution`; for
-    those that can move also `density` kg/m^3, `wall` m (None: solid), `volume` m^3 with mass, `mass` kg."""
+def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, BodyReport]:
+    """The report of each body that can move or has a material."""
     found = {}
     for body in scene.bodies:
         choice = materials.get(body.name, Choice())
-        entry: dict = {"material": choice.name, "friction": body.friction, "restitution": body.restitution}
+        entry = BodyReport(choice.name, body.friction, body.restitution)
         if body.motion == "dynamic":
             volume = scene.shapes[body.shape].volume
-            entry |= {"density": body.mass / volume, "wall": choice.wall, "volume": volume, "mass": body.mass}
+            entry = replace(entry, density=body.mass / volume, wall=choice.wall, volume=volume, mass=body.mass)
         if body.motion == "dynamic" or body.name in materials:
             found[body.name] = entry
     return found

@@ -9,20 +9,19 @@ import shutil
 import time
 import uuid
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Unpack
 
 from pipeline.options import COMMAND, OptionKeys, Options, options_of, read_config, write_config
+from pipeline.records import FitReport, MeshReport, PhotosReport, SceneReport, read, written
 from pipeline.report import write_report
 from sdfsim.base.compiling import say_compiling
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import CONFIG, check_own, locked, write_json
 from sdfsim.base.parallel import Progress, StageProgress
 
-# In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of a running stage: only its
-# fingerprint.
-RECORD = "stage.json"
+RECORD = "stage.json"  # in the folder of a stage: its `Record`
 
 # Share of an overall time budget that fitting may take, and the time of the other stages after training, s.
 FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
@@ -32,7 +31,7 @@ FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 class Instead:
     """Replaces a stage's own work, with the further inputs on which its result depends."""
 
-    run: Callable[[Project, Path], dict]
+    run: Callable[[Project, Path], Any]
     depends: Any
 
 
@@ -63,14 +62,26 @@ class Project:
         return str(pick_device(self.options.device))
 
 
+@dataclass(frozen=True)
+class Record:
+    """What `stage.json` in the folder of a finished stage says; that of a running stage has only the fingerprint."""
+
+    fingerprint: str  # of options and inputs
+    inputs: str  # name of the result of the stage before, or hash of the photos
+    made: str  # name of this result: two with the same fingerprint may differ (time budgets, GPUs)
+    seconds: float
+    report: dict[str, Any]
+    version: int = 1
+
+
 # The work of each stage: it makes its result in an existing folder and returns its report.
 
 
-def do_photos(project: Project, work: Path) -> dict:
+def do_photos(project: Project, work: Path) -> PhotosReport:
     from pipeline.inputs.photos import prepare_photos
 
     photos, notes = prepare_photos(Path(project.options.photos), work, on_progress=project.progress_of("photos"))
-    return {"count": len(photos), "notes": notes, "masks": sum(p.mask for p in photos)}
+    return PhotosReport(len(photos), notes, sum(p.mask for p in photos))
 
 
 def do_poses(project: Project, work: Path) -> dict:
@@ -102,7 +113,7 @@ def do_distill(project: Project, work: Path) -> dict:
     ).report  # fmt: skip
 
 
-def do_mesh(project: Project, work: Path) -> dict:
+def do_mesh(project: Project, work: Path) -> MeshReport:
     from pipeline.mesh.meshing import make_meshes
 
     try:
@@ -117,7 +128,7 @@ def do_mesh(project: Project, work: Path) -> dict:
         raise SdfsimError(error.message, hint, exit_code=EXIT_QUALITY) from error
 
 
-def do_fit(project: Project, work: Path) -> dict:
+def do_fit(project: Project, work: Path) -> FitReport:
     from pipeline.scene_writer import fit_parts
 
     budget = project.own_budget
@@ -130,14 +141,14 @@ def do_fit(project: Project, work: Path) -> dict:
     )  # fmt: skip
 
 
-def do_scene(project: Project, work: Path) -> dict:
+def do_scene(project: Project, work: Path) -> SceneReport:
     from pipeline.materials import materials_of
     from pipeline.scene_writer import write_scene
 
     before = read_record(project.place("scene"))
-    written = before["report"].get("scene_sha256") if before else None
+    known = read(SceneReport, before.report if before else None).scene_sha256
     return write_scene(
-        project.place("mesh"), project.folder / "scene.yaml", drop=project.options.drop, written=written,
+        project.place("mesh"), project.folder / "scene.yaml", drop=project.options.drop, written=known,
         materials=materials_of(project.options.material), seed=project.options.seed,
     )  # fmt: skip
 
@@ -146,7 +157,7 @@ def do_scene(project: Project, work: Path) -> dict:
 class Stage:
     """One stage."""
 
-    run: Callable[[Project, Path], dict]
+    run: Callable[[Project, Path], Any]  # returns the report, see `pipeline.records`
     folder: str  # where the result lies in that of the run
     # Raise it with every change that gives other results for the same inputs; later stages follow.
     version: int = 1
@@ -156,7 +167,7 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
     "poses": Stage(do_poses, "poses", version=8),
     "distill": Stage(do_distill, "distill", version=13),
-    "mesh": Stage(do_mesh, "mesh", version=16),
+    "mesh": Stage(do_mesh, "mesh", version=17),
     "fit": Stage(do_fit, "assets", version=3),
     "scene": Stage(do_scene, "scene", version=7),
 }
@@ -271,7 +282,7 @@ def run_one(project: Project, stage: str, *, again: bool) -> None:
     before = read_record(project.place(list(STAGES)[number_of(stage) - 1])) if stage != "photos" else None
     instead = project.instead.get(stage)
     if before:
-        inputs = before["made"]
+        inputs = before.made
     else:
         inputs = hash_of_photos(Path(project.options.photos)) if instead is None else ""
     depends = project.options.of_stage(stage) | {"own_budget": project.own_budget}
@@ -285,17 +296,17 @@ def run_one(project: Project, stage: str, *, again: bool) -> None:
     wanted = hashlib.sha256(text.encode()).hexdigest()
     known = read_record(place)
     complete = stage != "scene" or (project.folder / "scene.yaml").exists()
-    if not again and known and known["fingerprint"] == wanted and complete:
+    if not again and known and known.fingerprint == wanted and complete:
         for left in (work, _old(place)):  # by runs that were killed
             shutil.rmtree(left, ignore_errors=True)
         project.progress_of(stage)(1.0, "unchanged")
         return
     begin(work, wanted, fresh=again)
     started = time.monotonic()
-    report = (STAGES[stage] if instead is None else instead).run(project, work)
+    report = written((STAGES[stage] if instead is None else instead).run(project, work))
     # Includes the training of a killed run.
     seconds = time.monotonic() - started + report.get("seconds_before", 0.0)
-    finish(work, place, wanted, inputs, report, seconds)
+    finish(work, place, Record(wanted, inputs, uuid.uuid4().hex, seconds, report))
     project.progress_of(stage)(1.0, f"done in {seconds:.0f} s")
 
 
@@ -313,24 +324,23 @@ def hash_of_photos(given: Path) -> str:
     return digest.hexdigest()
 
 
-def current(folder: Path) -> dict[str, dict]:
+def current(folder: Path) -> dict[str, Record]:
     """Records by stage, up to the first stage that is missing or was made from a different result of the stage
     before."""
-    found: dict[str, dict] = {}
+    found: dict[str, Record] = {}
     before = None
     for name, stage in STAGES.items():
         known = read_record(folder / stage.folder)
-        if known is None or (before is not None and known["inputs"] != before["made"]):
+        if known is None or (before is not None and known.inputs != before.made):
             break
         found[name] = before = known
     return found
 
 
-def read_record(place: Path) -> dict | None:
+def read_record(place: Path) -> Record | None:
     """The record of a finished stage; None if it has not finished."""
     try:
-        known = json.loads((place / RECORD).read_text(encoding="utf-8"))
-        return known if {"fingerprint", "inputs", "made", "report", "seconds"} <= set(known) else None
+        return Record(**json.loads((place / RECORD).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return None
 
@@ -359,19 +369,12 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
     return work
 
 
-def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seconds: float) -> None:
+def finish(work: Path, place: Path, record: Record) -> None:
     """Writes the record and moves the finished folder to its place, where it replaces an earlier result of the stage.
-
-    Each result gets its own name, `made`, because two results with the same fingerprint may differ (time budgets,
-    GPUs). Raises SdfsimError if the place holds files that no stage wrote.
-    """
+    Raises SdfsimError if the place holds files that no stage wrote."""
     check_replaceable(place)
     # If the record cannot be written, the one with only the fingerprint stays, and the next run continues from here.
-    write_json(
-        work / RECORD,
-        {"version": 1, "fingerprint": wanted, "inputs": inputs, "made": uuid.uuid4().hex, "seconds": seconds,
-         "report": report},
-    )  # fmt: skip
+    write_json(work / RECORD, asdict(record))
     old = _old(place)
     shutil.rmtree(old, ignore_errors=True)
     # A folder cannot be replaced in one step; between the two renames the stage counts as not done.

@@ -18,6 +18,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -33,7 +34,8 @@ from pipeline.mesh.joint import JOINT, PART, HeldPart, find_joint
 from pipeline.mesh.moving_part import CELLS, alike, label_images, load_state, tie, which_move
 from pipeline.mesh.placement import check_distance, load_placement
 from pipeline.options import OptionKeys, options_of
-from pipeline.stages import RECORD, Instead, Project, check_apart, read_record, run_all, wanted_stages
+from pipeline.records import PhotosReport, read
+from pipeline.stages import RECORD, Instead, Project, Record, check_apart, read_record, run_all, wanted_stages
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
 from sdfsim.base.files import write_json
 from sdfsim.base.parallel import StageProgress
@@ -120,17 +122,16 @@ def reconstruct_states(
     if "mesh" not in again:
         return report, states[1].folder
     final.instead["photos"] = Instead(lambda own, work: label_part(own, states, scaled, work),
-                                      [_record(state, "mesh")["made"] for state in states])  # fmt: skip
+                                      [_record(state, "mesh").made for state in states])  # fmt: skip
     run_all(final, wanted("photos"))
-    best = states[_record(final, "photos")["report"]["state"]]
+    best = states[read(PhotosReport, _record(final, "photos").report).state]
     final.options = final.options.changed({"photos": best.options.photos})
     for stage in ("poses", "distill"):
-        record = _record(best, stage)
-        final.instead[stage] = Instead(lambda _, work, stage=stage: take(best, stage, work), record["made"])
+        final.instead[stage] = Instead(lambda _, work, stage=stage: take(best, stage, work), _record(best, stage).made)
     return run_all(final, again), final.folder
 
 
-def _record(project: Project, stage: str) -> dict:
+def _record(project: Project, stage: str) -> Record:
     found = read_record(project.place(stage))
     assert found is not None  # It has just been run.
     return found
@@ -156,19 +157,19 @@ def measured_in(states: Sequence[Project], distance: Any) -> int:
     raise SdfsimError(f"{errors[0].message} in the first state; in the second: {errors[1].message}", errors[0].hint)
 
 
-def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path) -> dict:
+def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path) -> PhotosReport:
     """Finds the joint, and takes the photos of the state that shows most of the part, with labels of the part and the
     joint in the world of the poses. A unit of this world is as long as in the meshes of the `scaled` state."""
     on_progress = own.progress_of("photos")
     one, other = (load_state(state.folder) for state in states)
     on_progress(0.1, "looking for static surfaces")
-    onto, tied = tie(other, one)
+    onto, _ = tie(other, one)
     other = other.moved(onto)
     near = CELLS * max(one.cell, other.cell)
     on_progress(0.3, "looking for the part that has moved")
     try:
         found = find_joint(one.visible, other.visible, seed=own.options.seed, near=near,
-                           empty=(one.empty, other.empty), paired=alike(one, other))  # fmt: skip
+                           empty=(one.empty, other.empty), paired=partial(alike, one, other))  # fmt: skip
     except SdfsimError as error:
         raise SdfsimError(f"joint: {error.message}", error.hint, exit_code=EXIT_QUALITY) from error
     shown = [len(np.unique(np.floor(points / near), axis=0)) for points in found.seen]
@@ -188,24 +189,22 @@ def label_part(own: Project, states: Sequence[Project], scaled: int, work: Path)
     # From metres of the first state's meshes to final metres, and to the world of the chosen state's poses.
     unit = 1.0 if scaled == 0 else 1.0 / onto.scale
     held = HeldPart(
-        found.kind, found.anchor, found.axis, found.travel, home.rotation, home.translation, unit,
-        sizes[scaled].size_from, sizes[scaled].size_assumed, found.off, found.doubt, found.follows,
-        float(np.linalg.norm(np.ptp(one.visible.vertices, axis=0))),
+        found.kind, found.anchor, found.axis, found.travel, found.off, found.doubt, found.follows, found.size,
+        home.rotation, home.translation, unit, sizes[scaled].size_from, sizes[scaled].size_assumed,
     )  # fmt: skip
     # The best state's own metres, moved into the first's if it is the second, came from the world of its poses.
     state = states[number]
     to_metres = load_placement(state.folder / "mesh").to_metres.after(load_field(state.place("distill")).to_unit)
     to_poses = to_metres.inverse()
     held.moved(to_poses.after(onto.inverse()) if number else to_poses).save(work / JOINT)
-    before = _record(states[number], "photos")["report"]
-    return {**before, "state": number, "shown": shown, "tied": tied}
+    return replace(read(PhotosReport, _record(state, "photos").report), state=number)
 
 
 def take(state: Project, stage: str, work: Path) -> dict:
     """A stage's result in the folder of a state."""
     place = state.place(stage)
     shutil.copytree(place, work, copy_function=_link, ignore=shutil.ignore_patterns(RECORD), dirs_exist_ok=True)
-    return _record(state, stage)["report"]
+    return _record(state, stage).report
 
 
 def _link(source: str | Path, target: str | Path) -> None:

@@ -1,12 +1,11 @@
 """The hollow of a body: its depth, whether photos see its bottom, and the thickness of the wall."""
 
-from dataclasses import asdict, dataclass
-
 import numpy as np
 from scipy import ndimage
 
 from pipeline.mesh.trust import FEW, Evidence
 from pipeline.mesh.visibility import heights
+from pipeline.records import Hollow
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
@@ -16,23 +15,6 @@ FLOOR = 0.3
 UPRIGHT = 0.5  # largest upward component of the normal of a wall
 LEAK = 0.2  # share of a hollow's bottom: smaller holes in it are where its thin floor was not found; a ring has larger
 KNOWN = 0.5  # share of a wall that photos have to see from both sides for a known thickness
-
-
-@dataclass(frozen=True)
-class Hollow:
-    """The hollow of a body in its upright position."""
-
-    depth: float  # m below its rim
-    below: float  # m, thickness of the matter below the hollow
-    seen: int  # photos that see its bottom: the median over it, by rays
-    wall: float | None  # m, the median thickness of the wall around it; None if there is none
-    wall_seen: float  # share of the wall, by vertices, of which photos see both sides
-    holes: float = 0.0  # share of its bottom that is missing
-
-    def to_dict(self) -> dict:
-        """Plain values for the report, lengths to a hundredth of a millimetre in a body of a metre."""
-        digits = 5 - int(np.floor(np.log10(self.depth + self.below)))
-        return {key: round(value, digits) if isinstance(value, float) else value for key, value in asdict(self).items()}
 
 
 def hollow(mesh: Mesh, least: float, evidence: Evidence | None = None) -> Hollow | None:
@@ -95,9 +77,9 @@ def _wall(mesh: Mesh, rim: float, bottom: np.ndarray, evidence: Evidence | None)
     return thick, float(both.mean())
 
 
-def hollow_line(name: str, found: dict) -> str:
-    """The report's line on the hollow of a body, from `Hollow.to_dict`."""
-    depth, below, seen = found["depth"], found["below"], found["seen"]
+def hollow_line(name: str, found: Hollow) -> str:
+    """The report's line on the hollow of a body."""
+    depth, below, seen = found.depth, found.below, found.seen
     photos = f"{seen} photos see its bottom" if seen > 1 else f"{('no', 'one')[seen]} photo sees its bottom"
     if below < FLOOR * depth:
         line = f"{name}: hollow, {depth:.2g} m deep below its rim, on a floor {below:.2g} m thick; {photos}"
@@ -105,10 +87,10 @@ def hollow_line(name: str, found: dict) -> str:
         line = f"{name}: hollow to {depth:.2g} m below its rim or deeper; {photos}, the {below:.2g} m below are a guess"
     else:
         line = f"{name}: hollow to {depth:.2g} m below its rim; {photos}, and the {below:.2g} m below that are solid"
-    if found.get("holes"):
-        line += f"; {found['holes']:.0%} of its floor was not found and is a hole"
-    if found["wall"] is None:
+    if found.holes:
+        line += f"; {found.holes:.0%} of its floor was not found and is a hole"
+    if found.wall is None:
         return line
-    if found["wall_seen"] < KNOWN:
-        return f"{line}; the thickness of its wall is unknown: photos see both sides of {found['wall_seen']:.0%} of it"
-    return f"{line}; its wall is {1000 * found['wall']:.2g} mm thick"
+    if found.wall_seen < KNOWN:
+        return f"{line}; the thickness of its wall is unknown: photos see both sides of {found.wall_seen:.0%} of it"
+    return f"{line}; its wall is {1000 * found.wall:.2g} mm thick"

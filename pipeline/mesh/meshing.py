@@ -9,21 +9,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
-from pipeline.cameras import View, load_poses, save_views
+from pipeline.cameras import PosedPhotos, Similarity, View, load_poses, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, open_photo
 from pipeline.materials import SCENERY
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.extraction import Distance, FieldSurface, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.hollows import hollow
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held
-from pipeline.mesh.placement import GRAVITY, Placement, Up, given_up, located_bodies, measured_scale, place
+from pipeline.mesh.placement import GRAVITY, Placement, Scale, Up, given_up, located_bodies, measured_scale, place
 from pipeline.mesh.supports import complete, on_any
-from pipeline.mesh.texture import Shots, shots_of, texture_parts
+from pipeline.mesh.texture import shots_of, texture_parts
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
 from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.options import Options
+from pipeline.records import MeshReport
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_bytes, write_json
 from sdfsim.base.parallel import Progress, share_of, silent
@@ -42,122 +43,103 @@ AXIS = (255, 255, 0)  # colour of a joint's axis there
 def make_meshes(
     distill: Path, poses: Path, photos: Path, out: Path, options: Options, *, device: str = "cpu",
     on_progress: Progress = silent,
-) -> dict:  # fmt: skip
-    """Writes the files that docs/objects.md lists and returns the stage's report. Vertices in the PLY files have
-    `views` and `uncertainty`, see `Evidence`. Raises SdfsimError (exit code 3) if there is hardly any surface, or
-    (1) for a distance or box that makes no sense."""
+) -> MeshReport:  # fmt: skip
+    """Writes the files that docs/objects.md lists. Vertices in the PLY files have `views` and `uncertainty`, see
+    `Evidence`. Raises SdfsimError (exit code 3) if there is hardly any surface, or (1) for a distance or box that makes
+    no sense."""
     trained = load_field(distill)
-    field, to_unit = trained.field.to(device), trained.to_unit
-    posed = load_poses(poses).moved(to_unit)
-    alone = bool(trained.report["masked"])
-    inner, limit = field_distance(field), ball
-    inside: Distance = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
+    field, to_unit, alone = trained.field.to(device), trained.to_unit, bool(trained.report["masked"])
+    posed, held = load_poses(poses).moved(to_unit), load_held(photos / JOINT)
+    inner = field_distance(field)
+    inside: Distance = lambda p: np.maximum(inner(p), ball(p))  # noqa: E731
     volume = sample_volume(inside, RESOLUTION[options.preset], on_progress=share_of(on_progress, 0.0, 0.25))
-    surface = surface_of(volume, field, posed, photos, limit, on_progress=share_of(on_progress, 0.25, 0.2))
-    scale = None
-    if options.distance is not None:
-        scale = measured_scale(options.distance, posed.views, load_photos(photos), Caster(surface.raw))
-    clicked = {}
-    if options.body:
-        clicked = located_bodies(options.body, posed.views, load_photos(photos), Caster(surface.raw))
-    capture, up = load_capture(photos), None
-    if capture is not None and capture.up is not None:
-        up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
-    if capture is not None and scale is None and options.size is None:
-        scale = 1 / to_unit.scale, f"metres of {capture.app}"
-    held = load_held(photos / JOINT)
-    if held is not None and scale is None and options.size is None:
-        scale = held.metres / to_unit.scale, held.size_from
-    if options.up is not None:
-        axes = to_unit.rotation if (photos / KNOWN_CAMERAS).exists() else (
-            place(surface.visible, posed.views, up=up).to_metres.rotation.T
-        )  # fmt: skip
-        up = given_up(options.up, axes, posed.views, load_photos(photos), surface.visible)
-    placement = place(surface.visible, posed.views, scale, size=options.size, alone=alone, up=up)
+    surface = surface_of(volume, field, posed, photos, ball, on_progress=share_of(on_progress, 0.25, 0.2))
+    placement = placed(surface, posed, to_unit, photos, options, held, alone=alone)
     if held is not None:
-        if placement.size_from == held.size_from:
-            placement = replace(placement, size_assumed=held.size_assumed)
         held.moved(placement.to_metres.after(to_unit)).save(out / JOINT)
-    level, known, completed = placement.to_metres.rotation[2], None, []
+    clicked = located_bodies(options.body, posed.views, load_photos(photos), Caster(surface.raw))
+    level, metres = placement.to_metres.rotation[2], placement.to_metres.scale
+    on_progress(0.45, "looking for level surfaces without texture")
+    completed = [] if alone else complete(surface, level, field.finest, posed, photos)
+    for one in completed:
+        volume, inside = one.filled(volume), one.within(inside)
+    limit = edge = ball
     if alone:
         # What nobody sees below the lowest place in sight is as level as what carried it; a field makes a dome of it.
-        bottom = ground(placement)
-        volume, limit = volume.limited(bottom), lambda p: np.maximum(ball(p), bottom(p))
-        surface = surface_of(volume, field, posed, photos, ball, on_progress=share_of(on_progress, 0.45, 0.05))
-    else:
-        on_progress(0.45, "looking for level surfaces without texture")
-        completed = complete(surface, level, field.finest, posed, photos)
-    if completed:
-        for one in completed:
-            volume, inside = one.filled(volume), one.within(inside)
-        known = on_any(completed, volume.cell)
-        surface = surface_of(volume, field, posed, photos, limit, known=known,
-                             on_progress=share_of(on_progress, 0.45, 0.05))  # fmt: skip
+        limit = ground(placement, ball)
     if options.crop is not None:
-        limit = box_of(placement, np.reshape(options.crop, (2, 3)), limit)
-        volume = volume.limited(limit)
+        limit = edge = box_of(placement, np.reshape(options.crop, (2, 3)), limit)
+    if limit is not ball or completed:
+        volume = volume if limit is ball else volume.limited(limit)
         if not (volume.values < 0).any():
-            raise SdfsimError(
-                "crop: the box holds nothing",
-                "corners are in metres, in the axes of the mesh/mesh.ply of a run without --crop",
-            )
-        surface = surface_of(volume, field, posed, photos, limit, known=known,
+            raise SdfsimError("crop: the box holds nothing", "corners are in metres, in the axes of the mesh/mesh.ply "
+                              "of a run without --crop")  # fmt: skip
+        known = on_any(completed, volume.cell) if completed else None
+        surface = surface_of(volume, field, posed, photos, edge, known=known,
                              on_progress=share_of(on_progress, 0.5, 0.2))  # fmt: skip
         # If the user has cropped the surroundings away, the rest is meant to move.
-        alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
+        alone = alone or (edge is not ball and bool((ball(surface.solid.vertices) < -2 * volume.cell).all()))
     on_progress(0.7, "looking for bodies")
     parts = split(surface, inside, field.finest, posed, photos, level, alone=alone, clicked=clicked)
     on_progress(0.8, "drawing objects.png")
     axis = axis_ends(parts, None if held is None else held.moved(to_unit))
     draw_names(parts, posed.views, photos, axis).save(out / "objects.png")
-    metres = placement.to_metres.scale
     closed, displayed = (
         {name: placement.mesh(mesh) for name, mesh in ({SCENERY: first} | parts.bodies).items() if mesh is not None}
         for first in (parts.solid, parts.shown)
     )
+    whole = joined(list(closed.values()))
     views = posed.moved(placement.to_metres).views
     shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
-    ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
     on_progress(0.82, "computing how far each place can be trusted")
-    evidence, trusted = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
-    write_parts(parts, surface.visible, placement, evidence, out, field.finest * metres)
-    textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
-    write_bytes(out / TEXTURED, write_glb(textures))
-    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres, evidence) for name in parts.bodies}
-    return {
-        "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
-        "completed_m2": [float(rounded(one.area * metres**2)) for one in completed],
-        "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
-        "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
-        "up_confidence": placement.up_confidence, "size": placement.size_from,
-        "size_assumed": placement.size_assumed, "objects": list(parts.bodies),
-        "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
-        "hollows": {name: found.to_dict() for name, found in deep.items() if found is not None},
-        ("places" if clicked else "masks") + "_without_surface": parts.missing, "unrefined": parts.unrefined, **trusted,
-    }  # fmt: skip
-
-
-def trust(
-    closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
-) -> tuple[Evidence, dict]:
-    """The photos' evidence for the vertices of the `closed` meshes, one after the other, and the same for the report;
-    writes `next_photos.json`. Vertices are `counted` [V] bool if they were not cut off; all is in metres."""
-    whole = joined(list(closed.values()))
     sight = Visibility(whole, shots.lift, shots.blocking)
-    evidence = evidence_of(sight, shots.views)
-    shown = {name: evidence.nearest(mesh.vertices) for name, mesh in displayed.items()}
-    photos, weak = next_photos(closed, evidence, sight, shots.blocking, shots.views, counted)
-    save_views([photo.view for photo in photos], out / NEXT)
-    return evidence, {
-        "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
-        "weak": round(weak, 4),
-        "next_photos": [photo.to_dict() for photo in photos],
-    }  # fmt: skip
+    evidence = evidence_of(sight, views)
+    counted = np.abs(limit(placement.to_metres.inverse().points(whole.vertices))) > 1.5 * surface.volume.cell
+    proposed, cameras, weak = next_photos(closed, evidence, sight, shots.blocking, views, counted)
+    save_views(cameras, out / NEXT)
+    write_parts(parts, surface.visible, placement, evidence, out, field.finest * metres)
+    write_bytes(out / TEXTURED, write_glb(texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))))
+    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres, evidence) for name in parts.bodies}
+    return MeshReport(
+        extent_m=rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
+        size=placement.size_from, size_assumed=placement.size_assumed, up_from=placement.up_from,
+        up_within_degrees=round(placement.up_within, 2), up_confidence=placement.up_confidence,
+        objects=list(parts.bodies), smallest_object_m=float(rounded(parts.smallest * metres)),
+        touching=parts.touching, masks_without_surface=[] if clicked else parts.missing,
+        places_without_surface=parts.missing if clicked else [], unrefined=parts.unrefined,
+        hollows={name: found for name, found in deep.items() if found is not None},
+        left_out_m=[float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
+        completed_m2=[float(rounded(one.area * metres**2)) for one in completed],
+        trust={name: summary(mesh, evidence.nearest(mesh.vertices)) for name, mesh in displayed.items()},
+        weak=round(weak, 4), next_photos=proposed,
+    )  # fmt: skip
 
 
-def ground(placement: Placement) -> Distance:
-    """Distance from the space above z = 0 m."""
-    return lambda points: -placement.to_metres.points(points)[:, 2] / placement.to_metres.scale
+def placed(surface: FieldSurface, posed: PosedPhotos, to_unit: Similarity, photos: Path, options: Options,
+           held: HeldPart | None, *, alone: bool) -> Placement:  # fmt: skip
+    """The placement of a surface by the options, else by what the photos came with, else by the surface itself."""
+    shown, views, scale, up = surface.visible, posed.views, None, None
+    capture = load_capture(photos)
+    if options.distance is not None:
+        scale = measured_scale(options.distance, views, load_photos(photos), Caster(surface.raw))
+    elif options.size is None and held is not None:
+        scale = Scale(held.metres / to_unit.scale, held.size_from, held.size_assumed)
+    elif options.size is None and capture is not None:
+        scale = Scale(1 / to_unit.scale, f"metres of {capture.app}")
+    if capture is not None and capture.up is not None:
+        up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
+    if options.up is not None:
+        axes = to_unit.rotation
+        if not (photos / KNOWN_CAMERAS).exists():
+            axes = place(shown, views, up=up).to_metres.rotation.T
+        up = given_up(options.up, axes, views, load_photos(photos), shown)
+    return place(shown, views, scale, size=options.size, alone=alone, up=up)
+
+
+def ground(placement: Placement, space: Distance) -> Distance:
+    """Distance from the part of a `space` above z = 0 m."""
+    to_metres = placement.to_metres
+    return lambda points: np.maximum(space(points), -to_metres.points(points)[:, 2] / to_metres.scale)
 
 
 def box_of(placement: Placement, corners: np.ndarray, space: Distance) -> Distance:
@@ -208,13 +190,18 @@ def read_parts(mesh_folder: Path) -> dict:
     return read_json(mesh_folder / "parts.json", "run the mesh stage first")
 
 
+def closed_files(mesh_folder: Path) -> dict[str, Path]:
+    """The files of the closed meshes of the scenery, if there is any, and of each body, by name."""
+    known = read_parts(mesh_folder)
+    files = {SCENERY: mesh_folder / "solid.ply"} if known["scenery"] else {}
+    return files | {one["name"]: mesh_folder / "objects" / f"{one['name']}.ply" for one in known["objects"]}
+
+
 def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
     """The meshes of the scene, by name, coloured by their uncertainty (`colors_of`)."""
-    known = read_parts(mesh_folder)
-    files = {SCENERY: "solid.ply"} if known["scenery"] else {}
-    files |= {entry["name"]: f"objects/{entry['name']}.ply" for entry in known["objects"]}
-    meshes = {name: read_mesh(mesh_folder / file) for name, file in files.items()}
-    values = {name: read_attributes(mesh_folder / file, ["uncertainty"])[0] for name, file in files.items()}
+    files = closed_files(mesh_folder)
+    meshes = {name: read_mesh(file) for name, file in files.items()}
+    values = {name: read_attributes(file, ["uncertainty"])[0] for name, file in files.items()}
     limits = color_range(joined(list(meshes.values())), np.concatenate(list(values.values())))
     return {name: replace(mesh, colors=to_bytes(colors_of(values[name], limits))) for name, mesh in meshes.items()}
 

@@ -3,7 +3,7 @@ alike, and which pixels show the part."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from pipeline.cameras import Similarity, View, load_poses
 from pipeline.field.training import load_field
 from pipeline.inputs.labels import UNKNOWN
 from pipeline.inputs.photos import open_photo
-from pipeline.mesh.meshing import read_parts
+from pipeline.mesh.meshing import closed_files, read_parts
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.visibility import framed
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
@@ -75,13 +75,11 @@ class State:
 def load_state(folder: Path) -> State:
     """The state in a folder of the mesh stage, in its own metres."""
     trained, place = load_field(folder / "distill"), load_placement(folder / "mesh").to_metres
-    known = read_parts(folder / "mesh")
-    files = [*(["solid.ply"] if known["scenery"] else []), *(f"objects/{one['name']}.ply" for one in known["objects"])]
     visible = read_mesh(folder / "mesh" / "mesh.ply")
-    closed = joined([read_mesh(folder / "mesh" / file) for file in files])
+    closed = joined([read_mesh(file) for file in closed_files(folder / "mesh").values()])
     views = load_poses(folder / "poses").moved(place.after(trained.to_unit)).views
     middle, radius = place.translation, INNER * place.scale
-    return State(visible, closed, views, folder / "photos", known["cell"], middle, radius)
+    return State(visible, closed, views, folder / "photos", read_parts(folder / "mesh")["cell"], middle, radius)
 
 
 @dataclass(frozen=True)
@@ -137,16 +135,12 @@ def matched(first: Landmarks, second: Landmarks) -> tuple[np.ndarray, np.ndarray
     return np.concatenate(here), np.concatenate(over)
 
 
-def alike(one: State, other: State) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """A function that gives points [K, 3] that look alike, near points [P, 3] that move in the first and in the second
-    state; some pairs are wrong."""
-
-    def paired(part: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if not len(part) or not len(there):
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        return matched(landmarks(one, part), landmarks(other, there))
-
-    return paired
+def alike(one: State, other: State, part: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points [K, 3] that look alike, near points [P, 3] that move in the first and in the second state; some pairs are
+    wrong."""
+    if not len(part) or not len(there):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    return matched(landmarks(one, part), landmarks(other, there))
 
 
 def tie(state: State, onto: State) -> tuple[Similarity, int]:

@@ -77,6 +77,14 @@ def load_placement(mesh_folder: Path) -> Placement:
         raise SdfsimError(f"{path}: damaged", "run the mesh stage again") from error
 
 
+class Scale(NamedTuple):
+    """A known scale."""
+
+    metres: float  # of a normalised unit
+    source: str  # in words
+    assumed: bool = False
+
+
 def find_up(shown: Mesh, views: Sequence[View]) -> Up:
     """Up from the largest nearly level plane, else from the cameras; their disagreement adds to the uncertainty."""
     cameras = camera_up(views)
@@ -234,40 +242,35 @@ def upright_rotation(shown: Mesh, views: Sequence[View], up: np.ndarray) -> np.n
     return frame_of(up)
 
 
-def place(shown: Mesh, views: Sequence[View], scale: tuple[float, str] | None = None, *, size: float | None = None,
+def place(shown: Mesh, views: Sequence[View], scale: Scale | None = None, *, size: float | None = None,
           alone: bool = False, up: Up | None = None) -> Placement:  # fmt: skip
     """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
 
-    Surface and views are in normalised space. `scale`, if known, is metres per normalised unit and its source; else
-    `size` m is the widest side, 1 m if it is None. `alone`: the floor is at the lowest point.
+    Surface and views are in normalised space. Without a known `scale`, `size` m is the widest side, 1 m if it is None.
+    `alone`: the floor is at the lowest point.
     """
     up = up or find_up(shown, views)
     rotation = upright_rotation(shown, views, up.direction)
     turned = shown.vertices @ rotation.T
-    assumed = scale is None and size is None
     if scale is None:
         source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
-        scale = (1.0 if size is None else size) / float(np.ptp(turned, axis=0).max()), source
-    metres, source = scale
-    in_metres = Mesh(metres * turned, shown.faces)
+        scale = Scale((size or 1.0) / float(np.ptp(turned, axis=0).max()), source, size is None)
+    in_metres = Mesh(scale.metres * turned, shown.faces)
     low, high = in_metres.vertices.min(0), in_metres.vertices.max(0)
     floor = low[2] if alone else resting_height(in_metres)
     translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, floor])
-    return Placement(Similarity(metres, rotation, translation), up.source, source, up.within, assumed)
+    return Placement(Similarity(scale.metres, rotation, translation), up.source, scale.source, up.within, scale.assumed)
 
 
-def measured_scale(
-    distance: Sequence, views: Sequence[View], photos: list[Photo], surface: Caster
-) -> tuple[float, str]:
-    """Metres per normalised unit from a known distance (see `Options`), and its source in words. Pixels are those of
-    the user's own photos. Raises the SdfsimErrors of `_end`, and one for a photo without a pose, or a pixel off the
-    surface."""
+def measured_scale(distance: Sequence, views: Sequence[View], photos: list[Photo], surface: Caster) -> Scale:
+    """The scale from a known distance (see `Options`). Pixels are those of the user's own photos. Raises the
+    SdfsimErrors of `_end`, and one for a photo without a pose, or a pixel off the surface."""
     first, second, metres = distance
     start, end = (_locate(text, views, photos, surface) for text in (first, second))
     found = float(np.linalg.norm(end - start))
     if found < 1e-3:
         raise SdfsimError(f"distance: {first} and {second} are in the same place")
-    return metres / found, f"given: {first} to {second} = {metres:g} m"
+    return Scale(metres / found, f"given: {first} to {second} = {metres:g} m")
 
 
 def check_distance(distance: Sequence, photos: list[Photo]) -> None:

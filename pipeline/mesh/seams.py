@@ -24,6 +24,8 @@ from pipeline.mesh.extraction import Volume
 from pipeline.mesh.visibility import Visibility
 from sdfsim.geometry.mesh import Mesh, vertex_normals
 
+# All set by hand on `touching` (a cup against a vase, and three books), where they are also measured (docs/objects.md),
+# unless another set is named.
 # A patch of one label that is smaller than this share of the label's largest is a mistake in a mask.
 STRAY = 0.1
 # Smallest share of the surface for a separate part without masks, and for a part with masks.
@@ -45,7 +47,7 @@ NARROW, COLORS = 0.06, 0.12
 SHALLOW = 0.75
 # Largest distance of the line where parts meet from a plane, as a share of its width, in addition to a sample.
 FLAT = 0.1
-# Parts with this many neighbouring samples touch.
+# Parts with this many neighbouring samples touch (not tuned).
 MEET = 12
 # The samples fill grooves: the true line is this many samples below the surface.
 FILLED = 0.45
@@ -53,7 +55,7 @@ FILLED = 0.45
 # these distances in samples outside its rim, that has at least this share of the rim's number of vertices, and faces
 # one way.
 PARALLEL, COVER, BESIDE, AROUND, ONE_SIDED = 0.97, 1.2, (0.7, 5.0), 0.3, 0.8
-# Within this many samples of its plane a seam stops the flood fill through the inside.
+# Within this many samples of its plane a seam stops the flood fill through the inside (not tuned).
 WALL = 0.9
 
 

@@ -260,17 +260,12 @@ def _facing(view: View, points: np.ndarray, normals: np.ndarray) -> tuple[np.nda
 
 
 def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """An image [H, W, C] whose unknown pixels (not `known` [H, W]) take the colours around them, because viewers that
-    shrink textures read pixels between charts, and interpolation reads pixels next to them."""
+    """An image [H, W, C] whose unknown pixels (not `known` [H, W]) take the colour of the nearest known one, because
+    viewers that shrink textures read pixels between charts, and interpolation reads pixels next to them."""
     import cv2
 
-    if known.all() or max(known.shape) == 1:
-        return image
-    rows, columns = known.shape
-    half = (columns + 1) // 2, (rows + 1) // 2
-    padded = np.pad(np.dstack([image * known[..., None], known]), ((0, rows % 2), (0, columns % 2), (0, 0)))
-    sums = padded.reshape(half[1], 2, half[0], 2, -1).sum((1, 3))
-    there = sums[..., -1] > 0
-    coarse = _filled(np.divide(sums[..., :-1], np.maximum(sums[..., -1:], 1)).astype(np.float32), there)
-    larger = cv2.resize(coarse, (2 * half[0], 2 * half[1]), interpolation=cv2.INTER_LINEAR)[:rows, :columns]
-    return np.where(known[..., None], image, larger.reshape(rows, columns, -1))
+    free = np.logical_not(known).astype(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    colors = np.zeros((nearest.max() + 1, image.shape[2]), np.float32)
+    colors[nearest[known]] = image[known]
+    return colors[nearest]

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import View, focus
 from pipeline.mesh.visibility import FAIR, Visibility, framed
+from pipeline.records import Proposal, Trust
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, face_normals, joined
 
@@ -101,20 +102,15 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
     return np.bincount(mesh.faces.ravel(), area, minlength=len(mesh.vertices))
 
 
-def summary(mesh: Mesh, evidence: Evidence) -> dict:
-    """Shares of a mesh's area: `seen_by` for 0, 1, 2, and 3 or more photos; `guessed` for fewer than two photos or
-    parallel lines of sight; `uncertainty_m`, the median of the rest, None if all is guessed."""
+def summary(mesh: Mesh, evidence: Evidence) -> Trust:
+    """What photos show of a mesh."""
     area, uncertainty = vertex_areas(mesh), evidence.uncertainty
     known = np.isfinite(uncertainty)
     median = None
     if known.any():
         median = float(np.quantile(uncertainty[known], 0.5, weights=area[known], method="inverted_cdf"))
     seen_by = np.bincount(np.minimum(evidence.views, FEW), area, minlength=FEW + 1) / area.sum()
-    return {
-        "seen_by": [round(float(share), 4) for share in seen_by],
-        "guessed": round(float(area[~known].sum() / area.sum()), 4),
-        "uncertainty_m": median,
-    }  # fmt: skip
+    return Trust(seen_by.round(4).tolist(), round(float(area[~known].sum() / area.sum()), 4), median)
 
 
 def color_range(mesh: Mesh, uncertainty: np.ndarray) -> tuple[float, float]:
@@ -137,30 +133,12 @@ def colors_of(uncertainty: np.ndarray, limits: tuple[float, float]) -> np.ndarra
     return np.where(known[:, None], color, GUESSED)
 
 
-@dataclass(frozen=True)
-class NextPhoto:
-    """A photo that would help."""
-
-    view: View  # its camera, metres, z up
-    target: np.ndarray  # [3] m that it looks at
-    gain: float  # its gain, as a share of the gain of photos from all around
-    words: str  # where to stand and where to look
-
-    def to_dict(self) -> dict:
-        """Plain values for the report."""
-        return {
-            "position": [round(float(x), 3) for x in self.view.center],
-            "looking_at": [round(float(x), 3) for x in self.target],
-            "gain": round(self.gain, 3), "words": self.words,
-        }  # fmt: skip
-
-
 def next_photos(
     meshes: Mapping[str, Mesh], evidence: Evidence, sight: Visibility, solid: Caster, views: Sequence[View],
     counted: np.ndarray,
-) -> tuple[list[NextPhoto], float]:  # fmt: skip
-    """The photos that help most, the best first, chosen greedily; empty if none improves `LEAST` of the surface. Also
-    the weak share of the surface that the photos or a camera around the scene could show.
+) -> tuple[list[Proposal], list[View], float]:  # fmt: skip
+    """The photos that help most and their cameras, the best first, chosen greedily; empty if none improves `LEAST` of
+    the surface. Also the weak share of the surface that the photos or a camera around the scene could show.
 
     Surface is weak if fewer than `FEW` photos see it, or if it is `UNSURE`. A photo helps a place that it sees without
     occlusion and at a good angle: by the share of `FEW` photos that the place lacks, else by the reduction of
@@ -168,7 +146,7 @@ def next_photos(
     bool matter.
     """
     if not counted.any():
-        return [], 0.0
+        return [], [], 0.0
     area = np.where(counted, vertex_areas(joined(list(meshes.values()))), 0)
     index = np.random.default_rng(0).choice(len(area), SAMPLES, p=area / area.sum())
     part = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes.values()])[index]
@@ -187,7 +165,8 @@ def next_photos(
     weak = poor & reachable
     short = FEW - now.views[weak]
     lacking = float(np.where(short > 0, short * (short + 1) / (2 * FEW), 1.0).sum())  # largest sum of `worth`
-    chosen: list[NextPhoto] = []
+    chosen: list[Proposal] = []
+    cameras: list[View] = []
     free = np.ones(len(places), bool)
     while len(chosen) < WANTED:
         found = _best(now, poor, [(places[k], around[k]) for k in np.flatnonzero(free)], middle, views[0])
@@ -202,11 +181,12 @@ def next_photos(
         poor = (counts < FEW) | (now.uncertainty > limit)
         most = int(np.bincount(part[seen]).argmax())
         words = f"{way_to(view.center, views, middle)}, looking at {list(meshes)[most]}"
-        chosen.append(NextPhoto(view, target, gain / lacking, words))
+        chosen.append(Proposal(view.center.tolist(), target.tolist(), gain / lacking, words))
+        cameras.append(view)
         turned = (places - middle) @ (view.center - middle)
         turned /= np.linalg.norm(places - middle, axis=1) * np.linalg.norm(view.center - middle)
         free &= turned < np.cos(np.radians(APART))
-    return chosen, float(weak.sum() / total)
+    return chosen, cameras, float(weak.sum() / total)
 
 
 def worth(now: Evidence, view: View, seen: np.ndarray) -> np.ndarray:

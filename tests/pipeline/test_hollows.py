@@ -36,7 +36,7 @@ def seen(mesh: Mesh, elevation: float, count: int = 12) -> Evidence:
 def told(mesh: Mesh, *evidence: Evidence) -> tuple[Hollow, str]:
     found = hollow(mesh, 0.01, *evidence)
     assert found is not None
-    return found, hollow_line("cup", found.to_dict())
+    return found, hollow_line("cup", found)
 
 
 def test_a_cup_is_as_deep_and_as_thick_as_it_is():

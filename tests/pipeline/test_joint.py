@@ -189,7 +189,7 @@ def test_nothing_and_two_things_that_move_are_told() -> None:
     except SdfsimError as error:
         assert "only one part has moved" in f"{error.message} {error.hint}"
     else:
-        assert found.follows < 0.9 and "of the moved surface does not follow the motion" in found.line(1.0)
+        assert found.follows < 0.9 and "of the moved surface does not follow the motion" in found.line()
 
 
 def test_places_that_look_alike_tell_how_a_plain_plate_has_turned() -> None:

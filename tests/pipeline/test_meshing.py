@@ -15,11 +15,12 @@ from pipeline.field.training import Trained
 from pipeline.inputs.photos import Photo, save_photos
 from pipeline.mesh import meshing, photo_refining
 from pipeline.mesh.extraction import sample_box
-from pipeline.mesh.meshing import make_meshes, read_parts, rounded, trust_meshes
+from pipeline.mesh.meshing import make_meshes, read_parts, trust_meshes
 from pipeline.mesh.photo_refining import GreyPhoto, refine
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import GUESSED
 from pipeline.options import options_of
+from pipeline.records import MeshReport
 from pipeline.report import mesh_notes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
@@ -86,12 +87,12 @@ def run(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def mesh(run: Path, tmp_path_factory) -> Iterator[Callable[..., tuple[dict, Path]]]:
+def mesh(run: Path, tmp_path_factory) -> Iterator[Callable[..., tuple[MeshReport, Path]]]:
     """Runs the mesh stage with some options, once for all tests; gives its report and its folder."""
     trained = Trained(Drawn(), 0.01, Similarity(1.0, np.eye(3), np.zeros(3)), {"masked": False})  # type: ignore[arg-type]
 
     @cache
-    def make(**options) -> tuple[dict, Path]:
+    def make(**options) -> tuple[MeshReport, Path]:
         places, folder = (run / "distill", run / "poses", run / "photos"), tmp_path_factory.mktemp("mesh")
         return make_meshes(*places, folder, options_of(preset="quick", **options)), folder
 
@@ -108,8 +109,8 @@ def test_a_cup_on_a_table_becomes_meshes_in_metres_with_names(mesh):
     report, folder = mesh(distance=(*places, 1.2 * 0.98))
     scale = load_placement(folder).to_metres.scale
     assert scale == pytest.approx(1.2 / WIDTH, rel=0.02)
-    assert report["objects"] == ["object1"] and report["up_confidence"] == "high"
-    assert report["size"].startswith(f"given: {places[0]} to {places[1]}")
+    assert report.objects == ["object1"] and report.up_confidence == "high"
+    assert report.size.startswith(f"given: {places[0]} to {places[1]}")
     cup, solid = load_mesh(folder / "objects" / "object1.ply"), load_mesh(folder / "solid.ply")
     assert is_closed(cup) and is_closed(solid)
     assert np.ptp(cup.vertices[:, 2]) == pytest.approx(0.3 * scale, rel=0.05)
@@ -130,13 +131,10 @@ def test_the_files_tell_what_photos_see_of_each_vertex(mesh):
     assert inner.any() and (views[inner] == 0).all()  # It stands on its table.
     colors = {name: part.colors for name, part in trust_meshes(folder).items()}
     assert list(colors) == ["scenery", "object1"] and (colors["object1"][views == 0] == GUESSED).all()
-    assert len(load_views(folder / "next_photos.json")) == len(report["next_photos"])
-
-
-def test_what_is_left_out_is_reported(mesh):
-    report, folder = mesh()
-    assert report["left_out_m"] == pytest.approx([0.06 * load_placement(folder).to_metres.scale], rel=0.2)
-    assert report["size_assumed"] and report["size"] == "assumed: widest side = 1 m"
+    assert len(load_views(folder / "next_photos.json")) == len(report.next_photos)
+    scale = load_placement(folder).to_metres.scale
+    assert report.left_out_m == pytest.approx([0.06 * scale], rel=0.2)  # the speck
+    assert report.smallest_object_m == pytest.approx(4 * Drawn.finest * scale, rel=1e-4)
 
 
 def test_cropping_leaves_the_frame_and_what_is_within(mesh):
@@ -146,7 +144,7 @@ def test_cropping_leaves_the_frame_and_what_is_within(mesh):
     # Without the floor nothing reaches the end of the trained space: the table is what is left to move.
     report, folder = mesh(size=2.0, crop=tuple(corners.ravel()))
     assert load_placement(folder).to_metres.to_dict() == whole.to_metres.to_dict()
-    assert not read_parts(folder)["scenery"] and report["objects"] == ["object1"]
+    assert not read_parts(folder)["scenery"] and report.objects == ["object1"]
     vertices = load_mesh(folder / "objects" / "object1.ply").vertices
     assert (vertices > corners[0] - 0.02).all() and (vertices < corners[1] + 0.02).all()
     with pytest.raises(SdfsimError, match="crop: "):
@@ -172,29 +170,12 @@ def test_what_no_photo_sees_below_a_body_without_scenery_is_level(tmp_path, monk
     options = options_of(preset="quick", size=0.8)
     report = make_meshes(run / "distill", run / "poses", run / "photos", run / "out", options)
     disc = load_mesh(run / "out" / "objects" / "object1.ply")
-    assert report["objects"] == ["object1"] and is_closed(disc)
+    assert report.objects == ["object1"] and is_closed(disc)
     height, cell = disc.vertices[:, 2], 2.04 / 96
     normals, areas = face_normals(disc)
     assert height.min() == pytest.approx(0.0, abs=1e-6) and np.ptp(height) == pytest.approx(0.12, abs=cell)
     level = (disc.vertices[disc.faces][..., 2] < 1e-6).all(1) & (normals[:, 2] < -0.999)
     assert areas[level].sum() > 0.8 * np.pi * 0.4**2  # marching cubes round its edge
-
-
-def test_lengths_are_reported_to_six_digits_of_the_largest():
-    np.testing.assert_array_equal(rounded([1234567.8, -3.24, 0.0]), [1234570.0, 0.0, 0.0])
-    np.testing.assert_array_equal(rounded([2 / 3, -1e-17, 1e-4 / 3]), [0.666667, 0.0, 3.3e-05])
-    assert rounded(2e-6 / 3) == 6.66667e-07 and rounded(0.0) == 0.0 and rounded(100.0) == 100.0
-
-
-def test_lengths_of_a_tiny_scene_are_those_of_its_meshes(mesh):
-    report, folder = mesh(size=2e-4)
-    parts, cup = read_parts(folder), load_mesh(folder / "objects" / "object1.ply").vertices
-    told = [report["extent_m"], parts["objects"][0]["low"], parts["objects"][0]["high"]]
-    found = [np.ptp(load_mesh(folder / "mesh.ply").vertices, axis=0), cup.min(0), cup.max(0)]
-    np.testing.assert_allclose(np.array(told) / 2e-4, np.array(found) / 2e-4, rtol=1e-4, atol=1e-4)
-    assert report["smallest_object_m"] / load_placement(folder).to_metres.scale == pytest.approx(
-        4 * Drawn.finest, rel=1e-4
-    )
 
 
 @cache
@@ -263,4 +244,6 @@ def test_a_body_that_cannot_be_moved_stays_and_it_is_reported_why(case, words, m
     found, why = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
     assert words in why
     np.testing.assert_array_equal(found.vertices, body.vertices)
-    assert f"ball: its surface was not fully refined by photos: {why}" in mesh_notes({"unrefined": {"ball": why}})
+    assert f"ball: its surface was not fully refined by photos: {why}" in mesh_notes(
+        MeshReport(unrefined={"ball": why})
+    )

@@ -19,7 +19,7 @@ from sdfsim.geometry.bvh import Winding
 from sdfsim.geometry.mass import mass_properties
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from tests.helpers.sparse import NOTHING, sparse_of
-from tests.helpers.surfaces import TABLE, TOP, WALL, both, box, cup, table
+from tests.helpers.surfaces import TABLE, TOP, WALL, both, box, table
 
 FINEST = 0.02
 NO_POINTS = np.zeros((0, 3))
@@ -146,19 +146,6 @@ def test_a_small_thing_that_stands_beside_a_body_is_no_crumb():
     assert len(parts.bodies) == 2
 
 
-def test_several_bodies_are_named_from_the_largest_down():
-    def scene(p: np.ndarray) -> np.ndarray:
-        things = cup(p), cup(p, (-0.25, 0.1), 0.1, 0.2), box(p, (-0.3, 0.0, -0.4), (0.08, 0.08, 0.1))
-        return np.minimum.reduce([table(p), *things])
-
-    parts = parts_of(scene)
-    heights = [np.ptp(mesh.vertices[:, 2]) for mesh in parts.bodies.values()]
-    assert list(parts.bodies) == ["object1", "object2", "object3"]
-    np.testing.assert_allclose(heights, [0.3, 0.2, 0.2], atol=0.3 * FINEST)
-    # The third stands on the floor, below the table.
-    assert parts.bodies["object3"].vertices[:, 2].min() == pytest.approx(-0.5, abs=0.1 * FINEST)
-
-
 def hidden(points: np.ndarray) -> np.ndarray:
     return (np.hypot(points[:, 0] - 0.1, points[:, 1] + 0.05) > 0.15) | (points[:, 2] < TOP + 0.02)
 
@@ -185,15 +172,6 @@ def test_what_is_no_body_stays_scenery(scene, seen, why):
     assert parts.solid is not None and signed_volume(parts.solid) == pytest.approx(
         signed_volume(surface_of(scene).solid)
     )
-
-
-def test_without_scenery_every_component_is_a_body():
-    pair = lambda p: np.minimum(box(p, (0.3, 0, 0), (0.1, 0.2, 0.1)), box(p, (-0.4, 0, 0), (0.3, 0.2, 0.2)))  # noqa: E731
-    surface = surface_of(pair)
-    parts = split(surface, pair, FINEST, NOTHING, Path(), np.array([0.0, 0, 1]), alone=True)
-    assert parts.solid is None and parts.shown is None
-    volumes = [signed_volume(mesh) for mesh in parts.bodies.values()]
-    np.testing.assert_allclose(volumes, [0.6 * 0.4 * 0.4, 0.2 * 0.4 * 0.2], rtol=0.05)
 
 
 def test_what_seams_split_off_inside_of_a_body_is_no_body(monkeypatch):

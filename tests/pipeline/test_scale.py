@@ -75,32 +75,23 @@ def test_a_photo_without_a_pixel_is_its_camera(views, photos):
 
 
 @pytest.mark.parametrize(
-    ("end", "says"),
+    ("place", "says"),
     [
-        ("photo9.jpg:1,1", "no photo is called 'photo9.jpg'"),
+        ("photo9.jpg:1,1", r"no photo is called 'photo9\.jpg' \(did you mean 'photo\d\.jpg'\?\)"),
         ("photo1.jpg:2000,1", r"photo1.jpg:2000,1 lies outside the photo \(1280 x 960 px\)"),
+        ("photo1.jpg:-1,1", r"no photo is called 'photo1.jpg:-1,1'"),
         (".jpg", "no photo is called '.jpg'"),
+        ("photo1.jpg", "photo1.jpg has no pixel"),
     ],
 )
-def test_photos_and_pixels_that_are_none_are_named_before_there_are_poses(photos, end, says):
+def test_photos_and_pixels_that_are_none_are_named_before_there_are_poses(photos, place, says):
     check_distance(("photo0.jpg", "photo1.jpg:1280,960", 1.0), photos)
-    with pytest.raises(SdfsimError, match=says):
-        check_distance(("photo0.jpg", end, 1.0), photos)
-
-
-@pytest.mark.parametrize(
-    ("spot", "says"),
-    [
-        ("photo9.jpg:1,1", r"body: no photo is called 'photo9\.jpg' \(did you mean 'photo\d\.jpg'\?\)"),
-        ("photo1.jpg:2000,1", r"body: photo1.jpg:2000,1 lies outside the photo \(1280 x 960 px\)"),
-        ("photo1.jpg:-1,1", r"body: no photo is called 'photo1.jpg:-1,1'"),
-        ("photo1.jpg", "body: photo1.jpg has no pixel"),
-    ],
-)
-def test_places_of_bodies_that_are_none_are_named_before_there_are_poses(photos, spot, says):
     check_bodies({"cup": ["photo0.jpg:1,1", "photo1.jpg:1280,960"]}, photos)
-    with pytest.raises(SdfsimError, match=says):
-        check_bodies({"cup": ["photo0.jpg:1,1", spot]}, photos)
+    with pytest.raises(SdfsimError, match=f"body: {says}"):
+        check_bodies({"cup": ["photo0.jpg:1,1", place]}, photos)
+    if "no pixel" not in says:
+        with pytest.raises(SdfsimError, match=f"distance: {says}"):
+            check_distance(("photo0.jpg", place, 1.0), photos)
 
 
 def test_places_of_bodies_are_where_their_pixels_meet_the_surface(views, photos):

@@ -8,11 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from PIL import Image
 
 from pipeline import stages
 from pipeline.options import Options, read_config
-from pipeline.stages import STAGES, begin, finish, reconstruct, run_stage
+from pipeline.stages import STAGES, Record, begin, finish, reconstruct, run_stage
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import locked
 from tests.helpers.command import run as command
@@ -64,14 +63,6 @@ def test_a_stage_of_another_version_is_done_again_with_those_after_it(photos, tm
     assert calls == ["mesh", "fit", "scene"]
 
 
-def test_another_photo_changes_everything(photos, tmp_path, calls):
-    reconstruct(photos, tmp_path / "out")
-    calls.clear()
-    Image.new("RGB", (80, 80)).save(photos / "9.png")
-    reconstruct(photos, tmp_path / "out")
-    assert calls == NAMES
-
-
 def test_a_mask_of_another_name_or_content_changes_everything(photos, tmp_path, calls):
     """The name of its folder is that of its body."""
     noise(photos / "masks" / "cup", ["0.png", "1.png", "2.png"], (80, 80))
@@ -105,17 +96,6 @@ def test_a_killed_stage_goes_on_in_its_own_folder(photos, tmp_path, calls, act):
     calls.clear()
     reconstruct(photos, tmp_path / "out")
     assert found == [True] and calls == ["distill", "mesh", "fit", "scene"]
-
-
-def test_leftovers_of_other_options_are_not_used(tmp_path):
-    work = begin(tmp_path / "w", "a", fresh=False)
-    (work / "x").write_text("")
-    (work / ".x.json.8.part").write_text("half")
-    again = begin(work, "a", fresh=False)
-    assert (again / "x").exists() and not (again / ".x.json.8.part").exists()
-    assert not (begin(work, "b", fresh=False) / "x").exists()
-    (work / "x").write_text("")
-    assert not (begin(work, "b", fresh=True) / "x").exists()
 
 
 def test_run_stage_needs_the_stages_before(photos, tmp_path, calls):
@@ -182,17 +162,6 @@ def test_stages_made_from_an_older_result_are_not_reported(photos, tmp_path, cal
     assert list(run_stage("scene", out)["stages"]) == NAMES
 
 
-def test_another_result_of_the_same_options_makes_later_stages_old(photos, tmp_path, calls):
-    """With a budget, or on a GPU, a stage done again makes something else of the same."""
-    out = tmp_path / "out"
-    reconstruct(photos, out)
-    report = reconstruct(photos, out, from_stage="distill", until_stage="distill")
-    assert list(report["stages"]) == ["photos", "poses", "distill"]
-    calls.clear()
-    reconstruct(photos, out)
-    assert calls == ["mesh", "fit", "scene"]
-
-
 def test_a_second_run_into_the_same_folder_is_refused(photos, tmp_path, calls):
     out = tmp_path / "out"
     reconstruct(photos, out, until_stage="photos")
@@ -202,38 +171,6 @@ def test_a_second_run_into_the_same_folder_is_refused(photos, tmp_path, calls):
                 again()
             assert caught.value.exit_code == 1
     run_stage("poses", out)
-
-
-def test_a_record_that_cannot_be_written_keeps_the_work(tmp_path, monkeypatch):
-    work = begin(tmp_path / "w", "a", fresh=False)
-    (work / "result").write_text("")
-
-    def full(path: Path, content: dict) -> None:
-        raise SdfsimError(f"{path}: cannot be written: No space left on device")
-
-    monkeypatch.setattr(stages, "write_json", full)
-    with pytest.raises(SdfsimError, match="No space left"):
-        finish(work, tmp_path / "place", "a", "before", {}, 1.0)
-    assert (begin(work, "a", fresh=False) / "result").exists()
-
-
-def test_a_skipped_stage_leaves_nothing_of_runs_that_were_killed(photos, tmp_path, calls, act):
-    """One that was to do it again, and one that had just put the new result in place of the old."""
-    out, ordinary = tmp_path / "out", STAGES["distill"].run
-    reconstruct(photos, out)
-
-    def killed(project: stages.Project, work: Path) -> dict:
-        raise KeyboardInterrupt
-
-    act("distill", killed)
-    with pytest.raises(KeyboardInterrupt):
-        reconstruct(photos, out, from_stage="distill")
-    act("distill", ordinary)
-    shutil.copytree(out / "mesh", out / ".mesh.old")
-    assert (out / ".distill.part").exists()
-    calls.clear()
-    reconstruct(photos, out)
-    assert calls == [] and not (out / ".distill.part").exists() and not (out / ".mesh.old").exists()
 
 
 @pytest.mark.parametrize("stage", ["photos", "fit"])
@@ -266,7 +203,7 @@ def test_what_appears_while_a_stage_runs_is_not_replaced(tmp_path):
     (tmp_path / "place").mkdir()
     (tmp_path / "place" / "mine").write_text("")
     with pytest.raises(SdfsimError, match="not replaced"):
-        finish(work, tmp_path / "place", "a", "before", {}, 1.0)
+        finish(work, tmp_path / "place", Record("a", "before", "made", 1.0, {}))
     assert (tmp_path / "place" / "mine").exists() and (work / "result").exists()
 
 

@@ -12,7 +12,6 @@ from PIL import Image
 from pipeline.cameras import PosedPhotos, Sparse, View
 from pipeline.mesh.extraction import FieldSurface, Volume
 from pipeline.mesh.supports import complete, on_any
-from pipeline.report import mesh_notes
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh
 from tests.pipeline.photo_sets import around
@@ -170,8 +169,3 @@ def test_flat_spots_of_a_round_thing_are_no_tables(photographed):
     for view in poses.views:
         Image.new("RGB", (240, 180), (150, 105, 70)).save(plain / "images" / view.name)
     assert complete(whole, UP, CELL, poses, plain) == []
-
-
-def test_the_report_says_what_was_completed():
-    (line,) = mesh_notes({"completed_m2": [0.3412]})
-    assert line.startswith("0.34 m^2 of a level surface without texture were completed as a plane")

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, camera_up, nearest_to_axes
+from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, camera_up
 from pipeline.field.supervision import unit_sphere_of
 from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
-from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
-from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
+from pipeline.mesh.placement import Scale, find_up, load_placement, place, plane_up, resting_height
+from pipeline.mesh.visibility import Visibility
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
 from tests.helpers.sparse import sparse_of
@@ -100,24 +100,6 @@ def test_a_vertex_behind_something_is_not_seen():
     assert len(hidden.of_view(view)[0]) == 0
 
 
-def test_colours_spread_from_the_nearest():
-    known = np.array([[0.0, 0, 0], [1, 0, 0]])
-    found = spread_colors(np.array([[0.0, 0, 0], [0.5, 0, 0], [0.75, 0, 0]]), known, np.array([[0.0], [100.0]]))
-    np.testing.assert_allclose(found[:, 0], [0, 50, 75], atol=1e-5)
-
-
-def test_bilinear_is_exact_on_a_ramp():
-    image = np.stack(np.meshgrid(np.arange(7.0), np.arange(5.0)), -1)
-    at = np.random.default_rng(0).uniform([0, 0], [6, 4], (40, 2))
-    np.testing.assert_allclose(bilinear(image, at), at)
-
-
-def test_axes_meet_where_the_cameras_look():
-    views = ring()
-    found = nearest_to_axes(np.array([v.center for v in views]), np.array([v.rotation[2] for v in views]))
-    np.testing.assert_allclose(found, 0, atol=1e-4)
-
-
 def test_the_unit_sphere_holds_the_object_and_moves_cameras_along():
     rng = np.random.default_rng(0)
     views = ring()
@@ -158,25 +140,6 @@ def test_up_from_the_dominant_plane():
     assert plane_up(clutter, other, np.ones(400), np.array([0.0, 0, 1]), 0.005) is None
 
 
-def test_the_dominant_plane_is_the_largest_not_the_one_with_most_samples():
-    """A table of many small faces beside a floor of few large ones, which slopes by 5 degrees."""
-    rng, slope = np.random.default_rng(0), np.radians(5)
-    floor = rng.uniform(-1, 1, (300, 2)) @ np.array([[np.cos(slope), 0, -np.sin(slope)], [0, 1, 0]])
-    table = np.column_stack([rng.uniform(-0.3, 0.3, (3000, 2)), np.full(3000, 0.5)])
-    sloping = np.array([np.sin(slope), 0, np.cos(slope)])
-    normals = np.concatenate([np.repeat(sloping[None], 300, 0), np.repeat([[0, 0, 1.0]], 3000, 0)])
-    areas = np.concatenate([np.full(300, 4 / 300), np.full(3000, 0.36 / 3000)])
-    found = plane_up(np.concatenate([floor, table]), normals, areas, np.array([0.0, 0, 1]), 0.02)
-    assert found is not None
-    assert np.degrees(np.arccos(np.clip(found[0] @ sloping, -1, 1))) < 0.01 and found[1] < 0.01
-
-
-def test_resting_height_is_the_floor_under_a_table():
-    mesh = scenery()
-    upper = Mesh(mesh.vertices + np.array([0, 0, 0.37]), mesh.faces)
-    assert resting_height(upper) == pytest.approx(0.37, abs=0.005)
-
-
 def test_placement_turns_gravity_down_and_sets_the_size(tmp_path):
     mesh = scenery()
     rng = np.random.default_rng(1)
@@ -194,7 +157,7 @@ def test_placement_turns_gravity_down_and_sets_the_size(tmp_path):
     np.testing.assert_allclose(load_placement(tmp_path).mesh(turned).vertices, placed.vertices)
     assert found.up_from == "plane" and found.up_within < 1 and found.up_confidence == "high"
     assert place(turned, views).size_assumed and not found.size_assumed
-    known = place(turned, views, (10.0, "a ruler"), size=3.0)
+    known = place(turned, views, Scale(10.0, "a ruler"), size=3.0)
     assert known.size_from == "a ruler" and np.ptp(known.mesh(turned).vertices, axis=0).max() == pytest.approx(6.0)
 
 
@@ -211,15 +174,6 @@ def test_a_floor_that_the_cameras_contradict_is_not_trusted():
 def test_bodies_without_scenery_stand_on_the_floor():
     found = place(cube(1.0), ring(), size=2.0, alone=True)
     assert found.mesh(cube(1.0)).vertices[:, 2].min() == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_similarity_and_its_inverse():
-    rng = np.random.default_rng(0)
-    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    move = Similarity(2.5, q * np.sign(np.linalg.det(q)), rng.normal(size=3))
-    p = rng.normal(size=(20, 3))
-    np.testing.assert_allclose(move.inverse().points(move.points(p)), p, atol=1e-12)
-    np.testing.assert_allclose(Similarity.from_dict(move.to_dict()).points(p), move.points(p))
 
 
 def test_cameras_and_points_move_together_and_know_from_where():

@@ -5,24 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
-from pipeline.mesh import texture
-from pipeline.mesh.extraction import components
-from pipeline.mesh.texture import BLOCK, Shots, fewer, rasterise, shots_of, textured, unfold
+from pipeline.mesh.texture import Shots, shots_of, textured, unfold
 from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
 from pipeline.scene_writer import skins_of
-from sdfsim.apps.recording import Playback, save_reconstruction, with_normals
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, joined, sample_surface, vertex_normals
+from sdfsim.geometry.mesh import Mesh, joined, sample_surface
 from sdfsim.geometry.mesh_io import read_glb, write_glb, write_ply
-from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import load_shape, scaled
-from tests.helpers.runs import read
 from tests.helpers.surfaces import cube, look_at, plate
 
 GREY, RED = np.array([90.0, 90, 90]), np.array([250.0, 20, 20])
@@ -92,16 +86,6 @@ def test_a_pattern_finer_than_the_mesh_is_in_the_texture(tmp_path):
     assert error < 5 and plain > 10 * error
 
 
-def test_the_best_view_gives_a_sharper_texture_than_the_mean(tmp_path, monkeypatch):
-    """Where the mesh is off by a little, the photos do not agree."""
-    true, mesh = plate(1), plate(20, z=0.012)
-    shots = photograph(tmp_path, ring(1.2), [true], [pattern])
-    points = np.random.default_rng(0).uniform([-0.3, -0.3, 0.012], [0.3, 0.3, 0.012], (4000, 3))
-    best = on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
-    monkeypatch.setattr(texture, "POWER", 1.0)
-    assert best > 1.2 * on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
-
-
 def test_what_stands_in_front_does_not_print_itself_on_what_is_behind(tmp_path):
     floor, block = plate(20), cube(0.25, (0.0, 0.0, 0.3))
     views = ring(1.2)
@@ -132,33 +116,6 @@ def test_what_no_photo_shows_at_all_gets_a_small_texture(tmp_path):
     made = textured(replace(mesh, colors=np.full(mesh.vertices.shape, 77, np.uint8)), shots)
     assert made.texture is not None and max(made.texture.shape) < 100
     assert np.abs(made.texture.astype(int) - 77).max() <= 1
-
-
-def test_charts_have_blocks_of_their_own():
-    mesh = cube(0.3, (0.0, 0.0, 0.0))
-    flat, origin, (rows, columns) = unfold(mesh, 200.0)
-    assert flat.uv is not None and rows % BLOCK == columns % BLOCK == 0
-    assert np.array_equal(flat.vertices, mesh.vertices[origin])
-    assert flat.uv.min() >= 0 and flat.uv.max() <= 1
-    corners = flat.uv[flat.faces] * [columns, rows]
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
-    assert area == pytest.approx(6 * 0.3**2 * 200**2, rel=0.12)  # charts grow to whole blocks
-    texels = rasterise(flat, vertex_normals(mesh)[origin], (rows, columns))
-    assert len(texels.at) == pytest.approx(area, rel=0.02)  # nothing lies twice
-    used = []
-    for chart in range((label := components(flat)).max() + 1):
-        own = rasterise(replace(flat, faces=flat.faces[label == chart]), vertex_normals(mesh)[origin], (rows, columns))
-        used.append(np.unique(own.at // columns // BLOCK * columns + own.at % columns // BLOCK))
-    assert len(used) >= 3 and len(np.concatenate(used)) == len(np.unique(np.concatenate(used)))
-
-
-def test_a_mesh_of_many_faces_gets_fewer():
-    mesh = plate(60)
-    mesh = replace(mesh, colors=to_bytes(pattern(mesh.vertices)))
-    coarse = fewer(mesh, 2000)
-    assert len(coarse.faces) <= 2000 and coarse.colors is not None and len(coarse.colors) == len(coarse.vertices)
-    assert fewer(mesh, len(mesh.faces)) is mesh
 
 
 def skin() -> Mesh:
@@ -193,36 +150,6 @@ def test_other_programs_read_the_glb_upright_with_texture_and_places(tmp_path):
     assert np.abs(image - mesh.texture).max() < 8
     assert np.allclose(visual.uv, np.c_[mesh.uv[:, 0], 1 - mesh.uv[:, 1]], atol=1e-6)  # type: ignore[union-attr]
     assert set(read_glb(tmp_path / "a.glb")) == {"scene", "object1"}
-
-
-def test_recordings_show_the_texture(tmp_path):
-    mesh = skin()
-    assert mesh.uv is not None and mesh.texture is not None
-    save_reconstruction(tmp_path / "r.rrd", [], np.zeros((0, 3)), None, plate(2), {"scene": mesh, "object1": mesh})
-    found = read(tmp_path / "r.rrd")
-    assert "/world/surface!" not in found and "/world/surface/scene!" in found
-    shown = found["/world/surface/object1!"]
-    np.testing.assert_allclose(shown["Mesh3D:vertex_texcoords"][0], mesh.uv, atol=1e-6)
-    assert len(shown["Mesh3D:albedo_texture_buffer"][0][0]) == mesh.texture.size
-    assert "Mesh3D:vertex_colors" not in shown and "Mesh3D:albedo_factor" not in shown
-    shape = replace(analytic_shape("box", size=(1, 1, 1)), skin=mesh)
-    still, ahead = np.zeros(3), np.array([0.0, 0, 0, 1])
-    body = Body("crate", 0, "dynamic", 2.0, np.array([0.0, 0, 1]), ahead, still, still, 1.0, 0.5, 0.5)
-    playback = Playback(Scene((shape,), (body,), np.array([0.0, 0, -9.81]), 1.0))
-    encoded = playback.stream.binary_stream()
-    playback.log_static()
-    (tmp_path / "p.rrd").write_bytes(encoded.read() or b"")
-    shown = read(tmp_path / "p.rrd")["/world/crate/mesh!"]
-    np.testing.assert_allclose(shown["Mesh3D:vertex_positions"][0], 2 * mesh.vertices, atol=1e-6)
-    assert len(shown["Mesh3D:albedo_texture_buffer"][0][0]) == mesh.texture.size
-
-
-def test_shading_goes_on_where_a_texture_is_cut():
-    ball = analytic_shape("sphere", radius=0.5).mesh
-    flat, _, (rows, columns) = unfold(ball, 60.0)
-    mesh, normals = with_normals(replace(flat, texture=np.zeros((rows, columns, 3), np.uint8)))
-    assert len(mesh.vertices) > len(ball.vertices)
-    np.testing.assert_allclose((normals * mesh.vertices).sum(1), 0.5, atol=1e-2)
 
 
 def test_the_skin_of_a_body_stands_at_the_bodys_origin(tmp_path):
