@@ -474,7 +474,7 @@ def main(
         if not (photos / "truth.ply").exists():
             raise SdfsimError(f"{photos}: no set with a known truth", f"{', '.join([*RENDERED, *JOINTS])} are others")
         given = captured(capture, out, photos) if capture else photos
-        report = reconstruct(given, out, size=size, distance=distance and list(distance), **options)
+        report = reconstruct(given, out, size=size, distance=distance, **options)
         parts = [name, capture, preset, f"{budget:g}_minutes" if budget else None]
         name = "_".join(["reconstruct", *filter(None, parts)])
         found = evaluate(out, photos)

@@ -254,7 +254,7 @@ def main(folder: Path, *, out: Out, preset: str = "quick", longest: float = 1800
         if named(found, folder) in {row.name for row in rows}:
             continue
         rows.append(judged(found, folder, out, preset, longest))
-        print(" | ".join(filter(None, rows[-1].cells())), flush=True)
+        print(*filter(None, rows[-1].cells()), sep=" | ", flush=True)
         write_json(done, [asdict(row) for row in rows])  # the rows so far
     for kind in sorted({row.kind for row in rows}):
         recorded(kind, [row for row in rows if row.kind == kind])
