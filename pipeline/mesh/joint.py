@@ -128,7 +128,7 @@ def find_joint(
     size = float(np.linalg.norm(np.ptp(one.vertices, axis=0)))
     near = STILL * size if near is None else near
     on = ClosestPoint(one), ClosestPoint(other)
-    clear = empty or 2 * (lambda points: np.ones(len(points), bool),)
+    clear = empty or (_everywhere, _everywhere)
     part, share = _moved(one, on[1], clear[1], near, rng)
     there, their_share = _moved(other, on[0], clear[0], near, rng)
     if share > MOST:
@@ -290,6 +290,10 @@ def _away(surface: ClosestPoint, points: np.ndarray) -> np.ndarray:
 def _extent(points: np.ndarray) -> float:
     """m, the diagonal of the box around points."""
     return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+
+
+def _everywhere(points: np.ndarray) -> np.ndarray:
+    return np.ones(len(points), bool)
 
 
 Points = tuple[np.ndarray, np.ndarray]  # [P, 3] m of a surface, with the normals there

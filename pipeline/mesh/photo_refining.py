@@ -26,7 +26,7 @@ LONG_SIDE = 640  # px; larger photos are reduced, because otherwise the right pl
 # Photos in which a patch is compared, those with the best viewing angle; and how many have to agree: any two do.
 # Of a drawn ball with an obstacle before three cameras, six photos are better than five and as good as eight.
 PHOTOS, FEWEST = 6, 3
-PATCH = np.stack(np.mgrid[-3:4, -3:4], -1).reshape(-1, 2).astype(np.float32)  # [G, 2] px from a patch's middle
+PATCH = np.indices((7, 7)).reshape(2, -1).T.astype(np.float32) - 3  # [G, 2] px from a patch's middle
 NOISE = 4.0  # grey levels squared: variance that is no texture
 PLACES = 25  # tried along the normal
 # Largest move of vertices per round, in cells of the field's finest grid, and rounds; half as far in the last.

@@ -265,7 +265,8 @@ def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
     import cv2
 
     free = np.logical_not(known).astype(np.uint8)
-    _, nearest = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    labels = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    nearest = np.asarray(labels, np.intp)
     colors = np.zeros((nearest.max() + 1, image.shape[2]), np.float32)
     colors[nearest[known]] = image[known]
     return colors[nearest]
