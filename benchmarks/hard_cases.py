@@ -13,10 +13,10 @@ from typing import Any
 
 from benchmarks.engines.drake import drake
 from benchmarks.results import ROOT, progress, write_section
+from sdfsim.apps.stress import USUAL, Study, draw_group, figures, loss_lines, stress, table, write_report
 from sdfsim.base.files import read_json, write_json
 from sdfsim.evaluation.engines import mujoco
-from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import USUAL, Study, draw_group, figures, loss_lines, stress, table, write_report
+from sdfsim.evaluation.laws.table import GROUPS
 
 ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
 DOCUMENT = ROOT / "docs" / "stability.md"
@@ -42,15 +42,15 @@ def slipped_back(study: Study, file: Path) -> list[str]:
     for who, now in accepted(study)["models"].items():
         was = read_json(file)["models"][who]
         worse += [f"{who}: {case}: blew up" for case in now["blew_up"] if case not in was["blew_up"]]
-        for key, figure in {f"{case.name}/{f.name}": f for case in study.cases for f in case.figures}.items():
-            if key not in was["figures"] or key not in now["figures"]:
-                continue
-            before, after = was["figures"][key], now["figures"][key]
-            slack = max(SPREADS * before["noise"], SHARE * abs(before["value"]), 10.0**-figure.digits)
-            gap = after["value"] - before["value"]
-            if (-gap if figure.longer else gap) > slack:
-                accepted_was = f"accepted {before['value']:.4g} ± {before['noise']:.2g}"
-                worse.append(f"{who}: {key} {after['value']:.4g} {figure.unit}, {accepted_was}")
+        for law in study.laws:
+            for name, figure in study.figures(law, who).items():
+                before = was["figures"].get(f"{law.name}/{name}")
+                if before is None or not figure.better:
+                    continue
+                slack = max(SPREADS * before["noise"], SHARE * abs(before["value"]), 10.0**-figure.digits)
+                if figure.better * (before["value"] - figure.measured) > slack:
+                    accepted_was = f"accepted {before['value']:.4g} ± {before['noise']:.2g}"
+                    worse.append(f"{who}: {law.name}/{name} {figure.measured:.4g} {figure.unit}, {accepted_was}")
     return worse
 
 

@@ -12,8 +12,8 @@ from benchmarks.engines.newton import newton
 from benchmarks.engines.rapier import rapier
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
-from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import bullet, by_engine, mujoco, shape_urdf, start_of_scene
+from sdfsim.evaluation.laws import hard_cases
 from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
