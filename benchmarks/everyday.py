@@ -2,7 +2,7 @@
 
     python -m benchmarks everyday -o DIR [--full]
 
-The scenes and checks are those of `python -m sdfsim.evaluation.everyday` at 10 cm, with closed forms for shapes that
+The scenes and checks are those of `python -m sdfsim.evaluation.laws.table` at 10 cm, with closed forms for shapes that
 have one. Engines use inner steps of 4 ms (for bodies of a metre; for smaller ones in proportion to the square root of
 their size), ours its default, which is the same. Closed forms are native to each engine; meshes that are not convex
 become pieces by CoACD (tetrahedra in Drake). Newton has triangles for all but spheres and boxes. Engines do not sleep.
@@ -27,10 +27,13 @@ from benchmarks.rivals import in_pieces
 from sdfsim.apps import mujoco_world
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import SUBSTEPS
-from sdfsim.evaluation import engines, everyday
+from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import LONGEST, Engine, Ran, Runner, TooSlow, by_engine, by_model, still
-from sdfsim.evaluation.everyday import ROWS, Check, Setting, checks
 from sdfsim.evaluation.harness import Job, Results, measure, one_thread
+from sdfsim.evaluation.laws import everyday, scenes
+from sdfsim.evaluation.laws.check import Check
+from sdfsim.evaluation.laws.scenes import Setting
+from sdfsim.evaluation.laws.table import ROWS, checks
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -133,7 +136,7 @@ def judged(row: str, at: Setting, run: Runner) -> Iterator[tuple[str, Check, str
         broken.extend([found.broke] if found.broke else [])
         return found
 
-    for name, check in checks(row, replace(at, by=watched)):
+    for name, check in checks(ROWS[row], replace(at, by=watched)):
         seen = True
         yield name, check, "".join(absent[:1]), "".join(broken[:1])
 
@@ -206,7 +209,7 @@ def table(results: Results) -> tuple[list[tuple[str, ...]], list[str]]:
 
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
-    content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday)]
+    content = [at.full, str(at), SUBSTEPS, LONGEST, inspect.getsource(everyday), inspect.getsource(scenes)]
     how = [inspect.getsource(module) for module in (engines, mujoco_world, *map(inspect.getmodule, OTHERS)) if module]
     jobs = [
         Job(row, name, [content, "" if name == OURS else how], counted, (row, at, name, out / "scenes"))
@@ -218,7 +221,7 @@ def compared(rows: list[str], at: Setting, out: Path) -> Results:
 
 
 def main(*, out: Out, full: bool = False) -> None:
-    results = compared(list(ROWS), Setting(full=full), out)
+    results = compared([name for name, law in ROWS.items() if law.group == "everyday"], Setting(full=full), out)
     for name in ENGINES:
         took = sum(found.get("s", 0.0) for (_, other), found in results.items() if other == name)
         print(f"{name}: {took:.0f} s of the processor")

@@ -13,9 +13,7 @@ from typing import Any
 
 from benchmarks.engines import drake, mujoco
 from benchmarks.records import ROOT, Out, progress, write_record
-from sdfsim.base.files import read_json, write_json
-from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import (
+from sdfsim.apps.stress import (
     LEGEND,
     TEACHER,
     USUAL,
@@ -27,6 +25,8 @@ from sdfsim.evaluation.stress import (
     stress,
     write_report,
 )
+from sdfsim.base.files import read_json, write_json
+from sdfsim.evaluation.laws.table import GROUPS
 
 ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
@@ -51,15 +51,15 @@ def slipped_back(study: Study, file: Path) -> list[str]:
     for who, now in accepted(study)["models"].items():
         was = read_json(file)["models"][who]
         worse += [f"{who}: {case}: blew up" for case in now["blew_up"] if case not in was["blew_up"]]
-        for key, figure in {f"{case.name}/{f.name}": f for case in study.cases for f in case.figures}.items():
-            if key not in was["figures"] or key not in now["figures"]:
-                continue
-            before, after = was["figures"][key], now["figures"][key]
-            slack = max(SPREADS * before["noise"], SHARE * abs(before["value"]), 10.0**-figure.digits)
-            gap = after["value"] - before["value"]
-            if (-gap if figure.longer else gap) > slack:
-                accepted_was = f"accepted {before['value']:.4g} ± {before['noise']:.2g}"
-                worse.append(f"{who}: {key} {after['value']:.4g} {figure.unit}, {accepted_was}")
+        for law in study.laws:
+            for name, figure in study.figures(law, who).items():
+                before = was["figures"].get(f"{law.name}/{name}")
+                if before is None or not figure.better:
+                    continue
+                slack = max(SPREADS * before["noise"], SHARE * abs(before["value"]), 10.0**-figure.digits)
+                if figure.better * (before["value"] - figure.measured) > slack:
+                    accepted_was = f"accepted {before['value']:.4g} ± {before['noise']:.2g}"
+                    worse.append(f"{who}: {law.name}/{name} {figure.measured:.4g} {figure.unit}, {accepted_was}")
     return worse
 
 
@@ -77,9 +77,9 @@ def main(*, out: Out, quick: bool = False) -> None:
         ("", *who[TEACHER]), [(name, *lost.values()) for name, lost in who.items()],
     )  # fmt: skip
     found = []
-    for case in study.cases:
-        head, *lines = rows(replace(study, cases=[case]), {"missed": "**", "behind": "*"})
-        found += [(GROUPS[case.group].title, case.title, *line[1:]) for line in lines]
+    for law in study.laws:
+        head, *lines = rows(replace(study, laws=[law]), {"missed": "**", "behind": "*"})
+        found += [(GROUPS[law.group].title, law.title, *line[1:]) for line in lines]
     write_record("hard_cases", command, f"{measured}.", ("group", *head), found, [f"- {line}" for line in LEGEND])
     # Engines without restitution would set the scale of the plots.
     others = replace(study, engines=list(USUAL))

@@ -34,9 +34,9 @@ from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
 from sdfsim.evaluation.evaluate import load_recorded
-from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, measure, one_thread, peak_memory
-from sdfsim.evaluation.penetration import depths
+from sdfsim.evaluation.instruments import depths
+from sdfsim.evaluation.laws.hard_cases import ball, body, box, on_floor
 from sdfsim.geometry.mesh import Mesh, clean
 from sdfsim.geometry.mesh_io import load_pieces, wavefront
 from sdfsim.physics.bodies import largest_extent
@@ -257,7 +257,8 @@ def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str,
                 break  # finer steps take longer still
             motions[inner] = [motion for motion, _, _ in runs]
             prepare = max(prepare, *(one for _, _, one in runs))
-            deep = np.concatenate([depths(one) / w for one, w in zip(motions[inner], size, strict=True)])
+            parts = zip(motions[inner], size, strict=True)
+            deep = np.concatenate([depths(one.scene, one.rollout) / w for one, w in parts])
             found[inner] = {
                 "ms": float(np.mean([ms for _, ms, _ in runs])),
                 "deep": float(np.percentile(deep, 95)) if len(deep) else 0.0,

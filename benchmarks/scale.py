@@ -36,9 +36,9 @@ from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
-from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory, why_failed
-from sdfsim.evaluation.penetration import depths
+from sdfsim.evaluation.instruments import depths
+from sdfsim.evaluation.laws.hard_cases import body, box, on_floor
 from sdfsim.learned.model import load_model
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout
@@ -114,7 +114,7 @@ def engine(run: Engine, file: Path, steps: int) -> dict:
 
 def _where(run: Ran) -> dict[str, float]:
     """Depth of overlaps, mm, and the number of bodies below the floor at the end."""
-    depth = depths(run)
+    depth = depths(run.scene, run.rollout)
     return {
         "depth_95": 1e3 * float(np.percentile(depth, 95)) if len(depth) else 0.0,
         "lost": int((run.motion.position[-1, :, 2] < -0.1).sum()),
@@ -166,7 +166,7 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
     seconds = time.perf_counter() - began
     mib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     loaded, rollout = load_scene(scene), Rollout.load(run / "rollout.npz")
-    depth = depths(Ran(loaded, rollout), every=20)
+    depth = depths(loaded, rollout, every=20)
     moving = [k for k, b in enumerate(loaded.bodies) if b.motion == "dynamic"]
     return {
         "bodies": len(moving),

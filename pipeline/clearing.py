@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import nnls
 
+from sdfsim.evaluation.true_surfaces import Placed, TrueSurface, gaps, of_mesh, true_surface
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics.pose import to_matrix
-from sdfsim.physics.true_surfaces import Placed, TrueSurface, gaps, of_mesh, true_surface
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.sdf.closed_forms import ClosedForm, PlaneSdf

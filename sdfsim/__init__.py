@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from sdfsim.apps.render import render
     from sdfsim.apps.run import simulate
     from sdfsim.base.errors import SceneError, SdfsimError
+    from sdfsim.evaluation.instruments import judged
     from sdfsim.physics.bodies import State
-    from sdfsim.physics.instruments import judged
     from sdfsim.physics.rollout import Rollout
     from sdfsim.scene.builder import SceneBuilder as Scene
     from sdfsim.scene.load import load_scene
@@ -63,7 +63,7 @@ _HOME = {
     "Shape": "sdfsim.shape.shape",
     "Simulator": "sdfsim.simulate.simulator",
     "State": "sdfsim.physics.bodies",
-    "judged": "sdfsim.physics.instruments",
+    "judged": "sdfsim.evaluation.instruments",
     "load_scene": "sdfsim.scene.load",
     "load_shape": "sdfsim.shape.shape",
     "export": "sdfsim.apps.export",

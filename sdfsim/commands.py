@@ -398,8 +398,8 @@ def stress(
     device: str = "auto",
 ) -> None:
     """Hard cases with every model and the teacher (PyBullet): a table, plots, and recordings of what went wrong."""
+    from sdfsim.apps import stress as study
     from sdfsim.base.lazy import pyplot
-    from sdfsim.evaluation import stress as study
 
     pyplot()
     found = study.stress(**session.given("model"), models=model or [], on_progress=session.progress)

@@ -37,9 +37,10 @@ FLOORS = [
     ["physics"],
     ["learned"],
     ["simulate"],
-    ["data", "apps"],
+    ["data"],
     ["training"],
     ["evaluation"],
+    ["apps"],
     ["commands"],
 ]
 

@@ -30,9 +30,9 @@ from sdfsim.base.files import (
     write_text,
 )
 from sdfsim.base.parallel import Progress, StageProgress, of_stage, silent, silent_stages
+from sdfsim.evaluation.instruments import LEAST, PART, judged
 from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics.bodies import State, largest_extent
-from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.steps import COUNTS, PHASES
 from sdfsim.physics.units import EARTH
@@ -265,7 +265,7 @@ def _dynamic(scene: Scene) -> list[int]:
 def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
     """The main numbers of a run. `cost` has every counter and phase of the step; `ended` says where the dynamic bodies
     are at the end, and which of them `left` the scene for good; `broken_laws` are the findings of instruments that do
-    not use the contact solve (see `sdfsim.physics.instruments`), in a twentieth of the run's time."""
+    not use the contact solve (see `sdfsim.evaluation.instruments`), in a twentieth of the run's time."""
     counters = rollout.counters
     rows, (centre, radius) = _dynamic(scene), framed(scene)
     place, speed = rollout.position[-1, rows], np.linalg.norm(rollout.velocity[-1, rows], axis=-1)

@@ -12,7 +12,7 @@ from sdfsim.base.console import columns
 from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, parallel, silent
-from sdfsim.data.batching import batches, first_frames, model_units, roll_out, scene_of
+from sdfsim.data.batching import batches, centred, first_frames, model_units, roll_out, scene_of
 from sdfsim.data.dataset import (
     Trajectory,
     conditions_of,
@@ -25,16 +25,18 @@ from sdfsim.data.dataset import (
 )
 from sdfsim.data.pybullet_sim import engine_settings, import_pybullet, substeps_of
 from sdfsim.evaluation import metrics
-from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
+from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, scene_rollout
+from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.metrics import Motions, energy_gain, errors
-from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
 from sdfsim.learned.model import Model, load_model
 from sdfsim.physics.options import STEP, SUBSTEPS
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
+from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.steppers import FreeFlight, stepper_of
 
+EVERY = 10  # every how many frames overlaps are measured
 SURVIVED = "0.25"  # m, the limit for which the median survival time is shown
 NOTHING = "-"
 # m/s; 0 shows the effect of state that a recording does not contain: an engine keeps more state than its recorded
@@ -134,10 +136,13 @@ def evaluate(
         }
     if not errors_only:
         on_progress(0.9, "penetration, energy and rest")
-        solids, rest = exact_solids(data, shapes), [metrics.resting(t) for t in recorded]
+        rest = [metrics.resting(t) for t in recorded]
         sides = {"model": contenders["model"], "teacher": recorded}
-        geometry = {name: solid.kind for name, solid in solids.items()}
-        depth = {who: penetration(motions, solids) for who, motions in sides.items()}
+        geometry = {
+            name: "closed form" if isinstance(shape.sdf, ClosedForm) else "pieces" if shape.pieces else "mesh"
+            for name, shape in shapes.items()
+        }
+        depth = {who: penetration(motions, shapes) for who, motions in sides.items()}
         report["penetration"] = depth | {"geometry": geometry, "every": EVERY}
         report["energy_gain"] = {who: energy_gain(motions) for who, motions in sides.items()}
         resting: dict[str, float | None] = {"bodies": int(sum(r.sum() for r in rest))}
@@ -148,6 +153,21 @@ def evaluate(
         report["resting_speed"] = resting
     on_progress(1.0, "done")
     return report
+
+
+def penetration(motions: Motions, shapes: dict[str, Shape]) -> dict[str, Any]:
+    """Penetration in m over the frames of all `motions` in which something touches: percentile_95 and worst of a
+    frame's deepest overlap (None if nothing touches), and steps_with_contact."""
+    own, found = {name: centred(shape) for name, shape in shapes.items()}, []
+    for motion in motions:
+        scene = scene_of([motion], [0], own)[0]
+        found.append(depths(scene, scene_rollout(scene, motion), EVERY))
+    depth = np.concatenate(found)
+    return {
+        "percentile_95": float(np.percentile(depth, 95)) if len(depth) else None,
+        "worst": float(depth.max()) if len(depth) else None,
+        "steps_with_contact": len(depth),
+    }
 
 
 def users_inner(dt: float, scenes: list[Scene]) -> int:
@@ -276,14 +296,12 @@ def notes(report: dict[str, Any]) -> list[str]:
     lines = [
         f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {source}.",
         f"The solve makes {report['inner_steps']} inner steps in a recorded one, as in a user's run.",
-        f"Penetration: the deepest node in every {depth['every']}th frame with contact.",
+        f"Penetration: the deepest overlap in every {depth['every']}th frame with contact.",
         "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
         f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.",
         f"Within {SURVIVED} m: until half of the bodies have been farther from the recording.",
         *(f"Outside the model's training: {line}." for line in report["outside_training"]),
     ]
-    if shown := sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh"):
-        lines.append(f"Without the engine's files, penetration is measured on the shown mesh of {', '.join(shown)}.")
     if steps < report["steps_asked"]:
         lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
     if not report["engine_substep"]:

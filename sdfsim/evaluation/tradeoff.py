@@ -20,11 +20,10 @@ from sdfsim.data.batching import every, first_frames, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, at_instants, check_alike, conditions_of, engine_substep
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
 from sdfsim.evaluation.engines import Engine, Start, Timing, bullet, dataset_urdf, start_of_scene, timed
-from sdfsim.evaluation.evaluate import load_recorded, perturbed
-from sdfsim.evaluation.hard_cases import tossed
+from sdfsim.evaluation.evaluate import load_recorded, penetration, perturbed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
+from sdfsim.evaluation.laws.hard_cases import tossed
 from sdfsim.evaluation.metrics import energy_gain, errors
-from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.load import load_scene
@@ -69,7 +68,6 @@ class Cases:
     starts: list[Trajectory]  # with velocities at the instants of the positions: the starts of our models
     shapes: dict[str, Shape]  # by name, with origins at the centres of mass
     urdfs: dict[str, Path]  # the engines' files, by name; missing ones are left out
-    solids: dict[str, ExactSolid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
     length: float = 1.0  # m of the scene in one unit of these; 1 for recordings
@@ -105,7 +103,6 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
         starts=[at_instants(t, substep) for t in recorded],
         shapes={name: replace(shape, com=np.zeros(3)) for name, shape in shapes.items()},
         urdfs=urdfs,
-        solids=exact_solids(data, shapes),
         floor=conditions.floor,
     )
 
@@ -134,8 +131,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
-    solids = exact_solids(folder, shapes)
-    return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, units.length, units.time)
+    return Cases([recorded], [t], shapes, start.urdfs, start.floor, True, units.length, units.time)
 
 
 def _centred(shape: Shape, name: str) -> Shape:
@@ -279,7 +275,7 @@ def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[st
     there = errors(motions, recorded, [h // stride for h in horizons])
     found = {str(h): there[str(h // stride)] for h in horizons}
     gain = energy_gain([first_frames(m, cases.steps + 1) for m in motions])
-    depth = penetration(motions, cases.solids)["percentile_95"]
+    depth = penetration(motions, cases.shapes)["percentile_95"]
     return {
         "translation_rmse": {h: cases.length * error["translation_rmse"] for h, error in found.items()},
         "translation_rmse_95": {
@@ -346,7 +342,7 @@ def tradeoff(
             scene = load_scene(source, lambda f, m: on_progress("shapes", f, m)) if source else tossed((1,))
             cases = cases_of_scene(scene, names[0], out / "engine", quick=quick)
         kinds, families, jobs = {FLOOR_LABEL: "floor"}, {}, []
-        content = [VERSION, machine(), replace(cases, urdfs={}, solids={})]
+        content = [VERSION, machine(), replace(cases, urdfs={})]
         by_nodes = not all(own_pieces(shape) for shape in cases.shapes.values())  # convex pieces need no nodes
         for variant in variants(names, quick=quick, nodes=by_nodes):
             kinds[variant.label] = "ours" if variant.contact else "baseline"

@@ -10,8 +10,8 @@ pytest.importorskip("pybullet")
 from benchmarks.engines import bullet, drake, mujoco, newton, rapier
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
-from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import by_engine, shape_urdf, start_of_scene
+from sdfsim.evaluation.laws import hard_cases
 from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene

@@ -26,9 +26,11 @@ from benchmarks.everyday import (
     unknown_to,
 )
 from sdfsim.base.errors import SdfsimError
-from sdfsim.evaluation import engines, everyday
+from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import by_model, still
-from sdfsim.evaluation.everyday import UNIT, Check, G, Put, Setting, about, fixed, floor, run, solid
+from sdfsim.evaluation.laws.check import Check, most, near
+from sdfsim.evaluation.laws.scenes import UNIT, G, Law, Put, Setting, about, fixed, floor, run, solid
+from sdfsim.evaluation.laws.table import ROWS
 from sdfsim.scene.scene import Scene
 
 FAST = ["PyBullet", "MuJoCo"]
@@ -148,13 +150,13 @@ def row_of_three(at: Setting) -> Iterator[Check]:
     for e, times in ((0.0, 1.0), (0.5, 1.0), (0.0, 2.0)):
         ran = run(at, "it", [Put("it", CUBE, [0, 0, 50], e=e), floor()], 0.2)
         wanted = 50 - times * 0.5 * G * ran.seconds[-1] ** 2 / UNIT
-        yield everyday.near(f"e = {e:g}, {times:g} times", ran.place("it")[-1, 2], wanted, 0.0, "sizes", 0.05)
-        yield everyday.most(f"e = {e:g}, {times:g} times: spin", np.abs(ran.w("it")).max(), 1e-9)
+        yield near(f"e = {e:g}, {times:g} times", ran.place("it")[-1, 2], wanted, 0.0, "sizes", 0.05)
+        yield most(f"e = {e:g}, {times:g} times: spin", np.abs(ran.w("it")).max(), 1e-9)
 
 
 @pytest.fixture
 def three(monkeypatch):
-    monkeypatch.setitem(everyday.ROWS, "row", row_of_three)
+    monkeypatch.setitem(ROWS, "row", Law("row", "everyday", "", row_of_three))
 
 
 def test_checks_are_those_that_hold_that_do_not_and_that_are_not_run(tmp_path, three):

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.hard_cases import RATCHET, slipped_back
-from sdfsim.evaluation.stress import stress
+from sdfsim.apps.stress import stress
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 from sdfsim import Rollout, Scene, SdfsimError, Simulator
-from sdfsim.physics.instruments import judged
+from sdfsim.evaluation.instruments import judged
 from sdfsim.physics.motion import MOTION
 from sdfsim.simulate.simulator import SimulationError
 

@@ -14,9 +14,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim import Simulator
+from sdfsim.evaluation.true_surfaces import Placed, TrueSurface, gaps, true_surface
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, convex_hull
-from sdfsim.physics.true_surfaces import Placed, TrueSurface, gaps, true_surface
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import analytic_shape, mesh_shape

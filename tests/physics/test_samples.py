@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sdfsim import Simulator, load_scene
+from sdfsim.evaluation.instruments import Verdict, energy_account, judged
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import write_ply
-from sdfsim.physics.instruments import Verdict, energy_account, judged
 from tests.helpers.command import run
 
 SAMPLES = sorted((Path(__file__).parents[2] / "samples").glob("*.yaml"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sdfsim import Simulator
-from sdfsim.evaluation import hard_cases
+from sdfsim.evaluation.laws import hard_cases
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.shape import contact_geometry

@@ -11,11 +11,11 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.run import summary
+from sdfsim.evaluation.instruments import in_order, judged, telling_frames
+from sdfsim.evaluation.true_surfaces import Gaps, Placed, gaps, true_surface
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.physics.instruments import in_order, judged, telling_frames
 from sdfsim.physics.rollout import Rollout
-from sdfsim.physics.true_surfaces import Gaps, Placed, gaps, true_surface
 from sdfsim.scene.scene import Body, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape

@@ -1,9 +1,10 @@
-"""Runs the hard cases with models, PyBullet (the teacher) and other engines; makes their table, plots and report."""
+"""Runs the table of laws with models, PyBullet (the teacher) and other engines; makes its tables, plots and report."""
 
+import inspect
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import asdict, dataclass, fields, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +16,23 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.base.version import __version__
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
-from sdfsim.evaluation.engines import Engine, Ran, TooSlow, bullet, by_engine, by_model, shape_urdf, still
-from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, cases, ran_away
+from sdfsim.evaluation import instruments
+from sdfsim.evaluation.engines import Engine, Ran, TooSlow, bullet, by_engine, by_model, still
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
+from sdfsim.evaluation.instruments import judged
+from sdfsim.evaluation.laws import everyday, hard_cases, scenes, textbook
+from sdfsim.evaluation.laws.check import Check
+from sdfsim.evaluation.laws.hard_cases import ran_away
+from sdfsim.evaluation.laws.scenes import Law
+from sdfsim.evaluation.laws.table import GROUPS, laws, settings
 from sdfsim.learned.model import SOLVER, Model, load_model
-from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
-from sdfsim.sdf.closed_forms import PlaneSdf
 
-VERSION = 5  # increase it when the measurements change, so that kept results are measured again
+MEASURED = (everyday, hard_cases, scenes, textbook, instruments)  # if their source changes, kept results are not used
 TEACHER = "teacher"
 USUAL = {TEACHER: bullet}
 OUTSIDE = "†"
 WATCHED = 10.0  # s of a recording
-OWN = 1e4  # estimated cost of a case that makes its own scenes, in the unit of `work`
 LOOKED_AT = 20  # frames of a motion, evenly spaced, in which surfaces are measured
 LEGEND = (
     "bold: beyond what is wanted, or the motion blew up",
@@ -39,15 +43,22 @@ LEGEND = (
 
 
 @dataclass(frozen=True)
-class Study:
-    """All results of the hard cases."""
+class Figure(Check):
+    """A check with its values in several repetitions; `measured` is their mean, or the worst if that counts."""
 
-    cases: list[Case]
+    noise: float = 0.0  # standard deviation, 0 for a single repetition
+
+
+@dataclass(frozen=True)
+class Study:
+    """All results of the table of laws."""
+
+    laws: list[Law]
     models: list[str]
     engines: list[str]  # the teacher, if PyBullet is installed
-    # (case, who) -> figures (name -> one value per repetition); lines of broke, outside and laws (which a motion of
+    # (law, who) -> figures (one record each, as `Figure`); lines of broke, outside and broken_laws (which a motion of
     # ours breaks, by instruments that do not use the solve); recording (a path in the folder, or None). If a model or
-    # engine does not take part in a case, there is no entry.
+    # engine does not take part in a law, there is no entry.
     results: Results
     quick: bool  # whether it is the short form
 
@@ -55,6 +66,11 @@ class Study:
     def who(self) -> list[str]:
         """Models, then engines."""
         return [*self.models, *self.engines]
+
+    def figures(self, law: Law, who: str) -> dict[str, Figure]:
+        """By name."""
+        found = self.results.get((law.name, who), {}).get("figures", ())
+        return {known["name"]: Figure(**known) for known in found}
 
 
 def stress(
@@ -67,12 +83,12 @@ def stress(
     engines: Mapping[str, Engine] = USUAL,
     on_progress: Progress = silent,
 ) -> Study:
-    """Run every case for which `out` has no result yet. `out` gets results/, the engine's files, and in recordings/ a
-    motion of each case that is not as wanted.
+    """Check every law for which `out` has no result yet. `out` gets results/, the engines' files, and in recordings/ a
+    motion of each law that is not as wanted.
 
     Args:
-        models: names or paths; none for the solver and the bundled networks on it.
-        quick: fewer and shorter cases.
+        models: names or paths; none for the solver.
+        quick: fewer and shorter scenes.
         shapes: folder of more meshes to rest on the floor, or name of a public set (see `public_folder`).
         engines: by name; the teacher is `TEACHER`.
 
@@ -85,68 +101,80 @@ def stress(
     names, others = [model.name for model in tested], list(engines)
     if twice := {name for name in names if names.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")
-    found = cases(quick=quick, shapes=shapes and public_folder(shapes, on_progress))
+    more = hard_cases.meshes(public_folder(shapes, on_progress)) if shapes else {}
+    found = laws(quick=quick, shapes=more)
     try:
         import_pybullet()
     except SdfsimError:
         others = [name for name in others if name != TEACHER]
-    scenes = {case.name: [case.scenes(repeat) for repeat in range(case.repeats)] for case in found}
-
-    def work(case: Case) -> float:
-        """Estimated cost of a model, without a unit; a step costs time even without bodies."""
-        if case.own:
-            return OWN
-        return case.seconds * sum(10 + len(scene.bodies) for repeat in scenes[case.name] for scene in repeat)
-
-    jobs, cut = [], {}
-    for case in sorted(found, key=work, reverse=True):
-        figures = [figure.name for figure in case.figures]
-        content = [VERSION, case.seconds, figures, scenes[case.name]]
+    content = [quick, more, *map(inspect.getsource, MEASURED)]
+    teacher = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
+    jobs = []
+    for law in found:
         for model in tested:
-            jobs.append(Job(case.name, model.name, [content, model, device], _tried, (case, model, device, out)))
-        for name in others if case.engines else []:
-            settings = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
-            jobs.append(Job(case.name, name, [content, settings], _tried, (case, engines[name], device, out)))
-            cut |= {id(shape): shape for scene in scenes[case.name][0] for shape in scene.shapes}
+            jobs.append(Job(law.name, model.name, [content, model, device], _tried, (law, model, device, out, quick)))
+        for name in others if law.engines else []:
+            jobs.append(Job(law.name, name, [content, teacher], _tried, (law, engines[name], device, out, quick)))
     with locked(out):
-        for (
-            shape
-        ) in cut.values():  # before the work is split up, so that a mesh is not cut into pieces by two processes
-            if not isinstance(shape.sdf, PlaneSdf):
-                shape_urdf(shape, out / "engine")
         results = measure(jobs, out / "results", where="cores", on_progress=on_progress)
-    if failed := [f"{case} with {one}: {r['failed']}" for (case, one), r in results.items() if "failed" in r]:
+    if failed := [f"{law} with {one}: {r['failed']}" for (law, one), r in results.items() if "failed" in r]:
         raise SdfsimError(failed[0])
     return Study(found, names, others, results, quick)
 
 
-def _tried(case: Case, model: Model | Engine, device: str, out: Path) -> dict[str, Any]:
-    """All repetitions of a case with one model or engine: see `Study.results`."""
-    figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
-    broke, outside, laws, recording = [], [], [], None
-    for repeat in range(case.repeats):
-        scenes = case.scenes(repeat)
-        if case.own and isinstance(model, Model):
-            for name, value in case.own(model).items():
-                figures[name].append(value)
+def _tried(law: Law, who: Model | Engine, device: str, out: Path, quick: bool) -> dict[str, Any]:
+    """All repetitions of a law with one model or engine: see `Study.results`."""
+    runs: list[Ran] = []
+
+    def run(scene: Scene, seconds: float) -> Ran:
+        # Engines have files of their own for each law: two processes must not cut one mesh into pieces at once.
+        runs.append(ran(who, scene, seconds, device, out / "engine" / law.name))
+        return runs[-1]
+
+    if law.counted:
+        held: list[bool] = []
+        for at in settings(quick=quick):
+            try:
+                held += [check.holds for check in law.checks(replace(at, by=run))]
+            except SdfsimError:  # what a model refuses is one check that does not hold
+                held.append(False)
+        fail = Figure("fail", float(held.count(False)), high=0.0, unit="checks", digits=0)
+        found = [fail, Figure("checks", float(len(held)), unit="in all", digits=0, better=0)]
+        return {"figures": list(map(_record, found)), "broke": [], "outside": [], "laws": [], "recording": None}
+    repeats, outside, broken, recording = [], [], [], None
+    for repeat in range(law.repeats):
+        before = len(runs)
+        repeats.append(list(law.checks(scenes.Setting(by=run, repeat=repeat))))
+        shown = next((one for one in runs[before:] if one.broke), runs[before])
+        if not isinstance(who, Model):
             continue
-        runs = [ran(model, scene, case.seconds, device, out / "engine") for scene in scenes]
-        measured = case.measure(runs)
-        for name, values in figures.items():
-            values.append(float(measured[name]))
-        broke += [run.broke for run in runs if run.broke]
-        for run in runs if isinstance(model, Model) else []:
-            outside += run.rollout.meta["outside_training"]
-            laws += judged(run.scene, run.rollout, every=max(1, len(run.rollout) // LOOKED_AT)).broken
-        missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
-        shown = next((run for run in runs if run.broke), runs[0])
-        if isinstance(model, Model) and not recording and (broke or missed):
-            recording = f"recordings/{model.name}/{case.name}.rrd"
+        for one in runs[before:]:
+            outside += one.rollout.meta["outside_training"]
+            broken += judged(one.scene, one.rollout, every=max(1, len(one.rollout) // LOOKED_AT)).broken
+        if not recording and (shown.broke or not all(check.holds for check in repeats[-1])):
+            recording = f"recordings/{who.name}/{law.name}.rrd"
             (out / recording).parent.mkdir(parents=True, exist_ok=True)
             watched = shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum()))
             save_rollout(shown.scene, watched, out / recording)
-    lines = {"outside": list(dict.fromkeys(outside)), "laws": laws}
-    return {"figures": figures, "broke": broke, "recording": recording, **lines}
+    return {
+        "figures": [_record(_figure(alike)) for alike in zip(*repeats, strict=True)],
+        "broke": [one.broke for one in runs if one.broke],
+        "outside": list(dict.fromkeys(outside)),
+        "laws": broken,
+        "recording": recording,
+    }
+
+
+def _figure(alike: Sequence[Check]) -> Figure:
+    values = [float(check.measured) for check in alike]
+    counts = max(values) if alike[0].worst else statistics.fmean(values)
+    noise = statistics.stdev(values) if len(values) > 1 else 0.0
+    return Figure(**{f.name: getattr(alike[0], f.name) for f in fields(Check)} | {"measured": counts, "noise": noise})
+
+
+def _record(figure: Figure) -> dict[str, Any]:
+    """What JSON can hold: without limits that are infinite."""
+    return {name: value for name, value in asdict(figure).items() if name not in ("low", "high") or isfinite(value)}
 
 
 def ran(who: Model | Engine, scene: Scene, seconds: float, device: str, folder: Path) -> Ran:
@@ -164,39 +192,27 @@ def ran(who: Model | Engine, scene: Scene, seconds: float, device: str, folder: 
 # --- what came out ---
 
 
-def value(result: dict[str, Any], figure: Figure) -> float:
-    """The mean of the repetitions, or the largest if that is what counts."""
-    values = result["figures"][figure.name]
-    return max(values) if figure.largest else statistics.fmean(values)
-
-
-def noise(result: dict[str, Any], figure: Figure) -> float:
-    """Standard deviation over the repetitions, 0 for a single one."""
-    values = result["figures"][figure.name]
-    return statistics.stdev(values) if len(values) > 1 else 0.0
-
-
-def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
+def cell(study: Study, law: Law, name: str, who: str) -> tuple[str, str]:
     """A figure with its spread, and its state: "missed" what is wanted, "behind" the teacher, "fine", or "shown"."""
-    result, teacher = study.results.get((case.name, who)), study.results.get((case.name, TEACHER))
-    if result is None:
+    figure, best = study.figures(law, who).get(name), study.figures(law, TEACHER).get(name)
+    if figure is None:
         return "-", "shown"
-    now, spread = value(result, figure), noise(result, figure)
-    shown = f"{round(now, figure.digits) + 0.0:.{figure.digits}f}"  # avoids -0
-    if float(f"{spread:.{figure.digits}f}") > 0:
-        shown += f" ± {spread:.{figure.digits}f}"
+    result, teacher = study.results[law.name, who], study.results.get((law.name, TEACHER))
+    shown = f"{round(figure.measured, figure.digits) + 0.0:.{figure.digits}f}"  # avoids -0
+    if float(f"{figure.noise:.{figure.digits}f}") > 0:
+        shown += f" ± {figure.noise:.{figure.digits}f}"
     shown += f" {figure.unit}"
     if result["broke"]:
         shown = f"blew up: {result['broke'][0]} ({len(result['broke'])} in all); until then {shown}"
     elif result["outside"]:
         shown += f" {OUTSIDE}"
-    if not figure.judged:
+    if not figure.better:
         return shown, "shown"
-    if result["broke"] or (figure.limit is not None and now > figure.limit):
+    if result["broke"] or not figure.holds:
         return shown, "missed"
-    if figure.limit is None and teacher and who != TEACHER and not teacher["broke"]:
-        gap = now - value(teacher, figure)
-        if (-gap if figure.longer else gap) > max(spread + noise(teacher, figure), 10.0**-figure.digits):
+    if not figure.wanted and best and teacher and who != TEACHER and not teacher["broke"]:
+        gap = figure.better * (best.measured - figure.measured)
+        if gap > max(figure.noise + best.noise, 10.0**-figure.digits):
             return shown, "behind"
     return shown, "fine"
 
@@ -205,12 +221,11 @@ def rows(study: Study, marks: dict[str, str]) -> list[tuple[str, ...]]:
     """The table, its header first, with a row for each figure; `marks` (state -> text) surround those that are missed
     or behind."""
     table: list[tuple[str, ...]] = [("case", "figure", "wanted", *study.who)]
-    for case in study.cases:
-        for k, figure in enumerate(case.figures):
-            found = [cell(study, case, figure, who) for who in study.who]
-            wanted = "" if figure.limit is None else f"at most {figure.limit:g}"
+    for law in study.laws:
+        for k, figure in enumerate(study.figures(law, study.models[0]).values()):
+            found = [cell(study, law, figure.name, who) for who in study.who]
             cells = (f"{marks.get(state, '')}{text}{marks.get(state, '')}" for text, state in found)
-            table.append(("" if k else case.title, figure.name, wanted, *cells))
+            table.append(("" if k else law.title, figure.name, figure.wanted, *cells))
     return table
 
 
@@ -218,13 +233,12 @@ def losses(study: Study) -> dict[str, dict[str, int]]:
     """For each model the number of judged figures, and of those missed, behind the teacher, or blown up."""
     found = {}
     for who in study.who:
-        mine = [case for case in study.cases if (case.name, who) in study.results]
-        states = [cell(study, case, figure, who)[1] for case in mine for figure in case.figures]
+        states = [cell(study, law, name, who)[1] for law in study.laws for name in study.figures(law, who)]
         found[who] = {
             "figures": sum(state != "shown" for state in states),
             "missed": states.count("missed"),
             "behind the teacher": states.count("behind"),
-            "cases that blew up": sum(bool(study.results[case.name, who]["broke"]) for case in mine),
+            "cases that blew up": sum(bool(r["broke"]) for (_, one), r in study.results.items() if one == who),
         }
     return found
 
@@ -236,23 +250,26 @@ def loss_lines(study: Study) -> list[str]:
 def table(study: Study) -> str:
     """The whole study in Markdown: the losses, the legend, and a table for each group."""
     parts = ["\n".join(f"- {line}" for line in [*loss_lines(study), *LEGEND]) + "\n"]
-    for name in dict.fromkeys(case.group for case in study.cases):
-        part = replace(study, cases=[case for case in study.cases if case.group == name])
+    for name in dict.fromkeys(law.group for law in study.laws):
+        part = replace(study, laws=[law for law in study.laws if law.group == name])
         parts += [f"**{GROUPS[name].title}**\n", markdown(rows(part, {"missed": "**", "behind": "*"}))]
     return "\n".join(parts)
 
 
 def draw_group(study: Study, name: str, path: Path) -> bool:
-    """Write a plot of one group's first figure along its cases. Returns False if these have no common axis."""
-    group, along = GROUPS[name], [case for case in study.cases if case.group == name and case.x is not None]
+    """Write a plot of one group's first figure along its laws. Returns False if these have no common axis."""
+    along = [law for law in study.laws if law.group == name and law.x is not None]
     if len(along) < 2:
         return False
-    figure, lines, places = along[0].figures[0], [], [case.x or 0.0 for case in along]
+    lines, places = [], [law.x or 0.0 for law in along]
     for who in study.who:
-        found = [study.results[case.name, who] for case in along]
-        lines.append(Line(who, places, *([of(result, figure) for result in found] for of in (value, noise))))
+        found = [next(iter(study.figures(law, who).values())) for law in along]
+        lines.append(Line(who, places, [one.measured for one in found], [one.noise for one in found]))
+    first = next(iter(study.figures(along[0], study.who[0]).values()))
     log = "x" if min(places) > 0 and max(places) > 20 * min(places) else ""
-    draw([Panel(group.title, group.axis, f"{figure.name} ({figure.unit})", lines, log, figure.limit)], path)
+    limit = first.high if first.wanted else None
+    title, axis = GROUPS[name]
+    draw([Panel(title, axis, f"{first.name} ({first.unit})", lines, log, limit)], path)
     return True
 
 
@@ -301,10 +318,11 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
 
 
 def figures(study: Study) -> dict[str, dict[str, dict[str, float]]]:
-    """By model or engine, then CASE/FIGURE: value and noise of every judged figure."""
+    """By model or engine, then LAW/FIGURE: value and noise of every judged figure."""
     found: dict[str, dict] = {who: {} for who in study.who}
-    judged = [(case.name, figure) for case in study.cases for figure in case.figures if figure.judged]
-    for (case, figure), who in product(judged, study.who):
-        if result := study.results.get((case, who)):
-            found[who][f"{case}/{figure.name}"] = {"value": value(result, figure), "noise": noise(result, figure)}
+    for who in study.who:
+        for law in study.laws:
+            for one in study.figures(law, who).values():
+                if one.better:
+                    found[who][f"{law.name}/{one.name}"] = {"value": one.measured, "noise": one.noise}
     return found

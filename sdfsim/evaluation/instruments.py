@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sdfsim.base.parallel import Progress, silent
+from sdfsim.evaluation.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.rollout import Rollout
-from sdfsim.physics.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
 from sdfsim.scene.builder import SceneBuilder, loaded
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Joint, Scene
@@ -31,6 +31,7 @@ FADE = 0.9  # whenever energy falls to a new low, this part of the earlier avail
 PART, LEAST = 0.05, 0.1  # part of a run's time that measuring surfaces may take, and s that it may always take
 FEW, MANY = 32, 4096  # pairs that are measured together: at first, and at most
 LOOSE = 0.001  # relative to the size of the smaller body: how far a joint's parts may be apart
+TOUCH = 0.01  # relative to the mean size of the dynamic bodies: surfaces that are nearer than this touch
 IMPACTS = 6  # frames after an impact in which surfaces are always measured
 FEW_BODIES = 64  # dynamic bodies: with more, only their total energy is accounted for
 
@@ -352,15 +353,31 @@ class _Course:
     pushed: np.ndarray  # [T+1, N] bool: whether anything but gravity acted in the step that led here
 
 
+def _course(scene: Scene, rollout: Rollout) -> _Course:
+    solids = [solid_of(shape) for shape in scene.shapes]
+    dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
+    pushed = _pushed(scene, rollout, dynamic & ~held_bodies(scene))
+    return _Course(scene, rollout, solids, dynamic, *contact_groups(scene.bodies), pushed)
+
+
+def depths(scene: Scene, rollout: Rollout, every: int = 5) -> np.ndarray:
+    """[F] m, depth of the deepest overlap of two bodies in every `every`-th frame in which bodies touch."""
+    course, found = _course(scene, rollout), []
+    sizes = [b.scale * largest_extent(scene.shapes[b.shape]) for b in scene.bodies if b.motion == "dynamic"]
+    touch = TOUCH * float(np.mean(sizes))
+    for frame in range(every, len(rollout.time), every):
+        pair = near_pairs(course, frame, np.full(len(scene.bodies), touch))
+        one, other = (placed(scene, rollout, np.full(len(pair), frame), pair[:, k]) for k in (0, 1))
+        apart = gaps(course.solids, one, other, np.full(len(pair), touch)).apart.min(initial=np.inf)
+        found += [max(0.0, -float(apart))] if apart <= touch else []
+    return np.array(found)
+
+
 def _surfaces(
     scene: Scene, rollout: Rollout, seconds: float, every: int, on_progress: Progress
 ) -> tuple[Near | None, Near | None, int]:
     started = time.perf_counter()
-    solids = [solid_of(shape) for shape in scene.shapes]
-    dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
-    group, allowed = contact_groups(scene.bodies)
-    pushed = _pushed(scene, rollout, dynamic & ~held_bodies(scene))
-    course = _Course(scene, rollout, solids, dynamic, group, allowed, pushed)
+    course = _course(scene, rollout)
     deepest: Near | None = None
     widest: Near | None = None
     always = telling_frames(scene, rollout)

@@ -1,0 +1,1 @@
+"""Laws of mechanics, each written once: see `table`."""

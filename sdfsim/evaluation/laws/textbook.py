@@ -1,0 +1,131 @@
+"""Laws of a textbook in closed form: single bodies and stacks, tighter than in everyday scenes."""
+
+from collections.abc import Iterator
+from math import atan, cos, radians, sin, sqrt, tan
+
+import numpy as np
+
+from sdfsim.evaluation.laws.check import Check, most, near
+from sdfsim.evaluation.laws.scenes import STILL, UNIT, G, Put, Setting, about, floor, run, solid
+
+METRE = sqrt(UNIT)  # times and speeds at 10 cm for one of bodies of a metre
+STARTS = (0.95, 0.98, 1.0, 1.03, 1.07)  # sizes
+BALL, CUBE = solid("analytic", "ball", 0.5), solid("analytic", "box", 1, 1, 1)
+
+
+def bounces(at: Setting) -> Iterator[Check]:
+    """A ball comes back to e^2 of its height, wherever in a step it lands."""
+    for e in (0.3, 0.5, 0.7, 0.9, 1.0):
+        shares = []
+        for start in STARTS:
+            put = Put("ball", BALL, [0, 0, 0.5 + start], e=e)
+            ran = run(at, "drop", [put, floor()], 3 * sqrt(2 * start * UNIT / G))
+            up = int(np.argmax(ran.v("ball")[:, 2] > 0))
+            shares.append((ran.place("ball")[up:, 2].max() - 0.5) / start)
+        yield near(f"e = {e:g}: height", float(np.mean(shares)), e**2, 0.02, "of the drop", 0.01)
+        yield most(f"e = {e:g}: spread", float(np.std(shares)), 0.02, "of the drop")
+
+
+def head_on(at: Setting) -> Iterator[Check]:
+    """Balls that meet head-on separate at e times their speed, and keep their momentum."""
+    for e in (0.2, 0.5, 0.8, 1.0):
+        for speed in (0.1, 0.3, 1.0):
+            both = [Put(name, BALL, [0.7 * side, 0, 10], v=[-0.5 * side * speed, 0, 0], e=sqrt(e))
+                    for name, side in (("a", -1), ("b", 1))]  # fmt: skip
+            ran = run(at, f"e = {e:g} at {speed:g} m/s", both, 1.2 * UNIT / speed, gravity=0.0)
+            a, b = (ran.v(put.name)[-1, 0] for put in both)
+            yield ran.near("speed apart", b - a, e * speed, 0.01, "m/s")
+            yield ran.most("momentum", abs(a + b) / speed, 1e-9)
+
+
+def slopes(at: Setting) -> Iterator[Check]:
+    """Rolling, and Coulomb's friction on slopes."""
+
+    def way(label: str, put: Put, degrees: float, pull: float) -> Iterator[Check]:
+        ran = run(at, label, [put, floor()], 1.5 * METRE, tilt=degrees)
+        wanted = 0.5 * pull * G * ran.seconds[-1] ** 2 / UNIT
+        yield ran.near("way", ran.moved("it")[-1, 0], wanted, 0.02, "sizes", 0.0 if pull else 1e-3)
+
+    v = 0.5 * METRE
+    rolls = Put("it", BALL, [0, 0, 0.5], v=[v, 0, 0], w=[0, v / (0.5 * UNIT), 0])
+    ran = run(at, "ball that rolls", [rolls, floor()], 3 * METRE)
+    yield ran.most("speed off", np.abs(np.linalg.norm(ran.v("it"), axis=1) / v - 1).max(), 1e-3)
+    capsule = solid("analytic", "capsule", 0.25, 1.0)
+    rolls = Put("it", capsule, [0, 0, 0.25], about("y", 90), v=[0, v, 0], w=[-v / (0.25 * UNIT), 0, 0])
+    ran = run(at, "capsule that rolls", [rolls, floor()], 2 * METRE)
+    yield ran.near("speed", ran.v("it")[-1, 1], v, 0.01, "m/s")
+    yield ran.near("height", ran.place("it")[-1, 2], 0.25, 0.0, "sizes", 2e-3)
+    yield from way("ball that rolls down", Put("it", BALL, [0, 0, 0.5]), 10.0, 5 / 7 * sin(radians(10)))
+    steep = radians(40)
+    mu = 0.5 * 2 / 7 * tan(steep)
+    yield from way("ball that slips", Put("it", BALL, [0, 0, 0.5], mu=mu), 40.0, sin(steep) - mu * cos(steep))
+    for mu in (0.2, 0.6):
+        for share in (0.9, 0.97, 1.1):
+            angle = share * atan(mu)
+            pull = max(0.0, sin(angle) - mu * cos(angle))
+            put = Put("it", CUBE, [0, 0, 0.5], mu=mu)
+            yield from way(f"cube, mu = {mu:g}, {share:g} of its angle", put, np.degrees(angle), pull)
+
+
+def plates(at: Setting) -> Iterator[Check]:
+    """A spinning plate under even pressure stops by the torque mu m g times the mean distance from its middle."""
+    square, disc = solid("analytic", "box", 1, 1, 0.1), solid("analytic", "cylinder", 0.5, 0.1)
+    mu, spin = 0.4, 5.0 / METRE
+    for name, shape, lever in (("square", square, 0.3826), ("disc", disc, 1 / 3)):
+        wanted = spin * shape.inertia[2, 2] / shape.volume * UNIT / (mu * G * lever)
+        put = Put("it", shape, [0, 0, 0.05], w=[0, 0, spin], mu=mu)
+        ran = run(at, name, [put, floor()], 2 * wanted)
+        stopped = ran.seconds[int(np.argmax(np.abs(ran.w("it")[:, 2]) < 0.01 * spin))]
+        yield ran.near("stops after", stopped, wanted, 0.2, "s")
+
+
+def drops(at: Setting) -> Iterator[Check]:
+    """What is dropped straight lands where it was let go, and rests."""
+    for name, shape in (("cube", CUBE), ("cylinder", solid("analytic", "cylinder", 0.5, 1.0)), ("ball", BALL)):
+        ran = run(at, name, [Put("it", shape, [0, 0, 1]), floor()], 10 * METRE, sleep=True)
+        place, half = ran.place("it"), len(ran.seconds) // 2
+        yield ran.most("off its place", np.abs(place[-1] - [0, 0, 0.5]).max(), 1e-3, "sizes")
+        yield ran.most("speed at rest", np.abs(ran.v("it")[half:]).max(), 3e-7, "m/s")
+        yield ran.most("moved at rest", np.abs(place[half:] - place[half]).max(), 1e-6, "sizes")
+
+
+def stacks(at: Setting) -> Iterator[Check]:
+    """Towers, a pyramid and a tower of planks stand, also if what lies on top is much heavier."""
+    cubes = {f"tower of {n}": [(0, 0, k + 0.5) for k in range(n)] for n in (5, 10, 20)}
+    cubes["pyramid"] = [(1.02 * (k - 0.5 * (4 - row)), 0, row + 0.5) for row in range(5) for k in range(5 - row)]
+    stacked = {name: (5.0, 0.1, [Put(f"{k}", CUBE, p) for k, p in enumerate(places)]) for name, places in cubes.items()}
+    plank, planks = solid("analytic", "box", 1, 0.2, 0.1), []
+    for k in range(18):
+        turn = about("z", 90) if k // 3 % 2 else STILL
+        place = turn.apply([0, 0.4 * (k % 3 - 1), (k // 3 + 0.5) * 0.1])
+        planks.append(Put(f"{k}", plank, place, turn))
+    stacked["planks"] = (5.0, 0.01, planks)
+    for ratio in (10, 30, 100, 300, 1000):
+        heavy = ratio > 100  # sweeps that end early make it creep off within half a minute at 1 m
+        pair = [Put("light", CUBE, [0, 0, 0.5]), Put("heavy", CUBE, [0.01 * heavy, 0, 1.5], dense=ratio)]
+        stacked[f"{ratio} on 1"] = (30.0 if heavy else 3.0, 1e-3 if heavy else 0.01, pair)
+    for name, (seconds, limit, bodies) in stacked.items():
+        ran = run(at, name, [*bodies, floor()], seconds * METRE)
+        moved = max(float(np.linalg.norm(ran.moved(put.name), axis=1).max()) for put in bodies)
+        yield ran.most("moved", moved, limit, "sizes")
+
+
+def overlaps(at: Setting) -> Iterator[Check]:
+    """What overlaps at the start comes apart, with no more energy than its depth gives."""
+    for depth in (0.02, 0.2, 0.5):
+        ran = run(at, f"cube {depth:g} deep in the floor", [Put("it", CUBE, [0, 0, 0.5 - depth]), floor()], 3 * METRE)
+        energy = 0.5 * (ran.v("it") ** 2).sum(1) + G * UNIT * ran.moved("it")[:, 2]
+        yield ran.most("energy", energy.max() / (G * UNIT * depth), 1.02, "of its depth's")
+        yield ran.near("height", ran.place("it")[-1, 2], 0.5, 0.0, "sizes", 2e-3)
+    for name, shape in (("balls", BALL), ("cubes", CUBE)):
+        for off in (0.0, 0.5):
+            both = [Put("a", shape, [0, 0, 0]), Put("b", shape, [0.8 * off, 0.6 * off, 0])]
+            ran = run(at, f"{name} {off:g} apart", both, 1.3 * METRE, gravity=0.0)
+            yield ran.most("speed", max(np.linalg.norm(ran.v(n), axis=1).max() for n in "ab"), 3 * METRE, "m/s")
+            away = ran.place("b")[-1] - ran.place("a")[-1]
+            yield ran.between("apart at the end", np.linalg.norm(away), off + 0.1, np.inf, "sizes")
+            middle = ran.moved("a") + ran.moved("b")
+            yield ran.most("common centre moved", 0.5 * np.abs(middle).max(), 1e-3, "sizes")
+
+
+TEXTBOOK = (bounces, head_on, slopes, plates, drops, stacks, overlaps)
