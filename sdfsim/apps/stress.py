@@ -3,7 +3,7 @@
 import inspect
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -169,7 +169,8 @@ def _figure(alike: Sequence[Check]) -> Figure:
     values = [float(check.measured) for check in alike]
     counts = max(values) if alike[0].worst else statistics.fmean(values)
     noise = statistics.stdev(values) if len(values) > 1 else 0.0
-    return Figure(**{f.name: getattr(alike[0], f.name) for f in fields(Check)} | {"measured": counts, "noise": noise})
+    known: dict[str, Any] = asdict(alike[0]) | {"measured": counts, "noise": noise}
+    return Figure(**known)
 
 
 def _record(figure: Figure) -> dict[str, Any]:

@@ -79,8 +79,8 @@ def main(arguments: Iterable[str] | None = None) -> int:
     given = parser.parse_args(None if arguments is None else list(arguments))
     held = total = 0
     names = given.law or [name for name, law in table.items() if law.group == "everyday"]
-    for name, size, yaw, kind in product(names, given.size, given.yaw, given.kind):
-        at = Setting(size, yaw, kind, given.full)
+    chosen = [Setting(*how, given.full) for how in product(given.size, given.yaw, given.kind)]
+    for name, at in product(names, chosen):
         print(f"--- {name} [{at}]", flush=True)
         for check in table[name].checks(at):
             held, total = held + check.holds, total + 1

@@ -91,8 +91,8 @@ def drops(at: Setting) -> Iterator[Check]:
 
 def stacks(at: Setting) -> Iterator[Check]:
     """Towers, a pyramid and a tower of planks stand, also if what lies on top is much heavier."""
-    cubes = {f"tower of {n}": [(0, 0, k + 0.5) for k in range(n)] for n in (5, 10, 20)}
-    cubes["pyramid"] = [(1.02 * (k - 0.5 * (4 - row)), 0, row + 0.5) for row in range(5) for k in range(5 - row)]
+    cubes = {f"tower of {n}": [(0.0, 0.0, k + 0.5) for k in range(n)] for n in (5, 10, 20)}
+    cubes["pyramid"] = [(1.02 * (k - 0.5 * (4 - row)), 0.0, row + 0.5) for row in range(5) for k in range(5 - row)]
     stacked = {name: (5.0, 0.1, [Put(f"{k}", CUBE, p) for k, p in enumerate(places)]) for name, places in cubes.items()}
     plank, planks = solid("analytic", "box", 1, 0.2, 0.1), []
     for k in range(18):
@@ -123,7 +123,7 @@ def overlaps(at: Setting) -> Iterator[Check]:
             ran = run(at, f"{name} {off:g} apart", both, 1.3 * METRE, gravity=0.0)
             yield ran.most("speed", max(np.linalg.norm(ran.v(n), axis=1).max() for n in "ab"), 3 * METRE, "m/s")
             away = ran.place("b")[-1] - ran.place("a")[-1]
-            yield ran.between("apart at the end", np.linalg.norm(away), off + 0.1, np.inf, "sizes")
+            yield ran.between("apart at the end", float(np.linalg.norm(away)), off + 0.1, np.inf, "sizes")
             middle = ran.moved("a") + ran.moved("b")
             yield ran.most("common centre moved", 0.5 * np.abs(middle).max(), 1e-3, "sizes")
 
