@@ -583,3 +583,53 @@ def test_names_of_any_script_are_kept_where_the_format_can(tmp_path: Path) -> No
     (line,) = (note for note in report["notes"] if "is called" in note)
     assert line.startswith("椅子 is called _, कुर्सी is called __1, стул is called __2, Cafe\u0301 1 is called Caf__1")
     assert "chair is" not in line and all((tmp_path / f"out.{name}.urdf").is_file() for name in ("_", "__1", "__2"))
+
+
+@pytest.mark.parametrize("fps", [24, 29.97, 1000])
+def test_motion_has_the_rate_that_was_asked_for(dropped, tmp_path, fps):
+    """Whole frames of an editing program, where a run has a step of its own; the poses are those of the run."""
+    export(dropped.folder, tmp_path / "run.glb", fps=fps, allow_outside=True)
+    tree, binary = chunks(tmp_path / "run.glb")
+    (animation,) = tree["animations"]
+    time = values(tree, binary, animation["samplers"][0]["input"])[:, 0]
+    end = dropped.rollout.time[-1]
+    np.testing.assert_allclose(time, np.arange(len(time)) / fps, atol=1e-6)
+    assert end - 1e-3 / fps <= time[-1] < end + 1 / fps
+    node = next(k for k, n in enumerate(tree["nodes"]) if n["name"] == "ball")
+    channel = next(c for c in animation["channels"] if c["target"] == {"node": node, "path": "translation"})
+    place = values(tree, binary, animation["samplers"][channel["sampler"]]["output"])
+    true = dropped.rollout.position[:, dropped.index("ball")]  # the centre of a ball is its origin
+    for axis in range(3):
+        np.testing.assert_allclose(place[:, axis], np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
+
+
+def test_a_usd_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> None:
+    from pxr import Usd, UsdGeom
+
+    export(survey, survey.with_suffix(".usda"))
+    stage = Usd.Stage.Open(str(survey.with_suffix(".usda")))
+    for name, box in HOUSES.items():
+        prim = UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}/geometry/solid"))
+        to_world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
+        points = np.array(prim.GetPointsAttr().Get(), dtype=float) @ to_world[:3, :3] + to_world[3, :3] - FAR
+        np.testing.assert_allclose([points.min(0), points.max(0)], box, atol=1e-4)
+
+
+def test_a_part_of_a_third_of_a_millimetre_loads_in_mujoco_and_falls(tmp_path: Path) -> None:
+    import mujoco
+
+    size, (low, high) = 3.6e-4, (0.0, 1.2e-3)
+    mesh_shape(primitives.box((size,) * 3), name="speck", kind="mesh").save(tmp_path / "speck")
+    scene = SceneBuilder().add("floor", plane={"offset": low})
+    scene.add("speck", asset=tmp_path / "speck", position=(0, 0, high), density=1000)
+    report = export(scene.save(tmp_path / "scene.yaml"), tmp_path / "scene.xml")
+    (line,) = (line for line in report["left_out"] if "MuJoCo refuses" in line)
+    assert "speck" in line and "mm" in line and "1e-9 kg" in line
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    assert model.body("speck").mass[0] * 1e-9 == pytest.approx(1000 * size**3, rel=1e-6)
+    mujoco.mj_step(model, data, 10)
+    assert (1000 * high - data.body("speck").xpos[2]) / 1000 == pytest.approx(9.81 * 0.01**2 / 2, rel=0.12)
+    mujoco.mj_step(model, data, 500)
+    assert data.body("speck").xpos[2] / 1000 == pytest.approx(size / 2, rel=0.05)

@@ -672,3 +672,43 @@ def test_recordings_show_axes_and_limits_where_they_are(tmp_path: Path) -> None:
     assert ends([by_name["string"]], place, turns, scene)[0, 0] == pytest.approx(
         np.array([[1.4, 0.3, 1.4], [1.4, 0.3, 0.4]])
     )
+
+
+def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
+    scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
+    report = export(tmp_path / "scene.yaml", tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    for name, value in start_positions(scene).items():
+        # The elbow has the arm first, so MuJoCo's goes from the arm to the forearm about the other way of its axis.
+        assert data.joint(name).qpos[0] == pytest.approx(value, abs=1e-9), name
+    for body in scene.bodies:
+        shape = scene.shapes[body.shape]
+        assert data.body(body.name).xpos == pytest.approx(body.position, abs=1e-9)
+        if body.motion == "dynamic":
+            centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(body.scale * shape.com)
+            speed = np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(body.name).id, speed, 0)
+            assert data.body(body.name).xipos == pytest.approx(centre, abs=1e-9)
+    assert float(model.joint("shoulder").damping[0]) == pytest.approx(0.2)
+    assert model.joint("shoulder").range == pytest.approx(np.radians([-30, 70]))
+    assert data.ctrl[0] == pytest.approx(0.4) and model.actuator_forcerange[0] == pytest.approx([-20, 20])
+    assert data.ten_length[0] == pytest.approx(1.0) and model.tendon_range[0] == pytest.approx([0, 1.2])
+    # At other positions the arm is where the scene's joint puts it.
+    data.joint("shoulder").qpos[0] = 0.9
+    data.joint("elbow").qpos[0] = 0.3
+    mujoco.mj_forward(model, data)
+    post = next(body for body in scene.bodies if body.name == "post")
+    joint = next(joint for joint in scene.joints if joint.name == "shoulder")
+    own, theirs = (Rotation.from_quat(quat) for quat in joint.quat_xyzw)
+    axes = theirs * Rotation.from_rotvec([0.9, 0, 0]) * own.inv()
+    place = post.position + joint.anchor[1] - axes.apply(joint.anchor[0])
+    assert data.body("arm").xpos == pytest.approx(place, abs=1e-9)
+    assert data.body("arm").xmat.reshape(3, 3) == pytest.approx(axes.as_matrix(), abs=1e-9)
+    elbow = next(joint for joint in scene.joints if joint.name == "elbow")
+    arm, fore = (Rotation.from_matrix(data.body(name).xmat.reshape(3, 3)) for name in ("arm", "fore"))
+    frames = [turn * Rotation.from_quat(q) for turn, q in zip((arm, fore), elbow.quat_xyzw, strict=True)]
+    assert (frames[1].inv() * frames[0]).as_rotvec() == pytest.approx([0.3, 0, 0], abs=1e-9)
+    assert not any("elbow" in line for line in report["left_out"])

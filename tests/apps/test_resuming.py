@@ -133,3 +133,13 @@ def test_a_run_until_all_rests_ends_where_it_would_have_however_often_it_is_kill
     resumed = simulate(scene, tmp_path / "run", resume=True, **options)
     assert whole["settled"] and resumed["settled"] and whole["steps"] == resumed["steps"] == run.SETTLED
     assert simulate(scene, tmp_path / "whole", resume=True, **options) == whole
+
+
+TOWER = Path(__file__).resolve().parents[2] / "samples" / "tower.yaml"
+
+
+def test_a_run_ends_when_everything_rests(tmp_path):
+    report = simulate(TOWER, tmp_path / "run", seconds=3.0, until_settled=True)
+    assert report["settled"] and report["simulated_s"] < 1.0
+    falling = simulate(TOWER, tmp_path / "short", seconds=0.05, until_settled=True)
+    assert falling["settled"] is False and falling["status"] == "done"

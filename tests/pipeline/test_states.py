@@ -193,3 +193,12 @@ def test_the_picture_of_names_shows_the_axis_along_the_part_and_the_way_of_a_sli
     ends = axis_ends(parts, slides)
     assert ends is not None and np.allclose(ends, [[0.3, 0, 0.4], [0.3, 0, 0.6]])
     assert axis_ends(parts, None) is None and axis_ends(Parts(None, None, {}, 0.0), HELD) is None
+
+
+def test_photos_that_lie_where_results_go_are_refused(tmp_path):
+    given = noise(tmp_path / "second" / "mesh", ["0.png", "1.png", "2.png"])
+    noise(tmp_path / "open", ["0.png", "1.png", "2.png"])
+    with pytest.raises(SdfsimError, match="where the result of the mesh stage belongs"):
+        reconstruct_states(given, tmp_path / "open", tmp_path)
+    assert sorted(path.name for path in given.iterdir()) == ["0.png", "1.png", "2.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["open", "second"]

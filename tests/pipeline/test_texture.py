@@ -5,18 +5,24 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
-from pipeline.mesh.texture import Shots, shots_of, textured, unfold
+from pipeline.mesh import texture
+from pipeline.mesh.extraction import components
+from pipeline.mesh.texture import BLOCK, Shots, rasterise, shots_of, textured, unfold
 from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
 from pipeline.scene_writer import skins_of
+from sdfsim.apps.recording import Playback, save_reconstruction
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, joined, sample_surface
+from sdfsim.geometry.mesh import Mesh, joined, sample_surface, vertex_normals
 from sdfsim.geometry.mesh_io import read_glb, write_glb, write_ply
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import load_shape, scaled
+from tests.helpers.runs import read
 from tests.helpers.surfaces import cube, look_at, plate
 
 GREY, RED = np.array([90.0, 90, 90]), np.array([250.0, 20, 20])
@@ -163,3 +169,54 @@ def test_the_skin_of_a_body_stands_at_the_bodys_origin(tmp_path):
     skins = skins_of(tmp_path)
     assert np.allclose(skins["scenery"].vertices, flat.vertices, atol=1e-6)
     assert np.allclose(skins["object1"].vertices, flat.vertices - [0.3, 0.4, 0.4], atol=1e-6)
+
+
+def test_the_best_view_gives_a_sharper_texture_than_the_mean(tmp_path, monkeypatch):
+    """Where the mesh is off by a little, the photos do not agree."""
+    true, mesh = plate(1), plate(20, z=0.012)
+    shots = photograph(tmp_path, ring(1.2), [true], [pattern])
+    points = np.random.default_rng(0).uniform([-0.3, -0.3, 0.012], [0.3, 0.3, 0.012], (4000, 3))
+    best = on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
+    monkeypatch.setattr(texture, "POWER", 1.0)
+    assert best > 1.2 * on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
+
+
+def test_charts_have_blocks_of_their_own():
+    mesh = cube(0.3, (0.0, 0.0, 0.0))
+    flat, origin, (rows, columns) = unfold(mesh, 200.0)
+    assert flat.uv is not None and rows % BLOCK == columns % BLOCK == 0
+    assert np.array_equal(flat.vertices, mesh.vertices[origin])
+    assert flat.uv.min() >= 0 and flat.uv.max() <= 1
+    corners = flat.uv[flat.faces] * [columns, rows]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
+    assert area == pytest.approx(6 * 0.3**2 * 200**2, rel=0.12)  # charts grow to whole blocks
+    texels = rasterise(flat, vertex_normals(mesh)[origin], (rows, columns))
+    assert len(texels.at) == pytest.approx(area, rel=0.02)  # nothing lies twice
+    used = []
+    for chart in range((label := components(flat)).max() + 1):
+        own = rasterise(replace(flat, faces=flat.faces[label == chart]), vertex_normals(mesh)[origin], (rows, columns))
+        used.append(np.unique(own.at // columns // BLOCK * columns + own.at % columns // BLOCK))
+    assert len(used) >= 3 and len(np.concatenate(used)) == len(np.unique(np.concatenate(used)))
+
+
+def test_recordings_show_the_texture(tmp_path):
+    mesh = skin()
+    assert mesh.uv is not None and mesh.texture is not None
+    save_reconstruction(tmp_path / "r.rrd", [], np.zeros((0, 3)), None, plate(2), {"scene": mesh, "object1": mesh})
+    found = read(tmp_path / "r.rrd")
+    assert "/world/surface!" not in found and "/world/surface/scene!" in found
+    shown = found["/world/surface/object1!"]
+    np.testing.assert_allclose(shown["Mesh3D:vertex_texcoords"][0], mesh.uv, atol=1e-6)
+    assert len(shown["Mesh3D:albedo_texture_buffer"][0][0]) == mesh.texture.size
+    assert "Mesh3D:vertex_colors" not in shown and "Mesh3D:albedo_factor" not in shown
+    shape = replace(analytic_shape("box", size=(1, 1, 1)), skin=mesh)
+    still, ahead = np.zeros(3), np.array([0.0, 0, 0, 1])
+    body = Body("crate", 0, "dynamic", 2.0, np.array([0.0, 0, 1]), ahead, still, still, 1.0, 0.5, 0.5)
+    playback = Playback(Scene((shape,), (body,), np.array([0.0, 0, -9.81]), 1.0))
+    encoded = playback.stream.binary_stream()
+    playback.log_static()
+    (tmp_path / "p.rrd").write_bytes(encoded.read() or b"")
+    shown = read(tmp_path / "p.rrd")["/world/crate/mesh!"]
+    np.testing.assert_allclose(shown["Mesh3D:vertex_positions"][0], 2 * mesh.vertices, atol=1e-6)
+    assert len(shown["Mesh3D:albedo_texture_buffer"][0][0]) == mesh.texture.size

@@ -318,3 +318,38 @@ def test_no_pocket_of_one_body_stays_within_another():
     part = flood(solid, upper.astype(int), [seam])
     assert set(np.unique(part[points[..., 2] < -2 * cell])) == {-1, 0}
     assert set(np.unique(part[points[..., 2] > 2 * cell])) == {-1, 1}
+
+
+def mug(make) -> tuple[list, list[str]]:
+    """A mug with a handle, which meets it in two sharp grooves, and a jug."""
+    body, faces = make.lathe(np.array([(0, 0), (0.1, 0), (0.1, 0.22), (0.075, 0.22), (0.075, 0.04), (0, 0.04)]))
+    ring, around = photo_sets.ring((0, 0, 0), 0.06, 0.02)
+    handle = ring @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) + [0.115, 0, 0.11]
+    jug, more = make.lathe(
+        np.array([(0, 0), (0.07, 0), (0.1, 0.06), (0.1, 0.14), (0.06, 0.22), (0.075, 0.27), (0, 0.27)])
+    )
+    shapes = {"mug": (body, faces), "handle": (handle, around), "jug": (jug - [0.22, 0, 0], more)}
+    colors = {"mug": (0.7, 0.66, 0.6), "handle": (0.16, 0.3, 0.62), "jug": (0.2, 0.32, 0.62)}
+    return photo_sets.in_room(make, shapes, colors), list(shapes)
+
+
+@pytest.mark.slow
+def test_a_mug_with_a_handle_and_a_jug_stay_one_each(tmp_path):
+    found = Scene(mug, ("mug", "handle", "jug"), 0.4).split(tmp_path / "p")
+    assert len(found.bodies) == 2 and found.touching == []
+
+
+def board(make) -> tuple[list, list[str]]:
+    """The shelf without its sides."""
+    parts, names = photo_sets.shelf(make)
+    return parts[: len(names) + 1] + parts[-2:], names
+
+
+@pytest.mark.slow
+def test_what_stands_apart_on_a_board_is_three_whole_bodies(tmp_path):
+    shelf = Scene(board, ("torus", "carton", "jug"), 0.7, 129)
+    found = shelf.split(tmp_path / "p")
+    assert len(found.bodies) == 3 and found.touching == []
+    for name, true in zip(found.bodies, ("torus", "jug", "carton"), strict=True):
+        sides = np.ptp(shelf.parts[["torus", "carton", "jug"].index(true)].vertices, axis=0)
+        np.testing.assert_allclose(np.ptp(found.bodies[name].vertices, axis=0), sides, rtol=0.01)

@@ -132,3 +132,12 @@ def test_what_a_joint_does_not_have_is_said():
         sim.joint("ball").effort = 1.0
     with pytest.raises(SdfsimError, match="'rail': is a slider, which has no angle\nhint: read position"):
         _ = sim.joint("rail").angle
+
+
+def test_reset_forgets_what_motors_were_told():
+    sim = free("hinge", motor={"most": 20.0})
+    joint = sim.joint("joint")
+    joint.most, joint.damping, joint.target = 5.0, 2.0, 1.0
+    sim.step(3)
+    sim.reset()
+    assert (joint.most, joint.damping, joint.target) == (pytest.approx(20.0), 0.0, None)
