@@ -258,7 +258,8 @@ def _velocities(rng: np.random.Generator, motion: str, extent: float) -> tuple[n
 
 
 def _speeds(rng: np.random.Generator, count: int = 1) -> np.ndarray:
-    return np.exp(rng.uniform(*np.log(SPEEDS), count))
+    low, high = np.log(SPEEDS)
+    return np.exp(rng.uniform(low, high, count))
 
 
 def _meet(teacher: Teacher, rng: np.random.Generator, pair: Bodies, height: float) -> None:

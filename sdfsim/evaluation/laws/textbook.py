@@ -91,7 +91,9 @@ def drops(at: Setting) -> Iterator[Check]:
 
 def stacks(at: Setting) -> Iterator[Check]:
     """Towers, a pyramid and a tower of planks stand, also if what lies on top is much heavier."""
-    cubes = {f"tower of {n}": [(0.0, 0.0, k + 0.5) for k in range(n)] for n in (5, 10, 20)}
+    cubes: dict[str, list[tuple[float, float, float]]] = {
+        f"tower of {n}": [(0.0, 0.0, k + 0.5) for k in range(n)] for n in (5, 10, 20)
+    }
     cubes["pyramid"] = [(1.02 * (k - 0.5 * (4 - row)), 0.0, row + 0.5) for row in range(5) for k in range(5 - row)]
     stacked = {name: (5.0, 0.1, [Put(f"{k}", CUBE, p) for k, p in enumerate(places)]) for name, places in cubes.items()}
     plank, planks = solid("analytic", "box", 1, 0.2, 0.1), []
