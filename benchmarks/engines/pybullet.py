@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.export import export, plain_names
-from sdfsim.apps.export_joints import speed_of, start_of, trees
+from sdfsim.apps.export_joints import speed_of, trees
 from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.scene.scene import Scene
 
@@ -32,7 +32,7 @@ class BulletWorld:
                     self._load(scene, k, Path(folder) / f"scene.{names[k]}.urdf", names)
         for k, one in tree.above.items():
             robot, link = self.of[k]
-            self.engine.resetJointState(robot, link, start_of(scene, one, k), *speed_of(scene, one, k), **self.here)
+            self.engine.resetJointState(robot, link, one.joint.start, *speed_of(scene, one, k), **self.here)
             drag = {"targetVelocity": 0.0, "force": one.joint.friction}
             self.engine.setJointMotorControl2(robot, link, self.engine.VELOCITY_CONTROL, **drag, **self.here)
         self.moving = [self.of[k] for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]

@@ -104,7 +104,7 @@ def test_bodies_in_plain_motion_do_what_their_start_says(cast):
     off = np.linalg.norm(np.cross(spin, [0.0, 0.0, -0.5]) + velocity, axis=1)
     along = (np.abs(velocity[:, :2]) < 1e-9).any(1)
     assert 8 <= (off < 1e-9).sum() <= 32 and 8 <= along.sum() <= 32 and not velocity[:, 2].any()
-    slides = in_motion("sliding", 0, cast, 100)
+    slides = in_motion("sliding", 0, cast, 500)
     assert not slides["angular_velocity"][0].any()
     assert np.linalg.norm(slides["velocity"][[0, -1], 1], axis=-1) @ [0, 1] < 0.1, "the cube has stopped"
     spins = in_motion("spinning", 0, cast, 25)

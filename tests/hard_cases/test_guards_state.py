@@ -41,10 +41,10 @@ def test_a_state_that_cannot_be_is_named_and_the_last_good_one_kept(kind, monkey
     sim = Simulator(gates.mixed(), random_model("impulse", push=0.1))
     advance = sim._advance
 
-    def inject(count: int, *, keep: bool) -> None:
+    def inject(count: int, *, keep: bool):
         if sim.steps_done == steps:
             sim.state = spoil(sim.state, *BROKEN[kind])
-        advance(count, keep=keep)
+        return advance(count, keep=keep)
 
     monkeypatch.setattr(simulator, "GLANCE", 0.0)  # one step in a call
     monkeypatch.setattr(sim, "_advance", inject)
