@@ -1,6 +1,7 @@
 """The *impulse* network in a simulation: the graph of a step, and the step with the network's impulses."""
 
 from copy import deepcopy
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -8,12 +9,16 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from sdfsim.base.compiling import cache_of, kept
 from sdfsim.learned.contact_graph import REST_SPEED, ContactGraph, number_pairs
 from sdfsim.learned.impulse import ImpulseNetwork, Velocities
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
+
+with kept(cache_of([Path(__file__).with_name("non_penetration.py")])):
+    from sdfsim.learned.non_penetration import separated
 
 # Fields of `Velocities`, and those of a graph that hold the same for free flight.
 FREE = {
@@ -93,11 +98,12 @@ def stepped(
         made = network(graph, friction=options.friction)
     time, moves = options.dt / known, bodies.moves[rows]
     rows = rows[moves]
-    share = _passive(graph, made, options.gravity)[moves, None]
+    share = _passive(graph, made, options.gravity)[:, None]
     end, spin, mean, turn = (
-        getattr(graph, of).numpy()[moves] + share * (getattr(made, name) - getattr(graph, of)).numpy()[moves]
+        getattr(graph, of).numpy() + share * (getattr(made, name) - getattr(graph, of)).numpy()
         for name, of in FREE.items()
     )
+    end, spin, mean, turn = (values[moves] for values in _apart(graph, end, spin, mean, turn))
     orientation = before.rows_of("orientation", rows)
     moved = {
         "position": before.rows_of("position", rows) + mean * (time * options.dt),
@@ -136,6 +142,28 @@ def _passive(graph: ContactGraph, made: Velocities, gravity: np.ndarray) -> np.n
     root = np.sqrt(linear**2 + 2.0 * square * spare)
     most = np.divide(root - linear, square, out=np.ones(len(spare)), where=square > 0)
     return np.minimum(most, 1.0)[island]
+
+
+def _apart(
+    graph: ContactGraph, end: np.ndarray, spin: np.ndarray, mean: np.ndarray, turn: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """The velocities [A, 3] at the end of a step and in its mean, with the impulses that keep bodies from sinking into
+    each other. The mean motion makes no overlap deeper than it is; where that needs a push, surfaces do not approach
+    each other at the end of the step either."""
+    bodies = [getattr(graph, name).numpy() for name in ("inverse_mass", "inverse_inertia")]
+    ends, arms = (
+        [getattr(graph, f"{of}_{side}" if of else side).numpy() for side in ("first", "second")] for of in ("", "arm")
+    )
+    normal = graph.normal.numpy()
+    touching = graph.gap.numpy() + graph.when.numpy() <= 1e-4
+    ends, arms = [side[touching] for side in ends], [side[touching] for side in arms]
+    normal = normal[touching]
+    moved = np.concatenate([mean, turn], 1)
+    pushed = separated(moved, *bodies, *ends, normal, *arms, np.zeros(len(normal))) > 0.0
+    left = np.concatenate([end, spin], 1)
+    where = [array[pushed] for array in (*ends, normal, *arms)]
+    separated(left, *bodies, *where, np.zeros(int(pushed.sum())))
+    return left[:, :3], left[:, 3:], moved[:, :3], moved[:, 3:]
 
 
 def _tensor(values: np.ndarray) -> Tensor:
