@@ -26,7 +26,7 @@ from sdfsim.base.lazy import NotInstalled, pyplot
 from sdfsim.base.parallel import Progress, silent, threads
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, largest_extent
-from sdfsim.physics.joint_columns import DAMPING, DRAG
+from sdfsim.physics.joint_columns import DAMPING, FRICTION
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver.world import FIRST
@@ -59,7 +59,7 @@ POINTS, BEYOND = 4, 2.0  # points of a profile on each side, and their farthest 
 CROWD, ROUNDS, AROUND = 24, 14, 0.15  # the search for long windows: points, rounds, and range, in widths
 SHELL = 5.0 / 3.0  # inertia of a hollow cube or ball over that of a solid one: the most that such a body can have
 # Columns of joints; the parameters are in units of `heft`.
-OF_JOINTS = {"joint_friction": DRAG, "joint_damping": DAMPING}
+OF_JOINTS = {"joint_friction": FRICTION, "joint_damping": DAMPING}
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,7 @@ class Scene:
         joints: the joints between bodies, in file order.
         gravity: [3] float64 m/s^2.
         duration: s.
+        step: s, None if it follows the size of what moves.
         seed: random seed of the run.
         model: bundled model name or path, None for the default.
         effects: the switches of the file.
@@ -184,6 +185,7 @@ class Scene:
     caveats: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     joints: tuple[Joint, ...] = ()
+    step: float | None = None
 
 
 def fingerprints(scene: Scene) -> dict[str, str]:

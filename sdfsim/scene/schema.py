@@ -688,6 +688,7 @@ class SceneTable(Table):
         "bundled model, or a .safetensors file in the scene's folder; the model sets the time step", None
     )
     duration: Number = key("simulated time", DEFAULT_DURATION, "s", gt=0)
+    step: Number | None = key("time step; by default it follows the size of what moves", None, "s", gt=0)
     seed: Whole = key("seed of the run's random numbers", 0, ge=0)
     gravity: Vector = key("acceleration of free fall", DEFAULT_GRAVITY, "m/s^2")
     effects: EffectsTable = key("which effects to compute", EffectsTable())

@@ -11,7 +11,7 @@ from numba import njit
 
 from sdfsim.physics.solver.broad_phase import near_pairs, swept
 from sdfsim.physics.solver.distance import distance
-from sdfsim.physics.solver.impulses import met_half_way
+from sdfsim.physics.solver.contacts import met_half_way
 from sdfsim.physics.solver.internal_edges import heed_supports
 from sdfsim.physics.solver.manifold import points_of
 from sdfsim.physics.solver.narrow_phase import find_near, narrow_phase
@@ -122,7 +122,7 @@ def points_within(shapes, world, work, motion, rules, manifolds, surfaces, soon)
         to_matrix(motion.orientation, b, matrix)
     manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, None)
     points, parts = reference(manifolds), reference(near)
-    narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.gone, work.scratch, surfaces, None)
+    narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.moved, work.scratch, surfaces, None)
     heed_supports(shapes, world, work, motion, rules, points, parts, work.scratch)
     most = points_of(manifolds, len(near.start))
     pair, value, count = np.empty((most, 2), np.int64), np.empty((most, 11)), 0

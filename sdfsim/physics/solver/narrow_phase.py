@@ -119,7 +119,9 @@ def find_near(shapes, world, work, motion, rules, span, old, surfaces, threads):
     swept(world, work, motion, rules, span)
     pairs = near_pairs(world, motion, work.low, work.high)
     manifolds = carried(world, motion, pairs, old)
-    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin, surfaces, threads)
+    near = near_parts(
+        shapes, world, motion, work.matrix, pairs, work.motion_bound, rules.contact_margin, surfaces, threads
+    )
     for p in range(len(pairs)):
         if near.count[p, 0] + near.count[p, 1] > 0:
             work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True

@@ -22,10 +22,12 @@ from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.physics.solver.edges import nodes_within, points_within
-from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows, Trial
+from sdfsim.physics.solver.joints import Each, Joints, Trial
 from sdfsim.physics.solver.manifold import scratch_room
+from sdfsim.physics.solver.rows import WIDTH as OF_ROW
 from sdfsim.physics.solver.run import HELD, SURFACES, THREADS, Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
+from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.validity import NO_LIMITS, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -85,14 +87,16 @@ class Compiled:
             numba.get_num_threads()  # starts the threads: cached code relies on that
         n = len(self.bodies)
         self.work = compiled.Work(
-            matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n, 3, 3)),
-            free=np.zeros((n, 9)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), wrench=np.zeros((n, 6)),
-            part=np.ones(n), ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
-            beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
+            matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n + 1, 3, 3)),
+            inverse_mass=np.append(self.world.inverse_mass, 0.0), twist=np.zeros((n + 1, 6)),
+            free=np.zeros((n + 1, 9)), change=np.zeros((n + 1, 6)), shift=np.zeros((n + 1, 6)),
+            wrench=np.zeros((n, 6)), part=np.ones(n), motion_bound=np.zeros(n), moved=np.zeros(n),
+            low=np.zeros((n, 3)), high=np.zeros((n, 3)),
+            beside=np.zeros(n, np.bool_), acted=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
-            scratch=scratch_room(),
+            turned=np.zeros((1, 4)), frame=np.zeros((1, 3, 3)), scratch=scratch_room(),
         )  # fmt: skip
-        self.held = held_by(self.bodies)
+        self.held = joints_of(self.bodies)
         # Threads are used for all kinds of pairs alike.
         self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
         self.seen: compiled.Motion | None = None  # motion in which `points_near` searches
@@ -165,8 +169,7 @@ class Compiled:
         touch = self._before.touch.with_rows(
             rows,
             {
-                "touching": motion.touching[rows], "quiet": motion.quiet[rows],
-                "anchor": motion.anchor[rows], "island": motion.island[rows],
+                "quiet": motion.quiet[rows], "anchor": motion.anchor[rows], "island": motion.island[rows],
             },
             pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
         )  # fmt: skip
@@ -223,16 +226,16 @@ def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
     touch = state.touch
     if touch is None:
         still, nobody = np.zeros(len(position), np.int64), np.full(len(position), -1, np.int64)
-        known = still > 0, still, np.concatenate([position, orientation, position, orientation], 1), nobody
+        known = still, np.concatenate([position, orientation, position, orientation], 1), nobody
     else:
-        known = (array.copy() for array in (touch.touching, touch.quiet, touch.anchor, touch.island))
+        known = (array.copy() for array in (touch.quiet, touch.anchor, touch.island))
     return compiled.Motion(position, orientation, *velocities, *known), _manifolds(touch)
 
 
 def _touch(motion: compiled.Motion, manifolds: compiled.Manifolds) -> Touch:
     return Touch(
-        touching=motion.touching.copy(), quiet=motion.quiet.copy(), anchor=motion.anchor.copy(),
-        island=motion.island.copy(), pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
+        quiet=motion.quiet.copy(), anchor=motion.anchor.copy(), island=motion.island.copy(),
+        pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
     )  # fmt: skip
 
 
@@ -242,23 +245,22 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, moved: np.ndarr
     acts on them."""
     touch = state.touch
     if bodies.joints is not None and state.joints is not None and changed.any():
-        # Impulses of joints at changed bodies, and at all bodies connected to them, are no longer known.
         place = jointed.coordinates(
             bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
         )
         known = state.joints.copy()
-        known[:, joint_columns.COORD], known[:, joint_columns.FRESH] = place, 1.0
+        known[:, joint_columns.COORD] = place
         state = replace(state, joints=known)
     if touch is None:
         return state
-    island, quiet, touching = (array.copy() for array in (touch.island, touch.quiet, touch.touching))
+    island, quiet = touch.island.copy(), touch.quiet.copy()
     beside = touch.pair[touch.count > 0]
     restless = changed.copy()
     restless[beside[changed[beside[:, 1]], 0]] = True
     restless[beside[changed[beside[:, 0]], 1]] = True
     up = np.full(len(island), gravity) | np.isin(island, island[restless & (island >= 0)])
-    island[up], quiet[up | changed], touching[moved] = -1, 0, False
-    return replace(state, touch=replace(touch, island=island, quiet=quiet, touching=touching))
+    island[up], quiet[up | changed] = -1, 0
+    return replace(state, touch=replace(touch, island=island, quiet=quiet))
 
 
 def contact_points(state: State) -> Touching:
@@ -464,7 +466,7 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
     )  # fmt: skip
 
 
-def held_by(bodies: Bodies) -> Held | None:
+def joints_of(bodies: Bodies) -> Joints | None:
     """The joints of a scene, with buffers for an inner step; None if there are none."""
     joints = bodies.joints
     if joints is None or not len(joints):
@@ -475,18 +477,17 @@ def held_by(bodies: Bodies) -> Held | None:
     def room(*shape: int) -> np.ndarray:
         return np.zeros(shape)
 
-    return Held(
+    return Joints(
         graph=Graph(**vars(order)),
         factors=Factors(room(k, 6, 6), room(k, 6, 6), room(f, 6, 6), room(f, 6, 6), room(k, 6)),
         each=Each(
             joints.body, joints.kind, joints.anchor, joints.axes, joints.number.copy(), room(j, joint_columns.STATE),
-            room(j, 1, 12),
+            room(j, OF_ROW),
         ),
-        rows=Rows(
-            room(j, ROWS, 12), np.zeros((j, ROWS), np.int64), room(j, ROWS), room(j, ROWS), room(j, ROWS),
-            room(j, ROWS), room(j, ROWS), room(1, 24),
+        held=Held(
+            joints.body, room(j, EQUATIONS, OF_ROW), np.zeros((j, EQUATIONS), np.int64),
+            *(room(j, EQUATIONS) for _ in range(5)),
         ),
-        trial=Trial(room(n, 3), room(n, 4), room(n, 3), room(n, 3), room(n, 3, 3), room(1, 4), room(1, 3, 3)),
-        reply=room(n, 6),
-        calm=np.zeros(n, np.bool_),
+        trial=Trial(room(n, 3), room(n, 4), room(n, 3), room(n, 3, 3)),
+        reply=room(n + 1, 6),
     )  # fmt: skip

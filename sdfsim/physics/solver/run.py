@@ -9,7 +9,7 @@ from numba import njit
 
 from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
-from sdfsim.physics.solver.joints import given, rest_held, stored
+from sdfsim.physics.solver.joints import begin_step, given, stored
 from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.sleep import rests
 from sdfsim.physics.solver.survey import broken, energy, touching
@@ -78,9 +78,10 @@ def run_steps(
             put(spin, i, get(motion.angular, going[i]))
         if rules.options.sleep and rests(world, motion):
             counts = (0, 0, 0)
-            _rest_on(world, work, motion)
+            for b in world.going:  # the full step would find no near bodies, and change nothing
+                work.met[b] = False
             if held is not None:
-                rest_held(held.each)
+                begin_step(held.each, True)
         else:
             manifolds, counts = advance(
                 shapes, world, work, motion, rules, manifolds, held, surfaces, threads, script, k
@@ -116,13 +117,6 @@ def run_steps(
                 written.depth[k] = max(written.depth[k], -here.gap[e])
                 found += 1
     return manifolds, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
-
-
-@njit(**BARE)
-def _rest_on(world, work, motion):
-    """A step in which all bodies sleep: the full step would find no near bodies, and change nothing."""
-    for b in world.going:
-        motion.touching[b] = work.met[b] = False
 
 
 @njit(**BARE)
