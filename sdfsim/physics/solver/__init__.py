@@ -4,6 +4,8 @@ Compiled code is cached in the user's cache folder, under a hash of all these fi
 """
 
 import sys
+from contextlib import AbstractContextManager
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from typing import Any
 from sdfsim.base.compiling import cache_of, kept
 
 
+@cache
 def _cache() -> Path:
     """The folder of the compiled step, named after a hash of its source."""
     here = Path(__file__).parent
@@ -33,6 +36,13 @@ def _without_blas() -> None:
     arrays.ensure_blas = asked
 
 
+def kept_here() -> AbstractContextManager[None]:
+    """Keep the compiled code of functions that are defined in the block in the folder of the compiled step."""
+    return kept(_cache())
+
+
 _without_blas()
-with kept(_cache()):
+with kept_here():
+    from sdfsim.physics.solver import edges as edges
+    from sdfsim.physics.solver import pieces as pieces
     from sdfsim.physics.solver import run as run

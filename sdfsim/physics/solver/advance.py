@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.flight import drift, pull_of
-from sdfsim.physics.solver.internal_edges import heed_supports
-from sdfsim.physics.solver.joints import assemble, begin_step, kept_together
-from sdfsim.physics.solver.narrow_phase import find_near, narrow_phase
-from sdfsim.physics.solver.references import reference
+from sdfsim.physics.solver.joints import begin_step, kept_together
+from sdfsim.physics.solver.narrow_phase import find_near
+from sdfsim.physics.solver.references import call, reference
 from sdfsim.physics.solver.sleep import put_to_sleep, roused, woken
-from sdfsim.physics.solver.solve import solve
-from sdfsim.physics.solver.time_of_impact import time_of_impact
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
@@ -32,65 +30,53 @@ from sdfsim.physics.solver.world import BETWEEN, END, START, kick_of
 
 
 @njit(**FAST, inline="always")
-def advance(shapes, world, work, motion, rules, manifolds, held, surfaces, threads, script, step):
-    """Advance `motion`, and the state of joints in `held`, by one step of a script, in place. The time depends on the
-    bodies that are awake, however many others there are.
-
-    All structures except `manifolds` and `held` are references. `run_steps` says which arguments may be None.
+def advance(shapes, world, work, motion, rules, manifolds, joints, pieces, script, step):
+    """Advance `motion`, and the state of joints, by one step of a script, in place. The time depends on the bodies that
+    are awake, however many others there are. All structures except `manifolds` are references.
 
     Returns:
         The manifolds at the end of the step; and counts: pairs tested, contacts of the last inner step, bodies that
         contacts or joints moved.
     """
-    joints = reference(held)
-    substeps = rules.options.substeps
+    substeps, jointed = rules.options.substeps, len(joints.each.body) > 0
     for b in world.going:
         to_matrix(motion.orientation, b, work.matrix)
         work.met[b] = False
     span = rules.substep_dt * substeps
-    manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
+    manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, pieces)
     stirred = rules.options.sleep
     while stirred:
         stirred = woken(world, motion, reference(manifolds), reference(near))
-        if held is not None:
-            stirred = stirred or roused(world, motion, joints.each.body)
+        stirred = stirred or roused(world, motion, joints.each.body)
         if stirred:
-            manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, threads)
-    if held is not None:
-        begin_step(joints.each, False)
-    contacts = 0
+            manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, pieces)
+    begin_step(joints.each, False)
+    contacts = np.int64(0)
     for k in range(substeps + 1):
-        phase = START if k == 0 else (END if k == substeps else BETWEEN)
+        phase = np.int64(START if k == 0 else (END if k == substeps else BETWEEN))
         if phase != END:
             for b in world.going:
                 if work.moved[b] > work.motion_bound[b] and (world.moves[b] or world.scripted[b]):
                     left = rules.substep_dt * (substeps - k)
-                    manifolds, near = find_near(shapes, world, work, motion, rules, left, manifolds, surfaces, threads)
+                    manifolds, near = find_near(shapes, world, work, motion, rules, left, manifolds, pieces)
                     break
-            for s in range(len(script.body)):
-                for x in range(3):
-                    motion.velocity[script.body[s], x] = script.velocity[step, k, s, x]
-                    motion.angular[script.body[s], x] = script.velocity[step, k, s, 3 + x]
+        for s in range(len(script.body)):
+            for x in range(3):
+                motion.velocity[script.body[s], x] = script.velocity[step, k, s, x]
+                motion.angular[script.body[s], x] = script.velocity[step, k, s, 3 + x]
         # Both are used again at the end of the step, so that the references hold.
         points, parts = reference(manifolds), reference(near)
         for b in world.going:
-            acts = work.beside[b]
-            if held is not None:
-                acts = acts or joints.graph.of_body[b] >= 0
-            _prepare(world, work, motion, rules, phase, b, acts)
-        if held is not None:
-            assemble(world, work, motion, rules, joints, phase)
+            _prepare(world, work, motion, rules, phase, b, work.beside[b] or joints.graph.of_body[b] >= 0)
+        if jointed:
+            call(pieces.assemble, (world, work, motion, rules, joints, phase))
         if phase != END:
-            narrow_phase(
-                shapes, world, motion, work.matrix, rules, points, parts, work.moved, work.scratch, surfaces, threads
-            )
-            heed_supports(shapes, world, work, motion, rules, points, parts, work.scratch)
-        system = solve(world, work, motion, rules, points, joints, threads, phase)
+            call(pieces.collide, (shapes, world, work, motion, rules, points, parts))
+        count = call(pieces.solve, (world, work, motion, rules, points, joints, phase))
         if phase != END:
-            contacts = len(system.where)
-            time_of_impact(shapes, world, work, motion, rules, points, parts, work.scratch, surfaces)
-            if held is not None:
-                kept_together(joints, work.part)
+            contacts = count
+            call(pieces.impact, (shapes, world, work, motion, rules, points, parts))
+            kept_together(joints, work.part)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
                 _move(world, work, motion, rules, phase, b)

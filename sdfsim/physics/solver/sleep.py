@@ -60,14 +60,13 @@ def roused(world, motion, body):
 @njit(**FAST)
 def put_to_sleep(world, work, motion, rules, manifolds, joints):
     """Freeze the islands whose bodies have all stayed in place for long enough; joints join bodies as contacts do.
-    `joints` is None if there are none."""
+    """
     n, rests = len(world.shape), False
     for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
             continue
         stays = work.acted[b]
-        if joints is not None:
-            stays = stays or joints.graph.of_body[b] >= 0
+        stays = stays or joints.graph.of_body[b] >= 0
         if stays and _strayed(world, motion, b, 0) < rules.stray:
             motion.quiet[b] += 1
         else:
@@ -86,12 +85,11 @@ def put_to_sleep(world, work, motion, rules, manifolds, joints):
         if manifolds.count[m] and world.moves[a] and world.moves[b]:
             join(parent, a, b)
     restless = np.zeros(n, np.bool_)
-    if joints is not None:
-        _join_held(world, joints.each.body, parent)
-        for j in range(len(joints.each.body)):
-            a = _driven_by_path(world, motion, joints.each.body, j)
-            if a >= 0:
-                restless[root(parent, a)] = True
+    _join_held(world, joints.each.body, parent)
+    for j in range(len(joints.each.body)):
+        a = _driven_by_path(world, motion, joints.each.body, j)
+        if a >= 0:
+            restless[root(parent, a)] = True
     for b in range(n):
         if world.moves[b] and motion.island[b] < 0 and motion.quiet[b] < rules.rest:
             restless[root(parent, b)] = True

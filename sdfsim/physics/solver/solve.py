@@ -56,6 +56,7 @@ HOLDS = 1e-11  # model lengths (and rad): rows of joints need not hold more exac
 TRIALS = 6  # rounds of the search for impulses after which rows hold
 BREAKS = 4  # rounds in which joints may break in one inner step
 EXACT = 0.01  # relative to the precision to which contacts without joints are solved
+AT_END = 0.1  # likewise at the end of a step, whose velocities users see
 # Relative to its effect without joints: if the effect of a bounded row is less, joints allow no motion along it, and
 # what is left is rounding. The joints then bear all of it.
 BLOCKED = 1e-7
@@ -69,7 +70,7 @@ def solve(world, work, motion, rules, manifolds, joints, threads, phase):
     to `change` and `shift` of `work`.
 
     Returns:
-        The rows that were solved.
+        The number of blocks of rows.
     """
     most = most_contacts(world, motion, manifolds)
     if joints is not None:
@@ -98,7 +99,7 @@ def solve(world, work, motion, rules, manifolds, joints, threads, phase):
         for i in range(islands):
             _solve_island(world, work, motion, rules, written, joints, None, i, phase)
     remember(manifolds, written, phase)
-    return rows
+    return len(rows.where)
 
 
 @njit(parallel=True, **FAST)
@@ -249,13 +250,14 @@ def _balance(world, work, motion, rules, rows, joints, delassus, island, rounds,
     """Relax all bounded rows until no impulse changes a velocity by more than `exact`, so that the rows of joints hold
     after the move."""
     lo, hi, mass, change = rows.start[island], rows.start[island + 1], work.inverse_mass, work.change
+    exact = rules.exact * (AT_END if phase == END else 1.0)
     if joints is None:
         for _ in range(rounds):
-            if sweep(rows, mass, change, None, lo, hi) <= rules.exact:
+            if sweep(rows, mass, change, None, lo, hi) <= exact:
                 break
         return
     first, last, graph, held = rows.first[island], rows.first[island + 1], joints.graph, joints.held
-    exact = EXACT * rules.exact if last > first else rules.exact
+    exact *= EXACT if last > first else 1.0
     for i in range(first, last):
         c = rows.component[i]
         for k in range(graph.comp[c], graph.comp[c + 1]):
