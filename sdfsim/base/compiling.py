@@ -70,10 +70,12 @@ def compile_before(jobs: Sequence[tuple[Any, tuple]], what: str) -> None:
 
     global _said, _spent
     with _lock:  # if several threads need one, one of them compiles
+        if not hasattr(jobs[0][0], "signatures"):  # plain Python
+            return
         missing = [job for job in jobs if (_name(job[0]), job[1]) not in _ready]
         _ready.update((_name(function), types) for function, types in missing)
-        # These types exactly: arrays of another type or layout need a form of their own. Plain Python needs none.
-        missing = [job for job in missing if hasattr(job[0], "signatures") and job[1] not in _forms(job[0])]
+        # These types exactly: arrays of another type or layout need a form of their own.
+        missing = [job for job in missing if job[1] not in _forms(job[0])]
         if not missing:
             return
         _said = True

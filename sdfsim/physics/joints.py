@@ -78,7 +78,7 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
         if joint.spring is not None:
             row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
         if (motor := joint.motor) is not None:
-            row[MAX_FORCE], row[TIME], gain = motor.most / effort, motor.time / time, motor.gain or 0.0
+            row[MAX_FORCE], row[TIME], gain = motor.max_force / effort, motor.time / time, motor.gain or 0.0
             row[GAIN] = gain * unit / effort
             if motor.speed is not None:
                 row[MOTOR], target[k] = TO_SPEED, motor.speed * time / unit

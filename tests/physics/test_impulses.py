@@ -11,7 +11,18 @@ from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 from sdfsim.physics.solver.solve import solve
-from sdfsim.physics.solver.world import BETWEEN, FIRST, GAP, KEY, NORMAL, NORMAL_IMPULSE, SECOND, TANGENTIAL, TORSION, VOID
+from sdfsim.physics.solver.world import (
+    BETWEEN,
+    FIRST,
+    GAP,
+    KEY,
+    NORMAL,
+    NORMAL_IMPULSE,
+    SECOND,
+    TANGENTIAL,
+    TORSION,
+    VOID,
+)
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from tests.helpers.scenes import make_body as body

@@ -177,7 +177,7 @@ def test_a_motor_works_against_friction_and_holds_its_speed():
     built = scene(gravity=(0, 0, 0))
     about = 0.5 * 4.0 * 0.3**2
     built.add("wheel", cylinder={"radius": 0.3, "height": 0.1}, mass=4.0)
-    motor = {"speed": 5.0, "most": 2.0}
+    motor = {"speed": 5.0, "max_force": 2.0}
     built.join("axle", "hinge", "wheel", anchor=(0, 0, 0), axis=(0, 0, 1), friction=0.5, motor=motor)
     simulator = Simulator(built)
     rate = (2.0 - 0.5) / about
@@ -196,7 +196,7 @@ def test_a_motor_works_against_friction_and_holds_its_speed():
 def test_a_motor_goes_to_its_place_and_holds_it_against_gravity():
     built = scene()
     built.add("arm", box={"size": (0.6, 0.1, 0.1)}, position=(0.3, 0, 0), mass=1.0)
-    motor = {"position_deg": 40.0, "most": 20.0}
+    motor = {"position_deg": 40.0, "max_force": 20.0}
     built.join("shoulder", "hinge", "arm", anchor=(0, 0, 0), axis=(0, -1, 0), motor=motor)
     simulator = Simulator(built)
     simulator.step(simulator.steps_in(2.0))
@@ -238,7 +238,7 @@ def test_a_four_bar_linkage_moves_as_its_closed_form():
     for name, one, two in (("crank", 0 * a, a), ("coupler", a, b), ("rocker", b, np.array([ground, 0.0]))):
         bar(name, one, two)
     up = {"axis": (0, 0, 1)}
-    built.join("shaft", "hinge", "crank", anchor=(0, 0, 0), motor={"speed": 4.0, "most": 1000.0}, **up)
+    built.join("shaft", "hinge", "crank", anchor=(0, 0, 0), motor={"speed": 4.0, "max_force": 1000.0}, **up)
     built.join("pin", "hinge", "coupler", "crank", anchor=(*a, 0), **up)
     built.join("pin2", "hinge", "rocker", "coupler", anchor=(*b, 0), **up)
     built.join("pivot", "hinge", "rocker", anchor=(ground, 0, 0), **up)
@@ -288,7 +288,7 @@ def cart(built: Scene, deep: float) -> tuple[dict, float]:
     """On a rail above the floor, driven by a motor."""
     built.add("floor", plane={}, friction=0.0)
     built.add("it", box={"size": (0.3, 0.3, 0.3)}, position=(0, 0, 0.15 - deep), mass=5.0, velocity=(0.5, 0, 0))
-    return {"type": "slider", "axis": (1, 0, 0), "motor": {"speed": 0.5, "most": 500.0}}, 0.5
+    return {"type": "slider", "axis": (1, 0, 0), "motor": {"speed": 0.5, "max_force": 500.0}}, 0.5
 
 
 @pytest.mark.parametrize("deep", [0.0, 5e-4, 1e-3, 1e-2])
@@ -343,11 +343,11 @@ def test_jointed_bodies_with_nothing_to_touch_swing():
 
 
 MOTORS = {
-    "as strong as it takes": {"position_deg": 0, "most": 50.0},
-    "keen": {"position_deg": 0, "most": 50.0, "time": 0.02},
-    "weak": {"position_deg": 0, "most": 2.0},
-    "with a gain": {"position_deg": 0, "most": 50.0, "gain": 60.0, "time": 0.05},
-    "speed": {"speed": 0.0, "most": 3.0},
+    "as strong as it takes": {"position_deg": 0, "max_force": 50.0},
+    "keen": {"position_deg": 0, "max_force": 50.0, "time": 0.02},
+    "weak": {"position_deg": 0, "max_force": 2.0},
+    "with a gain": {"position_deg": 0, "max_force": 50.0, "gain": 60.0, "time": 0.05},
+    "speed": {"speed": 0.0, "max_force": 3.0},
 }
 
 
@@ -373,9 +373,9 @@ def test_a_gripper_that_lifts_makes_no_energy():
     built.add("hand", box={"size": (0.2, 0.1, 0.02)}, position=(0, 0, 0.3), mass=1.0)
     for name, x in (("left", -0.06), ("right", 0.06)):
         built.add(name, box={"size": (0.02, 0.04, 0.16)}, position=(x, 0, 0.16), mass=0.1, friction=1.0)
-        close = {"position": 0.05, "most": 20.0}
+        close = {"position": 0.05, "max_force": 20.0}
         built.join(f"{name} rail", "slider", name, "hand", axis=(-np.sign(x), 0, 0), motor=close)
-    built.join("lift", "slider", "hand", axis=(0, 0, 1), motor={"position": 0.0, "most": 100.0})
+    built.join("lift", "slider", "hand", axis=(0, 0, 1), motor={"position": 0.0, "max_force": 100.0})
     simulator = Simulator(built)
     parts = list(simulator.frames(80))
     for k in range(200):
@@ -392,7 +392,7 @@ def test_a_gripper_that_lifts_makes_no_energy():
 @pytest.mark.parametrize("gain", [50.0, 1e3, 1e5, 1e7])
 @pytest.mark.parametrize("time", [0.0, 0.02, 0.3])
 def test_a_motor_with_a_gain_sags_by_the_load_over_it(gain: float, time: float):
-    simulator = rod({"motor": {"position_deg": 0, "most": 1e6, "gain": gain, "time": time}, "damping": 3.0})
+    simulator = rod({"motor": {"position_deg": 0, "max_force": 1e6, "gain": gain, "time": time}, "damping": 3.0})
     simulator.step(2000)
     angle = simulator.joint("pin").angle
     assert angle == pytest.approx(WEIGHT * math.cos(angle) / gain, rel=1e-3)
@@ -401,7 +401,7 @@ def test_a_motor_with_a_gain_sags_by_the_load_over_it(gain: float, time: float):
 
 @pytest.mark.parametrize(("gain", "time"), [(20.0, 0.0), (20.0, 0.02), (20.0, 0.3), (400.0, 0.01)])
 def test_a_motor_with_a_gain_moves_as_a_damped_oscillator(gain: float, time: float):
-    rollout = rod({"motor": {"position_deg": 30, "most": 1e6, "gain": gain, "time": time}}, gravity=0.0).run(2.0)
+    rollout = rod({"motor": {"position_deg": 30, "max_force": 1e6, "gain": gain, "time": time}}, gravity=0.0).run(2.0)
 
     def rates(_: float, y: np.ndarray) -> list[float]:
         return [y[1], gain * (math.pi / 6 - y[0] - time * y[1]) / ABOUT_END]
@@ -411,10 +411,10 @@ def test_a_motor_with_a_gain_moves_as_a_damped_oscillator(gain: float, time: flo
 
 
 def test_a_motor_with_a_gain_has_friction_and_a_largest_torque_beside_it():
-    motor = {"position_deg": 60, "most": 1.0, "gain": 20.0, "time": 0.02}
+    motor = {"position_deg": 60, "max_force": 1.0, "gain": 20.0, "time": 0.02}
     weak = rod({"motor": motor}, gravity=0.0).run(0.3)
     assert weak.joint_position[-1, 0] == pytest.approx(0.5 * weak.time[-1] ** 2 / ABOUT_END, rel=2e-3)
-    stiff = rod({"motor": {"speed": 2.0, "most": 100.0, "gain": 3.0}, "friction": 0.5}, gravity=0.0)
+    stiff = rod({"motor": {"speed": 2.0, "max_force": 100.0, "gain": 3.0}, "friction": 0.5}, gravity=0.0)
     stiff.step(300)
     assert stiff.joint("pin").speed == pytest.approx(2.0 - 0.5 / 3.0, rel=1e-4)
     pushed = rod({"motor": motor | {"gain": 1e-5}}, gravity=0.0)
@@ -435,7 +435,7 @@ def test_a_lever_on_a_spring_rests_where_its_weight_says(stiffness: float, dampi
 
 
 def test_a_target_at_the_joint_s_own_reading_is_within_its_limits(recwarn):
-    simulator = rod({"limits_deg": (0, 90), "motor": {"position_deg": 0, "most": 50.0}})
+    simulator = rod({"limits_deg": (0, 90), "motor": {"position_deg": 0, "max_force": 50.0}})
     simulator.step(100)
     for _ in range(20):
         simulator.joint("pin").target = simulator.joint("pin").angle
@@ -445,12 +445,16 @@ def test_a_target_at_the_joint_s_own_reading_is_within_its_limits(recwarn):
         simulator.joint("pin").target = -0.01
 
 
-@pytest.mark.parametrize("hold", [None, {"position_deg": 0, "most": 400}, {"position_deg": 0, "most": 40, "gain": 90}])
+@pytest.mark.parametrize(
+    "hold", [None, {"position_deg": 0, "max_force": 400}, {"position_deg": 0, "max_force": 40, "gain": 90}]
+)
 def test_the_work_of_two_motors_of_an_arm_is_what_energy_grows_by(hold: dict | None):
     built = scene(gravity=(0, 0, 0))
     built.add("upper", box={"size": (0.5, 0.05, 0.05)}, position=(0.25, 0, 0), mass=2.0)
     built.add("lower", box={"size": (0.5, 0.05, 0.05)}, position=(0.75, 0, 0), mass=1.0)
-    built.join("shoulder", "hinge", "upper", anchor=(0, 0, 0), axis=(0, 1, 0), motor={"position_deg": 0, "most": 100})
+    built.join(
+        "shoulder", "hinge", "upper", anchor=(0, 0, 0), axis=(0, 1, 0), motor={"position_deg": 0, "max_force": 100}
+    )
     built.join(
         "elbow", "hinge", "lower", "upper", anchor=(0.5, 0, 0), axis=(0, 1, 0), **({"motor": hold} if hold else {})
     )

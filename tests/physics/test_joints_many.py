@@ -121,7 +121,7 @@ def test_gears_turn_as_their_teeth_count():
             tooth, built_tooth = tooth | {"euler_xyz_deg": (0, 0, math.degrees(angle))}, True
             built.add(f"{name} {k}", **tooth, position=place, mass=0.1, friction=0.1, restitution=0.0)
             built.join(f"{name} tooth {k}", "fixed", f"{name} {k}", name)
-    motor = {"speed": 2.0, "most": 50.0}
+    motor = {"speed": 2.0, "max_force": 50.0}
     built.join("drive", "hinge", "small", anchor=(0, 0, 0), axis=(0, 0, 1), motor=motor)
     built.join("driven", "hinge", "large", anchor=(0.5, 0, 0), axis=(0, 0, 1), friction=0.2)
     simulator = Simulator(built)
@@ -142,7 +142,7 @@ def test_the_balls_of_watts_governor_rise_as_its_speed_says(rate: float):
     built.add(
         "sleeve", cylinder={"radius": 0.05, "height": 0.1}, position=low, mass=sleeve, angular_velocity=(0, 0, rate)
     )
-    built.join("shaft", "hinge", "spindle", anchor=(0, 0, 0), axis=(0, 0, 1), motor={"speed": rate, "most": 500.0})
+    built.join("shaft", "hinge", "spindle", anchor=(0, 0, 0), axis=(0, 0, 1), motor={"speed": rate, "max_force": 500.0})
     built.join("guide", "slider", "sleeve", "spindle", anchor=low, axis=(0, 0, 1), damping=20.0)
     for k, side in enumerate((1.0, -1.0)):
         place = np.array([side * length * math.sin(lean), 0.0, -length * math.cos(lean)])
@@ -262,7 +262,7 @@ def test_a_damped_pendulum_falls_asleep_and_wakes_when_it_is_pushed():
 def test_a_motor_that_is_told_another_place_wakes_what_it_drives():
     built = Scene(model="solver")
     built.add("arm", box={"size": (0.4, 0.1, 0.1)}, position=(0.2, 0, 0), mass=1.0)
-    motor = {"position_deg": 0.0, "most": 30.0}
+    motor = {"position_deg": 0.0, "max_force": 30.0}
     built.join("shoulder", "hinge", "arm", anchor=(0, 0, 0), axis=(0, 1, 0), motor=motor)
     simulator = Simulator(built)
     simulator.step(simulator.steps_in(3.0))

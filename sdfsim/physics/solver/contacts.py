@@ -61,7 +61,8 @@ def most_contacts(world, motion, manifolds):
 def contact_rows(world, work, motion, rules, manifolds, rows, phase):
     """Write the rows of all contacts that act. Returns the number of blocks.
 
-    At the end of a step, only the contacts that have pushed in its last inner step act: bodies do not approach there.
+    At the end of a step the contacts act that have pushed in its last inner step, and those that rest on each other
+    within the slop: bodies do not approach there.
     """
     matrix, free, h, kick = work.matrix, work.free, rules.substep_dt, kick_of(phase)
     row, count = rows.row, 0
@@ -76,8 +77,6 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
         first_of_pair = count
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
-            if phase == END and point[NORMAL_IMPULSE] == 0.0:
-                continue
             n = three(point, NORMAL)
             arm, other = met_half_way(
                 between, turn(matrix, a, three(point, FIRST)), turn(matrix, b, three(point, SECOND))
@@ -92,7 +91,9 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             way = -dot(then, n) * h
             early = way > thin
             too_far = gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)
-            if phase != END and (point[VOID] > 0.0 or too_far):
+            if phase == END:
+                too_far = point[NORMAL_IMPULSE] == 0.0 and (gap + h * approach > rules.slop or -approach > rules.slow)
+            if point[VOID] > 0.0 or too_far:
                 point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
                 continue
             # Newton's rule for all contacts of one impact: without friction and with e = 1, energy is conserved.

@@ -227,12 +227,12 @@ def _compiled(
 
 def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
     """Poses and velocities of paths for `steps` steps, and the time after them. Velocities change in each inner step:
-    if they jumped once a step, bodies on an accelerating tray would slip. That at the end is the one at this instant."""
+    if they jumped once a step, bodies on an accelerating tray would slip. The last is that at the end of the step."""
     inner, count = rules.substep_dt, rules.options.substeps
     times = [time]
     for _ in range(steps):
         times.append(times[-1] + inner * count)  # added up as single steps do, bit by bit
-    if tracks is None:
+    if tracks is None or not steps:
         return NO_SCRIPT, times[-1]
     instants = np.array([[t + inner * k for k in range(count)] for t in times[:-1]])
     after, half = np.array(times[1:])[:, None], 0.5 * inner
