@@ -88,7 +88,8 @@ def compile_before(jobs: Sequence[tuple[Any, tuple]], what: str) -> None:
         cores = os.cpu_count() or 1
         missing.sort(key=lambda job: -_seconds(job[0]))
         takes = max(_seconds(missing[0][0]), sum(_seconds(function) for function, _ in missing) / cores)
-        _log.warning("compiling %s (%d parts), once for this version: about %.0f s", what, len(missing), takes)
+        parts = f" in {len(missing)} parts" if len(missing) > 1 else ""
+        _log.warning("compiling %s%s, once for this version: about %.0f s", what, parts, takes)
 
         def compiled(job: tuple[Any, tuple]) -> None:
             wanted = dumps((*_name(job[0]), job[1]))

@@ -100,7 +100,14 @@ def _prepare(world, work, motion, rules, phase, b, acts):
         work.change[b, x] = work.shift[b, x] = 0.0
     for x in range(9):
         free[b, x] = 0.0
-    if not (acts and world.moves[b] and motion.island[b] < 0):
+    if not acts:
+        return
+    if phase != END:
+        for x in range(3):
+            work.position_before[b, x] = motion.position[b, x]
+            for y in range(3):
+                work.matrix_before[b, x, y] = matrix[b, x, y]
+    if not world.moves[b] or motion.island[b] >= 0:
         return
     v, w = pull_of(world, matrix, work.wrench, rules, kick_of(phase), b)
     for x in range(3):

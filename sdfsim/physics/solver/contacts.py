@@ -64,7 +64,12 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
     At the end of a step the contacts act that have pushed in its last inner step, and those that rest on each other
     within the slop: bodies do not approach there.
     """
-    matrix, free, h, kick = work.matrix, work.free, rules.substep_dt, kick_of(phase)
+    free, h, kick = work.free, rules.substep_dt, kick_of(phase)
+    # At the end of a step, contact points have not been searched again after the last move. They are taken where they
+    # were before it: at a body that rolls, they would have moved backwards with its surface, and their push would drive
+    # it.
+    matrix = work.matrix_before if phase == END else work.matrix
+    position = work.position_before if phase == END else motion.position
     row, count = rows.row, 0
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
@@ -72,7 +77,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             continue
         friction = world.friction[a] * world.friction[b] if rules.options.friction else 0.0
         bounce = world.restitution[a] * world.restitution[b] if rules.options.restitution else 0.0
-        between = sub(get(motion.position, a), get(motion.position, b))
+        between = sub(get(position, a), get(position, b))
         thin = THIN * min(world.thickness[a], world.thickness[b])
         first_of_pair = count
         for k in range(manifolds.count[m]):

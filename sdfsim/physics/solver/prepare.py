@@ -101,7 +101,9 @@ class Compiled:
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n + 1, 3, 3)),
-            inverse_mass=np.append(self.world.inverse_mass, 0.0), twist=np.zeros((n + 1, 6)),
+            inverse_mass=np.append(self.world.inverse_mass, 0.0),
+            matrix_before=pose.to_matrix(state.orientation), position_before=np.array(state.position),
+            twist=np.zeros((n + 1, 6)),
             free=np.zeros((n + 1, 9)), change=np.zeros((n + 1, 6)), shift=np.zeros((n + 1, 6)),
             wrench=np.zeros((n, 6)), part=np.ones(n), motion_bound=np.zeros(n), moved=np.zeros(n),
             low=np.zeros((n, 3)), high=np.zeros((n, 3)),

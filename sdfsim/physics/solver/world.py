@@ -84,6 +84,9 @@ class Work(NamedTuple):
     matrix: np.ndarray
     inverse: np.ndarray
     inverse_mass: np.ndarray  # [N + 1]
+    # matrix_before [N, 3, 3], position_before [N, 3]: before the last move
+    matrix_before: np.ndarray
+    position_before: np.ndarray
     # All velocities that follow have a last entry for the world, which stays 0: joints to it have the body -1.
     # twist [N + 1, 6]: velocities before the inner step. free [N + 1, 9]: their change without contacts and joints; and
     # that of the angular one by the gyroscopic torque. change, shift [N + 1, 6]: what contacts and joints add; and
