@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -329,12 +329,19 @@ def contact_time() -> float:
     return best(lambda: _written(*known, AGAIN)) / _written(*known, AGAIN)
 
 
+class Velocities(NamedTuple):
+    """What a sweep needs of `Work`."""
+
+    inverse_mass: np.ndarray
+    change: np.ndarray
+
+
 @njit(error_model="numpy")
-def _swept(mass: np.ndarray, rows: Rows, change: np.ndarray) -> None:
-    some = reference(rows)
+def _swept(velocities: Velocities, rows: Rows) -> None:
+    some, work = reference(rows), reference(velocities)
     for i in range(len(rows.start) - 1):
         for _ in range(SWEEPS):
-            sweep(some, mass, change, None, rows.start[i], rows.start[i + 1])
+            sweep(some, work, None, rows.start[i], rows.start[i + 1])
 
 
 def row_time() -> float:
@@ -345,8 +352,8 @@ def row_time() -> float:
     first = np.arange(ROWS)
     where = np.stack([first, np.zeros_like(first), first, first + 1], axis=1)
     rows = _room(row, where, np.arange(0, ROWS + 1, ISLAND), first)
-    change = np.zeros((bodies, 6))
-    return best(lambda: _swept(np.ones(bodies), rows, change)) / (ROWS * SWEEPS)
+    velocities = Velocities(np.ones(bodies), np.zeros((bodies, 6)))
+    return best(lambda: _swept(velocities, rows)) / (ROWS * SWEEPS)
 
 
 COMMANDS = (growth, large, many, roofline)

@@ -51,9 +51,11 @@ class Rows(NamedTuple):
 
 
 class Delassus(NamedTuple):
-    """The effect of unit impulses of an island's R rows (three for a block) on all of them through joints, and the
-    velocities along the rows so far. [0, 0] and [0] if the island has too many rows."""
+    """The effect of unit impulses of an island's R rows on all of them through joints, and the velocities along the
+    rows so far. [0, 0] and [0] if the island has too many rows."""
 
+    at: np.ndarray  # [C] int64, the first row of each block
+    block: np.ndarray  # [R] int64, the block of each row
     matrix: np.ndarray  # [R, R]
     change: np.ndarray  # [R]
     known: np.ndarray  # [R] impulses that the bodies have received
@@ -123,73 +125,39 @@ def within(one, other, most):
 
 
 @njit(**BARE)
-def sweep(rows, mass, change, delassus, lo, hi):
-    """Relax the blocks order[lo : hi] one after the other, friction of contacts last. Returns the largest change of a
-    velocity."""
+def sweep(rows, work, delassus, lo, hi):
+    """Relax the blocks order[lo : hi] one after the other, friction of contacts last. `delassus` is None if no joints
+    hold their bodies. Returns the largest change of a velocity."""
     worst = 0.0
-    for i in range(hi - lo):
-        c = rows.order[lo + i]
-        kind = rows.kind[c]
-        if kind == GRIP:
-            worst = max(worst, _relax_grip(rows, mass, change, delassus, c, 3 * i))
-        elif kind == MOTOR:
-            worst = max(worst, _relax_motor(rows, mass, change, delassus, c, 3 * i))
+    for i in range(lo, hi):
+        c = rows.order[i]
+        if delassus is None:
+            worst = max(worst, _relax(rows.where, rows.row, work.inverse_mass, work.change, c))
+        elif rows.kind[c] == GRIP:
+            worst = max(worst, _relax_grip(rows, work, delassus, c))
         else:
-            worst = max(worst, _relax(rows.where, rows.row, mass, change, delassus, c, 3 * i))
-    for i in range(hi - lo):
-        c = rows.order[lo + i]
+            worst = max(worst, _relax_one(rows, work, delassus, c))
+    for i in range(lo, hi):
+        c = rows.order[i]
         if rows.friction[c] > 0.0:
             most = rows.friction[c] * rows.row[c, 0, IMPULSE]
-            worst = max(worst, _relax_friction(rows.where, rows.row, mass, change, delassus, c, 3 * i, most))
+            if delassus is None:
+                worst = max(worst, _relax_friction(rows.where, rows.row, work.inverse_mass, work.change, c, most))
+            else:
+                worst = max(worst, _relax_held_friction(rows, work, delassus, c, most))
     return worst
 
 
 @njit(**BARE)
-def _short(rows, change, delassus, c, e, r):
-    """What row e of a block lacks of its wanted change; r is its number in the island."""
-    row = rows.row[c, e]
-    if delassus is not None:
-        if len(delassus.change):
-            return row[WANTED] - delassus.change[r + e]
-    return row[WANTED] - velocity_of(row, change, rows.where[c, 2], rows.where[c, 3])
-
-
-@njit(**BARE)
-def _set(rows, mass, change, delassus, c, e, r, total):
-    """Give row e of a block its impulse. Returns the change of its velocity."""
-    row = rows.row[c, e]
-    step = total - row[IMPULSE]
-    if step == 0.0:
-        return 0.0
-    row[IMPULSE] = total
-    _spread(rows.where, row, mass, change, delassus, c, r + e, step)
-    return abs(step) / row[MASS] if row[MASS] > 0.0 else 0.0
-
-
-@njit(**BARE)
-def _spread(where, row, mass, change, delassus, c, r, step):
-    if delassus is not None:
-        if len(delassus.change):
-            now, effect = delassus.change, delassus.matrix[r]  # names outside of the loop: it becomes vector code
-            for q in range(len(now)):
-                now[q] += step * effect[q]
-            return
-    give(mass, row, change, where[c, 2], where[c, 3], step)
+def rows_of(rows, c):
+    """Number of rows of a block."""
+    return 3 if rows.friction[c] > 0.0 or rows.kind[c] == GRIP else 1
 
 
 @njit(**INLINED)
-def _relax(where, row, mass, change, delassus, c, r):
+def _relax(where, row, mass, change, c):
     """Bring a row that only pushes to its wanted velocity. Returns the change of velocity."""
     a, b, own = where[c, 2], where[c, 3], row[c, 0]
-    if delassus is not None:
-        if len(delassus.change):
-            total = max(own[IMPULSE] + (own[WANTED] - delassus.change[r]) * own[MASS], 0.0) if own[MASS] > 0.0 else 0.0
-            step = total - own[IMPULSE]
-            if step == 0.0:
-                return 0.0
-            own[IMPULSE] = total
-            _spread(where, own, mass, change, delassus, c, r, step)
-            return abs(step) / own[MASS] if own[MASS] > 0.0 else 0.0
     v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
     u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
     axis = three(own, LINEAR)
@@ -203,30 +171,17 @@ def _relax(where, row, mass, change, delassus, c, r):
     w, z = along(w, three(own, TURN), step), along(z, three(own, COUNTER), step)
     for x in range(3):
         change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
-    return abs(step / own[MASS]) if own[MASS] > 0.0 else 0.0
+    return abs(step / own[MASS])
 
 
 @njit(**INLINED)
-def _relax_friction(where, row, mass, change, delassus, c, r, most):
+def _relax_friction(where, row, mass, change, c, most):
     """Bring both tangential rows of a contact to rest, as far as the cone of friction allows. Returns the change of
     velocity."""
     a, b, p, q = where[c, 2], where[c, 3], row[c, 1], row[c, 2]
     first, second = p[IMPULSE], q[IMPULSE]
     # One effective mass for both, so that friction is opposite to the slip.
     lesser = min(p[MASS], q[MASS])
-    if delassus is not None:
-        if len(delassus.change):
-            lesser = lesser if lesser > 0.0 else max(p[MASS], q[MASS])  # joints allow no motion along one of them
-            one = first + lesser * (p[WANTED] - delassus.change[r + 1]) if p[MASS] > 0.0 else 0.0
-            other = second + lesser * (q[WANTED] - delassus.change[r + 2]) if q[MASS] > 0.0 else 0.0
-            share = within(one, other, most)
-            one, other = share * one - first, share * other - second
-            p[IMPULSE], q[IMPULSE] = first + one, second + other
-            if one != 0.0:
-                _spread(where, p, mass, change, delassus, c, r + 1, one)
-            if other != 0.0:
-                _spread(where, q, mass, change, delassus, c, r + 2, other)
-            return max(abs(one), abs(other)) / lesser if lesser > 0.0 else 0.0
     v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
     u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
     between = sub(v, u)
@@ -248,19 +203,84 @@ def _relax_friction(where, row, mass, change, delassus, c, r, most):
     return max(abs(one), abs(other)) / lesser
 
 
-@njit(**BARE)
-def _relax_motor(rows, mass, change, delassus, c, r):
-    """Relax a motor with friction. Returns the change of velocity."""
-    row, own = rows.row[c, 0], rows.own[c]
-    if row[MASS] <= 0.0:
-        return _set(rows, mass, change, delassus, c, 0, r, 0.0)
-    effect, aim = 1.0 / row[MASS], own[AIM]
-    now = aim - _short(rows, change, delassus, c, 0, r) - row[IMPULSE] * effect  # the speed without it
-    if own[COMPLIANCE] > 0.0:
-        total = min(max((aim - now) / (effect + own[COMPLIANCE]), -own[STRONGEST]), own[STRONGEST])
+@njit(**INLINED)
+def _short(rows, work, delassus, c, e):
+    """What row e of a block lacks of its wanted change."""
+    wanted = rows.row[c, e, WANTED]
+    if len(delassus.change):
+        return wanted - delassus.change[delassus.at[c] + e]
+    return wanted - velocity_of(rows.row[c, e], work.change, rows.where[c, 2], rows.where[c, 3])
+
+
+@njit(**INLINED)
+def _set(rows, work, delassus, c, e, total):
+    """Give row e of a block its impulse. Returns the change of its velocity."""
+    step = total - rows.row[c, e, IMPULSE]
+    if step == 0.0:
+        return 0.0
+    rows.row[c, e, IMPULSE] = total
+    if len(delassus.change):
+        now, effect = (
+            delassus.change,
+            delassus.matrix[delassus.at[c] + e],
+        )  # outside of the loop: it becomes vector code
+        for q in range(len(now)):
+            now[q] += step * effect[q]
     else:
-        total = _driven(now, aim, effect, own[STRONGEST], own[DRAG])
-    return _set(rows, mass, change, delassus, c, 0, r, total)
+        give(work.inverse_mass, rows.row[c, e], work.change, rows.where[c, 2], rows.where[c, 3], step)
+    return abs(step) / rows.row[c, e, MASS] if rows.row[c, e, MASS] > 0.0 else 0.0
+
+
+@njit(**BARE)
+def _relax_one(rows, work, delassus, c):
+    """Relax the first row of a contact, a limit or a motor. Returns the change of velocity."""
+    mass, before, own = rows.row[c, 0, MASS], rows.row[c, 0, IMPULSE], rows.own[c]
+    short, total = _short(rows, work, delassus, c, 0), 0.0
+    if mass > 0.0:  # else joints allow no motion along it
+        total = before + short * mass
+        if rows.kind[c] == MOTOR:
+            now = own[AIM] - short - before / mass  # the speed without it
+            if own[COMPLIANCE] > 0.0:
+                total = (own[AIM] - now) / (1.0 / mass + own[COMPLIANCE])
+                total = min(max(total, -own[STRONGEST]), own[STRONGEST])
+            else:
+                total = _driven(now, own[AIM], 1.0 / mass, own[STRONGEST], own[DRAG])
+        else:
+            total = max(total, 0.0)
+    return _set(rows, work, delassus, c, 0, total)
+
+
+@njit(**BARE)
+def _relax_held_friction(rows, work, delassus, c, most):
+    """`_relax_friction` for bodies that joints may hold."""
+    mass, other_mass = rows.row[c, 1, MASS], rows.row[c, 2, MASS]
+    lesser = min(mass, other_mass)
+    lesser = lesser if lesser > 0.0 else max(mass, other_mass)  # joints may allow no motion along one of them
+    one = other = 0.0
+    if mass > 0.0:
+        one = rows.row[c, 1, IMPULSE] + lesser * _short(rows, work, delassus, c, 1)
+    if other_mass > 0.0:
+        other = rows.row[c, 2, IMPULSE] + lesser * _short(rows, work, delassus, c, 2)
+    share = within(one, other, most)
+    worst = _set(rows, work, delassus, c, 1, share * one)
+    return max(worst, _set(rows, work, delassus, c, 2, share * other))
+
+
+@njit(**BARE)
+def _relax_grip(rows, work, delassus, c):
+    """Relax the three rows of a ball joint's friction, which are bounded together. Returns the largest change."""
+    row, worst = rows.row[c], 0.0
+    known = row[0, IMPULSE], row[1, IMPULSE], row[2, IMPULSE]
+    for e in range(3):
+        total = row[e, IMPULSE] + _short(rows, work, delassus, c, e) * row[e, MASS]
+        _set(rows, work, delassus, c, e, total)
+    length = math.sqrt(row[0, IMPULSE] ** 2 + row[1, IMPULSE] ** 2 + row[2, IMPULSE] ** 2)
+    for e in range(3):
+        if length > rows.own[c, DRAG]:
+            _set(rows, work, delassus, c, e, row[e, IMPULSE] * rows.own[c, DRAG] / length)
+        if row[e, MASS] > 0.0:
+            worst = max(worst, abs(row[e, IMPULSE] - known[e]) / row[e, MASS])
+    return worst
 
 
 @njit(**BARE)
@@ -275,20 +295,3 @@ def _driven(now, aim, effect, most, grip):
         return sign * max(reach, -most - grip)
     stay = -now / effect
     return sign * min(max(stay, most - grip), most + grip)
-
-
-@njit(**BARE)
-def _relax_grip(rows, mass, change, delassus, c, r):
-    """Relax the three rows of a ball joint's friction, which are bounded together. Returns the largest change."""
-    row, worst = rows.row[c], 0.0
-    known = row[0, IMPULSE], row[1, IMPULSE], row[2, IMPULSE]
-    for e in range(3):
-        total = row[e, IMPULSE] + _short(rows, change, delassus, c, e, r) * row[e, MASS]
-        _set(rows, mass, change, delassus, c, e, r, total)
-    length = math.sqrt(row[0, IMPULSE] ** 2 + row[1, IMPULSE] ** 2 + row[2, IMPULSE] ** 2)
-    for e in range(3):
-        if length > rows.own[c, DRAG]:
-            _set(rows, mass, change, delassus, c, e, r, row[e, IMPULSE] * rows.own[c, DRAG] / length)
-        if row[e, MASS] > 0.0:
-            worst = max(worst, abs(row[e, IMPULSE] - known[e]) / row[e, MASS])
-    return worst

@@ -37,6 +37,7 @@ from sdfsim.physics.solver.rows import (
     Delassus,
     Rows,
     give,
+    rows_of,
     sweep,
     velocity_of,
 )
@@ -98,7 +99,8 @@ def solve(world, work, motion, rules, manifolds, joints, threads, phase):
     if not many:
         for i in range(islands):
             _solve_island(world, work, motion, rules, written, joints, None, i, phase)
-    remember(manifolds, written, phase)
+    if phase != END:  # half a kick later, the next step begins from the same impulses
+        remember(manifolds, written, phase)
     return len(rows.where)
 
 
@@ -114,10 +116,18 @@ def _solve_island(world, work, motion, rules, rows, joints, nothing, island, pha
     if joints is None:
         _solve_rows(world, work, motion, rules, rows, None, nothing, island, phase)
         return
-    count = 3 * (rows.start[island + 1] - rows.start[island])
-    held = rows.first[island + 1] > rows.first[island]
-    count = count if held and count <= DENSE else 0
-    delassus = Delassus(np.empty((count, count)), np.empty(count), np.empty(count))
+    lo, hi = rows.start[island], rows.start[island + 1]
+    held, count = rows.first[island + 1] > rows.first[island], np.int64(0)
+    at = np.empty(len(rows.kind), np.int64)
+    block = np.empty(3 * (hi - lo), np.int64)
+    for i in range(lo, hi):
+        c = rows.order[i]
+        at[c] = count
+        for _ in range(rows_of(rows, c)):
+            block[count] = c
+            count += 1
+    count = count if held and count <= DENSE else np.int64(0)
+    delassus = Delassus(at, block, np.empty((count, count)), np.empty(count), np.empty(count))
     for _ in range(BREAKS):
         _solve_rows(world, work, motion, rules, rows, joints, reference(delassus), island, phase)
         if not held or not _recorded(world, work, motion, rules, rows, joints, island, phase):
@@ -152,7 +162,7 @@ def _solve_rows(world, work, motion, rules, rows, joints, delassus, island, phas
     rounds = _sweeps(work.inverse_mass, rules, rows, island)
     if joints is not None:
         if len(delassus.change):
-            _find_delassus(world, work, motion, rows, joints, delassus, lo, hi)
+            _find_delassus(world, work, motion, rows, joints, delassus)
     share = 1.0
     while True:
         if deep:
@@ -253,7 +263,7 @@ def _balance(world, work, motion, rules, rows, joints, delassus, island, rounds,
     exact = rules.exact * (AT_END if phase == END else 1.0)
     if joints is None:
         for _ in range(rounds):
-            if sweep(rows, mass, change, None, lo, hi) <= exact:
+            if sweep(rows, work, None, lo, hi) <= exact:
                 break
         return
     first, last, graph, held = rows.first[island], rows.first[island + 1], joints.graph, joints.held
@@ -267,15 +277,15 @@ def _balance(world, work, motion, rules, rows, joints, delassus, island, rounds,
     _hold(work, rows, joints, change, first, last)
     for _ in range(TRIALS):
         if hi > lo:
-            _begin(rows, delassus, change, lo, hi)
+            _begin(rows, delassus, change)
             for _ in range(rounds):
-                worst = sweep(rows, mass, change, delassus, lo, hi)
+                worst = sweep(rows, work, delassus, lo, hi)
                 if not len(delassus.change):
                     _hold(work, rows, joints, change, first, last)
                 if worst <= exact:
                     break
             if len(delassus.change):
-                _finish(rows, delassus, mass, change, lo, hi)
+                _finish(rows, delassus, mass, change)
                 _hold(work, rows, joints, change, first, last)
         if phase == END or last == first:
             return
@@ -295,33 +305,32 @@ def _hold(work, rows, joints, change, first, last):
 
 
 @njit(**BARE)
-def _begin(rows, delassus, change, lo, hi):
+def _begin(rows, delassus, change):
     """Read the velocities along all rows of an island."""
-    if len(delassus.change):
-        for r in range(3 * (hi - lo)):
-            c = rows.order[lo + r // 3]
-            row = rows.row[c, r % 3]
-            delassus.known[r] = row[IMPULSE]
-            delassus.change[r] = velocity_of(row, change, rows.where[c, 2], rows.where[c, 3])
+    for r in range(len(delassus.change)):
+        c = delassus.block[r]
+        row = rows.row[c, r - delassus.at[c]]
+        delassus.known[r] = row[IMPULSE]
+        delassus.change[r] = velocity_of(row, change, rows.where[c, 2], rows.where[c, 3])
 
 
 @njit(**BARE)
-def _finish(rows, delassus, mass, change, lo, hi):
+def _finish(rows, delassus, mass, change):
     """Give the bodies the impulses that have changed."""
-    for r in range(3 * (hi - lo)):
-        c = rows.order[lo + r // 3]
-        row = rows.row[c, r % 3]
+    for r in range(len(delassus.change)):
+        c = delassus.block[r]
+        row = rows.row[c, r - delassus.at[c]]
         if row[IMPULSE] != delassus.known[r]:
             give(mass, row, change, rows.where[c, 2], rows.where[c, 3], row[IMPULSE] - delassus.known[r])
 
 
 @njit(**BARE)
-def _find_delassus(world, work, motion, rows, joints, delassus, lo, hi):
+def _find_delassus(world, work, motion, rows, joints, delassus):
     """The effect of a unit impulse along each row on all rows, through the joints."""
     graph, reply = joints.graph, joints.reply
-    for r in range(3 * (hi - lo)):
-        c = rows.order[lo + r // 3]
-        row, a, b = rows.row[c, r % 3], rows.where[c, 2], rows.where[c, 3]
+    for r in range(len(delassus.change)):
+        c = delassus.block[r]
+        row, a, b = rows.row[c, r - delassus.at[c]], rows.where[c, 2], rows.where[c, 3]
         if row[MASS] <= 0.0:
             for q in range(len(delassus.change)):
                 delassus.matrix[r, q] = 0.0
@@ -330,8 +339,9 @@ def _find_delassus(world, work, motion, rows, joints, delassus, lo, hi):
         give(work.inverse_mass, row, reply, a, b, 1.0)
         respond_through(graph, joints.factors, reply, row, a, b, own)
         for q in range(len(delassus.change)):
-            d = rows.order[lo + q // 3]
-            delassus.matrix[r, q] = velocity_of(rows.row[d, q % 3], reply, rows.where[d, 2], rows.where[d, 3])
+            d = delassus.block[q]
+            own_row = rows.row[d, q - delassus.at[d]]
+            delassus.matrix[r, q] = velocity_of(own_row, reply, rows.where[d, 2], rows.where[d, 3])
         effect = delassus.matrix[r, r]
         row[MASS] = 1.0 / effect if effect * row[MASS] > BLOCKED else 0.0
         for x in range(6):
