@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
-from sdfsim.apps.identify import identify, picture, report_lines, write_scene
+from sdfsim.apps.identify.optimiser import identify
+from sdfsim.apps.identify.report import picture, report_lines, write_scene
 from sdfsim.apps.observed import COLUMNS, load_recordings
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import import_pybullet
