@@ -10,7 +10,7 @@ from scipy.optimize import brentq, fsolve
 from scipy.special import ellipk
 
 from sdfsim.evaluation.laws.check import Check
-from sdfsim.evaluation.laws.scenes import G, Ran, Setting
+from sdfsim.evaluation.laws.scenes import G, Ran, Setting, run_built
 from sdfsim.scene.builder import SceneBuilder
 
 ABOUT_Z: dict[str, Any] = {"axis": (0, 0, 1)}
@@ -19,13 +19,6 @@ LEVEL: dict[str, Any] = {"anchor": (0, 0, 0), "axis": (0, -1, 0)}  # about y, fr
 
 def scene(gravity: float = G) -> SceneBuilder:
     return SceneBuilder(model="solver", gravity=(0, 0, -gravity), effects={"sleep": "off"})
-
-
-def held(at: Setting, label: str, built: SceneBuilder, seconds: float) -> Ran:
-    """Run a scene for `seconds`."""
-    made = built.load()
-    found = at.by(made, seconds)
-    return Ran(made, found.rollout, found.broke, at, label)
 
 
 def off(ran: Ran, what: str, measured: Any, wanted: Any, limit: float, unit: str = "") -> Check:
@@ -60,7 +53,7 @@ def pendulums(at: Setting) -> Iterator[Check]:
                 built.join("arm", "hinge", "bob", start_deg=swing, **LEVEL)
             else:
                 built.join("arm", "distance", "bob", anchor=place, to=(0, 0, 0), rod=1.0)
-            ran = held(at, f"{kind}, {swing:g} degrees", built, 60.0 if kind == "hinge" and swing > 1 else 12.0)
+            ran = run_built(at, f"{kind}, {swing:g} degrees", built, 60.0 if kind == "hinge" and swing > 1 else 12.0)
             turning = 0.4 * 0.1**2 if kind == "hinge" else 0.0  # on a hinge the ball turns with its arm
             period = 4.0 * sqrt((1.0 + turning) / G) * ellipk(sin(start / 2) ** 2)
             path = ran.rollout.position[:, 0]
@@ -71,7 +64,7 @@ def pendulums(at: Setting) -> Iterator[Check]:
     place = (0.0, 0.45 * sin(start), -0.45 * cos(start))
     built = scene().add("plate", box={"size": size}, position=place, mass=3.0, euler_xyz_deg=(degrees(start), 0, 0))
     built.join("edge", "hinge", "plate", anchor=(0, 0, 0), axis=(1, 0, 0), start_deg=degrees(start))
-    ran = held(at, "plate", built, 8.0)
+    ran = run_built(at, "plate", built, 8.0)
     about = (0.05**2 + 0.9**2) / 12 + 0.45**2
     period = 4.0 * sqrt(about / (G * 0.45)) * ellipk(sin(start / 2) ** 2)
     yield ran.near("period", _period(ran.time, ran.rollout.joint_position[:, 0]), period, 1e-4, "s")
@@ -86,7 +79,7 @@ def sliders(at: Setting) -> Iterator[Check]:
         place = (0, 2 * k, 0)
         built.add(f"cart {k}", box={"size": (0.3, 0.2, 0.1)}, position=place, mass=2.0, euler_xyz_deg=(0, 30, 0))
         built.join(f"rail {k}", "slider", f"cart {k}", axis=down, anchor=place, friction=friction)
-    ran = held(at, "slope of 30 degrees", built, 1.0)
+    ran = run_built(at, "slope of 30 degrees", built, 1.0)
     pull, rollout = G * sin(pi / 6) - 4.0 / 2.0, ran.rollout
     yield off(ran, "way", rollout.joint_position[:, 0], 0.5 * pull * ran.time**2, 1e-3 * 0.5 * pull, "m")
     yield ran.near("speed", rollout.velocity[-1, 0] @ down, pull * ran.time[-1], 1e-3, "m/s")
@@ -102,7 +95,7 @@ def ropes(at: Setting) -> Iterator[Check]:
     built = scene().add(
         "bob", sphere={"radius": 0.05}, position=start, mass=0.5, velocity=(0, rate * sin(lean), 0)
     ).join("rope", "distance", "bob", anchor=start, to=(0, 0, 0), rope=1.0)  # fmt: skip
-    ran = held(at, "conical pendulum", built, 6.0)
+    ran = run_built(at, "conical pendulum", built, 6.0)
     path = ran.rollout.position[:, 0]
     turned = np.unwrap(np.arctan2(path[:, 1], path[:, 0]))
     yield off(ran, "angle", turned, rate * ran.time, 6e-3 * rate, "rad")
@@ -110,7 +103,7 @@ def ropes(at: Setting) -> Iterator[Check]:
     yield ran.near("pull", np.linalg.norm(at_end(ran.rollout, 0, "force")), 0.5 * G / cos(lean), 1e-3, "N")
     built = scene().add("bob", sphere={"radius": 0.05}, position=(0, 0, -0.2), mass=0.5)
     built.join("rope", "distance", "bob", anchor=(0, 0, -0.2), to=(0, 0, 0), rope=0.8)
-    ran = held(at, "slack rope", built, 1.0)
+    ran = run_built(at, "slack rope", built, 1.0)
     free = ran.time < sqrt(2 * 0.6 / G) - 0.01
     height = ran.rollout.position[:, 0, 2]
     yield off(ran, "fall", height[free], -0.2 - 0.5 * G * ran.time[free] ** 2, 1e-9, "m")
@@ -125,7 +118,7 @@ def doors(at: Setting) -> Iterator[Check]:
         "door", "hinge", "leaf", anchor=(0, 0, 1), start_deg=60, limits_deg=(0, 110), restitution=0.6,
         spring={"stiffness": about * rate**2}, **ABOUT_Z,
     )  # fmt: skip
-    ran = held(at, "door", built, 3.5)
+    ran = run_built(at, "door", built, 3.5)
     angle = ran.rollout.joint_position[:, 0]
     before = ran.time < pi / 2 / rate - 0.01  # a quarter of the spring's period
     yield off(ran, "angle", angle[before], pi / 3 * np.cos(rate * ran.time[before]), 1e-3, "rad")
@@ -145,7 +138,7 @@ def _wheel(**joint: Any) -> tuple[SceneBuilder, float]:
 def damping(at: Setting) -> Iterator[Check]:
     """Damping slows a wheel exponentially."""
     built, _ = _wheel(damping=0.5 * 4.0 * 0.3**2 * 3.0)
-    ran = held(at, "wheel", built, 1.0)
+    ran = run_built(at, "wheel", built, 1.0)
     yield off(ran, "speed", ran.rollout.angular_velocity[:, 0, 2] / np.exp(-3.0 * ran.time), 6.0, 6e-3, "rad/s")
 
 
@@ -154,7 +147,7 @@ def motors(at: Setting) -> Iterator[Check]:
     holds it against gravity."""
     built, about = _wheel(friction=0.5, motor={"speed": 11.0, "most": 2.0})
     rate = (2.0 - 0.5) / about
-    ran = held(at, "wheel", built, 1.0)
+    ran = run_built(at, "wheel", built, 1.0)
     speed, rollout = ran.rollout.angular_velocity[:, 0, 2], ran.rollout
     rising = ran.time < 5.0 / rate - 0.02
     yield off(ran, "speed", speed[rising], 6.0 + rate * ran.time[rising], 6e-4 * rate, "rad/s")
@@ -162,10 +155,12 @@ def motors(at: Setting) -> Iterator[Check]:
     given, turned = np.cumsum(rollout.counters["energy_given"])[rising], rollout.joint_position[rising, 0]
     yield ran.near("work", given[-1], 2.0 * turned[-1], 1e-3, "J")
     built, _ = _wheel(friction=3.0, motor={"speed": 11.0, "most": 2.0})
-    yield off(ran := held(at, "weak motor", built, 1.2), "speed", ran.rollout.angular_velocity[-1], 0.0, 1e-9, "rad/s")
+    yield off(
+        ran := run_built(at, "weak motor", built, 1.2), "speed", ran.rollout.angular_velocity[-1], 0.0, 1e-9, "rad/s"
+    )
     arm = scene().add("arm", box={"size": (0.6, 0.1, 0.1)}, position=(0.3, 0, 0), mass=1.0)
     arm.join("shoulder", "hinge", "arm", motor={"position_deg": 40.0, "most": 20.0}, **LEVEL)
-    ran = held(at, "arm", arm, 2.0)
+    ran = run_built(at, "arm", arm, 2.0)
     yield off(ran, "angle", at_end(ran.rollout, 0), radians(40.0), 1e-4, "rad")
     yield ran.near("torque", at_end(ran.rollout, 0, "torque")[1], -G * 0.3 * cos(radians(40.0)), 1e-3, "N m")
 
@@ -184,14 +179,14 @@ def rod(gravity: float, **joint: Any) -> SceneBuilder:
 def levers(at: Setting) -> Iterator[Check]:
     """A lever on a spring, or on a motor with a gain, sags by the load over the stiffness."""
     for stiffness, drag in ((1e3, 25.9), (1e6, 245.0), (1e4, 3.0)):
-        ran = held(at, f"{stiffness:g} N m/rad", rod(G, spring={"stiffness": stiffness}, damping=drag), 20.0)
+        ran = run_built(at, f"{stiffness:g} N m/rad", rod(G, spring={"stiffness": stiffness}, damping=drag), 20.0)
         angle = at_end(ran.rollout, 0)
         yield ran.near("rests at", angle, -WEIGHT * cos(angle) / stiffness, 1e-3, "rad")
         yield off(ran, "speed", ran.rollout.angular_velocity[-1], 0.0, 1e-6, "rad/s")
     for gain in (50.0, 1e3, 1e7):
         for time in (0.0, 0.3):
             motor = {"position_deg": 0, "most": 1e6, "gain": gain, "time": time}
-            ran = held(at, f"gain {gain:g}, time {time:g}", rod(G, motor=motor, damping=3.0), 20.0)
+            ran = run_built(at, f"gain {gain:g}, time {time:g}", rod(G, motor=motor, damping=3.0), 20.0)
             angle = at_end(ran.rollout, 0)
             yield ran.near("rests at", angle, -WEIGHT * cos(angle) / gain, 1e-3, "rad")
             yield off(ran, "speed", ran.rollout.angular_velocity[-1], 0.0, 1e-3 * WEIGHT / gain, "rad/s")
@@ -201,19 +196,19 @@ def servos(at: Setting) -> Iterator[Check]:
     """A motor with a gain moves as a damped oscillator, with at most its strength, and less by friction."""
     for gain, time in ((20.0, 0.0), (20.0, 0.02), (20.0, 0.3), (400.0, 0.01)):
         motor: dict[str, Any] = {"position_deg": 30, "most": 1e6, "gain": gain, "time": time}
-        ran = held(at, f"gain {gain:g}, time {time:g}", rod(0.0, motor=motor), 2.0)
+        ran = run_built(at, f"gain {gain:g}, time {time:g}", rod(0.0, motor=motor), 2.0)
 
         def rates(_: float, y: np.ndarray, gain: float = gain, time: float = time) -> list[float]:
             return [y[1], gain * (pi / 6 - y[0] - time * y[1]) / ABOUT_END]
 
         known = solve_ivp(rates, (0.0, 3.0), [0.0, 0.0], t_eval=ran.time, rtol=1e-9, atol=1e-12).y[0]
         yield off(ran, "angle", ran.rollout.joint_position[:, 0], known, 0.01 * pi / 6, "rad")
-    ran = held(at, "weak", rod(0.0, motor={"position_deg": 60, "most": 1.0, "gain": 20.0, "time": 0.02}), 0.3)
+    ran = run_built(at, "weak", rod(0.0, motor={"position_deg": 60, "most": 1.0, "gain": 20.0, "time": 0.02}), 0.3)
     yield ran.near("angle", at_end(ran.rollout, 0), 0.5 * ran.time[-1] ** 2 / ABOUT_END, 2e-3, "rad")
-    ran = held(at, "friction", rod(0.0, motor={"speed": 2.0, "most": 100.0, "gain": 3.0}, friction=0.5), 3.5)
+    ran = run_built(at, "friction", rod(0.0, motor={"speed": 2.0, "most": 100.0, "gain": 3.0}, friction=0.5), 3.5)
     yield ran.near("speed", -ran.rollout.angular_velocity[-1, 0, 1], 2.0 - 0.5 / 3.0, 1e-4, "rad/s")
     stuck = {"position_deg": 1.0, "most": 1.0, "gain": 20.0, "time": 0.02}
-    ran = held(at, "stuck", rod(0.0, motor=stuck, friction=0.5), 1.0)  # 20 N m/rad of a degree is less than that
+    ran = run_built(at, "stuck", rod(0.0, motor=stuck, friction=0.5), 1.0)  # 20 N m/rad of a degree is less than that
     yield off(ran, "angle", ran.rollout.joint_position, 0.0, 1e-12, "rad")
 
 
@@ -237,7 +232,7 @@ def work(at: Setting) -> Iterator[Check]:
         arm.join("elbow", "hinge", "lower", "rod", anchor=(0.5, 0, 0), axis=(0, 1, 0), **hold)
         made[f"arm, elbow {name}"] = arm
     for label, built in made.items():
-        ran = held(at, label, built, 2.0 if "arm" in label else 0.7)
+        ran = run_built(at, label, built, 2.0 if "arm" in label else 0.7)
         energy = ran.energy()
         gained = np.cumsum(ran.rollout.counters["energy_given"]) - (energy - energy[0])
         yield ran.most("not accounted for", np.abs(gained).max() / max(np.ptp(energy), 0.1), 2e-3)
@@ -252,7 +247,7 @@ def sockets(at: Setting) -> Iterator[Check]:
         built.add("other", sphere={"radius": 0.3}, mass=2.0, position=(0, 0, 0 if beside else 5))
         built.join("socket", "ball", "ball", "other" if beside else "world", anchor=(0, 0, 0), friction=0.3)
         own, others = 0.4 * 1.5 * 0.2**2, 0.4 * 2.0 * 0.3**2
-        ran = held(at, "on another body" if beside else "on the world", built, 1.2)
+        ran = run_built(at, "on another body" if beside else "on the world", built, 1.2)
         slowing = 0.3 / own + (0.3 / others if beside else 0.0)
         left = np.maximum(1.0 - slowing / np.linalg.norm(spin) * ran.time, 0.0)
         seen = ran.rollout.angular_velocity[:, 0] - ran.rollout.angular_velocity[:, 1]
@@ -278,7 +273,7 @@ def blocked(at: Setting) -> Iterator[Check]:
         cart.add("it", box={"size": (0.3, 0.3, 0.3)}, position=(0, 0, 0.15 - deep), mass=5.0, velocity=(0.5, 0, 0))
         cart.join("joint", "slider", "it", axis=(1, 0, 0), motor={"speed": 0.5, "most": 500.0})
         for name, built, speed, mass in (("door", door, 0.4, 20), ("drawer", drawer, 0.5, 5), ("cart", cart, 0.5, 5)):
-            ran = held(at, f"{name}, {1e3 * deep:g} mm deep", built, 1.0)
+            ran = run_built(at, f"{name}, {1e3 * deep:g} mm deep", built, 1.0)
             row = ran.rollout.names.index("it")
             yield off(ran, "height", ran.rollout.position[:, row, 2], ran.rollout.position[0, row, 2], 1e-6, "m")
             yield off(ran, "speed", np.linalg.norm(ran.rollout.velocity[:, row], axis=1), speed, 1e-4, "m/s")
@@ -291,7 +286,7 @@ def breaks(at: Setting) -> Iterator[Check]:
     for name, mass, x in (("light", 1.0, 0.0), ("heavy", 3.0, 1.0)):
         built.add(name, sphere={"radius": 0.1}, position=(x, 0, -0.5), mass=mass)
         built.join(name, "fixed", name, anchor=(x, 0, -0.5), breaks_at={"force": 20.0})
-    ran = held(at, "20 N", built, 0.5)
+    ran = run_built(at, "20 N", built, 0.5)
     light, heavy = ran.rollout.position[-1, :2, 2] + 0.5
     yield off(ran, "height of 1 kg", light, 0.0, 1e-6, "m")
     yield ran.most("height of 3 kg", heavy, -1.0, "m")
@@ -301,7 +296,7 @@ def breaks(at: Setting) -> Iterator[Check]:
         built.add("ball", sphere={"radius": 0.1}, position=(-0.5, 0, 0), velocity=(5, 0, 0), mass=1.0, restitution=1.0)
         if bolted:
             built.join("bolt", "fixed", "block", breaks_at={"force": 50.0})
-        ran = held(at, "blow", built, 0.3)
+        ran = run_built(at, "blow", built, 0.3)
         after.append(ran.rollout.velocity[-1])
     yield off(ran, "velocities", after[0], after[1], 1e-9, "m/s")
     yield ran.near("speed", after[0][0, 0], 1.5 * 5.0 / 3.0, 1e-6, "m/s")
@@ -318,7 +313,7 @@ def double_pendulum(at: Setting) -> Iterator[Check]:
     built.add("two", sphere={"radius": 0.1}, position=one + k * np.array([sin(1.2), 0.0, -cos(1.2)]), mass=n)
     built.join("upper", "hinge", "one", start_deg=degrees(start[0]), **LEVEL)
     built.join("lower", "hinge", "two", "one", anchor=one, axis=(0, -1, 0))
-    ran = held(at, "double pendulum", built, 10.0)
+    ran = run_built(at, "double pendulum", built, 10.0)
 
     def slope(_: float, y: np.ndarray) -> list[float]:
         a, b, u, v = y
@@ -357,7 +352,7 @@ def linkages(at: Setting) -> Iterator[Check]:
     built.join("pin", "hinge", "coupler", "crank", anchor=(*a, 0), **ABOUT_Z)
     built.join("pin2", "hinge", "rocker", "coupler", anchor=(*b, 0), **ABOUT_Z)
     built.join("pivot", "hinge", "rocker", anchor=(ground, 0, 0), **ABOUT_Z)
-    ran = held(at, "four bars", built, 2.0)
+    ran = run_built(at, "four bars", built, 2.0)
     wanted = []
     for angle in ran.rollout.joint_position[:, 0]:
         b = joined(angle, b)
@@ -402,7 +397,7 @@ def _linked(slopes: np.ndarray, size: tuple[float, float, float], mass: float, k
 def chains(at: Setting) -> Iterator[Check]:
     """A chain of a hundred links hangs as its own equilibrium, and one of thirty that is let go aside falls into it."""
     slopes, pull = _hanging(100, 0.05, 3.5)
-    ran = held(at, "100 links", _linked(slopes, (0.05, 0.01, 0.01), 0.02, "ball", damping=1e-4), 2.0)
+    ran = run_built(at, "100 links", _linked(slopes, (0.05, 0.01, 0.01), 0.02, "ball", damping=1e-4), 2.0)
     path, first = ran.rollout.position, ran.rollout.position[0]
     yield off(ran, "links", path, first, -1e-3 * first[:, 2].min(), "m")
     wanted = 0.02 * G * np.array([-pull, 0.0, 50.0])
@@ -411,7 +406,7 @@ def chains(at: Setting) -> Iterator[Check]:
     )
     slopes, _ = _hanging(30, 0.1, 2.2)
     bent = np.where(np.arange(30) < 15, -1.0, 1.0) * acos(2.2 / 3.0)
-    ran = held(at, "30 links", _linked(bent, (0.1, 0.02, 0.02), 0.1, "ball", damping=0.08), 20.0)
+    ran = run_built(at, "30 links", _linked(bent, (0.1, 0.02, 0.02), 0.1, "ball", damping=0.08), 20.0)
     yield off(ran, "links", ran.rollout.position[-1], _middles(slopes, 0.1), 3e-3, "m")
 
 
@@ -421,7 +416,7 @@ def bridges(at: Setting) -> Iterator[Check]:
     built = _linked(slopes, (0.25, 1.2, 0.05), 12.5, "hinge", axis=(0, 1, 0), damping=40.0)
     place = (4.8, 0, 0.25 * np.sin(slopes[:20]).sum() + 0.36)
     built.add("tonne", box={"size": (1.0, 1.0, 0.6)}, position=place, mass=1000.0, friction=0.8)
-    ran = held(at, "bridge", built, 6.0)
+    ran = run_built(at, "bridge", built, 6.0)
     later = ran.time > 3.0  # a mean, as it still swings a little
     carried = ran.rollout.joint_force[later][:, [0, 40], 2].mean(0).sum()
     yield ran.near("carried", carried, (40 * 12.5 + 1000) * G, 1e-2, "N")
@@ -437,7 +432,7 @@ def cradles(at: Setting) -> Iterator[Check]:
         place = top + 0.5 * np.array([sin(angle), 0.0, -cos(angle)])
         built.add(f"ball{k}", sphere={"radius": 0.05}, position=place, mass=0.5, friction=0.0, restitution=1.0)
         built.join(f"rod{k}", "distance", f"ball{k}", anchor=place, to=top, rod=0.5)
-    ran = held(at, "cradle", built, 1.1)
+    ran = run_built(at, "cradle", built, 1.1)
     height, full = ran.rollout.position[:, :, 2] + 0.5, 0.5 * (1.0 - cos(swing))
     yield ran.near("height of the last ball", height[:, 4].max(), full, 0.03, "m")
     yield ran.most("height of the others", height[:, 1:4].max(), 0.02 * full, "m")
@@ -459,7 +454,7 @@ def cradles(at: Setting) -> Iterator[Check]:
             built.join(f"{name} tooth {k}", "fixed", f"{name} {k}", name)
     built.join("drive", "hinge", "small", anchor=(0, 0, 0), motor={"speed": 2.0, "most": 50.0}, **ABOUT_Z)
     built.join("driven", "hinge", "large", anchor=(0.5, 0, 0), friction=0.2, **ABOUT_Z)
-    ran = held(at, "gears", built, 4.0)
+    ran = run_built(at, "gears", built, 4.0)
     drive, driven = ran.rollout.joint_position[-1, -2:]
     yield ran.near("angle of the first", drive, 8.0, 0.05, "rad")
     yield ran.near("angle of the second", driven, -drive * 8 / 12, 0.0, "rad", 0.2)
@@ -483,7 +478,7 @@ def governors(at: Setting) -> Iterator[Check]:
             built.add(f"ball{k}", sphere={"radius": 0.05}, position=place, mass=ball, **moving)
             built.join(f"arm{k}", "hinge", f"ball{k}", "spindle", anchor=(0, 0, 0), axis=(0, 1, 0))
             built.join(f"rod{k}", "distance", f"ball{k}", "sleeve", anchor=place, to=low, rod=length)
-        ran = held(at, f"{rate:g} rad/s", built, 4.0)
+        ran = run_built(at, f"{rate:g} rad/s", built, 4.0)
         yield ran.near("height", ran.rollout.position[-1, 2, 2], -height, 2e-3, "m")
 
 
@@ -498,7 +493,7 @@ def loads(at: Setting) -> Iterator[Check]:
             built.add(f"link{k}", box={"size": (0.1, 0.1, 0.3)}, position=(0, 0, -0.15 - 0.3 * k), mass=mass,
                       velocity=moving)  # fmt: skip
             built.join(f"joint{k}", "ball", f"link{k}", f"link{k - 1}" if k else "world", anchor=(0, 0, -0.3 * k))
-        ran = held(at, f"five links of 1 kg and one of {ratio:g} kg", built, 3.0)
+        ran = run_built(at, f"five links of 1 kg and one of {ratio:g} kg", built, 3.0)
         yield off(ran, "energy", ran.energy(), ran.energy()[1], 1e-3 * (5 + ratio) * G * 0.1, "J")
         yield ran.most("joints that do not hold", sum("joint" in law for law in ran.verdict.broken), 0)
     way = np.array([sin(0.5), 0.0, -cos(0.5)])
@@ -510,7 +505,7 @@ def loads(at: Setting) -> Iterator[Check]:
             built.join(f"joint{k}", "ball", f"link{k}", f"link{k - 1}" if k else "world", anchor=0.1 * k * way)
         built.add("load", sphere={"radius": 0.1}, position=2.1 * way, mass=0.1 * ratio)
         built.join("hook", "ball", "load", "link19", anchor=2.0 * way)
-        ran = held(at, f"{ratio:g} times a link's mass", built, 6.0)
+        ran = run_built(at, f"{ratio:g} times a link's mass", built, 6.0)
         swing = 0.1 * ratio * G * 2.1 * (1.0 - cos(0.5))
         yield off(ran, "energy", ran.energy(), ran.energy()[0], 1e-4 * swing, "J")
         yield from ran.laws()
@@ -522,7 +517,7 @@ def loads(at: Setting) -> Iterator[Check]:
         built.join(f"joint{k}", "ball", f"link{k}", other, anchor=(0.1 * k, 0, 0), damping=0.02)
     built.add("load", sphere={"radius": 0.1}, position=(1.0, 0, -0.3), mass=10.0)
     built.join("hook", "distance", "link10", "load", anchor=(1.0, 0, 0), to=(1.0, 0, -0.3), rope=0.3)
-    ran = held(at, "slack rope under a load", built, 1.5)
+    ran = run_built(at, "slack rope under a load", built, 1.5)
     yield ran.most("energy gained", (ran.energy() - ran.energy()[0]).max(), 1e-3 * 10.0 * G * 0.3, "J")
 
 
