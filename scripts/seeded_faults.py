@@ -92,6 +92,20 @@ FAULTS = (
         "deep = -gap * rules.erp / rules.substep_dt",
         "target = push = -gap * rules.erp / rules.substep_dt",
     ),
+    fault(
+        "friction of a face acts at its corners",
+        "impulses.py",
+        "plates",
+        "if point[TORSION] < 1.0:",
+        "if point[TORSION] < 0.0:",
+    ),
+    fault(
+        "only fast bodies rebound",
+        "impulses.py",
+        "bounces",
+        "bounce > 0.0 and abs(approach) > rules.slow",
+        "bounce > 0.0 and abs(approach) > 100.0 * rules.slow",
+    ),
     fault("there is one sweep only", "world.py", "elastic", "rounds: int = ROUNDS", "rounds: int = 1"),
     fault(
         "gravity is missing in one of five inner steps",

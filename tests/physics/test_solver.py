@@ -13,7 +13,6 @@ from sdfsim.scene.scene import Scene
 from sdfsim.shape import contact_geometry
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import load_shape, with_sdf
-from tests.hard_cases import gates
 from tests.helpers.runs import Killed, simulate
 from tests.helpers.scenes import ball, cube
 from tests.helpers.scenes import make_body as body
@@ -52,38 +51,6 @@ def test_contacts_bear_the_weights_of_a_heavy_cube_on_a_light_one(ratio):
         weight[pair[1]] += point[:count, 10].sum() / inner / gravity
     masses = sim.bodies.mass
     assert weight[1:] == pytest.approx([masses[1], masses.sum()], rel=0.02)
-
-
-@pytest.mark.parametrize("size", [0.01, 100.0])
-def test_size_and_planet_only_change_the_units(size):
-    scene = gates.mixed()
-    time = np.sqrt(size * 9.81 / 1.62)
-    bodies = tuple(
-        replace(
-            b, scale=b.scale * size, position=b.position * size, velocity=b.velocity * size / time,
-            angular_velocity=b.angular_velocity / time,
-        )
-        for b in scene.bodies
-    )  # fmt: skip
-    there = replace(scene, gravity=np.array([0.0, 0.0, -1.62]), bodies=bodies)
-    here = replace(scene, gravity=np.array([0.0, 0.0, -9.81]))
-    one, other = (Simulator(s, "solver").run(steps=25) for s in (here, there))
-    assert np.abs(other.position / size - one.position).max() <= 1e-4
-
-
-@pytest.mark.parametrize("distance", [1.7, 1e3, 1e6])
-def test_where_it_happens_does_not_matter(distance):
-    shift = distance * np.array([1.0, -1.0, 0.5])
-    scene = gates.mixed()
-    far = replace(scene, bodies=tuple(replace(b, position=b.position + shift) for b in scene.bodies))
-    one, other = (Simulator(s, "solver").run(steps=25) for s in (scene, far))
-    assert np.abs(other.position - shift - one.position).max() <= 1e-6
-
-
-def test_a_run_is_the_same_again():
-    one, again = (Simulator(heap(5), "solver").run(1.0) for _ in range(2))
-    for name in ("position", "orientation", "velocity", "angular_velocity"):
-        assert getattr(one, name).tobytes() == getattr(again, name).tobytes(), name
 
 
 def test_a_killed_run_goes_on_to_the_last_bit(tmp_path, monkeypatch):
