@@ -1,4 +1,4 @@
-"""The faults of `scripts/seeded_faults.py` fit the source as it is. The script itself takes minutes, and is run by hand."""
+"""The faults of `scripts/seeded_faults.py` fit the source as it is. The script itself takes minutes: run it by hand."""
 
 import runpy
 from collections import Counter
