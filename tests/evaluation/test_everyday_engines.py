@@ -189,27 +189,19 @@ def test_what_takes_too_long_is_not_run_and_what_breaks_is_missed(tmp_path, thre
     assert len(found["missed"]) == 6 and not found["held"] and not found["not_run"]
 
 
-def test_newton_knows_no_restitution_and_one_friction_of_all_that_move():
-    def newton(*bodies: Put) -> str:
-        return unknown_to("Newton", scene_of(*bodies))
+@pytest.mark.parametrize("name", ["Newton", "Drake"])
+def test_engines_without_restitution_know_one_friction_of_all_that_move(name):
+    def unknown(*bodies: Put) -> str:
+        return unknown_to(name, scene_of(*bodies))
 
     a, b = Put("a", CUBE, [0, 0, 2], mu=0.3), Put("b", CUBE, [3, 0, 2], mu=0.3)
-    assert newton(a, b, replace(floor(), mu=0.15)) == newton(a, replace(floor(), mu=1.0)) == ""
-    assert newton(replace(a, e=0.1), replace(floor(), e=0.5)) == "restitution"
-    assert "several materials" in newton(a, replace(b, mu=0.4))
-    assert "so different" in newton(a, replace(floor(), mu=0.1))
-
-
-def test_drake_knows_no_restitution_and_one_friction_of_all_that_move():
-    def drake(*bodies: Put) -> str:
-        return unknown_to("Drake", scene_of(*bodies))
-
-    a, b = Put("a", CUBE, [0, 0, 2], mu=0.3), Put("b", CUBE, [3, 0, 2], mu=0.3)
-    assert drake(a, floor()) == ""
-    assert drake(replace(a, e=0.1), floor()) == "restitution"
-    assert drake(replace(a, e=0.1)) == ""  # nothing to meet
-    assert "so different" in drake(a, b, floor())
-    assert "several materials" in drake(a, replace(b, mu=0.4))
+    level = replace(floor(), mu=0.15 if name == "Newton" else 1.0)
+    assert unknown(a, level) == ""
+    assert unknown(replace(a, e=0.1), level) == "restitution"
+    assert unknown(replace(a, e=0.1)) == ""  # nothing to meet
+    assert "several materials" in unknown(a, replace(b, mu=0.4))
+    other = (replace(floor(), mu=0.1),) if name == "Newton" else (b, floor())
+    assert "so different" in unknown(a, *other)
     assert unknown_to("PyBullet", scene_of(a, replace(b, mu=0.4, e=0.3), floor())) == ""
 
 
