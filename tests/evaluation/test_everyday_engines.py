@@ -18,13 +18,13 @@ from benchmarks.everyday import (
     OURS,
     NotRun,
     counted,
-    in_parts,
     is_installed,
     judged,
     runner,
     table,
     unknown_to,
 )
+from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import by_model, still
@@ -117,7 +117,7 @@ def test_cylinders_and_capsules_are_as_long_as_they_are(tmp_path, name, form):
 
 def test_a_convex_mesh_is_its_own_piece(tmp_path):
     ball, box = solid("mesh", "ball", 0.5, 3), fixed("box", solid("analytic", "box", 4, 4, 1), [0, 0, 0])
-    (piece,) = in_parts(scene_of(Put("it", ball, [0, 0, 2]), box), tmp_path).shapes[0].pieces
+    (piece,) = in_pieces(scene_of(Put("it", ball, [0, 0, 2]), box), tmp_path).shapes[0].pieces
     assert len(piece) == len(ball.mesh.vertices)
     assert np.linalg.norm(piece, axis=1) == pytest.approx(0.5, abs=1e-3)
 
