@@ -212,14 +212,14 @@ FAULTS = (
     fault(
         "a hinge holds one axis only",
         "joints.py",
-        "linkages",
+        "doors",
         "        for k in range(2):\n            _write_turn(line[j, 3 + k]",
         "        for k in range(1):\n            _write_turn(line[j, 3 + k]",
     ),
     fault(
         "what a joint holds touches",
         "broad_phase.py",
-        "cradles",
+        "linkages",
         "            if world.apart[k] == b:",
         "            if world.apart[k] == -2:",
     ),
