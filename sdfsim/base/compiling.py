@@ -78,6 +78,11 @@ def compile_before(jobs: Sequence[tuple[Any, tuple]], what: str) -> None:
         missing = [job for job in missing if job[1] not in _forms(job[0])]
         if not missing:
             return
+        cores = os.cpu_count() or 1
+        missing.sort(key=lambda job: -_seconds(job[0]))
+        takes = max(_seconds(missing[0][0]), sum(_seconds(function) for function, _ in missing) / cores)
+        parts = f" in {len(missing)} parts" if len(missing) > 1 else ""
+        _log.warning("compiling %s%s, once for this version: about %.0f s", what, parts, takes)
         _said = True
         try:
             _cache_of(missing[0][0])._impl.locator.ensure_cache_path()
@@ -85,11 +90,6 @@ def compile_before(jobs: Sequence[tuple[Any, tuple]], what: str) -> None:
             return
         started = time.perf_counter()
         path = json.dumps([*sys.path]).encode() + b"\n"
-        cores = os.cpu_count() or 1
-        missing.sort(key=lambda job: -_seconds(job[0]))
-        takes = max(_seconds(missing[0][0]), sum(_seconds(function) for function, _ in missing) / cores)
-        parts = f" in {len(missing)} parts" if len(missing) > 1 else ""
-        _log.warning("compiling %s%s, once for this version: about %.0f s", what, parts, takes)
 
         def compiled(job: tuple[Any, tuple]) -> None:
             wanted = dumps((*_name(job[0]), job[1]))

@@ -189,7 +189,7 @@ def levers(at: Setting) -> Iterator[Check]:
             ran = run_built(at, f"gain {gain:g}, time {time:g}", rod(G, motor=motor, damping=3.0), 20.0)
             angle = at_end(ran.rollout, 0)
             yield ran.near("rests at", angle, -WEIGHT * cos(angle) / gain, 1e-3, "rad")
-            yield off(ran, "speed", ran.rollout.angular_velocity[-1], 0.0, 1e-3 * WEIGHT / gain, "rad/s")
+            yield off(ran, "speed", ran.rollout.angular_velocity[-1], 0.0, max(1e-3 * WEIGHT / gain, 1e-8), "rad/s")
 
 
 def servos(at: Setting) -> Iterator[Check]:

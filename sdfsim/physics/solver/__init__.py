@@ -4,21 +4,10 @@ Compiled code is cached in the user's cache folder, under a hash of all these fi
 """
 
 import sys
-from contextlib import AbstractContextManager
-from functools import cache
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
-from sdfsim.base.compiling import cache_of, kept
-
-
-@cache
-def _cache() -> Path:
-    """The folder of the compiled step, named after a hash of its source."""
-    here = Path(__file__).parent
-    files = [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]
-    return cache_of(file for file in files if file.name != "prepare.py")
+from sdfsim.physics.solver.code_cache import kept_here
 
 
 def _without_blas() -> None:
@@ -34,11 +23,6 @@ def _without_blas() -> None:
     finally:
         linalg.ensure_blas = asked
     arrays.ensure_blas = asked
-
-
-def kept_here() -> AbstractContextManager[None]:
-    """Keep the compiled code of functions that are defined in the block in the folder of the compiled step."""
-    return kept(_cache())
 
 
 _without_blas()

@@ -14,7 +14,7 @@ from numba import cfunc, int64
 from numba.core import config
 from numba.core.caching import FunctionCache
 
-from sdfsim.physics.solver import kept_here
+from sdfsim.physics.solver.code_cache import kept_here
 from sdfsim.physics.solver.internal_edges import heed_supports
 from sdfsim.physics.solver.joints import assemble as assemble_joints
 from sdfsim.physics.solver.narrow_phase import find_parts, narrow_phase

@@ -206,9 +206,7 @@ class Compiled:
         return {name: counts.get(name, np.zeros(len(known))) for name in (*COUNTS, *PHASES)}
 
 
-def _compiled(
-    what: str, function: Any, arguments: tuple, others: tuple, used: dict[str, Piece]
-) -> Pieces:
+def _compiled(what: str, function: Any, arguments: tuple, others: tuple, used: dict[str, Piece]) -> Pieces:
     """Make sure that a compiled function, which takes `arguments`, pieces and `others`, and its pieces are compiled.
     Returns the addresses of the pieces that are `used`."""
     shapes, world, work, motion, rules, manifolds, *joints = (Reference(typeof(each)) for each in arguments)

@@ -59,8 +59,7 @@ def roused(world, motion, body):
 
 @njit(**FAST)
 def put_to_sleep(world, work, motion, rules, manifolds, joints):
-    """Freeze the islands whose bodies have all stayed in place for long enough; joints join bodies as contacts do.
-    """
+    """Freeze the islands whose bodies have all stayed in place for long enough; joints join bodies as contacts do."""
     n, rests = len(world.shape), False
     for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
