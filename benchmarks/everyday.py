@@ -36,9 +36,6 @@ from sdfsim.evaluation.laws.scenes import Setting
 from sdfsim.evaluation.laws.table import ROWS, checks
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
-from sdfsim.sdf.closed_forms import ClosedForm
-from sdfsim.shape.convex_pieces import convex_vertices
-from sdfsim.shape.shape import own_pieces
 
 OURS, DRAKE, NEWTON = "sdfsim", "Drake", "Newton"
 ENGINES: dict[str, tuple[str, Engine | None]] = {  # package and runner of each
@@ -72,7 +69,7 @@ def runner(name: str, folder: Path) -> Runner:
             if engine is None:
                 found = by_model(scene, seconds)
             else:
-                parts = in_parts(scene, folder / "pieces")
+                parts = in_pieces(scene, folder / "pieces")
                 found = by_engine(parts, seconds, engine, folder / "engine", scene_units(scene))
         except SdfsimError as error:
             raise NotRun("too slow" if isinstance(error, TooSlow) else error.message) from error
@@ -97,19 +94,6 @@ def unknown_to(name: str, scene: Scene) -> str:
     if apart or (name == NEWTON and any(2.0 * b.friction < one.friction for b in others for one in moving)):
         return "friction of two materials that are so different"
     return ""
-
-
-def in_parts(scene: Scene, folder: Path) -> Scene:
-    """The scene with convex pieces for shapes without a closed form: their own vertices if they are convex, else the
-    pieces of `in_pieces`, kept in a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    shapes = []
-    for shape in scene.shapes:
-        if not isinstance(shape.sdf, ClosedForm) and not own_pieces(shape):
-            whole = convex_vertices(shape.mesh)
-            shape = replace(shape, pieces=(whole,) if len(whole) else ())
-        shapes.append(shape)
-    return in_pieces(replace(scene, shapes=tuple(shapes)), folder)
 
 
 # --- judging ---

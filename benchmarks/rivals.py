@@ -44,8 +44,9 @@ from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.sdf.closed_forms import ClosedForm
+from sdfsim.shape.convex_pieces import convex_vertices
 from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_mesh
-from sdfsim.shape.shape import own_pieces
+from sdfsim.shape.shape import Shape, own_pieces
 from sdfsim.simulate.simulator import Simulator
 
 ENGINES: dict[str, Engine | None] = {
@@ -187,15 +188,20 @@ SHAPES = ["MOVi-B", *(case for case in CASES if case not in LARGE)]
 
 def in_pieces(scene: Scene, folder: Path) -> Scene:
     """The scene with convex pieces for every shape except closed forms, kept in a folder."""
-    shapes = []
-    for shape in scene.shapes:
-        if not isinstance(shape.sdf, ClosedForm) and not own_pieces(shape):
-            file = folder / f"{shape.mesh.digest()[:16]}.obj"
-            if not file.exists():
-                write_text(file, wavefront(convex_pieces(shape)))
-            shape = replace(shape, pieces=tuple(piece.vertices for piece in load_pieces(file)))
-        shapes.append(shape)
+    folder.mkdir(parents=True, exist_ok=True)
+    whole = [isinstance(shape.sdf, ClosedForm) or bool(own_pieces(shape)) for shape in scene.shapes]
+    shapes = [s if one else replace(s, pieces=cut(s, folder)) for s, one in zip(scene.shapes, whole, strict=True)]
     return replace(scene, shapes=tuple(shapes))
+
+
+def cut(shape: Shape, folder: Path) -> tuple[np.ndarray, ...]:
+    """The vertices of a shape if it is convex, else those of its pieces by CoACD."""
+    if len(vertices := convex_vertices(shape.mesh)):
+        return (vertices,)
+    file = folder / f"{shape.mesh.digest()[:16]}.obj"
+    if not file.exists():
+        write_text(file, wavefront(convex_pieces(shape)))
+    return tuple(piece.vertices for piece in load_pieces(file))
 
 
 # --- measuring ---
@@ -221,7 +227,7 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
 
 def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
     """The scenes of a case, of equal friction and without restitution and sleep."""
-    (folder / "pieces").mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if data is not None and case == "MOVi-B":
         recorded, shapes = load_recorded(data, "test", most=MOVI_B)
         scenes = [scene_of([t], [0], shapes, conditions_of(data).floor)[0] for t in recorded]

@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,14 +40,14 @@ from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory, why
 from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.laws.hard_cases import body, box, on_floor
 from sdfsim.learned.model import load_model
-from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.solver.contacts import contact_rows
 from sdfsim.physics.solver.distance import distances
-from sdfsim.physics.solver.impulses import IMPULSE, MASS, WANTED, WIDTH, System, _balance, _equations
 from sdfsim.physics.solver.prepare import compiled_rules, compiled_shapes
 from sdfsim.physics.solver.references import reference
+from sdfsim.physics.solver.rows import IMPULSE, MASS, WANTED, WIDTH, Rows, sweep
+from sdfsim.physics.solver.world import BETWEEN
 from sdfsim.physics.solver.world import COLUMNS as OF_POINT
-from sdfsim.physics.solver.world import Rules
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
@@ -219,7 +219,7 @@ def many(data: Path, *, scenes: int = 1000) -> None:
 
 
 # Operations (a product, a sum, a comparison or a root each) and bytes of one distance, one contact and one row, counted
-# in `physics/solver/distance.py` (`_grid`) and `physics/solver/impulses.py` (`_equations`, `_relax`): eight samples and
+# in `physics/solver/distance.py` (`_grid`), `contacts.py` (`contact_rows`) and `rows.py` (`_relax`): eight samples and
 # the number of a brick, and the columns of the table of shapes; a point, poses, inertias and velocities of two bodies,
 # and three rows, written twice as they are made of zeros; a row, and the changes of two bodies' velocities, read and
 # written.
@@ -302,12 +302,19 @@ def distance_time(*, scattered: bool) -> float:
 
 
 @njit(error_model="numpy")
-def _written(world, work, motion, rules, manifolds, times: int) -> int:
+def _written(world, work, motion, rules, manifolds, rows, times: int) -> int:
     count = 0
     for _ in range(times):
         some = reference(world), reference(work), reference(motion), reference(rules), reference(manifolds)
-        count += len(_equations(*some).where)
+        count += contact_rows(*some, reference(rows), BETWEEN)
     return count
+
+
+def _room(row: np.ndarray, where: np.ndarray, start: np.ndarray, order: np.ndarray) -> Rows:
+    blocks, nothing = len(row), np.zeros(0, np.int64)
+    zero = [np.zeros(blocks) for _ in range(3)]
+    kind = np.zeros(blocks, np.int64)
+    return Rows(kind, where, row, zero[0], np.zeros((blocks, 4)), *zero[1:], start, order, nothing, nothing)
 
 
 def contact_time() -> float:
@@ -316,14 +323,25 @@ def contact_time() -> float:
     simulator.step(30)
     scene: Any = simulator.carry.scene
     rules = compiled_rules(simulator.options)
-    known = scene.world, scene.work, scene._motion, rules, scene._manifolds
+    most, nothing = int(scene._manifolds.count.sum()), np.zeros(0, np.int64)
+    rows = _room(np.zeros((most, 3, WIDTH)), np.zeros((most, 4), np.int64), nothing, nothing)
+    known = scene.world, scene.work, scene._motion, rules, scene._manifolds, rows
     return best(lambda: _written(*known, AGAIN)) / _written(*known, AGAIN)
 
 
+class Velocities(NamedTuple):
+    """What a sweep needs of `Work`."""
+
+    inverse_mass: np.ndarray
+    change: np.ndarray
+
+
 @njit(error_model="numpy")
-def _swept(mass: np.ndarray, rules: Rules, system: System, change: np.ndarray, islands: int) -> None:
-    for i in range(islands):
-        _balance(mass, rules, system, change, i, rules.rounds)
+def _swept(velocities: Velocities, rows: Rows) -> None:
+    some, work = reference(rows), reference(velocities)
+    for i in range(len(rows.start) - 1):
+        for _ in range(SWEEPS):
+            sweep(some, work, None, rows.start[i], rows.start[i + 1])
 
 
 def row_time() -> float:
@@ -333,12 +351,9 @@ def row_time() -> float:
     row[:, :, MASS], row[:, :, WANTED], row[:, :, IMPULSE] = 0.01, 1.0, 0.0
     first = np.arange(ROWS)
     where = np.stack([first, np.zeros_like(first), first, first + 1], axis=1)
-    zero = np.zeros(ROWS)
-    start = np.arange(0, ROWS + 1, ISLAND)
-    system = System(where, row, zero, zero.copy(), zero.copy(), np.zeros((ROWS, 3)), start, first)
-    rules = compiled_rules(Options(np.array([0.0, 0.0, -10.0]), 0.1, 5))._replace(rounds=SWEEPS, exact=0.0)
-    change = np.zeros((bodies, 6))
-    return best(lambda: _swept(np.ones(bodies), rules, system, change, len(start) - 1)) / (ROWS * SWEEPS)
+    rows = _room(row, where, np.arange(0, ROWS + 1, ISLAND), first)
+    velocities = Velocities(np.ones(bodies), np.zeros((bodies, 6)))
+    return best(lambda: _swept(velocities, rows)) / (ROWS * SWEEPS)
 
 
 COMMANDS = (growth, large, many, roofline)

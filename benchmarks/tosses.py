@@ -24,7 +24,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.engines.drake import DrakeWorld
 from benchmarks.engines.pybullet import BulletWorld
 from benchmarks.records import Cell, Out, progress, write_record
-from sdfsim.apps.identify import Identified, identify, repeated, write_scene
+from sdfsim.apps.identify.optimiser import identify
+from sdfsim.apps.identify.report import Identified, write_scene
+from sdfsim.apps.identify.residuals import repeated
 from sdfsim.apps.mujoco_world import MujocoWorld
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError

@@ -248,7 +248,8 @@ def identify(
     allow_outside: Outside = False,
 ) -> None:
     """Recorded motions -> friction, restitution, sizes, masses, height and tilt of the ground."""
-    from sdfsim.apps import identify as room
+    from sdfsim.apps.identify.optimiser import identify as identified
+    from sdfsim.apps.identify.report import picture, report_lines, write_scene
     from sdfsim.apps.observed import load_recordings
     from sdfsim.base.files import check_writable
     from sdfsim.data.public_tosses import public_tosses
@@ -260,12 +261,12 @@ def identify(
     public = [path for path, given in zip(paths, recordings, strict=True) if path != given]
     scene = scene or next((path / "scene.yaml" for path in public), None)
     motions, known = load_recordings(paths, scene, allow_outside=allow_outside, on_progress=shapes)
-    found = room.identify(motions, known, profiles=out is not None, on_progress=fit)
-    lines, wrote = room.report_lines(found), {}
+    found = identified(motions, known, profiles=out is not None, on_progress=fit)
+    lines, wrote = report_lines(found), {}
     if out is not None and known.path is not None:
-        lines += [*room.write_scene(found, known.path, out), f"wrote {out}"]
+        lines += [*write_scene(found, known.path, out), f"wrote {out}"]
         wrote, drawn = {"wrote": out}, out.with_suffix(".png")
-        if missing := room.picture(found, drawn):
+        if missing := picture(found, drawn):
             lines.append(f"no {drawn.name}: {missing}")
         else:
             wrote["picture"] = drawn

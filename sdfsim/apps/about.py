@@ -109,6 +109,6 @@ def _loads(library: str) -> bool:
 
 
 def _compiled() -> bool:
-    from sdfsim.physics.solver.run import HELD, THREADS, run_steps
+    from sdfsim.physics.solver.run import run_steps
 
-    return is_compiled(run_steps, {HELD: True, THREADS: True})
+    return is_compiled(run_steps)

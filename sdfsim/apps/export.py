@@ -719,7 +719,7 @@ def _refined_joint(joint: Joint) -> Joint:
     if motor is not None:
         speed, position = (None if goal is None else goal * along for goal in (motor.speed, motor.position))
         gain = None if motor.gain is None else motor.gain * push / along
-        motor = replace(motor, most=motor.most * push, speed=speed, position=position, gain=gain)
+        motor = replace(motor, max_force=motor.max_force * push, speed=speed, position=position, gain=gain)
     return replace(
         joint, anchor=k * joint.anchor, start=along * joint.start,
         limits=limits and (limits[0] * along, limits[1] * along),

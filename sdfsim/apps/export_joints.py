@@ -144,8 +144,8 @@ def gains(joint: Joint) -> tuple[float, float]:
     if motor is None or (motor.speed is None and motor.position is None):
         return 0.0, 0.0
     if motor.speed is not None:
-        return 0.0, motor.gain or KEEN * motor.most
-    kp = motor.gain or KEEN * motor.most / max(motor.time, LEAST_TIME)
+        return 0.0, motor.gain or KEEN * motor.max_force
+    kp = motor.gain or KEEN * motor.max_force / max(motor.time, LEAST_TIME)
     return kp, kp * motor.time
 
 
@@ -242,7 +242,7 @@ def mjcf_rest(
             continue
         kp, kv = gains(joint)
         keys = {"name": f"{names[joint.name]}_motor", "joint": names[joint.name]}
-        keys |= {"forcerange": numbers((-joint.motor.most, joint.motor.most))}
+        keys |= {"forcerange": numbers((-joint.motor.max_force, joint.motor.max_force))}
         if joint.motor.speed is not None:
             add(into["actuator"], "velocity", kv=numbers(kv), **keys)
             controls.append(joint.motor.speed)
@@ -280,7 +280,7 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
     if joint.kind in ("hinge", "slider"):
         add(made, "axis", xyz=numbers(one.axis()))
         low, high = joint.limits or (-EFFORT, EFFORT)
-        effort = EFFORT if joint.motor is None else joint.motor.most
+        effort = EFFORT if joint.motor is None else joint.motor.max_force
         ends = {} if joint.kind == "hinge" and not bounded else {"lower": numbers(low), "upper": numbers(high)}
         add(made, "limit", **ends, effort=numbers(effort), velocity=numbers(EFFORT))
     if joint.damping or joint.friction:
@@ -362,7 +362,7 @@ def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[st
     drive.CreateTypeAttr("force")
     if joint.motor is not None:
         kp, kv = gains(joint)
-        drive.CreateMaxForceAttr(joint.motor.most)
+        drive.CreateMaxForceAttr(joint.motor.max_force)
         drive.CreateDampingAttr(kv / degrees)
         drive.CreateStiffnessAttr(kp / degrees)
         if joint.motor.speed is not None:

@@ -459,7 +459,7 @@ class _Reader:
                 freely.append(called)
             wanted = gain[0] * float(self.data.ctrl[k])
             if torque:
-                found[name] = {"most": most}
+                found[name] = {"max_force": most}
                 idle.append(called)
             elif bias[1] < 0:
                 goal = wanted / (-bias[1] * gear)
@@ -467,10 +467,10 @@ class _Reader:
                     self.notes.append(f"actuator {called} aims at {goal:.6g}: {near:.6g} is the nearest of its limits")
                     goal = near
                 stiff = float(-bias[1] * gear**2)
-                found[name] = {"position": goal, "most": most, "gain": stiff, "time": float(bias[2] / bias[1])}
+                found[name] = {"position": goal, "max_force": most, "gain": stiff, "time": float(bias[2] / bias[1])}
             else:
                 speed, gain = wanted / (-bias[2] * gear), float(-bias[2] * gear**2)
-                found[name] = {"speed": speed, "most": most, "gain": gain}
+                found[name] = {"speed": speed, "max_force": most, "gain": gain}
         if idle:
             self.notes.append(named("motors do nothing until an effort or a target of their joint is set", idle))
         if freely:

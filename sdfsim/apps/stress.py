@@ -20,7 +20,7 @@ from sdfsim.evaluation import instruments
 from sdfsim.evaluation.engines import Engine, Ran, TooSlow, bullet, by_engine, by_model, still
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
 from sdfsim.evaluation.instruments import judged
-from sdfsim.evaluation.laws import everyday, hard_cases, scenes, textbook
+from sdfsim.evaluation.laws import everyday, hard_cases, joints, scenes, textbook
 from sdfsim.evaluation.laws.check import Check
 from sdfsim.evaluation.laws.hard_cases import ran_away
 from sdfsim.evaluation.laws.scenes import Law
@@ -28,7 +28,14 @@ from sdfsim.evaluation.laws.table import GROUPS, laws, settings
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.scene.scene import Scene
 
-MEASURED = (everyday, hard_cases, scenes, textbook, instruments)  # if their source changes, kept results are not used
+MEASURED = (
+    everyday,
+    hard_cases,
+    joints,
+    scenes,
+    textbook,
+    instruments,
+)  # if their source changes, kept results are not used
 TEACHER = "teacher"
 USUAL = {TEACHER: bullet}
 OUTSIDE = "†"
@@ -133,7 +140,7 @@ def _tried(law: Law, who: Model | Engine, device: str, out: Path, quick: bool) -
 
     if law.counted:
         held: list[bool] = []
-        for at in settings(quick=quick):
+        for at in settings(law, quick=quick):
             try:
                 held += [check.holds for check in law.checks(replace(at, by=run))]
             except SdfsimError:  # what a model refuses is one check that does not hold

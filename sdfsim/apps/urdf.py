@@ -401,7 +401,7 @@ class _Reader:
             pose[:3, :3] = Rotation.from_rotvec(start * along).as_matrix() @ turn
         effort = self._effort(element)
         held |= {"anchor": pose[:3, 3], "axis": along, "start": start, "limits": limits, "others": others}
-        held |= {"motor": {"most": effort} if effort > 0.0 else None}
+        held |= {"motor": {"max_force": effort} if effort > 0.0 else None}
         return replace(links[child], pose=pose), [LinkJoint(kind=KINDS[kind], **held)]  # type: ignore[arg-type]
 
     def _effort(self, element: Element) -> float:

@@ -5,10 +5,12 @@ import gc
 import hashlib
 import json
 import logging
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -56,40 +58,55 @@ def kept(cache: Path) -> Iterator[None]:
         settings.CACHE_DIR = before
 
 
-def compile_before(
-    function: Any, arguments: Sequence[Any], what: str, takes: str, missing: Mapping[int, bool] | None = None
-) -> None:
-    """Compile a numba `function` for arguments of these types, unless it is in memory or in numba's cache for this
-    source. Warn once in a process that `what` is compiled. `missing`: see `is_compiled`.
+def compile_before(jobs: Sequence[tuple[Any, tuple]], what: str) -> None:
+    """Compile numba functions for types of arguments, [(function, types)], unless they are in memory or in numba's
+    cache for their source. Warn that `what` is compiled.
 
-    A process of its own compiles it and fills the cache, and this one loads it from there, as all later ones do: code
-    that has just been compiled rounds differently, so a run could not be repeated bit by bit. If the cache cannot be
-    written, the first call compiles.
+    Processes of their own compile them, as many as there are cores, and fill the cache, and this one loads them from
+    there, as all later ones do: code that has just been compiled rounds differently, so a run could not be repeated bit
+    by bit. If the cache cannot be written, the first call compiles.
     """
-    from numba import typeof
     from numba.core.serialize import dumps
 
     global _said, _spent
-    types = tuple(typeof(each) for each in arguments)
-    with _lock:  # if several threads need it, one of them compiles
-        if (what, types) in _ready:
+    with _lock:  # if several threads need one, one of them compiles
+        if not hasattr(jobs[0][0], "signatures"):  # plain Python
             return
-        _ready.add((what, types))
+        missing = [job for job in jobs if (_name(job[0]), job[1]) not in _ready]
+        _ready.update((_name(function), types) for function, types in missing)
         # These types exactly: arrays of another type or layout need a form of their own.
-        if not hasattr(function, "signatures") or types in _forms(function):
+        missing = [job for job in missing if job[1] not in _forms(job[0])]
+        if not missing:
             return
-        again = ", for other types of arrays" if is_compiled(function, missing) else ""
-        _log.warning("compiling %s%s, once for this version: about %s", what, again, takes)
+        cores = os.cpu_count() or 1
+        missing.sort(key=lambda job: -_seconds(job[0]))
+        takes = max(_seconds(missing[0][0]), sum(_seconds(function) for function, _ in missing) / cores)
+        parts = f" in {len(missing)} parts" if len(missing) > 1 else ""
+        _log.warning("compiling %s%s, once for this version: about %.0f s", what, parts, takes)
         _said = True
         try:
-            function._cache._impl.locator.ensure_cache_path()
+            _cache_of(missing[0][0])._impl.locator.ensure_cache_path()
         except (AttributeError, OSError):
             return
         started = time.perf_counter()
-        wanted = dumps((function.py_func.__module__, function.py_func.__qualname__, types))
         path = json.dumps([*sys.path]).encode() + b"\n"
-        subprocess.run([sys.executable, "-c", _CHILD], input=path + wanted, capture_output=True, check=False)
+
+        def compiled(job: tuple[Any, tuple]) -> None:
+            wanted = dumps((*_name(job[0]), job[1]))
+            subprocess.run([sys.executable, "-c", _CHILD], input=path + wanted, capture_output=True, check=False)
+
+        with ThreadPoolExecutor(cores) as pool:
+            list(pool.map(compiled, missing))
         _spent += time.perf_counter() - started
+
+
+def _name(function: Any) -> tuple[str, str]:
+    return function.py_func.__module__, function.py_func.__qualname__
+
+
+def _seconds(function: Any) -> float:
+    """About how long a function is compiled, s."""
+    return float(getattr(function, "seconds", 20.0))
 
 
 def say_compiling() -> None:
@@ -135,25 +152,21 @@ def _compile_here(wanted: bytes) -> None:
     getattr(import_module(module), name).compile(types)
 
 
-def is_compiled(function: Any, missing: Mapping[int, bool] | None = None) -> bool:
-    """Whether a numba function is ready within a second. One that runs as plain Python needs no compiling.
+def is_compiled(function: Any) -> bool:
+    """Whether a numba function is ready within a second. One that runs as plain Python needs no compiling."""
+    return not hasattr(function, "signatures") or bool(_forms(function))
 
-    Args:
-        missing: argument index -> whether it is None, for arguments where None selects another specialisation.
-    """
-    if not hasattr(function, "signatures"):
-        return True
-    return any(_fits(arguments, missing) for arguments in _forms(function))
+
+def _cache_of(function: Any) -> Any:
+    """Numba's cache of a dispatcher, or of a piece of the contact step."""
+    return function.cache() if hasattr(function, "cache") else function._cache
 
 
 def _forms(function: Any) -> list[tuple]:
-    """The types of arguments for which a numba function is in memory, or in the cache for its source as it is now."""
+    """The types of arguments for which a function is in memory, or in the cache for its source as it is now."""
     try:
-        kept = [key[0] for key in function._cache._cache_file._load_index()]
-    except (AttributeError, OSError):  # there is no cache, or it cannot be read
-        kept = []
-    return [*function.signatures, *kept]
-
-
-def _fits(arguments: tuple, missing: Mapping[int, bool] | None) -> bool:
-    return all((str(arguments[place]) == "none") == none for place, none in (missing or {}).items())
+        index = _cache_of(function)._cache_file._load_index()
+    except (AttributeError, OSError, RuntimeError):  # there is no cache, or it cannot be read
+        index = {}
+    known = (key[0] for key in index)
+    return [*function.signatures, *(getattr(each, "args", each) for each in known)]

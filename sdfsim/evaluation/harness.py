@@ -54,10 +54,10 @@ def measure(
         where: "here": one after the other in this process; "cores": on all cores, in the order of `jobs`; "fresh": each
             in its own process, whose peak memory is then the job's.
     """
-    from sdfsim.physics.solver import _cache  # numba is slow to load
+    from sdfsim.physics.solver.code_cache import code_folder  # numba is slow to load
 
     todo: list[tuple[Job, Path, str]] = []
-    version = [__version__, _cache().name]  # the name is a hash of the compiled step's source
+    version = [__version__, code_folder().name]  # the name is a hash of the compiled step's source
     results: Results = {}
     for job in jobs:
         file, mark = folder / job.method / f"{job.case}.json", digest(job.content, version)

@@ -36,12 +36,12 @@ def sphere(radius: float = 0.5, subdivisions: int = 3) -> Mesh:
 def cylinder(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
     """A cylinder along z, its middle at the origin."""
     profile = np.array([[0, -height / 2], [radius, -height / 2], [radius, height / 2], [0, height / 2]])
-    return _revolve(profile, segments)
+    return revolve(profile, segments)
 
 
 def cone(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
     """A cone along z, apex up, the middle of its height at the origin."""
-    return _revolve(np.array([[0, -height / 2], [radius, -height / 2], [0, height / 2]]), segments)
+    return revolve(np.array([[0, -height / 2], [radius, -height / 2], [0, height / 2]]), segments)
 
 
 def torus(major: float = 0.35, minor: float = 0.15, segments: int = 64, sides: int = 32) -> Mesh:
@@ -82,7 +82,7 @@ def torus_knot() -> Mesh:
 def bowl(radius: float = 0.5, wall: float = 0.5 * BOWL_WALL) -> Mesh:
     """Half of a spherical shell about the origin, of outer `radius` m and `wall` m thick, open at the top (+z)."""
     outer, inner = _bowl_profiles(radius, wall, 16)
-    return _revolve(np.concatenate([outer, inner[::-1]]), 64)
+    return revolve(np.concatenate([outer, inner[::-1]]), 64)
 
 
 def bowl_radii(count: int, ball: float) -> tuple[float, float]:
@@ -175,7 +175,7 @@ def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
     return np.stack([profile[:, 0] * np.cos(turn), profile[:, 0] * np.sin(turn), profile[:, 1]], axis=1)
 
 
-def _revolve(profile: np.ndarray, segments: int) -> Mesh:
+def revolve(profile: np.ndarray, segments: int) -> Mesh:
     """The solid of a profile [K, 2] of (radius, z), both ends on the axis, turned about z."""
     rings = np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
     # On the axis all copies of a point are one vertex and half of each quad vanishes; `clean` handles both.

@@ -130,7 +130,6 @@ class Bodies:
 class Touch(Rows):
     """What the contact solve keeps about N bodies from one step to the next."""
 
-    touching: np.ndarray  # [N] bool, whether contacts acted in the last inner step
     quiet: np.ndarray  # [N] int64, number of steps that a body in contact has stayed near its anchor
     anchor: np.ndarray  # [N, 14] float64, the pose that it has stayed near, and its pose half of that time later
     island: np.ndarray  # [N] int64, a number shared by the bodies that fell asleep together; -1 if awake

@@ -12,15 +12,14 @@ from sdfsim.physics.joint_columns import (
     BROKEN,
     COORD,
     DAMPING,
-    DRAG,
     FORCE,
-    FRESH,
+    FRICTION,
     GAIN,
     HIGH,
     KINDS,
     LENGTH,
     LOW,
-    MOST,
+    MAX_FORCE,
     MOTOR,
     NUMBERS,
     REST,
@@ -75,11 +74,11 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
             row[HIGH] = joint.limits[1] / unit
         row[BOUNCE] = joint.restitution
         row[DAMPING] = joint.damping / (effort / unit * time)
-        row[DRAG] = joint.friction / effort
+        row[FRICTION] = joint.friction / effort
         if joint.spring is not None:
             row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
         if (motor := joint.motor) is not None:
-            row[MOST], row[TIME], gain = motor.most / effort, motor.time / time, motor.gain or 0.0
+            row[MAX_FORCE], row[TIME], gain = motor.max_force / effort, motor.time / time, motor.gain or 0.0
             row[GAIN] = gain * unit / effort
             if motor.speed is not None:
                 row[MOTOR], target[k] = TO_SPEED, motor.speed * time / unit
@@ -102,7 +101,7 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
 def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
     """[J, STATE] of joints at the start, when only the poses of bodies are known."""
     state = np.zeros((len(joints), STATE))
-    state[:, TARGET], state[:, FRESH] = joints.target, 1.0
+    state[:, TARGET] = joints.target
     state[:, COORD] = coordinates(joints, joints.start, position, orientation)
     return state
 
@@ -136,7 +135,7 @@ def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple
     if not effort.any():
         return number, target
     number = number.copy()
-    number[effort, MOTOR], number[effort, MOST], number[effort, GAIN] = TO_SPEED, np.abs(target[effort]), 0.0
+    number[effort, MOTOR], number[effort, MAX_FORCE], number[effort, GAIN] = TO_SPEED, np.abs(target[effort]), 0.0
     return number, np.where(effort, NEVER * np.sign(target), target)
 
 

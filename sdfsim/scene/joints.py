@@ -111,7 +111,7 @@ def _joint(
         damping=table.damping,
         friction=table.friction,
         spring=spring and Spring(spring.stiffness, math.radians(spring.rest_deg) if hinge else spring.rest),
-        motor=motor and Motor(motor.most, motor.speed, place_of, motor.time, motor.gain),
+        motor=motor and Motor(motor.max_force, motor.speed, place_of, motor.time, motor.gain),
         breaks_force=math.inf if breaks is None or breaks.force is None else breaks.force,
         breaks_torque=math.inf if breaks is None or breaks.torque is None else breaks.torque,
         collides=table.collide == "on",

@@ -88,6 +88,7 @@ def scene_of(table: SceneTable, faults: Faults, on_progress: Progress) -> Scene:
         bodies=tuple(bodies),
         gravity=np.array(table.gravity),
         duration=table.duration,
+        step=table.step,
         seed=table.seed,
         model=table.model,
         effects=Effects(**dict(table.effects)),

@@ -94,11 +94,11 @@ class Spring:
 @dataclass(frozen=True)
 class Motor:
     """The motor of a hinge (rad, N m) or a slider (m, N). It keeps `speed`, or goes to `position`, with at most the
-    torque or force `most`. The distance to the position shrinks by a factor e in `time` s. If both are None it does
+    torque or force `max_force`. The distance to the position shrinks by a factor e in `time` s. Without either it does
     nothing until a target is set. With a `gain` the torque or force is gain * (position - now - time * its rate of
     change), in N m/rad or N/m, or gain * (speed - now), in N m s/rad or N s/m; without, as much as that takes."""
 
-    most: float
+    max_force: float
     speed: float | None = None
     position: float | None = None
     time: float = 0.1
@@ -163,6 +163,7 @@ class Scene:
         joints: the joints between bodies, in file order.
         gravity: [3] float64 m/s^2.
         duration: s.
+        step: s, None if it follows the size of what moves.
         seed: random seed of the run.
         model: bundled model name or path, None for the default.
         effects: the switches of the file.
@@ -184,6 +185,7 @@ class Scene:
     caveats: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     joints: tuple[Joint, ...] = ()
+    step: float | None = None
 
 
 def fingerprints(scene: Scene) -> dict[str, str]:

@@ -70,7 +70,7 @@ _MEANT = {
     "rotation": _TURNS, "orientation": _TURNS, "quat": _TURNS, "quaternion": _TURNS, "euler": _TURNS, "rpy": _TURNS,
     "pose": "position, and " + _TURNS, "pos": "position", "xyz": "position", "origin": "position", "mu": "friction",
     "weight": "mass", "fixed": "motion: static", "static": "motion: static", "kinematic": "motion: kinematic",
-    "bounce": "restitution", "file": "mesh", "effort": "most", "target": "position, position_deg or speed",
+    "bounce": "restitution", "file": "mesh", "effort": "max_force", "target": "position, position_deg or speed",
     "parent": "bodies", "child": "bodies", "limit": "limits or limits_deg", "range": "limits or limits_deg",
 }  # fmt: skip
 
@@ -526,15 +526,20 @@ class MotorTable(Table):
     )
     position: Number | None = key("target position of a slider", None, "m")
     position_deg: Number | None = key("target angle of a hinge", None, "degrees")
-    most: Number = key("largest torque of a hinge in N m, or largest force of a slider in N", gt=0)
+    max_force: Number = key("largest torque of a hinge in N m, or largest force of a slider in N", gt=0)
     time: Number = key(
         "time in which the distance to the target shrinks by a factor e; not with `speed`", 0.1, "s", ge=0
     )
     gain: Number | None = key(
         "torque or force is `gain` times (target - `time` times the rate of change - now), or times (speed - now); in "
-        "N m/rad or N m s/rad for a hinge, else in N/m or N s/m; by default as much as the target takes, up to `most`",
+        "N m/rad or N m s/rad for a hinge, else in N/m or N s/m; by default as much as the target takes",
         None, gt=0,
     )  # fmt: skip
+
+    @validator_of_model(mode="before")
+    @classmethod
+    def _earlier_name(cls, data: Any) -> Any:
+        return {"max_force" if key == "most" else key: data[key] for key in data} if isinstance(data, dict) else data
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -688,6 +693,7 @@ class SceneTable(Table):
         "bundled model, or a .safetensors file in the scene's folder; the model sets the time step", None
     )
     duration: Number = key("simulated time", DEFAULT_DURATION, "s", gt=0)
+    step: Number | None = key("time step; by default it follows the size of what moves", None, "s", gt=0)
     seed: Whole = key("seed of the run's random numbers", 0, ge=0)
     gravity: Vector = key("acceleration of free fall", DEFAULT_GRAVITY, "m/s^2")
     effects: EffectsTable = key("which effects to compute", EffectsTable())

@@ -11,9 +11,9 @@ from sdfsim.physics.joint_columns import (
     BROKEN,
     COORD,
     DAMPING,
-    DRAG,
+    FRICTION,
     GAIN,
-    MOST,
+    MAX_FORCE,
     MOTOR,
     NOTHING,
     PULL,
@@ -100,8 +100,8 @@ class JointHandle:
     def effort(self) -> float | None:
         """The torque in N m about a hinge's axis, or the force in N along a slider's, that acts on the first body from
         now on, at any speed, until it is set again; None while the motor follows its `target` or does nothing. Setting
-        `target`, or None, ends it. It is limited to the motor's `most`, if there is a motor. Raises SdfsimError for any
-        other joint."""
+        `target`, or None, ends it. It is limited to the motor's `max_force`, if there is one. Raises SdfsimError for
+        any other joint."""
         self._need("effort", "hinge", "slider")
         return float(self._told[TARGET]) * self._strength if self._number[MOTOR] == EFFORT else None
 
@@ -110,22 +110,22 @@ class JointHandle:
         self._need("effort", "hinge", "slider")
         if value is None:
             return self._tell({MOTOR: NOTHING}, 0.0)
-        most = self._number[MOST] or np.inf
+        most = self._number[MAX_FORCE] or np.inf
         return self._tell({MOTOR: EFFORT}, float(np.clip(self._finite("effort", value) / self._strength, -most, most)))
 
     @property
-    def most(self) -> float:
+    def max_force(self) -> float:
         """The largest torque in N m, or force in N, of the motor; 0 if there is none. Setting it adds a motor. Raises
         SdfsimError for any joint but a hinge or slider."""
-        self._need("most", "hinge", "slider")
-        return float(self._number[MOST]) * self._strength
+        self._need("max_force", "hinge", "slider")
+        return float(self._number[MAX_FORCE]) * self._strength
 
-    @most.setter
-    def most(self, value: float) -> None:
-        self._need("most", "hinge", "slider")
-        most = self._finite("most", value, least=0.0) / self._strength
-        time = self._number[TIME] if self._number[MOST] else Motor(1.0).time / self._simulator.units.time
-        self._tell({MOST: most, TIME: time})
+    @max_force.setter
+    def max_force(self, value: float) -> None:
+        self._need("max_force", "hinge", "slider")
+        most = self._finite("max_force", value, least=0.0) / self._strength
+        time = self._number[TIME] if self._number[MAX_FORCE] else Motor(1.0).time / self._simulator.units.time
+        self._tell({MAX_FORCE: most, TIME: time})
 
     @property
     def time(self) -> float:
@@ -144,7 +144,7 @@ class JointHandle:
     @property
     def gain(self) -> float | None:
         """The motor's torque or force for an error of its target: N m/rad or N/m for a position, N m s/rad or N s/m for
-        a speed; None if it is as much as the target takes, up to `most`. Raises SdfsimError if there is no motor."""
+        a speed; None if it is as much as the target takes, up to `max_force`. Raises SdfsimError without a motor."""
         unit = self._strength / self._aim
         return float(self._number[GAIN]) * unit or None
 
@@ -174,12 +174,12 @@ class JointHandle:
     def friction(self) -> float:
         """N m for a hinge or a ball, N for a slider. Raises SdfsimError for any other joint."""
         self._need("friction", "hinge", "slider", "ball")
-        return float(self._number[DRAG]) * self._strength
+        return float(self._number[FRICTION]) * self._strength
 
     @friction.setter
     def friction(self, value: float) -> None:
         self._need("friction", "hinge", "slider", "ball")
-        self._tell({DRAG: self._finite("friction", value, least=0.0) / self._strength})
+        self._tell({FRICTION: self._finite("friction", value, least=0.0) / self._strength})
 
     @property
     def _joint(self) -> Joint:
@@ -248,8 +248,8 @@ class JointHandle:
     @property
     def _aim(self) -> float:
         """One model unit of the target: rad or m, or rad/s or m/s."""
-        if not self._number[MOST] > 0.0:
-            hint = "give it one in the scene, joints[].motor, or set most; effort needs none"
+        if not self._number[MAX_FORCE] > 0.0:
+            hint = "give it one in the scene, joints[].motor, or set max_force; effort needs none"
             raise SdfsimError(f"joint {self.name!r}: has no motor", hint)
         return self._unit / self._simulator.units.time if self._keeps_speed else self._unit
 

@@ -82,7 +82,7 @@ class Simulator(LiveScene):
         model: bundled name, path or `Model`; None: the scene's model, else the default.
         device: "cpu", "cuda" or "auto".
         seed: seed of torch's generator (recorded; no step uses random numbers today).
-        dt: s, the step; None: by the size of the bodies (the model has a fixed step in its own units).
+        dt: s, the step; None: the scene's, else by the size of the bodies (a model has a fixed step in its units).
         free_flight: "exact", or "learned": networks on surface nodes then predict it, as in the papers.
 
     Attributes:
@@ -117,6 +117,7 @@ class Simulator(LiveScene):
         asked = effects["contact"].on or free_flight == "learned"
         model = model if isinstance(model, Model) else load_model(model, weights=asked)
         self._asked = {"dt": dt, "free_flight": free_flight}
+        dt = scene.step if dt is None else dt
         stepper = stepper_of(model, contact=effects["contact"].on or jointed, free_flight=free_flight, device=device)
         if not stepper.forces:
             _check_inputs(scene, model.name, joints=jointed)

@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
-from sdfsim.apps.identify import identify, picture, report_lines, write_scene
+from sdfsim.apps.identify import optimiser
+from sdfsim.apps.identify.optimiser import identify
+from sdfsim.apps.identify.report import picture, report_lines, write_scene
 from sdfsim.apps.observed import COLUMNS, load_recordings
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import import_pybullet
@@ -144,7 +146,8 @@ def test_a_sliding_block_shows_its_friction_and_no_restitution(tmp_path, slope, 
 
 def test_the_picture_shows_what_the_recordings_tell_and_what_they_do_not(tmp_path, monkeypatch):
     scene = sliding_block(tmp_path, noise=3e-4)
-    out = tmp_path / "found.yaml"
+    out, kept = tmp_path / "found.yaml", []
+    monkeypatch.setattr(optimiser, "identify", lambda *given, **how: kept.append(identify(*given, **how)) or kept[0])
     done = CliRunner().invoke(
         cli.app, ["identify", str(tmp_path / "block.csv"), "--scene", str(scene), "-o", str(out), "--json"]
     )
@@ -152,7 +155,7 @@ def test_the_picture_shows_what_the_recordings_tell_and_what_they_do_not(tmp_pat
     assert json.loads(done.stdout)["picture"] == str(out.with_suffix(".png"))
     with Image.open(out.with_suffix(".png")) as image:
         assert image.format == "PNG" and min(image.size) > 200
-    found = identify(*load_recordings([tmp_path / "block.csv"], scene), profiles=True)
+    (found,) = kept
     profiles = {p.estimate.kind: p for p in found.profiles}
     friction, restitution = profiles["own_friction"], profiles["own_restitution"]
     # Stopping after v^2 / (2 g mu): what is off by a tenth of that is seen, on either side of the 0.3 it was made with.
@@ -222,7 +225,7 @@ def test_gaps_jumps_flips_and_rows_without_numbers_are_survived(tmp_path):
     scene = bouncing_balls(tmp_path, noise=5e-5)
     spoilt, rng, jumps = tmp_path / "spoilt", np.random.default_rng(3), 0
     spoilt.mkdir()
-    for k in range(6):
+    for k in range(3):
         rows = list(csv.reader((tmp_path / f"{k}.csv").open()))
         head, body = rows[0], rows[1:]
         for t in rng.choice(np.arange(10, 190, 10), 4, replace=False):
@@ -237,13 +240,13 @@ def test_gaps_jumps_flips_and_rows_without_numbers_are_survived(tmp_path):
             csv.writer(file).writerows([head, *(row for t, row in enumerate(body) if t not in gone)])
     recordings, loaded = load_recordings([spoilt], scene)
     assert sum(r.jumps for r in recordings) == jumps
-    assert sum(r.lost for r in recordings) == 6 * (3 + 3)
+    assert sum(r.lost for r in recordings) == 3 * (3 + 3)
     for r in recordings:
         assert np.abs(r.velocity[r.known]).max() < 5.0 and r.known.mean() > 0.5
         assert np.linalg.norm(r.angular_velocity[r.known], axis=-1).max() < 1e-3
     found = identify(recordings, loaded)
     assert found.report()["restitution"]["ball / ground"]["value"] == pytest.approx(0.7, abs=0.015)
-    assert any("24 jumps" in line and "36 poses" in line for line in report_lines(found))
+    assert any("12 jumps" in line and "18 poses" in line for line in report_lines(found))
 
 
 def test_a_start_is_fitted_through_the_flight(tmp_path):

@@ -143,10 +143,10 @@ def test_a_urdf_with_efforts_can_be_driven_and_is_limp_until_then(tmp_path: Path
     file = write(tmp_path, "arm.urdf", ARM)
     scene, _ = imported(file, fixed=True)
     shoulder = next(joint for joint in scene.joints if joint.name == "shoulder")
-    assert shoulder.motor is not None and shoulder.motor.most == pytest.approx(20.0)
+    assert shoulder.motor is not None and shoulder.motor.max_force == pytest.approx(20.0)
     assert shoulder.motor.position is None and shoulder.motor.speed is None
     limp, driven = Simulator(scene), Simulator(scene)
-    driven.joint("shoulder").most = 5000.0
+    driven.joint("shoulder").max_force = 5000.0
     driven.joint("shoulder").target = 0.8
     for sim in (limp, driven):
         sim.step(sim.steps_in(1.5))
@@ -179,8 +179,8 @@ def test_actuators_of_an_mjcf_become_motors_as_strong_as_theirs(tmp_path: Path) 
     scene, report = imported(write(tmp_path, "robot.xml", ACTUATED))
     motors = {joint.name: joint.motor for joint in scene.joints}
     assert motors["ja"].position == pytest.approx(np.radians(10)) and motors["ja"].time == pytest.approx(0.1)
-    assert (motors["jb"].most, motors["jb"].position, motors["jb"].speed) == (pytest.approx(15.0), None, None)
-    assert (motors["jc"].most, motors["jc"].speed) == (pytest.approx(3.0), 0.0)
+    assert (motors["jb"].max_force, motors["jb"].position, motors["jb"].speed) == (pytest.approx(15.0), None, None)
+    assert (motors["jc"].max_force, motors["jc"].speed) == (pytest.approx(3.0), 0.0)
     # Torques at the joint: a gear of 2 multiplies both the place that the actuator sees and its force.
     assert (motors["ja"].gain, motors["jc"].gain) == (pytest.approx(200.0), pytest.approx(7.0))
     told = "\n".join(report["notes"])
@@ -250,12 +250,12 @@ def test_a_robot_with_stiff_servos_moves_alike_here_and_after_its_export(tmp_pat
 def test_motors_of_every_kind_move_alike_after_their_export(tmp_path: Path) -> None:
     scene = SceneBuilder(gravity=(0, 0, -9.81))
     motors = {
-        "goes": ("hinge", {"position_deg": 40, "most": 60}),
-        "quick": ("hinge", {"position_deg": 40, "most": 60, "time": 0.02}),
-        "soft": ("hinge", {"position_deg": 40, "most": 60, "gain": 30, "time": 0.2}),
-        "turns": ("hinge", {"speed": 2, "most": 60}),
-        "drags": ("hinge", {"speed": 2, "most": 60, "gain": 5}),
-        "lifts": ("slider", {"position": 0.2, "most": 60, "gain": 400, "time": 0.1}),
+        "goes": ("hinge", {"position_deg": 40, "max_force": 60}),
+        "quick": ("hinge", {"position_deg": 40, "max_force": 60, "time": 0.02}),
+        "soft": ("hinge", {"position_deg": 40, "max_force": 60, "gain": 30, "time": 0.2}),
+        "turns": ("hinge", {"speed": 2, "max_force": 60}),
+        "drags": ("hinge", {"speed": 2, "max_force": 60, "gain": 5}),
+        "lifts": ("slider", {"position": 0.2, "max_force": 60, "gain": 400, "time": 0.1}),
     }
     for k, (name, (kind, motor)) in enumerate(motors.items()):
         scene.add(name, box={"size": (0.3, 0.05, 0.05)}, position=(0.15, k, 2), mass=1.0, collides_with=[])
@@ -484,7 +484,7 @@ def jointed() -> SceneBuilder:
     scene.join("elbow", "hinge", "arm", "fore", anchor=(0.75, 0.0, 0.7), axis=(0, 0.2, 1), start_deg=-15)
     scene.join("wrist", "ball", "bob", "fore", anchor=(1.3, 0.25, 0.5), damping=0.01)
     scene.join("track", "slider", "cart", anchor=(0, 2, 0.3), axis=(1, 0, 0), start=0.1, limits=(-0.5, 1),
-               motor={"position": 0.4, "most": 20, "time": 0.2})  # fmt: skip
+               motor={"position": 0.4, "max_force": 20, "time": 0.2})  # fmt: skip
     scene.join("weld", "fixed", "lid", "cart", anchor=(0, 2, 0.35))
     scene.join("string", "distance", "kite", "bob", anchor=(1.4, 0.3, 1.4), to=(1.4, 0.3, 0.4), rope=1.2)
     return scene
@@ -533,7 +533,7 @@ def same_joint(scene: Scene, other: Scene, name: str) -> None:
         numbers = [joint.damping, joint.friction, *(joint.limits or (0, 0)), joint.length or 0.0]
         numbers += [joint.spring.stiffness, joint.spring.rest] if joint.spring else [0, 0]
         motor = joint.motor
-        numbers += [motor.most, motor.position or 0, motor.speed or 0, motor.time] if motor else [0, 0, 0, 0]
+        numbers += [motor.max_force, motor.position or 0, motor.speed or 0, motor.time] if motor else [0, 0, 0, 0]
         return [joint.kind, held, anchor, axis if joint.kind in ("hinge", "slider") else np.zeros(3), np.array(numbers)]
 
     for one, two in zip(told(scene), told(other), strict=True):

@@ -7,7 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.identify import Problem, Windows
+from sdfsim.apps.identify.parameters import Problem
+from sdfsim.apps.identify.residuals import Windows
 from sdfsim.apps.observed import cleaned, flying_trees, held_together, with_velocities
 from sdfsim.scene.builder import SceneBuilder
 

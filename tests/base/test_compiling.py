@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import typeof
 
 from sdfsim.base import compiling
 from sdfsim.base.compiling import compile_before, is_compiled
@@ -61,30 +62,29 @@ def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, cap
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
     monkeypatch.setattr(compiling, "_ready", set())
     double = importlib.import_module(f"doubling_{cache}").double
-    compile_before(double, (3,), "doubling", "a second")
-    assert caplog.messages == ["compiling doubling, once for this version: about a second"]
+    compile_before([(double, (typeof(3),))], "doubling")
+    assert caplog.messages == ["compiling doubling, once for this version: about 20 s"]
     assert is_compiled(double) == (cache == "True") and double(3) == 6
     assert (sum(double.stats.cache_hits.values()), len(double.stats.cache_misses)) == (1, 0) or cache == "False"
 
 
-class Uncompiled:
-    signatures = ()
-
-    def __call__(self, *arguments):
+def test_a_scene_compiles_the_pieces_that_it_needs(monkeypatch):
+    def asked(jobs, what):
+        names.append({function.py_func.__name__ for function, _ in jobs} - {"run_steps"})
         raise InterruptedError
 
-
-def test_scenes_with_joints_and_with_many_bodies_are_told_of_by_themselves(monkeypatch, caplog):
-    monkeypatch.setattr(compiling, "_ready", set())
-    monkeypatch.setattr(solver, "run_steps", Uncompiled())
+    names: list[set[str]] = []
+    monkeypatch.setattr(solver, "compile_before", asked)
     balls = [make_body(f"ball {k}", 0, [3 * k, 0, 1]) for k in range(solver.CROWD)]
     pin = Joint("pin", "ball", (0, 1), np.array([[1.5, 0, 0], [-1.5, 0, 0]]), np.array([[0.0, 0, 0, 1]] * 2))
-    for bodies, joints in ((balls[:2], ()), (balls[:2], (pin,)), (balls, ()), (balls[:2], ())):  # each is told of once
+    for bodies, joints in ((balls[:2], ()), (balls[:2], (pin,)), (balls, ())):
         scene = Scene((analytic_shape("sphere", radius=0.5),), tuple(bodies), np.zeros(3), 1.0, joints=joints)
         with pytest.raises(InterruptedError):
             Simulator(scene, "solver").step()
-    told = [line for line in caplog.messages if line.startswith("compiling")]
-    assert len(told) == 3 and "joints" in told[1] and "many bodies" in told[2]
+    few, jointed, many = names
+    assert few == {"near_solids", "collide_solids", "impact_solids", "solve_contacts"}
+    assert jointed == few - {"solve_contacts"} | {"solve_joints", "assemble"}
+    assert many == {"near_many", "collide_many", "impact_surfaces", "solve_many"}
 
 
 def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeypatch, caplog):
@@ -98,11 +98,10 @@ def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeyp
     monkeypatch.setattr(compiling, "_ready", set())
     double, before = importlib.import_module("layouts").double, compiling.seconds_spent()
     for array, told in ((np.ones((2, 2)), 1), (np.zeros((3, 3)), 1), (np.ones((4, 4))[::2], 2), (np.ones((2, 2)), 2)):
-        compile_before(double, (array,), "doubling", "a second")
+        compile_before([(double, (typeof(array),))], "doubling")
         assert len(caplog.messages) == told
         assert double(array).tolist() == (2 * array).tolist()
     assert not double.stats.cache_misses  # nothing was compiled here
-    assert "doubling, for other types of arrays, once" in caplog.messages[1]
     assert compiling.seconds_spent() > before
 
 

@@ -18,13 +18,13 @@ from benchmarks.everyday import (
     OURS,
     NotRun,
     counted,
-    in_parts,
     is_installed,
     judged,
     runner,
     table,
     unknown_to,
 )
+from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import by_model, still
@@ -117,7 +117,7 @@ def test_cylinders_and_capsules_are_as_long_as_they_are(tmp_path, name, form):
 
 def test_a_convex_mesh_is_its_own_piece(tmp_path):
     ball, box = solid("mesh", "ball", 0.5, 3), fixed("box", solid("analytic", "box", 4, 4, 1), [0, 0, 0])
-    (piece,) = in_parts(scene_of(Put("it", ball, [0, 0, 2]), box), tmp_path).shapes[0].pieces
+    (piece,) = in_pieces(scene_of(Put("it", ball, [0, 0, 2]), box), tmp_path).shapes[0].pieces
     assert len(piece) == len(ball.mesh.vertices)
     assert np.linalg.norm(piece, axis=1) == pytest.approx(0.5, abs=1e-3)
 
@@ -189,27 +189,19 @@ def test_what_takes_too_long_is_not_run_and_what_breaks_is_missed(tmp_path, thre
     assert len(found["missed"]) == 6 and not found["held"] and not found["not_run"]
 
 
-def test_newton_knows_no_restitution_and_one_friction_of_all_that_move():
-    def newton(*bodies: Put) -> str:
-        return unknown_to("Newton", scene_of(*bodies))
+@pytest.mark.parametrize("name", ["Newton", "Drake"])
+def test_engines_without_restitution_know_one_friction_of_all_that_move(name):
+    def unknown(*bodies: Put) -> str:
+        return unknown_to(name, scene_of(*bodies))
 
     a, b = Put("a", CUBE, [0, 0, 2], mu=0.3), Put("b", CUBE, [3, 0, 2], mu=0.3)
-    assert newton(a, b, replace(floor(), mu=0.15)) == newton(a, replace(floor(), mu=1.0)) == ""
-    assert newton(replace(a, e=0.1), replace(floor(), e=0.5)) == "restitution"
-    assert "several materials" in newton(a, replace(b, mu=0.4))
-    assert "so different" in newton(a, replace(floor(), mu=0.1))
-
-
-def test_drake_knows_no_restitution_and_one_friction_of_all_that_move():
-    def drake(*bodies: Put) -> str:
-        return unknown_to("Drake", scene_of(*bodies))
-
-    a, b = Put("a", CUBE, [0, 0, 2], mu=0.3), Put("b", CUBE, [3, 0, 2], mu=0.3)
-    assert drake(a, floor()) == ""
-    assert drake(replace(a, e=0.1), floor()) == "restitution"
-    assert drake(replace(a, e=0.1)) == ""  # nothing to meet
-    assert "so different" in drake(a, b, floor())
-    assert "several materials" in drake(a, replace(b, mu=0.4))
+    level = replace(floor(), mu=0.15 if name == "Newton" else 1.0)
+    assert unknown(a, level) == ""
+    assert unknown(replace(a, e=0.1), level) == "restitution"
+    assert unknown(replace(a, e=0.1)) == ""  # nothing to meet
+    assert "several materials" in unknown(a, replace(b, mu=0.4))
+    other = (replace(floor(), mu=0.1),) if name == "Newton" else (b, floor())
+    assert "so different" in unknown(a, *other)
     assert unknown_to("PyBullet", scene_of(a, replace(b, mu=0.4, e=0.3), floor())) == ""
 
 

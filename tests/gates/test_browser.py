@@ -21,7 +21,7 @@ from tests.helpers.browser import Browser
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.gate
-RED, GREEN = (255, 0, 0), (0, 255, 0)
+RED = (255, 0, 0)
 # Where the dots are, px of the upright photo, by the photo.
 DOTS = {"wide & big.jpg": (3010, 411), "turned.jpg": (200, 1105), "<b>it's.png": (33, 300)}
 

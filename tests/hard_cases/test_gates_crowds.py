@@ -18,7 +18,8 @@ def total(rollout) -> np.ndarray:
     return rollout.counters["kinetic_energy"] + rollout.counters["potential_energy"]
 
 
-def assert_falls_into_the_bowl(model, count: int, seconds: float) -> None:
+@pytest.mark.parametrize(("count", "seconds"), [(27, 0.5), pytest.param(512, 2.0, marks=pytest.mark.slow)])
+def test_balls_fall_into_a_bowl(model, count, seconds):
     scene = gates.in_bowl(count)
     rollout = Simulator(scene, model).run(seconds=seconds)
     gates.assert_sound(rollout)
@@ -32,24 +33,20 @@ def assert_falls_into_the_bowl(model, count: int, seconds: float) -> None:
     assert below > -0.01  # nobody through the bowl and the floor
 
 
-def test_twenty_seven_balls_into_a_bowl(model):
-    assert_falls_into_the_bowl(model, 27, 0.5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("count", "seconds"), [(512, 2.0)])
-def test_many_balls_into_a_bowl(model, count, seconds):
-    assert_falls_into_the_bowl(model, count, seconds)
-
-
 def resident() -> float:
     """MiB of memory that the process holds."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 2**20
 
 
-def assert_runs_on(model, settle: int, steps: int, sleep: str) -> None:
-    """The sample pile, settled, for many steps more."""
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="/proc, which tells a process's memory, exists on Linux only"
+)
+@pytest.mark.parametrize(
+    ("settle", "steps", "sleep"),
+    [(150, 150, "off"), *(pytest.param(400, 10_000, sleep, marks=pytest.mark.slow) for sleep in ("on", "off"))],
+)
+def test_many_steps_of_a_settled_pile(model, settle, steps, sleep):
     scene = sdfsim.load_scene(gates.SAMPLES / "pile.yaml")
     sim = Simulator(replace(scene, effects=Effects(sleep=sleep)), model)
     start = total(sim.initial_rollout())[0]
@@ -70,23 +67,6 @@ def assert_runs_on(model, settle: int, steps: int, sleep: str) -> None:
     assert fallen > 0 and worst < 0.01 * fallen
     assert len(gc.get_objects()) < objects + steps // 2  # one object a step would be more
     assert resident() < memory + 32.0
-
-
-@pytest.mark.skipif(
-    not Path("/proc/self/statm").exists(), reason="/proc, which tells a process's memory, exists on Linux only"
-)
-@pytest.mark.parametrize("sleep", ["off"])
-def test_hundreds_of_steps_of_a_pile(model, sleep):
-    assert_runs_on(model, 150, 150, sleep)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    not Path("/proc/self/statm").exists(), reason="/proc, which tells a process's memory, exists on Linux only"
-)
-@pytest.mark.parametrize("sleep", ["on", "off"])
-def test_ten_thousand_steps_of_a_settled_pile(model, sleep):
-    assert_runs_on(model, 400, 10_000, sleep)
 
 
 def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):

@@ -24,15 +24,12 @@ def dropped(nodes: np.ndarray, shape=gates.CUBE):
     return replace(scene, shapes=(replace(shape, nodes=nodes), *scene.shapes[1:]))
 
 
-@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), surface_model], ids=["impulse", "sdf-sim"])
+@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), surface_model, lambda: "solver"],
+                         ids=["impulse", "sdf-sim", "solver"])  # fmt: skip
 def test_coplanar_nodes_run(make):
     rollout = Simulator(dropped(FLAT), make()).run(steps=12)
     gates.assert_sound(rollout)
     assert rollout.contact_count.sum() > 0
-
-
-def test_coplanar_nodes_run_with_every_model(model):
-    gates.assert_sound(Simulator(dropped(FLAT), model).run(steps=40))
 
 
 @pytest.mark.parametrize(

@@ -129,17 +129,11 @@ def missed(kinds: tuple[str, str], count: int, seed: int) -> tuple[int, list[str
     return len(deep), wrong
 
 
+@pytest.mark.parametrize(("count", "least"), [(FEW, 0), pytest.param(MANY, FEW, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kinds", PAIRS, ids=" on ".join)
-def test_a_step_tells_every_contact(kinds):
-    asked, wrong = missed(kinds, FEW, seed=0)
-    assert asked > 0 and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kinds", PAIRS, ids=" on ".join)
-def test_a_step_tells_every_contact_of_many(kinds):
-    asked, wrong = missed(kinds, MANY, seed=1)
-    assert asked > FEW and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])
+def test_a_step_tells_every_contact(kinds, count, least):
+    asked, wrong = missed(kinds, count, seed=least)
+    assert asked > least and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])
 
 
 def joined(name: str, boxes: list[tuple[tuple, tuple]], *, pieces: bool) -> Shape:

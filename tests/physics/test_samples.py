@@ -11,6 +11,7 @@ from sdfsim import Simulator, load_scene
 from sdfsim.evaluation.instruments import Verdict, energy_account, judged
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import write_ply
+from sdfsim.geometry.primitives import revolve
 from tests.helpers.command import run
 
 SAMPLES = sorted((Path(__file__).parents[2] / "samples").glob("*.yaml"))
@@ -39,24 +40,6 @@ def test_what_rolls_on_a_grid_gains_little_from_any_start(sample, seconds):
     assert max(gained) <= 0.01, np.round(np.sort(gained), 4)
 
 
-def turned(profile: list[tuple[float, float]], around: int, size: float) -> Mesh:
-    """A profile (radius, height), counter-clockwise from the axis and back to it, times `size`, turned about z."""
-    radius, height = size * np.array(profile).T
-    angle = 2 * np.pi * np.arange(around) / around
-    rings = [np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(around, z)])
-             for r, z in zip(radius[1:-1], height[1:-1], strict=True)]  # fmt: skip
-    vertices = np.concatenate([*rings, [[0, 0, height[0]], [0, 0, height[-1]]]])
-    low, high, faces = len(vertices) - 2, len(vertices) - 1, []
-    for i in range(around):
-        j = (i + 1) % around
-        for k in range(len(rings) - 1):
-            a, b, c, d = k * around + i, k * around + j, (k + 1) * around + j, (k + 1) * around + i
-            faces += [(a, b, c), (a, c, d)]
-        last = (len(rings) - 1) * around
-        faces += [(low, j, i), (high, last + i, last + j)]
-    return Mesh(vertices, np.array(faces))
-
-
 CUP = [(0, 0), (0.3, 0), (0.45, 0.9), (0.35, 0.9), (0.22, 0.12), (0, 0.12)]  # a wall of a tenth, on a sharp foot
 BOWL = [(0, 0), (0.2, 0), (0.5, 0.4), (0.42, 0.4), (0.16, 0.08), (0, 0.08)]
 
@@ -82,7 +65,7 @@ bodies:
   - {{name: table, shape: table, motion: static, position: [0, 0, {-0.05 * size}]}}
   - {{name: cup, shape: cup, {start}, mass: 0.5}}
 """
-    found = verdict(text, tmp_path, turned(CUP, 72, size), 0.7 * size**0.5)
+    found = verdict(text, tmp_path, revolve(size * np.array(CUP), 72), 0.7 * size**0.5)
     assert found.broken == ()
     assert found.overlap is not None and found.overlap.part < 0.006
 
@@ -100,7 +83,7 @@ bodies:
   - {{name: one, shape: ball, position: [0.25, 0.06, 0.45], friction: 0.6, restitution: 0.3}}
   - {{name: other, shape: ball, position: [-0.13, -0.22, 0.5], velocity: [-0.5, 0.6, 0], friction: 0.6}}
 """
-    found = verdict(text, tmp_path, turned(BOWL, 48, 1.0), 1.2)
+    found = verdict(text, tmp_path, revolve(np.array(BOWL), 48), 1.2)
     # The larger one gains 1.02 % of what is in play, where the law allows 1 %: docs/stability.md.
     assert not [line for line in found.broken if not line.startswith("energy")]
     assert max(found.energy.climb, found.energy.worst) < 0.0105

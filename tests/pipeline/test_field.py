@@ -117,10 +117,6 @@ def trainer() -> Trainer:
     return Trainer(settings, toy_rays(), supervision_of(NOTHING, SMALL.finest), 0)
 
 
-def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
-    assert_resumes(trainer, 4, tmp_path / "c.safetensors")
-
-
 @pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "another field"])
 def test_a_checkpoint_that_cannot_be_read_is_reported_and_leaves_nothing_behind(tmp_path, damage, one_thread):
     path, before, run, untouched = tmp_path / "c.safetensors", trainer(), trainer(), trainer()

@@ -47,7 +47,7 @@ HINGE = "name: door, type: hinge, anchor: [0.9, 0, 0], axis: [0, 0, 1]"
             "spring.rest: is not for a hinge: give rest_deg",
         ),
         ("{HINGE, bodies: [leaf, world], motor: {most: 3, speed: 1, position_deg: 2}}", "motor.position_deg: give"),
-        ("{HINGE, bodies: [leaf, world], motor: {speed: 3}}", "motor.most: is required"),
+        ("{HINGE, bodies: [leaf, world], motor: {speed: 3}}", "motor.max_force: is required"),
         ("{HINGE, bodies: [leaf, world], breaks_at: {}}", "breaks_at: force or torque is required"),
         ("{HINGE, bodies: [leaf, world], frame: crate}", "frame: must be world, leaf or world (got 'crate')"),
         ("{HINGE, bodies: [leaf, world], restitution: 0.5}", "restitution: is for limits or a rope only"),
@@ -119,7 +119,7 @@ def test_points_may_be_told_in_a_body(load):
 
 
 def test_what_pulls_and_drives_is_kept_in_radians(load):
-    given = "spring: {stiffness: 3, rest_deg: 90}, motor: {position_deg: 180, most: 2, time: 0.3}"
+    given = "spring: {stiffness: 3, rest_deg: 90}, motor: {position_deg: 180, max_force: 2, time: 0.3}"
     (joint,) = load(f"{TOP}  - {{{HINGE}, bodies: [leaf, world], {given}}}\n").joints
     assert joint.spring == Spring(3.0, math.radians(90))
     assert joint.motor == Motor(2.0, None, math.radians(180), 0.3)

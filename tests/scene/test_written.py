@@ -85,7 +85,7 @@ def test_a_wrong_body_is_refused_where_it_is_added(keys, told):
          "start_deg: is for hinge only (this is a slider; give start)"),
         ("hinge", {"anchor": (0, 0), "axis": (0, 0, 1)}, "anchor: must be 3 numbers (got 2)"),
         ("slider", {"axis": (0, 0, 1), "limits": [1.0]}, "limits: must be 2 numbers (got 1)"),
-        ("slider", {"axis": (0, 0, 1), "limits": (0, 1), "motor": {"position": 1.5, "most": 3}},
+        ("slider", {"axis": (0, 0, 1), "limits": (0, 1), "motor": {"position": 1.5, "max_force": 3}},
          "motor.position: is beyond the limits, 0 to 1 m (got 1.5 m)"),
         ("hing", {}, "type: must be one of hinge, slider"),
     ],

@@ -52,16 +52,16 @@ def test_friction_holds_a_smaller_effort_and_a_slider_holds_its_weight():
 def test_a_motor_may_be_given_and_its_strength_changed():
     sim = free("hinge")
     joint = sim.joint("joint")
-    assert joint.most == 0.0
+    assert joint.max_force == 0.0
     with pytest.raises(SdfsimError, match=r"'joint': has no motor\nhint: .*set most"):
         joint.target = 0.5
-    joint.most = 20.0
+    joint.max_force = 20.0
     assert joint.target is None
     joint.target = 0.5
     sim.step(sim.steps_in(2.0))
     assert joint.angle == pytest.approx(0.5, abs=1e-4)
     # Weaker than a steady torque against it, it lets go.
-    joint.most = 1.0
+    joint.max_force = 1.0
     sim["box"].pull(torque=(0, 0, 3.0))
     speed = joint.speed
     sim.step(10)
@@ -73,7 +73,7 @@ def test_a_motor_may_be_given_and_its_strength_changed():
 
 
 def test_the_time_of_a_motor_is_that_in_which_the_way_shrinks_by_e():
-    sim = free("hinge", motor={"position_deg": 0.0, "most": 1e4})
+    sim = free("hinge", motor={"position_deg": 0.0, "max_force": 1e4})
     joint = sim.joint("joint")
     joint.time, joint.target = 0.25, 1.0
     assert joint.time == pytest.approx(0.25)
@@ -102,7 +102,7 @@ def test_damping_and_friction_change_while_it_runs(kind, heft):
 
 
 def test_a_target_beyond_the_limits_is_told():
-    sim = free("hinge", limits_deg=(-90, 90), motor={"most": 20.0})
+    sim = free("hinge", limits_deg=(-90, 90), motor={"max_force": 20.0})
     with pytest.warns(UserWarning, match=r"joint 'joint': target 2 is beyond the limits, -1\.571 to 1\.571"):
         sim.joint("joint").target = 2.0
 
@@ -113,7 +113,7 @@ def test_a_target_beyond_the_limits_is_told():
         (lambda j: setattr(j, "target", "open"), "joint 'joint': target: must be a finite number.*got 'open'"),
         (lambda j: setattr(j, "target", (1, 2)), "target: must be a finite number"),
         (lambda j: setattr(j, "effort", np.nan), "effort: must be a finite number"),
-        (lambda j: setattr(j, "most", -1), "most: must be a finite number of at least 0"),
+        (lambda j: setattr(j, "max_force", -1), "max_force: must be a finite number of at least 0"),
         (lambda j: setattr(j, "time", -1), "time: must be a finite number of at least 0"),
         (lambda j: setattr(j, "friction", True), "friction: must be a finite number of at least 0"),
         (lambda j: j.position, "is a hinge, which has no position\nhint: read angle"),
@@ -121,7 +121,7 @@ def test_a_target_beyond_the_limits_is_told():
 )
 def test_what_cannot_be_told_is_refused_in_a_line(act, message):
     with pytest.raises(SdfsimError, match=message):
-        act(free("hinge", motor={"most": 20.0}).joint("joint"))
+        act(free("hinge", motor={"max_force": 20.0}).joint("joint"))
 
 
 def test_what_a_joint_does_not_have_is_said():
@@ -135,9 +135,9 @@ def test_what_a_joint_does_not_have_is_said():
 
 
 def test_reset_forgets_what_motors_were_told():
-    sim = free("hinge", motor={"most": 20.0})
+    sim = free("hinge", motor={"max_force": 20.0})
     joint = sim.joint("joint")
-    joint.most, joint.damping, joint.target = 5.0, 2.0, 1.0
+    joint.max_force, joint.damping, joint.target = 5.0, 2.0, 1.0
     sim.step(3)
     sim.reset()
-    assert (joint.most, joint.damping, joint.target) == (pytest.approx(20.0), 0.0, None)
+    assert (joint.max_force, joint.damping, joint.target) == (pytest.approx(20.0), 0.0, None)

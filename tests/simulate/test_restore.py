@@ -15,9 +15,9 @@ def resting() -> Simulator:
     scene.add("box", box={"size": (0.2, 0.2, 0.2)}, position=(3, 0, 0.1), mass=2.0, restitution=0.0)
     scene.add("leaf", box={"size": (0.8, 0.04, 1.0)}, position=(0.4, 0, 1.0), mass=5.0)
     scene.add("drawer", box={"size": (0.3, 0.3, 0.1)}, position=(0, 2, 1.0), mass=3.0)
-    motor = {"position_deg": 0.0, "most": 60.0}
+    motor = {"position_deg": 0.0, "max_force": 60.0}
     scene.join("door", "hinge", "leaf", anchor=(0, 0, 1), axis=(0, 0, 1), limits_deg=(-10, 110), motor=motor)
-    scene.join("rail", "slider", "drawer", axis=(1, 0, 0), motor={"position": 0.0, "most": 80.0})
+    scene.join("rail", "slider", "drawer", axis=(1, 0, 0), motor={"position": 0.0, "max_force": 80.0})
     made = Simulator(scene)
     made.step(made.steps_in(2.0))
     assert all(made[name].asleep for name in ("box", "leaf", "drawer"))
@@ -45,7 +45,7 @@ ACTS = {
     "target of a slider": lambda sim: setattr(sim.joint("rail"), "target", 0.3),
     "effort": lambda sim: setattr(sim.joint("door"), "effort", 3.0),
     "most and target": lambda sim: (
-        setattr(sim.joint("door"), "most", 90.0), setattr(sim.joint("door"), "target", 0.7)
+        setattr(sim.joint("door"), "max_force", 90.0), setattr(sim.joint("door"), "target", 0.7)
     ),
     "push": lambda sim: sim["box"].push((4.0, 0, 0)),
     "push of what is held": lambda sim: sim["leaf"].push((0, 2.0, 0)),

@@ -20,6 +20,7 @@ from sdfsim.evaluation.laws.check import Check, most, near
 from sdfsim.evaluation.true_surfaces import gaps
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, convex_hull, joined
+from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Body, Effects, Scene
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape
@@ -296,6 +297,13 @@ def run(
     pull = yaw.apply(gravity * np.array([sin(radians(tilt)), 0.0, -cos(radians(tilt))]))
     scene = Scene(tuple(shapes), tuple(made), pull, 1.0, effects=Effects(sleep="on" if sleep else "off"))
     found = at.by(scene, seconds * at.time)
+    return Ran(scene, found.rollout, found.broke, at, label)
+
+
+def run_built(at: Setting, label: str, built: SceneBuilder, seconds: float) -> Ran:
+    """Run a scene in SI, which the setting does not change."""
+    scene = built.load()
+    found = at.by(scene, seconds)
     return Ran(scene, found.rollout, found.broke, at, label)
 
 

@@ -4,8 +4,8 @@
 
 prints a line for each check: the measured value, the wanted one, and whether the check holds. `--size` is the unit of
 length (the size of the smallest bodies), `--yaw` turns the whole scene about the vertical, and `--kind` says how solids
-are given: in closed form, as the exact distance of a mesh, or as samples of it on a grid. Hard cases have these scenes
-of their own and are not changed by them.
+are given: in closed form, as the exact distance of a mesh, or as samples of it on a grid. Hard cases and joints have
+scenes of their own, which these do not change.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from typing import NamedTuple
 from sdfsim.evaluation.laws.check import Check
 from sdfsim.evaluation.laws.everyday import EVERYDAY
 from sdfsim.evaluation.laws.hard_cases import hard_cases
+from sdfsim.evaluation.laws.joints import JOINTS
 from sdfsim.evaluation.laws.scenes import KINDS, SIZES, Law, Setting
 from sdfsim.evaluation.laws.textbook import TEXTBOOK
 from sdfsim.shape.shape import Shape
@@ -40,11 +41,12 @@ GROUPS = {
     "precision": Group("other arithmetic: time until motions are 10 % of a body's size apart"),
     "everyday": Group("everyday scenes: checks that do not hold"),
     "textbook": Group("laws of a textbook: checks that do not hold"),
+    "joints": Group("laws of joints: checks that do not hold"),
 }
 
 ROWS = {
     row.__name__: Law(row.__name__, group, row.__name__.replace("_", " "), row, engines=False, counted=True)
-    for group, rows in (("everyday", EVERYDAY), ("textbook", TEXTBOOK))
+    for group, rows in (("everyday", EVERYDAY), ("textbook", TEXTBOOK), ("joints", JOINTS))
     for row in rows
 }
 
@@ -54,9 +56,9 @@ def laws(*, quick: bool = False, shapes: Mapping[str, Shape] | None = None) -> l
     return [*hard_cases(quick=quick, shapes=shapes), *ROWS.values()]
 
 
-def settings(*, quick: bool = False) -> list[Setting]:
-    """How the counted laws are run in reports."""
-    if quick:
+def settings(law: Law, *, quick: bool = False) -> list[Setting]:
+    """How a counted law is run in reports."""
+    if quick or law.group == "joints":
         return [Setting()]
     return [*(Setting(size) for size in SIZES), Setting(yaw=37.0), *(Setting(kind=kind) for kind in KINDS[1:])]
 

@@ -6,7 +6,8 @@ from math import atan, cos, radians, sin, sqrt, tan
 import numpy as np
 
 from sdfsim.evaluation.laws.check import Check, most, near
-from sdfsim.evaluation.laws.scenes import STILL, UNIT, G, Put, Setting, about, floor, run, solid
+from sdfsim.evaluation.laws.scenes import STILL, UNIT, G, Put, Setting, about, floor, run, run_built, solid
+from sdfsim.scene.builder import SceneBuilder
 
 METRE = sqrt(UNIT)  # times and speeds at 10 cm for one of bodies of a metre
 STARTS = (0.95, 0.98, 1.0, 1.03, 1.07)  # sizes
@@ -39,7 +40,7 @@ def head_on(at: Setting) -> Iterator[Check]:
 
 
 def slopes(at: Setting) -> Iterator[Check]:
-    """Rolling, and Coulomb's friction on slopes."""
+    """Rolling, and Coulomb's friction on slopes and on the level, where it is the same in all directions."""
 
     def way(label: str, put: Put, degrees: float, pull: float) -> Iterator[Check]:
         ran = run(at, label, [put, floor()], 1.5 * METRE, tilt=degrees)
@@ -59,6 +60,12 @@ def slopes(at: Setting) -> Iterator[Check]:
     steep = radians(40)
     mu = 0.5 * 2 / 7 * tan(steep)
     yield from way("ball that slips", Put("it", BALL, [0, 0, 0.5], mu=mu), 40.0, sin(steep) - mu * cos(steep))
+    for degrees in (0.0, 30.0, 45.0):
+        ahead, speed = about("z", degrees).apply([1.0, 0.0, 0.0]), 1.5 * METRE
+        slides = Put("it", CUBE, [0, 0, 0.5], v=speed * ahead)
+        ran = run(at, f"cube that slides at {degrees:g} degrees", [slides, floor()], 4 * METRE)
+        wanted, dt = speed**2 / (2 * 0.5 * G) / UNIT, float(np.diff(ran.seconds).mean())
+        yield ran.near("way", ran.moved("it")[-1] @ ahead, wanted, 0.01, "sizes", speed * dt / 2 / UNIT)
     for mu in (0.2, 0.6):
         for share in (0.9, 0.97, 1.1):
             angle = share * atan(mu)
@@ -130,4 +137,27 @@ def overlaps(at: Setting) -> Iterator[Check]:
             yield ran.most("common centre moved", 0.5 * np.abs(middle).max(), 1e-3, "sizes")
 
 
-TEXTBOOK = (bounces, head_on, slopes, plates, drops, stacks, overlaps)
+def sleepers(at: Setting) -> Iterator[Check]:
+    """What sleeps is hit as if it were awake: a cube that slides without friction gives all of its speed to it."""
+    speed = 0.5 * METRE
+    still = Put("still", CUBE, [0, 0, 0.5], mu=0.0, e=1.0)
+    slides = Put("slides", CUBE, [-3, 0, 0.5], v=[speed, 0, 0], mu=0.0, e=1.0)
+    ran = run(at, "cubes", [still, slides, floor()], 4 * UNIT / speed, sleep=True)
+    yield ran.near("speed after", ran.v("still")[-1, 0], speed, 0.01, "m/s")
+    yield ran.near("speed of the other", ran.v("slides")[-1, 0], 0.0, 0.0, "m/s", 0.01 * speed)
+
+
+def trays(at: Setting) -> Iterator[Check]:
+    """A cup stays on a tray that is sped up below the limit of friction, and slips by the surplus above it."""
+    for pull in (3.0, 4.2):
+        path = [{"time": 0.1 + t, "position": (0.5 * pull * t * t, 0, 0)} for t in np.linspace(0, 1, 1001).tolist()]
+        built = SceneBuilder(model="solver")
+        built.add("tray", box={"size": (4, 1, 0.04)}, motion="kinematic", path=path, friction=1, restitution=0)
+        built.add("cup", cylinder={"radius": 0.05, "height": 0.08}, position=(0, 0, 0.06), friction=0.4, restitution=0)
+        ran = run_built(at, f"{pull:g} m/s^2", built, 0.9)
+        behind = ran.rollout.position[-1, 0, 0] - ran.rollout.position[-1, 1, 0]
+        wanted = max(0.0, 0.5 * (pull - 0.4 * G) * (ran.time[-1] - 0.1) ** 2)
+        yield ran.near("behind", behind, wanted, 0.0, "m", 1e-3)
+
+
+TEXTBOOK = (bounces, head_on, slopes, plates, drops, stacks, overlaps, sleepers, trays)

@@ -5,17 +5,9 @@ Compiled code is cached in the user's cache folder, under a hash of all these fi
 
 import sys
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
-from sdfsim.base.compiling import cache_of, kept
-
-
-def _cache() -> Path:
-    """The folder of the compiled step, named after a hash of its source."""
-    here = Path(__file__).parent
-    files = [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]
-    return cache_of(file for file in files if file.name != "prepare.py")
+from sdfsim.physics.solver.code_cache import kept_here
 
 
 def _without_blas() -> None:
@@ -34,5 +26,7 @@ def _without_blas() -> None:
 
 
 _without_blas()
-with kept(_cache()):
+with kept_here():
+    from sdfsim.physics.solver import edges as edges
+    from sdfsim.physics.solver import pieces as pieces
     from sdfsim.physics.solver import run as run

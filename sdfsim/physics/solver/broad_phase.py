@@ -14,10 +14,10 @@ from sdfsim.physics.solver.world import COLUMNS, POINTS, Manifolds
 @njit(**BARE)
 def swept(world, work, motion, rules, span):
     """For each body, how far any of its points may move, and the box around everything that it may reach."""
-    ways, low, high, matrix = work.ways, work.low, work.high, work.matrix
+    ways, low, high, matrix = work.motion_bound, work.low, work.high, work.matrix
     fall = norm(vector(rules.options.gravity)) * span
     for b in world.going:
-        ways[b], work.gone[b], work.beside[b] = 0.0, 0.0, False
+        ways[b], work.moved[b], work.beside[b] = 0.0, 0.0, False
         if world.shape[b] < 0 or not math.isfinite(world.radius[b]):
             continue
         if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):

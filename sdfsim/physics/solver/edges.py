@@ -10,12 +10,11 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.broad_phase import near_pairs, swept
+from sdfsim.physics.solver.contacts import met_half_way
 from sdfsim.physics.solver.distance import distance
-from sdfsim.physics.solver.impulses import met_half_way
-from sdfsim.physics.solver.internal_edges import heed_supports
 from sdfsim.physics.solver.manifold import points_of
-from sdfsim.physics.solver.narrow_phase import find_near, narrow_phase
-from sdfsim.physics.solver.references import reference
+from sdfsim.physics.solver.narrow_phase import find_near
+from sdfsim.physics.solver.references import call, reference
 from sdfsim.physics.solver.surface_distance import map_between, mapped
 from sdfsim.physics.solver.vectors import (
     ENTRY,
@@ -102,13 +101,13 @@ def nodes_within(shapes, world, work, motion, rules, node, start):
 
 
 @njit(**ENTRY)
-def points_within(shapes, world, work, motion, rules, manifolds, surfaces, soon):
+def points_within(shapes, world, work, motion, rules, manifolds, pieces, soon):
     """Points at which bodies are within `rules.contact_margin` of each other, or will be after the time `rules.ahead`
     in free motion.
 
     Args:
         manifolds: empty, of this type.
-        surfaces: True if shapes may meet as surfaces, else None.
+        pieces: the addresses of `Pieces` that fit the scene.
         soon: a shorter time.
 
     Returns:
@@ -120,10 +119,8 @@ def points_within(shapes, world, work, motion, rules, manifolds, surfaces, soon)
     matrix, span = work.matrix, rules.ahead
     for b in world.going:
         to_matrix(motion.orientation, b, matrix)
-    manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, surfaces, None)
-    points, parts = reference(manifolds), reference(near)
-    narrow_phase(shapes, world, motion, matrix, rules, points, parts, work.gone, work.scratch, surfaces, None)
-    heed_supports(shapes, world, work, motion, rules, points, parts, work.scratch)
+    manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, pieces)
+    call(pieces.collide, (shapes, world, work, motion, rules, reference(manifolds), reference(near)))
     most = points_of(manifolds, len(near.start))
     pair, value, count = np.empty((most, 2), np.int64), np.empty((most, 11)), 0
     for m in range(len(manifolds.count)):

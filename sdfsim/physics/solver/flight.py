@@ -41,6 +41,29 @@ def pull_of(world, matrix, wrench, rules, part, b):
 
 
 @njit(**BARE)
+def drift(world, work, rules, position, orientation, angular, matrix, v, w, shifted, turned, span, b):
+    """Move a body for a time at its velocities v and w, and at those that do not last; only w changes on the way.
+    Returns a bound of its turning speed."""
+    put(position, b, along(get(position, b), add(v, shifted), span))
+    if world.moves[b] and not rules.options.rotation:
+        put(angular, b, (0.0, 0.0, 0.0))
+        return 0.0
+    put(angular, b, w)
+    speed = norm(w) + norm(turned)
+    if world.moves[b] and not world.isotropic[b]:
+        torque_free(world, orientation, angular, matrix, span, work.turned, work.frame, b)
+    else:
+        turned = add(w, turned)
+    r = scale(turned, span)
+    if r[0] != 0.0 or r[1] != 0.0 or r[2] != 0.0:
+        q = turned_by(r, orientation, b)
+        for x in range(4):
+            orientation[b, x] = q[x]
+        to_matrix(orientation, b, matrix)
+    return speed
+
+
+@njit(**BARE)
 def torque_free(world, orientation, angular, matrix, span, trial, frame, b):
     """Rotation without torque: angular momentum is conserved exactly, the pose is exact to fourth order
     (Runge-Kutta-Munthe-Kaas)."""

@@ -84,7 +84,7 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
                         break
                 break
     if again:
-        went = work.gone[a] + work.gone[b]
+        went = work.moved[a] + work.moved[b]
         count = collide_solids(shapes, world, motion, work.matrix, rules, manifolds, near, went, scratch, p)
         manifolds.count[p] = renewed(rules, manifolds.point, p, manifolds.count[p], scratch, count)
 

@@ -176,10 +176,12 @@ def merged(rules, point, p, known, scratch, count, rounded):
             if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
                 alike[e] += 1
             away[e] = min(away[e], gone + 0.01 * turned)
-            # Points that touch, or are about to, come first: a corner that is far out but above would replace a point
-            # that carries load. A rolling body would sink in if its next node had to wait until it touches.
+            # Points that carry load come first, else a body at rest would change its points when all are equally deep;
+            # then those that touch, or are about to: a corner that is far out but above is no help, and a rolling body
+            # would sink in if its next node had to wait until it touches.
             if away[e] > rules.apart * rules.apart and alike[e] < EACH:
-                far = away[e] + (TOUCHES if every[e, GAP] <= rules.slop else 0.0)
+                bears = every[e, NORMAL_IMPULSE] > 0.0
+                far = away[e] + (2.0 * TOUCHES if bears else TOUCHES if every[e, GAP] <= rules.slop else 0.0)
                 if far > farthest + EVEN:
                     farthest, following = far, e
         chosen = following

@@ -36,7 +36,7 @@ from sdfsim.physics.solver.manifold import (
     thinned,
     write,
 )
-from sdfsim.physics.solver.references import reference
+from sdfsim.physics.solver.references import call, reference
 from sdfsim.physics.solver.surface_distance import (
     KEYS,
     at_least,
@@ -79,6 +79,7 @@ SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is tested
 class Parts(NamedTuple):
     """The near parts of the bodies of P pairs, each pair's in the room that all of its parts would need."""
 
+    pair: np.ndarray  # [P, 2] the two bodies
     start: np.ndarray  # [P, 2] index of the first of each body's, see `Near`
     count: np.ndarray  # [P, 2]
     leaf: np.ndarray  # [L] int32
@@ -108,7 +109,7 @@ class Near(NamedTuple):
 
 
 @njit(**FAST)
-def find_near(shapes, world, work, motion, rules, span, old, surfaces, threads):
+def find_near(shapes, world, work, motion, rules, span, old, pieces):
     """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
 
     Sets in `work` how far each body may move until the next search, and which bodies have others near.
@@ -119,7 +120,7 @@ def find_near(shapes, world, work, motion, rules, span, old, surfaces, threads):
     swept(world, work, motion, rules, span)
     pairs = near_pairs(world, motion, work.low, work.high)
     manifolds = carried(world, motion, pairs, old)
-    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.contact_margin, surfaces, threads)
+    near = near_parts(shapes, world, work, motion, rules, pairs, pieces)
     for p in range(len(pairs)):
         if near.count[p, 0] + near.count[p, 1] > 0:
             work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True
@@ -143,8 +144,8 @@ def pair_kind(shapes, s, t):
 
 
 @njit(**FAST, inline="always")
-def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, threads):
-    """The parts of P pairs that are nearer than the bodies may move; `ways` [N] says how far each body may move."""
+def near_parts(shapes, world, work, motion, rules, pairs, pieces):
+    """The parts of P pairs that are nearer than the bodies may move."""
     count = len(pairs)
     start = np.zeros((count, 2), np.int64)
     total = 0
@@ -157,20 +158,28 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach, surfaces, thre
             if way == SURFACES and not is_round(shapes.table, own):
                 total += shapes.clump_leaf[shapes.clump_start[own + 1]] - shapes.clump_leaf[shapes.clump_start[own]]
             elif way == SOLIDS and side == 0:
-                pieces = shapes.solids.start[s + 1] - shapes.solids.start[s]
-                total += pieces * max(1, shapes.solids.start[t + 1] - shapes.solids.start[t])
+                solids = shapes.solids.start
+                total += (solids[s + 1] - solids[s]) * max(1, solids[t + 1] - solids[t])
             elif way == ROUND and side == 0:
                 total += 1  # the body itself
-    found = Parts(start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total))
-    parts, many = reference(found), False
+    found = Parts(pairs, start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total))
+    call(pieces.near, (shapes, world, work, motion, rules, reference(found)))
+    return _gathered(shapes, found)
+
+
+@njit(**FAST)
+def find_parts(shapes, world, work, motion, rules, parts, surfaces, threads):
+    """Fill in the parts that are near. Returns the number of pairs."""
+    matrix, pairs, ways, reach = work.matrix, parts.pair, work.motion_bound, rules.contact_margin
+    many = False
     if threads is not None:  # known at compile time
-        many = count >= MANY
+        many = len(pairs) >= MANY
         if many:
             _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts, surfaces)
     if not many:
-        for p in range(count):
+        for p in range(len(pairs)):
             _near(shapes, world, motion, matrix, pairs, ways, reach, parts, p, surfaces)
-    return _gathered(shapes, found)
+    return len(pairs)
 
 
 @njit(**FAST)
@@ -291,11 +300,9 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
 
 
 @njit(**BARE, inline="always")
-def narrow_phase(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, surfaces, threads):
-    """Update all manifolds to the present poses: move or drop old points, and find new ones.
-
-    `gone` [N] is how far any point of a body may have moved since `near` was made.
-    """
+def narrow_phase(shapes, world, work, motion, rules, manifolds, near, surfaces, threads):
+    """Update all manifolds to the present poses: move or drop old points, and find new ones."""
+    matrix, gone, scratch = work.matrix, work.moved, work.scratch
     if threads is not None:  # known at compile time
         if len(near.start) >= MANY:
             _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, surfaces)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba import int64, typeof
 
 from sdfsim.base.compiling import compile_before, running
 from sdfsim.physics import joint_columns, pose
@@ -22,10 +23,15 @@ from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.physics.solver.edges import nodes_within, points_within
-from sdfsim.physics.solver.joints import ROWS, Each, Factors, Graph, Held, Rows, Trial
+from sdfsim.physics.solver.joints import Each, Joints, Trial
 from sdfsim.physics.solver.manifold import scratch_room
-from sdfsim.physics.solver.run import HELD, SURFACES, THREADS, Kept, Script, run_steps
+from sdfsim.physics.solver.narrow_phase import Near, Parts
+from sdfsim.physics.solver.pieces import Piece, Pieces, chosen
+from sdfsim.physics.solver.references import Reference
+from sdfsim.physics.solver.rows import WIDTH as OF_ROW
+from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
+from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.validity import NO_LIMITS, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
@@ -40,6 +46,15 @@ SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "
 CROWD = 64  # number of dynamic bodies from which threads may test pairs
 TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
 INSTANTS = 4  # of a step, at which networks look for contacts
+NO_PARTS = Parts(
+    np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, np.int32),
+    np.zeros(0),
+)  # fmt: skip
+NOTHING_NEAR = Near(
+    np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 3)),
+    np.zeros(0), np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros(0, np.bool_), np.zeros((0, 3)),
+    np.zeros(0, np.bool_), np.zeros(0, np.int64),
+)  # fmt: skip
 NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 0, 6)))
 
 
@@ -80,23 +95,28 @@ class Compiled:
     def place(self, state: State) -> None:
         """Place static bodies as in `state`."""
         self.world = compiled_world(replace(self.bodies, shape=self._shape), state, self.shapes)
-        self.threads = True if np.count_nonzero(self.world.moves) >= CROWD else None
+        self.threads = np.count_nonzero(self.world.moves) >= CROWD
         if self.threads:
             numba.get_num_threads()  # starts the threads: cached code relies on that
         n = len(self.bodies)
         self.work = compiled.Work(
-            matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n, 3, 3)),
-            free=np.zeros((n, 9)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), wrench=np.zeros((n, 6)),
-            part=np.ones(n), ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
-            beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
+            matrix=pose.to_matrix(state.orientation), inverse=np.zeros((n + 1, 3, 3)),
+            inverse_mass=np.append(self.world.inverse_mass, 0.0),
+            matrix_before=pose.to_matrix(state.orientation), position_before=np.array(state.position),
+            twist=np.zeros((n + 1, 6)),
+            free=np.zeros((n + 1, 9)), change=np.zeros((n + 1, 6)), shift=np.zeros((n + 1, 6)),
+            wrench=np.zeros((n, 6)), part=np.ones(n), motion_bound=np.zeros(n), moved=np.zeros(n),
+            low=np.zeros((n, 3)), high=np.zeros((n, 3)),
+            beside=np.zeros(n, np.bool_), acted=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
-            scratch=scratch_room(),
+            turned=np.zeros((1, 4)), frame=np.zeros((1, 3, 3)), scratch=scratch_room(),
         )  # fmt: skip
-        self.held = held_by(self.bodies)
+        self.joints = joints_of(self.bodies)
         # Threads are used for all kinds of pairs alike.
-        self.surfaces = True if self.threads or meet_as_surfaces(self.bodies.contact) else None
+        self.surfaces = self.threads or meet_as_surfaces(self.bodies.contact)
         self.seen: compiled.Motion | None = None  # motion in which `points_near` searches
-        self._announced = False  # whether the step is known to be compiled
+        self.searches: Pieces | None = None  # its pieces, once they are compiled
+        self._pieces: Pieces | None = None  # those of the step, once they are compiled
         self._load: np.ndarray | None = None
         self._options: Options | None = None  # the options from which `_rules` were made
         self._latest: State | None = None  # the state whose arrays are `_motion` and `_manifolds`
@@ -107,20 +127,18 @@ class Compiled:
     ) -> tuple[Any, ...]:  # fmt: skip
         """Make `steps` steps and write to `motion`. Returns what `run_steps` does, and last the `Kept` of each step."""
         n, count = steps if keep else 0, len(self.bodies)
-        joints = 0 if self.held is None else len(self.held.each.body)
+        joints = len(self.joints.each.body)
         kept = Kept(
             np.empty((n, count, 3)), np.empty((n, count, 4)), np.empty((n, count, 3)), np.empty((n, count, 3)),
             np.empty((n, 3)), np.empty((n, 5), np.int64), np.empty(n), np.empty((n, joints, 7)),
         )  # fmt: skip
+        arguments = (self.shapes, self.world, self.work, motion, rules, manifolds, self.joints)
         # An integer of another type would cause another compilation.
-        arguments = (
-            self.shapes, self.world, self.work, motion, rules, manifolds, self.held, self.surfaces, self.threads,
-            script, most, kept, TOUCHING, int(steps),
-        )  # fmt: skip
-        if not self._announced:
-            self._announced = True
-            _compiled(arguments, joints > 0, self.surfaces is not None, self.threads is not None)
-        return *run_steps(*arguments), kept
+        others = script, most, kept, TOUCHING, int(steps)
+        if self._pieces is None:
+            used = chosen(surfaces=self.surfaces, threads=self.threads, joints=joints > 0)
+            self._pieces = _compiled("the contact step", run_steps, arguments, others, used)
+        return *run_steps(*arguments, self._pieces, *others), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make `steps` steps of the contact solve from `state`, or fewer if one leads to a state beyond the limits
@@ -129,13 +147,12 @@ class Compiled:
         if state is not self._latest:
             self._motion, self._manifolds = taken_up(state)
             self._before = replace(state, touch=state.touch or _touch(self._motion, self._manifolds))
-            if self.held is not None:
-                each = self.held.each
-                each.state[:] = 0.0 if state.joints is None else state.joints
-                if state.joints is not None and self.bodies.joints is not None:
-                    each.number[:], each.state[:, joint_columns.TARGET] = jointed.driven(
-                        self.bodies.joints, state.joints, state.drive
-                    )
+            if state.joints is not None and self.bodies.joints is not None:
+                each = self.joints.each
+                each.state[:] = state.joints
+                each.number[:], each.state[:, joint_columns.TARGET] = jointed.driven(
+                    self.bodies.joints, state.joints, state.drive
+                )
         if state.load is not self._load:
             self.work.wrench[:] = 0.0 if state.load is None else state.load
             self._load = state.load
@@ -165,16 +182,15 @@ class Compiled:
         touch = self._before.touch.with_rows(
             rows,
             {
-                "touching": motion.touching[rows], "quiet": motion.quiet[rows],
-                "anchor": motion.anchor[rows], "island": motion.island[rows],
+                "quiet": motion.quiet[rows], "anchor": motion.anchor[rows], "island": motion.island[rows],
             },
             pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
         )  # fmt: skip
         arrays = (motion.position, motion.orientation, motion.velocity, motion.angular)
         moved = {name: array[rows] for name, array in zip(MOTION, arrays, strict=True)}
         known = state.joints
-        if self.held is not None and state.joints is not None:
-            known = self.held.each.state.copy()
+        if state.joints is not None:
+            known = self.joints.each.state.copy()
             known[:, joint_columns.TARGET] = state.joints[:, joint_columns.TARGET]  # as `driven` received it
         self._latest = self._before.with_rows(rows, moved, touch=touch, time=time, load=state.load, joints=known)
         last = self._counts(np.array([[*counts, (motion.island[rows] >= 0).sum()]]), spent) if done else {}
@@ -190,30 +206,49 @@ class Compiled:
         return {name: counts.get(name, np.zeros(len(known))) for name in (*COUNTS, *PHASES)}
 
 
-def _compiled(arguments: tuple, joints: bool, surfaces: bool, threads: bool) -> None:
-    """Make sure that the step is compiled for scenes with these features."""
-    words = {"joints": joints, "hollow shapes": surfaces and not threads, "many bodies": threads}
-    given = [word for word, some in words.items() if some]
-    what = "the contact step" + (f" for scenes with {', '.join(given)}" if given else "")
-    missing = {HELD: not joints, SURFACES: not surfaces, THREADS: not threads}
-    compile_before(run_steps, arguments, what, "two minutes" if joints else "a minute", missing)
+def _compiled(what: str, function: Any, arguments: tuple, others: tuple, used: dict[str, Piece]) -> Pieces:
+    """Make sure that a compiled function, which takes `arguments`, pieces and `others`, and its pieces are compiled.
+    Returns the addresses of the pieces that are `used`."""
+    shapes, world, work, motion, rules, manifolds, *joints = (Reference(typeof(each)) for each in arguments)
+    near = (shapes, world, work, motion, rules)
+    types = {
+        "near": (*near, Reference(typeof(NO_PARTS))),
+        "collide": (*near, manifolds, Reference(typeof(NOTHING_NEAR))),
+        "assemble": (*near[1:], *joints, int64),
+        "solve": (*near[1:], manifolds, *joints, int64),
+    }
+    types["impact"] = types["collide"]
+    nowhere = Pieces(0, 0, 0, 0, 0)
+    whole = tuple(typeof(each) for each in (*arguments, nowhere, *others))
+    jobs = [(piece, types[of]) for of, piece in used.items()]
+    compile_before([(function, whole), *jobs], what)
+    return nowhere._replace(**{of: piece.address(types[of]) for of, piece in used.items()})
 
 
 def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
     """Poses and velocities of paths for `steps` steps, and the time after them. Velocities change in each inner step:
-    if they jumped once a step, bodies on an accelerating tray would slip."""
+    if they jumped once a step, bodies on an accelerating tray would slip. The last is that at the end of the step."""
     inner, count = rules.substep_dt, rules.options.substeps
     times = [time]
     for _ in range(steps):
         times.append(times[-1] + inner * count)  # added up as single steps do, bit by bit
-    if tracks is None:
+    if tracks is None or not steps:
         return NO_SCRIPT, times[-1]
-    instants = [t + inner * k for t in times[:-1] for k in range(count)]
-    place, turn = (np.stack(part) for part in zip(*map(tracks.at, [*instants, times[-1]]), strict=True))
-    spin = pose.to_rotvec(pose.multiply(turn[1:], pose.conjugate(turn[:-1])))
-    speeds = np.concatenate([np.diff(place, axis=0), spin], -1) / inner
-    ends = np.concatenate([place, turn], -1)[count::count]
-    return Script(tracks.body, ends, speeds.reshape(steps, count, len(tracks.body), 6)), times[-1]
+    instants = np.array([[t + inner * k for k in range(count)] for t in times[:-1]])
+    after, half = np.array(times[1:])[:, None], 0.5 * inner
+    place, turn = _at(tracks, np.concatenate([instants, after, after - half, after + half], 1))
+    speeds = np.empty((steps, count + 1, len(tracks.body), 6))
+    for k, (one, other) in enumerate([*((k, k + 1) for k in range(count)), (count + 1, count + 2)]):
+        speeds[:, k, :, :3] = place[:, other] - place[:, one]
+        speeds[:, k, :, 3:] = pose.to_rotvec(pose.multiply(turn[:, other], pose.conjugate(turn[:, one])))
+    return Script(tracks.body, np.concatenate([place, turn], -1)[:, count], speeds / inner), times[-1]
+
+
+def _at(tracks: Tracks, instants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [n, m, S, 3] and orientations [n, m, S, 4] at instants [n, m]."""
+    found = zip(*map(tracks.at, instants.flat), strict=True)
+    place, turn = (np.stack(part) for part in found)
+    return place.reshape(*instants.shape, -1, 3), turn.reshape(*instants.shape, -1, 4)
 
 
 def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
@@ -223,16 +258,16 @@ def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
     touch = state.touch
     if touch is None:
         still, nobody = np.zeros(len(position), np.int64), np.full(len(position), -1, np.int64)
-        known = still > 0, still, np.concatenate([position, orientation, position, orientation], 1), nobody
+        known = still, np.concatenate([position, orientation, position, orientation], 1), nobody
     else:
-        known = (array.copy() for array in (touch.touching, touch.quiet, touch.anchor, touch.island))
+        known = (array.copy() for array in (touch.quiet, touch.anchor, touch.island))
     return compiled.Motion(position, orientation, *velocities, *known), _manifolds(touch)
 
 
 def _touch(motion: compiled.Motion, manifolds: compiled.Manifolds) -> Touch:
     return Touch(
-        touching=motion.touching.copy(), quiet=motion.quiet.copy(), anchor=motion.anchor.copy(),
-        island=motion.island.copy(), pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
+        quiet=motion.quiet.copy(), anchor=motion.anchor.copy(), island=motion.island.copy(),
+        pair=manifolds.pair, count=manifolds.count, point=manifolds.point,
     )  # fmt: skip
 
 
@@ -242,23 +277,22 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, moved: np.ndarr
     acts on them."""
     touch = state.touch
     if bodies.joints is not None and state.joints is not None and changed.any():
-        # Impulses of joints at changed bodies, and at all bodies connected to them, are no longer known.
         place = jointed.coordinates(
             bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
         )
         known = state.joints.copy()
-        known[:, joint_columns.COORD], known[:, joint_columns.FRESH] = place, 1.0
+        known[:, joint_columns.COORD] = place
         state = replace(state, joints=known)
     if touch is None:
         return state
-    island, quiet, touching = (array.copy() for array in (touch.island, touch.quiet, touch.touching))
+    island, quiet = touch.island.copy(), touch.quiet.copy()
     beside = touch.pair[touch.count > 0]
     restless = changed.copy()
     restless[beside[changed[beside[:, 1]], 0]] = True
     restless[beside[changed[beside[:, 0]], 1]] = True
     up = np.full(len(island), gravity) | np.isin(island, island[restless & (island >= 0)])
-    island[up], quiet[up | changed], touching[moved] = -1, 0, False
-    return replace(state, touch=replace(touch, island=island, quiet=quiet, touching=touching))
+    island[up], quiet[up | changed] = -1, 0
+    return replace(state, touch=replace(touch, island=island, quiet=quiet))
 
 
 def contact_points(state: State) -> Touching:
@@ -298,17 +332,18 @@ def points_near(scene: Compiled, state: State, options: Options) -> tuple[np.nda
             array[going] = at.rows_of(name, going)
         rules = compiled_rules(options)._replace(ahead=(1.0 - part) * options.dt)
         soon = options.dt / INSTANTS
-        arguments = (scene.shapes, scene.world, scene.work, motion, rules, _manifolds(None), scene.surfaces, soon)
-        if not k:
-            missing = {6: scene.surfaces is None}
-            compile_before(points_within, arguments, "the search for contacts", "half a minute", missing)
-        pair, value = points_within(*arguments)
+        arguments = (scene.shapes, scene.world, scene.work, motion, rules, _manifolds(None))
+        if scene.searches is None:
+            used = chosen(surfaces=scene.surfaces, threads=False, joints=False)
+            used = {of: used[of] for of in ("near", "collide")}
+            scene.searches = _compiled("the search for contacts", points_within, arguments, (soon,), used)
+        pair, value = points_within(*arguments, scene.searches, soon)
         key = pair[:, 0] * len(scene.bodies) + pair[:, 1]
         due = np.setdiff1d(key[value[:, 10] <= rules.contact_margin], known)
-        chosen = np.isin(key, due)
+        fresh = np.isin(key, due)
         value[:, 10] = part
-        pairs.append(pair[chosen])
-        values.append(value[chosen])
+        pairs.append(pair[fresh])
+        values.append(value[fresh])
         known = np.concatenate([known, due])
     return np.concatenate(pairs), np.concatenate(values)
 
@@ -464,29 +499,26 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
     )  # fmt: skip
 
 
-def held_by(bodies: Bodies) -> Held | None:
-    """The joints of a scene, with buffers for an inner step; None if there are none."""
-    joints = bodies.joints
-    if joints is None or not len(joints):
-        return None
+def joints_of(bodies: Bodies) -> Joints:
+    """The joints of a scene, with buffers for an inner step."""
+    joints = bodies.joints if bodies.joints is not None else jointed.joints_of((), bodies.com, length=1, time=1, mass=1)
     order = jointed.ordered(joints, bodies.moves)
     n, j, k, f = len(bodies), len(joints), len(order.node), len(order.row)
 
     def room(*shape: int) -> np.ndarray:
         return np.zeros(shape)
 
-    return Held(
+    return Joints(
         graph=Graph(**vars(order)),
         factors=Factors(room(k, 6, 6), room(k, 6, 6), room(f, 6, 6), room(f, 6, 6), room(k, 6)),
         each=Each(
             joints.body, joints.kind, joints.anchor, joints.axes, joints.number.copy(), room(j, joint_columns.STATE),
-            room(j, 1, 12),
+            room(j, OF_ROW),
         ),
-        rows=Rows(
-            room(j, ROWS, 12), np.zeros((j, ROWS), np.int64), room(j, ROWS), room(j, ROWS), room(j, ROWS),
-            room(j, ROWS), room(j, ROWS), room(1, 24),
+        held=Held(
+            joints.body, room(j, EQUATIONS, OF_ROW), np.zeros((j, EQUATIONS), np.int64),
+            *(room(j, EQUATIONS) for _ in range(5)),
         ),
-        trial=Trial(room(n, 3), room(n, 4), room(n, 3), room(n, 3), room(n, 3, 3), room(1, 4), room(1, 3, 3)),
-        reply=room(n, 6),
-        calm=np.zeros(n, np.bool_),
+        trial=Trial(room(n, 3), room(n, 4), room(n, 3), room(n, 3, 3)),
+        reply=room(n + 1, 6),
     )  # fmt: skip

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils, config
 from numba.core.imputils import impl_ret_borrowed
@@ -68,6 +69,23 @@ def _reference(typing: Any, value: types.Type) -> Any:
     return Reference(value)(value), code
 
 
+@intrinsic
+def _call(typing: Any, address: types.Type, arguments: types.Type) -> Any:
+    if not isinstance(arguments, types.BaseTuple):
+        return None
+
+    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        kinds = [context.get_value_type(each) for each in arguments]
+        function = ir.FunctionType(context.get_value_type(types.int64), kinds)
+        place = builder.inttoptr(given[0], function.as_pointer())
+        return builder.call(place, cgutils.unpack_tuple(builder, given[1], len(kinds)))
+
+    return types.int64(types.int64, arguments), code
+
+
+# Call a function at an address with a tuple of references and whole numbers; it returns a whole number. Nothing checks
+# the types of the arguments.
+call: Any = (lambda function, arguments: function(*arguments)) if vars(config)["DISABLE_JIT"] else _call
 # A reference to a NamedTuple, for compiled code; None for None. Numba frees arrays after the last use of the variable
 # that holds them, so take references of arguments only, or of variables that are used again after the last use of the
 # reference.

@@ -9,13 +9,12 @@ from numba import njit
 
 from sdfsim.physics.joint_columns import COORD, PULL
 from sdfsim.physics.solver.advance import advance
-from sdfsim.physics.solver.joints import given, rest_held, stored
+from sdfsim.physics.solver.joints import begin_step, given, stored
 from sdfsim.physics.solver.references import reference
 from sdfsim.physics.solver.sleep import rests
 from sdfsim.physics.solver.survey import broken, energy, touching
 from sdfsim.physics.solver.vectors import BARE, ENTRY, FAST, add, dot, get, put, sub
 
-HELD, SURFACES, THREADS = 6, 7, 8  # positions of the arguments of `run_steps` that may be None
 ROOM = 64  # number of contact points for which a recording has room at first
 
 
@@ -24,7 +23,8 @@ class Script(NamedTuple):
 
     body: np.ndarray  # [S] int64
     pose: np.ndarray  # [n, S, 7] position and orientation at the end of a step
-    velocity: np.ndarray  # [n, m, S, 6] velocity and angular velocity that lead there, for each of m inner steps
+    # [n, m + 1, S, 6] velocity and angular velocity that lead there, for each of m inner steps, and at the end
+    velocity: np.ndarray
 
 
 class Kept(NamedTuple):
@@ -41,16 +41,12 @@ class Kept(NamedTuple):
 
 
 @njit(**ENTRY, nogil=True)
-def run_steps(
-    shapes, world, work, motion, rules, manifolds, held, surfaces, threads, script, most, kept, within, steps
-):
-    """Advance `motion`, and the state of joints in `held`, by the given number of steps, in place. Ends early at the
+def run_steps(shapes, world, work, motion, rules, manifolds, joints, pieces, script, most, kept, within, steps):
+    """Advance `motion`, and the state of `joints`, by the given number of steps, in place. Ends early at the
     first invalid state.
 
     Args:
-        held: None if no joint holds bodies. Code for an argument that is None is not compiled.
-        surfaces: True if shapes may meet as surfaces, else None.
-        threads: True if there may be enough pairs for threads to pay off, else None.
+        pieces: the addresses of `Pieces` that fit the scene.
         most: [5] limits of a valid state, see `survey.broken`.
         within: bodies that are no farther apart count as touching.
 
@@ -61,7 +57,7 @@ def run_steps(
         of bodies that touch [C, 2] and the points [C, 3] where they touch.
     """
     shapes, world, work = reference(shapes), reference(world), reference(work)
-    motion, rules, written = reference(motion), reference(rules), reference(kept)
+    motion, rules, written, joints = reference(motion), reference(rules), reference(kept), reference(joints)
     going, dt = world.going, rules.substep_dt * rules.options.substeps
     place, spin = np.empty((len(going), 3)), np.empty((len(going), 3))
     pair, point, found = np.empty((ROOM, 2), np.int64), np.empty((ROOM, 3)), 0
@@ -71,20 +67,18 @@ def run_steps(
             b = script.body[s]
             for x in range(3):
                 # The mean velocity determines which bodies a scripted body may reach in the step.
-                motion.velocity[b, x] = script.velocity[k, :, s, x].mean()
-                motion.angular[b, x] = script.velocity[k, :, s, 3 + x].mean()
+                motion.velocity[b, x] = script.velocity[k, :-1, s, x].mean()
+                motion.angular[b, x] = script.velocity[k, :-1, s, 3 + x].mean()
         for i in range(len(going)):
             put(place, i, get(motion.position, going[i]))
             put(spin, i, get(motion.angular, going[i]))
         if rules.options.sleep and rests(world, motion):
             counts = (0, 0, 0)
-            _rest_on(world, work, motion)
-            if held is not None:
-                rest_held(held.each)
+            for b in world.going:  # the full step would find no near bodies, and change nothing
+                work.met[b] = False
+            begin_step(joints.each, True)
         else:
-            manifolds, counts = advance(
-                shapes, world, work, motion, rules, manifolds, held, surfaces, threads, script, k
-            )
+            manifolds, counts = advance(shapes, world, work, motion, rules, manifolds, joints, pieces, script, k)
         for s in range(len(script.body)):
             b = script.body[s]
             for x in range(3):
@@ -100,13 +94,11 @@ def run_steps(
                 if wrong >= 0:
                     return manifolds, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
         pulled = _pulled(going, work.wrench, motion, place, spin, dt)
-        if held is not None:
-            pulled += given(held.each)
+        pulled += given(joints.each)
         total += pulled
         if len(kept.depth):
             _keep(written, k, world, motion, rules, counts, pulled)
-            if held is not None:
-                _keep_joints(written, k, held.each)
+            _keep_joints(written, k, joints.each)
             here = touching(manifolds, motion.position, motion.orientation, within)
             pair, point = _with_room(pair, point, found, found + len(here.pair))
             written.count[k, 4], written.depth[k] = len(here.pair), 0.0
@@ -116,13 +108,6 @@ def run_steps(
                 written.depth[k] = max(written.depth[k], -here.gap[e])
                 found += 1
     return manifolds, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
-
-
-@njit(**BARE)
-def _rest_on(world, work, motion):
-    """A step in which all bodies sleep: the full step would find no near bodies, and change nothing."""
-    for b in world.going:
-        motion.touching[b] = work.met[b] = False
 
 
 @njit(**BARE)

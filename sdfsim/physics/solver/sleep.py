@@ -22,6 +22,14 @@ def rests(world, motion):
 
 
 @njit(**BARE)
+def _wake(motion, island):
+    for c in range(len(motion.island)):
+        if motion.island[c] == island:
+            motion.island[c] = -1
+            motion.quiet[c] = 0
+
+
+@njit(**BARE)
 def woken(world, motion, manifolds, near):
     """Wake the islands that something awake may touch in this step. Returns whether there were any."""
     found = False
@@ -30,32 +38,34 @@ def woken(world, motion, manifolds, near):
         if near.count[p, 0] + near.count[p, 1] == 0:
             continue
         for sleeper, other in ((a, b), (b, a)):
-            island = motion.island[sleeper]
-            if island < 0:
-                continue
-            awake = motion.island[other] < 0 and (world.moves[other] or world.scripted[other])
             moving = norm(get(motion.velocity, other)) + norm(get(motion.angular, other)) > 0.0
-            if awake and moving:
+            if motion.island[sleeper] >= 0 and stirs(world, motion, other) and moving:
                 found = True
-                for c in range(len(motion.island)):
-                    if motion.island[c] == island:
-                        motion.island[c] = -1
-                        motion.quiet[c] = 0
-                        motion.touching[c] = True
+                _wake(motion, motion.island[sleeper])
+    return found
+
+
+@njit(**BARE)
+def roused(world, motion, body):
+    """Wake sleeping bodies that a joint holds to a scripted moving body. Returns whether there were any."""
+    found = False
+    for j in range(len(body)):
+        a = _driven_by_path(world, motion, body, j)
+        if a >= 0 and motion.island[a] >= 0:
+            found = True
+            _wake(motion, motion.island[a])
     return found
 
 
 @njit(**FAST)
-def put_to_sleep(world, motion, rules, manifolds, held):
-    """Freeze the islands whose bodies have all stayed in place for long enough; joints join bodies as contacts do.
-    `held` is None if there are no joints."""
+def put_to_sleep(world, work, motion, rules, manifolds, joints):
+    """Freeze the islands whose bodies have all stayed in place for long enough; joints join bodies as contacts do."""
     n, rests = len(world.shape), False
     for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
             continue
-        stays = motion.touching[b]
-        if held is not None:
-            stays = stays or held.graph.of_body[b] >= 0
+        stays = work.acted[b]
+        stays = stays or joints.graph.of_body[b] >= 0
         if stays and _strayed(world, motion, b, 0) < rules.stray:
             motion.quiet[b] += 1
         else:
@@ -74,9 +84,11 @@ def put_to_sleep(world, motion, rules, manifolds, held):
         if manifolds.count[m] and world.moves[a] and world.moves[b]:
             join(parent, a, b)
     restless = np.zeros(n, np.bool_)
-    if held is not None:
-        _join_held(world, held.each.body, parent)
-        _stir_held(world, motion, held.each.body, parent, restless)
+    _join_held(world, joints.each.body, parent)
+    for j in range(len(joints.each.body)):
+        a = _driven_by_path(world, motion, joints.each.body, j)
+        if a >= 0:
+            restless[root(parent, a)] = True
     for b in range(n):
         if world.moves[b] and motion.island[b] < 0 and motion.quiet[b] < rules.rest:
             restless[root(parent, b)] = True
@@ -93,7 +105,6 @@ def put_to_sleep(world, motion, rules, manifolds, held):
             motion.island[b] = number + root(parent, b)
             put(motion.velocity, b, (0.0, 0.0, 0.0))
             put(motion.angular, b, (0.0, 0.0, 0.0))
-            motion.touching[b] = True
 
 
 @njit(**BARE)
@@ -106,14 +117,14 @@ def _join_held(world, joint, parent):
 
 
 @njit(**BARE)
-def _stir_held(world, motion, joint, parent, restless):
-    """Mark bodies that a joint holds to a moving scripted body as restless."""
-    for j in range(len(joint)):
-        for s in range(2):
-            a, b = joint[j, s], joint[j, 1 - s]
-            if a >= 0 and b >= 0 and world.scripted[b] and world.moves[a]:
-                if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
-                    restless[root(parent, a)] = True
+def _driven_by_path(world, motion, body, j):
+    """The dynamic body that joint j holds to a scripted body that moves, or -1."""
+    for s in range(2):
+        a, b = body[j, s], body[j, 1 - s]
+        if a >= 0 and b >= 0 and world.moves[a] and world.scripted[b]:
+            if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
+                return a
+    return -1
 
 
 @njit(**BARE)

@@ -32,7 +32,7 @@ def time_of_impact(shapes, world, work, motion, rules, manifolds, near, scratch,
         if world.moves[b] or world.scripted[b]:
             speed += norm(_after(motion.angular, free, change, 3, b)) * world.radius[b]
         depth = _harmless(shapes, world, a, b)
-        away = near.away_all[p] - work.gone[a] - work.gone[b]
+        away = near.away_all[p] - work.moved[a] - work.moved[b]
         if speed * rules.substep_dt > depth and not away > speed * rules.substep_dt:
             free_part = _until_near(
                 shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth, surfaces
@@ -63,7 +63,7 @@ def _harmless(shapes, world, a, b):
 def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth, surfaces):
     """The part of the inner step by which a pair may move until it overlaps slightly, by conservative advancement."""
     free, change = work.free, work.change
-    gone = work.gone[manifolds.pair[p, 0]] + work.gone[manifolds.pair[p, 1]]
+    gone = work.moved[manifolds.pair[p, 0]] + work.moved[manifolds.pair[p, 1]]
     place, frame, turned = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 4))
     scales, coms = np.empty(2), np.empty((2, 3))
     for side in range(2):

@@ -106,6 +106,18 @@ def turn_back(m, i, v):
 
 
 @njit(**BARE)
+def rotated_matrix(m, tensor, i, out):
+    """Write the tensor [N, 3, 3] of body i in its own axes, turned by m[i], to `out` [3, 3]."""
+    for x in range(3):
+        for y in range(3):
+            total = 0.0
+            for u in range(3):
+                for w in range(3):
+                    total += m[i, x, u] * tensor[i, u, w] * m[i, y, w]
+            out[x, y] = total
+
+
+@njit(**BARE)
 def to_matrix(q, i, out):
     """Write the rotation matrix of quaternion q[i] (xyzw) to out[i]."""
     x, y, z, w = q[i, 0], q[i, 1], q[i, 2], q[i, 3]

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from sdfsim.physics.options import ROUNDS, SLOP, Options
+from sdfsim.physics.solver.vectors import BARE
 
 POINTS = 24  # largest number of points of a manifold
 # Columns of a contact point: its position on each body (about its centre of mass, in its axes); the unit normal from
-# the second body to the first (world); the distance; the impulses of the last inner step, along the normal and
+# the second body to the first (world); the distance; the impulses of a whole inner step, along the normal and
 # tangential (world); the two patches that meet there; the factor by which friction acts nearer to the middle of the
 # patch than the point is; and whether it is void, see `internal_edges`.
 FIRST, SECOND, NORMAL, GAP, NORMAL_IMPULSE, TANGENTIAL, KEY, TORSION, VOID, COLUMNS = (
@@ -25,6 +27,18 @@ FIRST, SECOND, NORMAL, GAP, NORMAL_IMPULSE, TANGENTIAL, KEY, TORSION, VOID, COLU
     16,
     17,
 )
+
+
+# Phases of a step. Its kicks (changes of velocity) and moves alternate: half a kick at the start, a move, whole kicks
+# between moves, and half a kick at the end. So velocities between steps are those at an instant, and free flight is an
+# exact parabola (velocity Verlet; RATTLE for joints).
+START, BETWEEN, END = range(3)
+
+
+@njit(**BARE)
+def kick_of(phase):
+    """The part of an inner step for which forces act before the next move."""
+    return 1.0 if phase == BETWEEN else 0.5
 
 
 class World(NamedTuple):
@@ -66,28 +80,40 @@ class Work(NamedTuple):
     """Buffers that a step fills for dynamic and scripted bodies; others keep their values, so that they cost
     nothing."""
 
-    # matrix, inverse: [N, 3, 3] rotation and inverse inertia, world axes
+    # matrix [N, 3, 3], inverse [N + 1, 3, 3]: rotation and inverse inertia, world axes
     matrix: np.ndarray
     inverse: np.ndarray
-    # free [N, 9]: change of velocities in an inner step without contact; and of the angular one by the gyroscopic
-    # torque. change, shift [N, 6]: what contacts add; and velocities that move bodies once and do not last
+    inverse_mass: np.ndarray  # [N + 1]
+    # matrix_before [N, 3, 3], position_before [N, 3]: before the last move
+    matrix_before: np.ndarray
+    position_before: np.ndarray
+    # All velocities that follow have a last entry for the world, which stays 0: joints to it have the body -1.
+    # twist [N + 1, 6]: velocities before the inner step. free [N + 1, 9]: their change without contacts and joints; and
+    # that of the angular one by the gyroscopic torque. change, shift [N + 1, 6]: what contacts and joints add; and
+    # velocities that move bodies once and do not last
+    twist: np.ndarray
     free: np.ndarray
     change: np.ndarray
     shift: np.ndarray
     wrench: np.ndarray  # [N, 6] force at the centre of mass and torque, world axes, that pull at a body during the step
     part: np.ndarray  # [N] part of the inner step by which a body may move
-    ways: np.ndarray  # [N] how far a body may move until the next search for near bodies
-    gone: np.ndarray  # [N] how far it has moved since
+    motion_bound: np.ndarray  # [N] how far a body may move until the next search for near bodies
+    moved: np.ndarray  # [N] how far it has moved since
     # low, high: [N, 3] the box of everything that it may reach until then
     low: np.ndarray
     high: np.ndarray
-    # beside, met: [N] bool, whether another body is near, and whether contacts acted in this step
+    # beside, acted, met: [N] bool, whether another body is near, and whether contacts or joints acted in this inner
+    # step, and in any of this step
     beside: np.ndarray
+    acted: np.ndarray
     met: np.ndarray
     # parent, number: [N] int64 for finding islands
     parent: np.ndarray
     number: np.ndarray
     latest: np.ndarray  # [N] int64 for finding the contacts of a body
+    # turned, frame: [1, 4] and [1, 3, 3] a pose on trial
+    turned: np.ndarray
+    frame: np.ndarray
     scratch: NamedTuple  # `manifold.Scratch`
 
 
@@ -99,9 +125,6 @@ class Motion(NamedTuple):
     # velocity, angular: [N, 3] of the centres of mass, world
     velocity: np.ndarray
     angular: np.ndarray
-    # [N] bool, whether contacts acted in the last inner step: the velocity is then the mean over this inner step, and
-    # not that at its end (so that it is 0 at rest)
-    touching: np.ndarray
     quiet: np.ndarray  # [N] int64, number of steps that a body has stayed near its anchor
     anchor: np.ndarray  # [N, 14] the pose that it has stayed near, and its pose half of that time later
     island: np.ndarray  # [N] int64, a number shared by the bodies that fell asleep together, -1 if awake

@@ -1,0 +1,1 @@
+"""`sdfsim identify`: parameters of a scene from recorded motions. Start reading at `optimiser`."""

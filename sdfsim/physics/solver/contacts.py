@@ -1,0 +1,228 @@
+"""Rows of contacts, compiled: today's law of contact, one block of rows for each point."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from sdfsim.physics.solver.broad_phase import frozen
+from sdfsim.physics.solver.rows import (
+    BEFORE,
+    CALM,
+    CONTACT,
+    IMPULSE,
+    LINEAR,
+    PUSH,
+    SHARE,
+    WANTED,
+    respond,
+    three,
+    within,
+    write_point,
+)
+from sdfsim.physics.solver.vectors import BARE, add, along, cross, dot, get, scale, sub, turn, vector
+from sdfsim.physics.solver.world import (
+    END,
+    FIRST,
+    GAP,
+    KEY,
+    NORMAL,
+    NORMAL_IMPULSE,
+    SECOND,
+    START,
+    TANGENTIAL,
+    TORSION,
+    VOID,
+    kick_of,
+)
+
+TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when bodies in contact meet
+AT_REST = 1e-9  # squared speed: slower tangential motion has no direction
+# Bodies that approach by more than this part of their thickness in an inner step rebound before they have touched, else
+# after: thin bodies would overlap deeply.
+THIN = 0.005
+# At most this many contacts of two bodies count for the energy that they may gain: the many points of a hollow shape
+# may gain no more than the corners of a box.
+FEW = 4
+
+
+@njit(**BARE)
+def most_contacts(world, motion, manifolds):
+    """Number of contact points of bodies that are awake."""
+    most = 0
+    for m in range(len(manifolds.count)):
+        if not frozen(world, motion, manifolds.pair[m, 0], manifolds.pair[m, 1]):
+            most += manifolds.count[m]
+    return most
+
+
+@njit(**BARE)
+def contact_rows(world, work, motion, rules, manifolds, rows, phase):
+    """Write the rows of all contacts that act. Returns the number of blocks.
+
+    At the end of a step the contacts act that have pushed in its last inner step, and those that rest on each other
+    within the slop: bodies do not approach there.
+    """
+    free, h, kick = work.free, rules.substep_dt, kick_of(phase)
+    # At the end of a step, contact points have not been searched again after the last move. They are taken where they
+    # were before it: at a body that rolls, they would have moved backwards with its surface, and their push would drive
+    # it.
+    matrix = work.matrix_before if phase == END else work.matrix
+    position = work.position_before if phase == END else motion.position
+    row, count = rows.row, 0
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        if frozen(world, motion, a, b):
+            continue
+        friction = world.friction[a] * world.friction[b] if rules.options.friction else 0.0
+        bounce = world.restitution[a] * world.restitution[b] if rules.options.restitution else 0.0
+        between = sub(get(position, a), get(position, b))
+        thin = THIN * min(world.thickness[a], world.thickness[b])
+        first_of_pair = count
+        for k in range(manifolds.count[m]):
+            point = manifolds.point[m, k]
+            n = three(point, NORMAL)
+            arm, other = met_half_way(
+                between, turn(matrix, a, three(point, FIRST)), turn(matrix, b, three(point, SECOND))
+            )
+            now = _relative(motion.velocity, motion.angular, a, b, arm, other)
+            coming = _coming(free, a, b, arm, other)
+            free_fall = add(now, coming)
+            then = add(free_fall, _turning(free, a, b, arm, other))
+            # The mean over the inner step before: velocities are those at an instant only at the start of a step.
+            approach = dot(sub(now, coming), n) if phase == START else dot(now, n)
+            gap = point[GAP]
+            way = -dot(then, n) * h
+            early = way > thin
+            too_far = gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)
+            if phase == END:
+                too_far = point[NORMAL_IMPULSE] == 0.0 and (gap + h * approach > rules.slop or -approach > rules.slow)
+            if point[VOID] > 0.0 or too_far:
+                point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
+                continue
+            # Newton's rule for all contacts of one impact: without friction and with e = 1, energy is conserved.
+            target, rebounds = 0.0, phase != END and bounce > 0.0 and abs(approach) > rules.slow
+            if rebounds:
+                # Bodies that rebound before they have touched get the speed that they will have here on their way back.
+                fall = 2.0 * dot(coming, n) / (kick * h) * max(gap, 0.0) * (1.0 - bounce * bounce)
+                square = bounce * bounce * approach * approach + (fall if early else 0.0)
+                target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
+            # An impact is over before a body has turned: the gyroscopic torque acts after it.
+            before = dot(free_fall, n) if rebounds else dot(then, n)
+            deep = push = rest = 0.0
+            if phase != END:
+                if gap > TOUCH:
+                    rest = -gap / h
+                    target = target if rebounds else rest
+                elif gap > -rules.split:
+                    if gap < -rules.slop:
+                        push = (-gap - rules.slop) * rules.erp / h
+                        target = max(push, target)
+                else:
+                    deep = -gap * rules.erp / h
+            rows.kind[count] = CONTACT
+            rows.where[count, 0], rows.where[count, 1], rows.where[count, 2], rows.where[count, 3] = m, k, a, b
+            write_point(row[count, 0], n, arm, other)
+            respond(work, rules, row[count, 0], a, b)
+            row[count, 0, WANTED] = target - before
+            row[count, 0, IMPULSE] = kick * point[NORMAL_IMPULSE]
+            rows.deep[count], rows.parted[count], rows.friction[count] = deep, 0.0, friction
+            rows.own[count, CALM], rows.own[count, BEFORE], rows.own[count, PUSH] = rest - before, before, push
+            for e in range(1, 3):
+                row[count, e, IMPULSE] = 0.0
+            if friction > 0.0:
+                if point[TORSION] < 1.0:
+                    arm, other = _drawn_in(matrix, manifolds.point, m, manifolds.count[m], k, a, b, between)
+                    then = add(
+                        _relative(motion.velocity, motion.angular, a, b, arm, other), _coming(free, a, b, arm, other)
+                    )
+                    then = add(then, _turning(free, a, b, arm, other))
+                one = _tangent(n, along(then, n, -dot(then, n)), vector(rules.options.gravity))
+                drag = three(point, TANGENTIAL)
+                for e in range(1, 3):
+                    axis = one if e == 1 else cross(n, one)
+                    write_point(row[count, e], axis, arm, other)
+                    respond(work, rules, row[count, e], a, b)
+                    row[count, e, WANTED] = -dot(then, axis)
+                    row[count, e, IMPULSE] = kick * dot(drag, axis)
+                share = within(row[count, 1, IMPULSE], row[count, 2, IMPULSE], friction * row[count, 0, IMPULSE])
+                row[count, 1, IMPULSE] *= share
+                row[count, 2, IMPULSE] *= share
+            count += 1
+        for c in range(first_of_pair, count):
+            rows.own[c, SHARE] = min(FEW / (count - first_of_pair), 1.0)
+    return count
+
+
+@njit(**BARE)
+def remember(manifolds, rows, phase):
+    """Write impulses to the manifolds, as those of a whole inner step."""
+    whole = 1.0 / kick_of(phase)
+    for c in range(len(rows.where)):
+        if rows.kind[c] != CONTACT:
+            continue
+        point = manifolds.point[rows.where[c, 0], rows.where[c, 1]]
+        point[NORMAL_IMPULSE] = whole * rows.row[c, 0, IMPULSE]
+        for x in range(3):
+            one, other = rows.row[c, 1], rows.row[c, 2]
+            drag = one[IMPULSE] * one[LINEAR + x] + other[IMPULSE] * other[LINEAR + x]
+            point[TANGENTIAL + x] = whole * drag if rows.friction[c] > 0.0 else 0.0
+
+
+@njit(**BARE)
+def met_half_way(between, arm, other):
+    """Move both ends of a contact half way towards each other: an impulse at one point conserves angular momentum."""
+    apart = add(between, sub(arm, other))
+    return along(arm, apart, -0.5), along(other, apart, 0.5)
+
+
+@njit(**BARE)
+def _drawn_in(matrix, point, m, count, k, a, b, between):
+    """Where friction acts for a point that bounds a face: nearer to the middle of the points of the same two
+    patches."""
+    middle, opposite, alike = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
+    for e in range(count):
+        if point[m, e, KEY] == point[m, k, KEY]:
+            middle, opposite = add(middle, three(point[m, e], FIRST)), add(opposite, three(point[m, e], SECOND))
+            alike += 1
+    own, share = point[m, k], point[m, k, TORSION]
+    arm = along(scale(middle, (1.0 - share) / alike), three(own, FIRST), share)
+    other = along(scale(opposite, (1.0 - share) / alike), three(own, SECOND), share)
+    return met_half_way(between, turn(matrix, a, arm), turn(matrix, b, other))
+
+
+@njit(**BARE)
+def _relative(velocity, angular, a, b, arm, other):
+    """Velocity of the point of the first body relative to that of the second."""
+    one = add(get(velocity, a), cross(get(angular, a), arm))
+    two = add(get(velocity, b), cross(get(angular, b), other))
+    return sub(one, two)
+
+
+@njit(**BARE)
+def _coming(free, a, b, arm, other):
+    """Change of the relative velocity by gravity and pulls."""
+    one = add((free[a, 0], free[a, 1], free[a, 2]), cross((free[a, 3], free[a, 4], free[a, 5]), arm))
+    two = add((free[b, 0], free[b, 1], free[b, 2]), cross((free[b, 3], free[b, 4], free[b, 5]), other))
+    return sub(one, two)
+
+
+@njit(**BARE)
+def _turning(free, a, b, arm, other):
+    """Change of the relative velocity by the gyroscopic torque."""
+    return sub(cross((free[a, 6], free[a, 7], free[a, 8]), arm), cross((free[b, 6], free[b, 7], free[b, 8]), other))
+
+
+@njit(**BARE)
+def _tangent(n, slip, gravity):
+    """The first direction of friction: along the slip, else along gravity's tangential part, else any."""
+    length = dot(slip, slip)
+    if length < AT_REST:
+        slip = along(gravity, n, -dot(gravity, n))
+        length = dot(slip, slip)
+        if length < 1e-6 * dot(gravity, gravity) + 1e-30:
+            axis = (1.0, 0.0, 0.0) if abs(n[0]) < 0.7 else (0.0, 1.0, 0.0)
+            slip = cross(n, axis)
+            length = dot(slip, slip)
+    return scale(slip, 1.0 / math.sqrt(length))
