@@ -64,6 +64,14 @@ class LiveScene(ABC):
         together."""
         return self._state
 
+    @abstractmethod
+    def alter(self, name: str, **fields: float) -> None:
+        """Give a body another mass, friction or restitution."""
+
+    @abstractmethod
+    def _row(self, name: str) -> int:
+        """The row of a body; raises SdfsimError if there is none of this name."""
+
     def change(self, row: int, **fields: np.ndarray | None) -> None:
         """Replace fields of the state that differ only in the row of one body."""
         self._state = replace(self._state, **fields)
@@ -101,11 +109,14 @@ class BodyHandle:
     """One body of a simulator, by its `name`: read it, set it, push and pull it. Changes take effect from the next step
     on."""
 
-    __slots__ = ("_row", "_simulator", "name")  # so that a misspelt name does not make a new attribute
+    __slots__ = ("_simulator", "name")  # so that a misspelt name does not make a new attribute
 
-    def __init__(self, simulator: LiveScene, row: int) -> None:
-        self._simulator, self._row = simulator, row
-        self.name = simulator.scene.bodies[row].name
+    def __init__(self, simulator: LiveScene, name: str) -> None:
+        self._simulator, self.name = simulator, name
+
+    @property
+    def _row(self) -> int:
+        return self._simulator._row(self.name)
 
     @property
     def centre(self) -> np.ndarray:
@@ -155,8 +166,30 @@ class BodyHandle:
 
     @property
     def mass(self) -> float:
-        """kg; 0 for a body that is not dynamic."""
+        """kg; 0 for a body that is not dynamic. Setting it scales the inertia."""
         return float(self._simulator.bodies.mass[self._row]) * self._simulator.units.mass
+
+    @mass.setter
+    def mass(self, mass: float) -> None:
+        self._simulator.alter(self.name, mass=mass)
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient; a contact has the product of both bodies'."""
+        return self._simulator.scene.bodies[self._row].friction
+
+    @friction.setter
+    def friction(self, friction: float) -> None:
+        self._simulator.alter(self.name, friction=friction)
+
+    @property
+    def restitution(self) -> float:
+        """Coefficient of restitution; a contact has the product of both bodies'."""
+        return self._simulator.scene.bodies[self._row].restitution
+
+    @restitution.setter
+    def restitution(self, restitution: float) -> None:
+        self._simulator.alter(self.name, restitution=restitution)
 
     @property
     def inertia(self) -> np.ndarray:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import numpy as np
 
@@ -16,25 +17,27 @@ from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import Progress, parallel, silent, threads
 from sdfsim.base.version import __version__
 from sdfsim.learned.model import SOLVER, Model, load_model
-from sdfsim.physics.bodies import Bodies, Moment, State, from_scene
-from sdfsim.physics.joint_columns import TARGET
+from sdfsim.physics import pose
+from sdfsim.physics.bodies import Bodies, Moment, State, Units, from_scene
+from sdfsim.physics.joint_columns import BROKEN, COORD, FRESH, TARGET
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
-from sdfsim.physics.steps import Frames, Steps
+from sdfsim.physics.steps import Frames
 from sdfsim.physics.units import inner_steps
 from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
-from sdfsim.scene.builder import loaded, plain, validated
+from sdfsim.scene.builder import SceneBuilder, loaded, plain, validated
+from sdfsim.scene.keys import BodyKeys
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.schema import BodyTable
 from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
 from sdfsim.simulate.joint import JointHandle
+from sdfsim.simulate.record import Recording
 from sdfsim.simulate.steppers import Carry, FreeFlight, energies_of, stacked, stepper_of
 
 if TYPE_CHECKING:
     from sdfsim.physics.solver.prepare import SharedShapes
-    from sdfsim.scene.builder import SceneBuilder
 
 GLANCE = 0.1  # s between two progress reports
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
@@ -52,6 +55,14 @@ class SimulationError(SdfsimError):
             hint += "; light bodies that joints hold to heavy ones may need some damping in their joints"
         super().__init__(message, hint, exit_code=EXIT_QUALITY)
         self.rollout = rollout
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A moment of a simulator with all that a `State` leaves out: the scene and the options at that time."""
+
+    state: State
+    attributes: Mapping[str, Any]
 
 
 class Simulator(LiveScene):
@@ -74,7 +85,8 @@ class Simulator(LiveScene):
         step, steps      make n steps: the state after all of them, or after each contact_points   contact points, with
         forces and normals joint            a joint by its name: its angle, its motor (`JointHandle`) reset back to the
         start state, restore   keep a state, and go back to it rollouts         many variants of the scene, on all cores
-        frames           a run in pieces, to show it while it runs
+        frames           a run in pieces, to show it while it runs record           keep what your own steps do
+        add, remove      bodies, while it runs
 
     Args:
         scene: bodies, shapes, gravity. A scene written in Python, the path of a file or the name of a sample is loaded
@@ -84,6 +96,7 @@ class Simulator(LiveScene):
         seed: seed of torch's generator (recorded; no step uses random numbers today).
         dt: s, the step; None: the scene's, else by the size of the bodies (a model has a fixed step in its units).
         free_flight: "exact", or "learned": networks on surface nodes then predict it, as in the papers.
+        units: those of another simulator, for states that the two share; None: by the bodies.
 
     Attributes:
         state: poses, velocities, contacts and more, model units; see `LiveScene`.
@@ -107,6 +120,7 @@ class Simulator(LiveScene):
         *,
         dt: float | None = None,
         free_flight: FreeFlight = "exact",
+        units: Units | None = None,
     ) -> None:
         say_compiling()
         self.scene = scene = loaded(scene)
@@ -123,7 +137,7 @@ class Simulator(LiveScene):
             _check_inputs(scene, model.name, joints=jointed)
         self.stepper, self.model, self.device = stepper, stepper.model, str(stepper.device)
         self.seed = scene.seed if seed is None else seed
-        self.units = stepper.units(scene, dt)
+        self.units = units or stepper.units(scene, dt)
         self.dt = self.model.dt * self.units.time
         self.outside_training = stepper.unknown([scene], self.units)
         surfaces = tuple(stepper.surface(shape) for shape in scene.shapes)
@@ -133,6 +147,7 @@ class Simulator(LiveScene):
         if jointed and not effects["contact"].on:
             self.bodies = replace(self.bodies, allowed=np.zeros_like(self.bodies.allowed))
         self._names = tuple(b.name for b in scene.bodies)
+        self._recordings: list[Recording] = []
         self._joint_names = tuple(joint.name for joint in scene.joints)
         self._joint_unit = [1.0 if joint.kind in ("hinge", "ball") else self.units.length for joint in scene.joints]
         check_sizes(self.bodies, self._names, self.units.length)
@@ -196,9 +211,9 @@ class Simulator(LiveScene):
         while made < count:
             some = min(some, count - made)
             started = running()
-            kept = self._advance(some, keep=True).frames
+            part = self._advance(some, keep=True)
             spent = running() - started
-            yield self._rollout(cast("Frames", kept), 1e3 * spent / some)
+            yield cast("Rollout", part)
             made += some
             if at_once is None:
                 some = max(1, min(2 * some, int(some * GLANCE / max(spent, 1e-6))))
@@ -221,6 +236,10 @@ class Simulator(LiveScene):
     def carry(self) -> Carry:
         """What the stepper keeps from step to step; made on first use."""
         if self._carry is None:
+            if self._shared is None and self.stepper.distances:
+                from sdfsim.physics.solver.prepare import SharedShapes
+
+                self._shared = SharedShapes()  # so that `restore` and `add` do not compile shapes again
             self._carry = self.stepper.init(self.bodies, self._state, self._options, self._shared)
             self._carry.checked = True
         return self._carry
@@ -241,13 +260,135 @@ class Simulator(LiveScene):
         self._changed.clear()
         self._carry, self._given = None, 0.0
         self.steps_done = round(state.time / self._options.dt)
+        for recording in self._recordings:
+            recording.cut(self._driven(self.initial_rollout()))
+
+    def snapshot(self) -> Snapshot:
+        """This moment, with the scene and the options. `rewind` returns to it exactly, whatever was changed since."""
+        left_out = ("_carry", "_recordings", "_shared", "_si")
+        return Snapshot(self.state, {name: value for name, value in vars(self).items() if name not in left_out})
+
+    def rewind(self, snapshot: Snapshot) -> None:
+        """Return to a `snapshot` of this simulator: bodies that were added since are gone, and removed ones are
+        back."""
+        vars(self).update(snapshot.attributes, _si=None, _changed=set())
+        self.restore(snapshot.state)
+
+    @contextmanager
+    def record(self) -> Iterator[Recording]:
+        """Keep the frames of all steps that are made inside a `with` block. Its `rollout` has them so far, also after
+        the block: `with simulator.record() as run: ...`."""
+        recording = Recording(self._driven(self.initial_rollout()))
+        self._recordings.append(recording)
+        try:
+            yield recording
+        finally:
+            self._recordings.remove(recording)
+
+    def alter(self, name: str, **fields: float) -> None:
+        """Give a body another mass, friction or restitution, from the next step on, with the limits of a scene file;
+        its inertia scales with its mass. Handles of bodies do the same: `simulator["ball"].friction = 0.2`."""
+        self._accept()
+        row, old = self._row(name), self.scene
+        body = _changed(old.bodies[row], fields, f"body {name!r}")
+        self.scene = replace(old, bodies=(*old.bodies[:row], body, *old.bodies[row + 1 :]))
+        ratio = body.mass / old.bodies[row].mass if "mass" in fields else 1.0
+        gravity, before = self._options.gravity, self.bodies
+        factors = {"mass": ratio, "inertia": ratio, "inverse_mass": 1.0 / ratio}
+        arrays = {key: getattr(before, key).copy() for key in (*factors, "friction", "restitution")}
+        for key, factor in factors.items():
+            arrays[key][row] *= factor
+        arrays["friction"][row], arrays["restitution"][row] = body.friction, body.restitution
+        self.bodies = replace(before, **arrays)
+        energy = [sum(energies_of(bodies, self._state, gravity)) for bodies in (before, self.bodies)]
+        self._given += energy[1] - energy[0]
+        if self._carry is not None:
+            self._carry.bodies, self._carry.weights, self._carry.tensors = self.bodies, None, None
+            if self._carry.scene is not None:
+                self._carry.scene.revise(self.bodies)
+        known, found = plan(old), plan(self.scene)
+        switched = {key: found[key].on for key in ("friction", "restitution") if found[key].on != known[key].on}
+        self.options = self._options._replace(**switched)
+        self._changed.add(row)
+
+    def add(self, name: str, **keys: Unpack[BodyKeys]) -> BodyHandle:
+        """Add a body while the simulation runs, with the keys of `Scene.add`; `become` says what stays. Raises
+        SdfsimError as `Scene.add` and `Simulator` do."""
+        if name in self._names:
+            raise SdfsimError(f"body {name!r}: two bodies have this name", "give each a name of its own")
+        made, (shapes, bodies) = SceneBuilder().add(name, **keys).load(), (self.scene.shapes, self.scene.bodies)
+        new = tuple(replace(body, shape=body.shape + len(shapes)) for body in made.bodies)
+        self.become(replace(self.scene, shapes=shapes + made.shapes, bodies=bodies + new))
+        return self[made.bodies[0].name]
+
+    def remove(self, name: str) -> None:
+        """Remove a body and its joints while the simulation runs; bodies that lay on it wake."""
+        row, scene = self._row(name), self.scene
+        number = {k: k - (k > row) for k in range(-1, len(scene.bodies))} | {-1: -1}
+        joints = [replace(j, bodies=(number[j.bodies[0]], number[j.bodies[1]])) for j in scene.joints
+                  if row not in j.bodies]  # fmt: skip
+        self.become(replace(scene, bodies=scene.bodies[:row] + scene.bodies[row + 1 :], joints=tuple(joints)))
+
+    def become(self, scene: Scene) -> None:
+        """Go on with another scene, in which bodies may be added at the end or removed. Bodies and joints of the same
+        names go on as they are; so do contacts and sleep, unless the new bodies change the step. Recordings begin anew.
+        Raises SdfsimError as `Simulator` does, and then nothing has changed."""
+        self._accept()
+        moment, was, before = self.si_state(), self._state, {name: k for k, name in enumerate(self._names)}
+        row = np.array([before.get(body.name, -1) for body in scene.bodies])
+        bodies = list(scene.bodies)
+        for k in np.flatnonzero(row >= 0):
+            arm = pose.rotate(moment.orientation[row[k]], self.bodies.com[row[k]]) * self.units.length
+            bodies[k] = replace(
+                bodies[k], position=moment.position[row[k]] - arm, quat_xyzw=moment.orientation[row[k]],
+                velocity=moment.velocity[row[k]], angular_velocity=moment.angular_velocity[row[k]],
+            )  # fmt: skip
+        units = self.stepper.units(scene, self._asked["dt"])
+        same = (units.length, units.time) == (self.units.length, self.units.time)
+        units = replace(units, mass=self.units.mass)
+        new = Simulator(replace(scene, bodies=tuple(bodies)), self.model, self.device, self.seed, units=units,
+                        **self._asked)  # fmt: skip
+        gone = np.setdiff1d(np.arange(len(before)), row)
+        ratio = self.units.length / units.length
+        state = replace(new._state, time=was.time * self.units.time / units.time)
+        if was.load is not None:
+            load = np.where(row[:, None] >= 0, was.load[row], 0.0) * self.units.acceleration / units.acceleration
+            load[:, 3:] *= ratio
+            state = replace(state, load=load if load.any() else None)
+        if same:
+            state = carried(self.bodies, was, state, row, gone)
+        if state.joints is not None and was.joints is not None:
+            state = self._with_joints(new, state, was, same=same)
+        kept = {name: vars(self)[name] for name in ("_recordings", "_shared")}
+        new._state = new._good = state
+        new.steps_done = round(state.time / new._options.dt)
+        vars(self).update(vars(new), **kept)  # handles, and whoever else knows this simulator, go on with it
+        for recording in self._recordings:
+            recording.begin(self._driven(self.initial_rollout()))
+
+    def _with_joints(self, new: Simulator, state: State, was: State, *, same: bool) -> State:
+        """The `state` of `new` with the joints of `was`. In other units (unless `same`) the impulses are unknown, and
+        numbers of motors that a user has changed are again those of the scene."""
+        known = np.array([self._joint_names.index(name) for name in new._joint_names], int)
+        joints = was.joints[known].copy()
+        if not same:
+            unit = np.array(self._joint_unit)[known] / np.array(new._joint_unit)
+            joints = state.joints.copy()
+            joints[:, COORD], joints[:, BROKEN] = was.joints[known, COORD] * unit, was.joints[known, BROKEN]
+            joints[:, TARGET] = was.joints[known, TARGET] * unit
+        joints[:, FRESH] = 1.0
+        return replace(state, joints=joints, drive=was.drive[known] if same and was.drive is not None else None)
 
     def __getitem__(self, name: str) -> BodyHandle:
         """A body by its name. Raises SdfsimError if no body has that name."""
+        self._row(name)
+        return BodyHandle(self, name)
+
+    def _row(self, name: str) -> int:
         if name not in self._names:
             close = nearest(name, self._names)
             raise SdfsimError(f"there is no body {name!r}{close}", f"bodies are {', '.join(self._names[:20])}")
-        return BodyHandle(self, self._names.index(name))
+        return self._names.index(name)
 
     def joint(self, name: str) -> JointHandle:
         """A joint by its name. Raises SdfsimError if no joint has that name."""
@@ -324,8 +465,10 @@ class Simulator(LiveScene):
         """The current state as a rollout of one frame. Raises as `steps` does."""
         self._accept()
         state, counts = self._state, {} if self._carry is None else self._carry.counts
-        one = state, 0.0, counts, self.stepper.touching(state, self._carry)
-        return self._rollout(stacked(state, [one], self.bodies, self._options), 0.0)
+        one, given = (state, 0.0, counts, self.stepper.touching(state, self._carry)), self._given
+        first = self._rollout(stacked(state, [one], self.bodies, self._options), 0.0)
+        self._given = given if self._recordings else 0.0  # a recording has yet to count it
+        return first
 
     def si_state(self) -> Moment:
         """Motion and time of the current state, in metres and seconds. To return to it later, keep `state` instead."""
@@ -343,17 +486,35 @@ class Simulator(LiveScene):
         moved = {name: changed[name] * unit for name, unit in u.motion.items() if name in changed}
         return self._si[1].with_rows(rows, moved, time=state.time * u.time)
 
-    def _advance(self, count: int, *, keep: bool = False) -> Steps:
-        """Make `count` steps, in one call if the stepper can."""
+    def _advance(self, count: int, *, keep: bool = False) -> Rollout | None:
+        """Make `count` steps, in one call if the stepper can. Returns their frames with `keep`, or if somebody
+        records."""
         self._accept(keep=keep)
-        made = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep)
+        started = running()
+        made = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep or bool(self._recordings))
         self._state = self._good = made.state
         self.steps_done += made.done
-        if not keep:
+        part = None
+        if made.frames is None:
             self._given += made.given
+        else:
+            part = self._rollout(made.frames, 1e3 * (running() - started) / max(made.done, 1))
+            for recording in self._recordings:
+                recording.add(self._driven(part))
         if made.fault is not None:
-            raise self._broke(self._described(made.fault), made.frames)
-        return made
+            raise self._broke(self._described(made.fault), part if keep else None)
+        return part
+
+    def _driven(self, part: Rollout) -> Rollout:
+        """The frames of steps in which motors did not change, with their targets and efforts as counters."""
+        found = {}
+        for k, joint in enumerate(self.scene.joints if part.joint_names else ()):
+            if joint.kind in ("hinge", "slider"):
+                handle = JointHandle(self, k)
+                found[f"target_{joint.name}"] = handle.target if handle.most else None
+                found[f"effort_{joint.name}"] = handle.effort
+        counters = {key: np.full(len(part.time), np.nan if v is None else v) for key, v in found.items()}
+        return replace(part, counters=part.counters | counters)
 
     def _accept(self, *, keep: bool = False) -> None:
         """Check the user's changes before anything is computed from them, and announce them to the stepper. Raises
@@ -373,7 +534,8 @@ class Simulator(LiveScene):
             broken = "time is not finite"
         if broken:
             self._state = good
-            raise self._broke(broken, stacked(good, [], self.bodies, self._options) if keep else None)
+            nothing = stacked(good, [], self.bodies, self._options)
+            raise self._broke(broken, self._rollout(nothing, 0.0) if keep else None)
         gravity = self._options.gravity
         self._given += sum(energies_of(self.bodies, state, gravity)) - sum(energies_of(self.bodies, good, gravity))
         self._state = self._good = self.stepper.announce(state, self.carry, changed, differing_motion(state, good))
@@ -381,12 +543,11 @@ class Simulator(LiveScene):
     def _described(self, fault: Fault) -> str:
         return f"body {self._names[fault.body]!r}: {fault.described(self.units, self._options.dt)}"
 
-    def _broke(self, what: str, frames: Frames | None = None) -> SimulationError:
+    def _broke(self, what: str, frames: Rollout | None = None) -> SimulationError:
         """The error, with the `frames` up to the last good state, or that state alone."""
         last = f"the last good state is that of step {self.steps_done}, t = {self.steps_done * self.dt:.4g} s"
         message = f"step {self.steps_done + 1}: {what}; {last}"
-        known = self.initial_rollout() if frames is None else self._rollout(frames, 0.0)
-        return SimulationError(message, known)
+        return SimulationError(message, self.initial_rollout() if frames is None else frames)
 
     def _rollout(self, frames: Frames, milliseconds: float) -> Rollout:
         """Frames up to the present step in SI units, each of which took `milliseconds`."""
@@ -437,6 +598,36 @@ def _whole(count: int) -> int:
     return int(count)
 
 
+def carried(bodies: Bodies, was: State, state: State, row: np.ndarray, gone: np.ndarray) -> State:
+    """The `state` of other bodies, with poses, contacts and sleep of `was` for those that were among `bodies`: `row`
+    [M] int64 is the former row of each, -1 for new ones. Those beside the bodies `gone` wake. Same units."""
+    if was.touch is not None and len(gone):
+        from sdfsim.physics.solver.prepare import disturbed
+
+        was = disturbed(bodies, was, np.isin(np.arange(len(bodies)), gone), np.zeros(len(bodies), bool))
+    known = row >= 0
+
+    def rows(name: str, of: Any, like: np.ndarray) -> np.ndarray:
+        like = like.copy()
+        like[known] = getattr(of, name)[row[known]]
+        return like
+
+    arrays: dict[str, Any] = {name: rows(name, was, getattr(state, name)) for name in MOTION}
+    touch = was.touch
+    if touch is not None:
+        number = np.full(len(bodies), -1)
+        number[row[known]] = np.flatnonzero(known)
+        pair = number[touch.pair]
+        kept, still = (pair >= 0).all(1), np.zeros(len(row), int)
+        place = np.concatenate([arrays["position"], arrays["orientation"]] * 2, 1)
+        arrays["touch"] = replace(
+            touch, touching=rows("touching", touch, still > 0), quiet=rows("quiet", touch, still),
+            anchor=rows("anchor", touch, place), island=rows("island", touch, still - 1),
+            pair=pair[kept], count=touch.count[kept], point=touch.point[kept],
+        )  # fmt: skip
+    return replace(state, **arrays)
+
+
 def differing(bodies: Bodies, state: State, other: State) -> np.ndarray:
     """[N] bool, the bodies whose motion, pulling force or motors differ between the two states."""
     found = differing_motion(state, other)
@@ -465,11 +656,11 @@ def varied(scene: Scene, variant: Variant) -> Scene:
     for name in variant:
         if name not in known:
             raise SdfsimError(f"variant: there is no body {name!r}{nearest(name, known)}")
-    return replace(scene, bodies=tuple(_changed(body, variant.get(body.name, {})) for body in scene.bodies))
+    made = (_changed(body, variant.get(body.name, {}), f"variant: body {body.name!r}") for body in scene.bodies)
+    return replace(scene, bodies=tuple(made))
 
 
-def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
-    what = f"variant: body {body.name!r}"
+def _changed(body: Body, fields: Mapping[str, Any], what: str) -> Body:
     for name in fields:
         if name not in VARIED:
             raise SdfsimError(f"{what}: {name}: no such field{nearest(name, VARIED)}; fields are {', '.join(VARIED)}")

@@ -121,6 +121,13 @@ class Compiled:
         self._options: Options | None = None  # the options from which `_rules` were made
         self._latest: State | None = None  # the state whose arrays are `_motion` and `_manifolds`
 
+    def revise(self, bodies: Bodies) -> None:
+        """Take over other masses, inertias, friction and restitution of the same bodies."""
+        self.bodies, world = bodies, self.world
+        for name in ("friction", "restitution", "inverse_mass", "inertia"):
+            getattr(world, name)[:] = getattr(bodies, name)
+        world.inverse_inertia[:] = np.linalg.inv(bodies.inertia) * bodies.moves[:, None, None]
+
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules, steps: int = 1,
         script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, keep: bool = False,
