@@ -19,7 +19,7 @@ from sdfsim.base.version import __version__
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, Moment, State, Units, from_scene
-from sdfsim.physics.joint_columns import BROKEN, COORD, FRESH, TARGET
+from sdfsim.physics.joint_columns import BROKEN, COORD, TARGET
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
@@ -376,7 +376,6 @@ class Simulator(LiveScene):
             joints = state.joints.copy()
             joints[:, COORD], joints[:, BROKEN] = was.joints[known, COORD] * unit, was.joints[known, BROKEN]
             joints[:, TARGET] = was.joints[known, TARGET] * unit
-        joints[:, FRESH] = 1.0
         return replace(state, joints=joints, drive=was.drive[known] if same and was.drive is not None else None)
 
     def __getitem__(self, name: str) -> BodyHandle:
@@ -511,7 +510,7 @@ class Simulator(LiveScene):
         for k, joint in enumerate(self.scene.joints if part.joint_names else ()):
             if joint.kind in ("hinge", "slider"):
                 handle = JointHandle(self, k)
-                found[f"target_{joint.name}"] = handle.target if handle.most else None
+                found[f"target_{joint.name}"] = handle.target if handle.max_force else None
                 found[f"effort_{joint.name}"] = handle.effort
         counters = {key: np.full(len(part.time), np.nan if v is None else v) for key, v in found.items()}
         return replace(part, counters=part.counters | counters)
@@ -621,9 +620,8 @@ def carried(bodies: Bodies, was: State, state: State, row: np.ndarray, gone: np.
         kept, still = (pair >= 0).all(1), np.zeros(len(row), int)
         place = np.concatenate([arrays["position"], arrays["orientation"]] * 2, 1)
         arrays["touch"] = replace(
-            touch, touching=rows("touching", touch, still > 0), quiet=rows("quiet", touch, still),
-            anchor=rows("anchor", touch, place), island=rows("island", touch, still - 1),
-            pair=pair[kept], count=touch.count[kept], point=touch.point[kept],
+            touch, quiet=rows("quiet", touch, still), anchor=rows("anchor", touch, place),
+            island=rows("island", touch, still - 1), pair=pair[kept], count=touch.count[kept], point=touch.point[kept],
         )  # fmt: skip
     return replace(state, **arrays)
 

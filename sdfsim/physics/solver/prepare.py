@@ -126,6 +126,7 @@ class Compiled:
         self.bodies, world = bodies, self.world
         for name in ("friction", "restitution", "inverse_mass", "inertia"):
             getattr(world, name)[:] = getattr(bodies, name)
+        self.work.inverse_mass[:-1] = bodies.inverse_mass
         world.inverse_inertia[:] = np.linalg.inv(bodies.inertia) * bodies.moves[:, None, None]
 
     def run(
