@@ -82,7 +82,7 @@ def play(
     source: Annotated[
         Path,
         typer.Argument(
-            help="scene.yaml, a name of `sdfsim samples`, a room, a Shape folder, a mesh, or a robot (.urdf .xml .mjcf).",
+            help="scene.yaml, a sample's name, a room, a Shape folder, a mesh, or a robot (.urdf .xml .mjcf).",
             show_default=False,
         ),
     ],

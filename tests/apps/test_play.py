@@ -54,7 +54,7 @@ def session() -> Session:
 
 def test_a_dragged_body_follows_the_pointer_by_the_point_that_was_taken(session):
     cube = session.simulator["cube"]
-    corner = cube.centre + (0.05, 0.05, 0.05)
+    corner = np.add(cube.centre, 0.05)
     session.grab("cube", corner)
     for k in range(60):
         session.drag("cube", corner + np.array([-0.4, 0.0, 0.3]) * (k + 1) / 60)
@@ -62,7 +62,7 @@ def test_a_dragged_body_follows_the_pointer_by_the_point_that_was_taken(session)
     after(session, 2.0)
     # It hangs from the corner, below the pointer: held by just its weight.
     grip = cube.centre + pose.rotate(cube.quat_xyzw, session.hands["cube"].grip)
-    np.testing.assert_allclose(grip, corner + (-0.4, 0.0, 0.3), atol=2e-3)
+    np.testing.assert_allclose(grip, np.add(corner, (-0.4, 0.0, 0.3)), atol=2e-3)
     np.testing.assert_allclose(cube.centre[:2], grip[:2], atol=5e-3)
     assert grip[2] - cube.centre[2] == pytest.approx(0.05 * np.sqrt(3), rel=0.02)
     assert np.linalg.norm(cube.velocity) < 0.02
@@ -96,7 +96,7 @@ def test_the_spring_is_as_strong_as_the_body_is_heavy():
 
 def test_a_key_turns_a_body_and_it_is_held_so_until_it_is_let_go(session):
     cube = session.simulator["cube"]
-    session.grab("cube", cube.centre, cube.centre + (-0.3, 0, 0.3))
+    session.grab("cube", cube.centre, np.add(cube.centre, (-0.3, 0, 0.3)))
     after(session, 0.5)
     for _ in range(6):
         session.turn("cube", (0, 0, 1), np.radians(15))
@@ -123,7 +123,7 @@ def test_a_link_of_a_robot_is_dragged_against_its_motors_and_sliders_set_their_t
     tip = session.simulator["lower"].centre
     for joint in ("elbow", "shoulder"):
         session.simulator.joint(joint).target = None
-    session.grab("lower", tip, tip + (-0.2, 0, 0.4))
+    session.grab("lower", tip, np.add(tip, (-0.2, 0, 0.4)))
     after(session, 2.0)
     assert np.linalg.norm(session.simulator["lower"].centre - tip - (-0.2, 0, 0.4)) < 0.1
     assert session.look(*session._seen_since(0.5)) == []
@@ -260,28 +260,35 @@ def test_an_impossible_state_pauses_and_is_told(session):
     session.step()
 
 
+def chances(session: Session, rng: np.random.Generator) -> dict:
+    """What a person may do next to a body by chance."""
+    names = [body.name for body in session.simulator.scene.bodies if body.motion == "dynamic"]
+    name, at = str(rng.choice(names)), rng.normal(size=3) * (0.3, 0.2, 0.1) + (0, 0, 0.7)
+    return {  # each is run before the next round
+        "grab": lambda: session.grab(name, session.simulator[name].centre + rng.normal(size=3) * 0.03, at),
+        "drag": lambda: session.drag(name, at),
+        "release": lambda: session.release(name),
+        "turn": lambda: session.turn(name, rng.normal(size=3), rng.normal()),
+        "hold": lambda: session.hold(name, held=bool(rng.random() < 0.5)),
+        "push": lambda: session.push(name, session.simulator[name].centre, rng.normal(size=3)),
+        "throw": lambda: session.throw(
+            np.add(rng.normal(size=3), (0, 0, 2.0)), np.add(rng.normal(size=3), (0, 0, -1.0))
+        ),
+        "friction": lambda: session.set(name, "friction", float(rng.uniform(0, 1.2))),
+        "restitution": lambda: session.set(name, "restitution", float(rng.uniform(0, 0.9))),
+        "mass": lambda: session.set(name, "mass", float(rng.uniform(0.1, 2.0))),
+        "back": lambda: session.back(float(rng.uniform(0, 1.0))),
+        "reset": session.reset,
+        "copy": lambda: len(names) < 8 and session.copy(name),
+        "delete": lambda: len(names) > 2 and session.delete(name),
+    }
+
+
 def test_random_commands_end_without_an_error_or_an_unreported_broken_law():
     rng, session = np.random.default_rng(5), Session(Simulator(tabletop()))
     session.playing = True
     for k in range(1000):
-        names = [body.name for body in session.simulator.scene.bodies if body.motion == "dynamic"]
-        name, at = str(rng.choice(names)), rng.normal(size=3) * (0.3, 0.2, 0.1) + (0, 0, 0.7)
-        acts = {
-            "grab": lambda: session.grab(name, session.simulator[name].centre + rng.normal(size=3) * 0.03, at),
-            "drag": lambda: session.drag(name, at),
-            "release": lambda: session.release(name),
-            "turn": lambda: session.turn(name, rng.normal(size=3), rng.normal()),
-            "hold": lambda: session.hold(name, held=bool(rng.random() < 0.5)),
-            "push": lambda: session.push(name, session.simulator[name].centre, rng.normal(size=3)),
-            "throw": lambda: session.throw(rng.normal(size=3) + (0, 0, 2.0), rng.normal(size=3) - (0, 0, 1.0)),
-            "friction": lambda: session.set(name, "friction", float(rng.uniform(0, 1.2))),
-            "restitution": lambda: session.set(name, "restitution", float(rng.uniform(0, 0.9))),
-            "mass": lambda: session.set(name, "mass", float(rng.uniform(0.1, 2.0))),
-            "back": lambda: session.back(float(rng.uniform(0, 1.0))),
-            "reset": session.reset,
-            "copy": lambda: len(names) < 8 and session.copy(name),
-            "delete": lambda: len(names) > 2 and session.delete(name),
-        }
+        acts = chances(session, rng)
         rare = ("throw", "back", "reset", "copy", "delete", "mass", "hold")
         weights = np.array([0.2 if act in rare else 1.0 for act in acts])
         if rng.random() < 0.2:
@@ -397,10 +404,12 @@ def test_a_saved_run_is_read_by_the_other_commands(tmp_path):
 def test_a_mesh_a_shape_a_room_and_a_robot_are_opened(tmp_path):
     assert [body.name for body in Simulator(opened("samples/shapes/can")).scene.bodies] == ["floor", "can"]
     robot = tmp_path / "robot.urdf"
-    link = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>' \
-           '</inertial><collision><geometry><box size="0.1 0.1 0.3"/></geometry></collision></link>'  # fmt: skip
-    joint = '<joint name="hinge" type="revolute"><parent link="base"/><child link="tip"/><origin xyz="0 0 0.4"/>' \
-            '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="30" velocity="3"/></joint>'  # fmt: skip
+    inertia = '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+    box = '<collision><geometry><box size="0.1 0.1 0.3"/></geometry></collision>'
+    link = f'<link name="{{0}}"><inertial><mass value="1"/>{inertia}</inertial>{box}</link>'
+    limit = '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="30" velocity="3"/>'
+    ends = '<parent link="base"/><child link="tip"/><origin xyz="0 0 0.4"/>'
+    joint = f'<joint name="hinge" type="revolute">{ends}{limit}</joint>'
     robot.write_text(f'<robot name="r">{link.format("base")}{link.format("tip")}{joint}</robot>')
     scene = opened(robot)
     session = Session(Simulator(scene))

@@ -121,7 +121,7 @@ class Controls(Page):
         across = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
 
         def of_picked(command: Callable[..., Any], *more: Any) -> Callable[[], None]:
-            return lambda: self.picked and self.do(command, self.picked, *more)
+            return lambda: self.do(command, self.picked, *more) if self.picked else None
 
         session = self.session
         for key, label, act in (
