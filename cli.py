@@ -38,7 +38,7 @@ def options(
 COMMANDS = [reconstruct, measure, poses, distill, mesh, joint, fit]
 COMMANDS += [commands.simulate, commands.samples, commands.plan, commands.view, commands.render, commands.identify]
 COMMANDS += [commands.export, commands.dataset, commands.train, commands.evaluate, commands.tradeoff, commands.stress]
-COMMANDS += [commands.info]
+COMMANDS += [commands.play, commands.info]
 for command in COMMANDS:
     app.command()(command)
 app.command("import")(commands.import_)

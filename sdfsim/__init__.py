@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pipeline.states import reconstruct
     from sdfsim.apps.export import export
     from sdfsim.apps.fit import fit
+    from sdfsim.apps.play import play, show
     from sdfsim.apps.render import render
     from sdfsim.apps.run import simulate
     from sdfsim.base.errors import SceneError, SdfsimError
@@ -50,8 +51,10 @@ __all__ = [
     "judged",
     "load_scene",
     "load_shape",
+    "play",
     "reconstruct",
     "render",
+    "show",
     "simulate",
 ]
 
@@ -68,6 +71,8 @@ _HOME = {
     "load_shape": "sdfsim.shape.shape",
     "export": "sdfsim.apps.export",
     "fit": "sdfsim.apps.fit",
+    "play": "sdfsim.apps.play",
+    "show": "sdfsim.apps.play",
     "reconstruct": "pipeline.states",
     "render": "sdfsim.apps.render",
     "simulate": "sdfsim.apps.run",

@@ -77,6 +77,29 @@ def simulate(
 
 
 @command
+def play(
+    session: Session,
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="scene.yaml, a sample's name, a room, a Shape folder, a mesh, or a robot (.urdf .xml .mjcf).",
+            show_default=False,
+        ),
+    ],
+    model: Model = None,
+    paused: Annotated[bool, typer.Option("--paused", help="Time stands still at first.")] = False,
+    port: Annotated[int | None, typer.Option(help="Port of the page (default: 8080, or a free one).")] = None,
+    allow_outside: Outside = False,
+) -> None:
+    """Scene, room, shape, mesh or robot -> a live page: drag, throw, pause, save (docs/viewing.md)."""
+    from sdfsim.apps import play as room
+
+    with room.play(**session.given(), on_progress=session.stage_progress) as playing:
+        session.report({"page": playing.address}, [f"play at {playing.address}"])
+        session.hold("the page stays up until Ctrl-C, or until this process is ended")
+
+
+@command
 def plan(
     session: Session, scene: SceneFile, model: Model = None, allow_outside: Outside = False, device: str = "auto"
 ) -> None:

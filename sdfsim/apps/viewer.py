@@ -29,7 +29,7 @@ _NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
 def stream_to_viewer(playback: Playback, kind: str) -> str:
     """Send everything that `playback` logs from now on to a viewer: a window (`native`), or a page (`web`) that exists
     as long as this process runs. Returns the address of the page. Raises SdfsimError if the viewer does not start."""
-    port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
+    port, page_port = free_port(_GRPC_PORT), free_port(_WEB_PORT)
     web = ["--serve-web", "--web-viewer-port", str(page_port)]
     viewer = _launch(port, web if kind == "web" else ["--expect-data-soon", "--hide-welcome-screen"])
     if not _started(viewer, port) or (kind == "web" and not _started(viewer, page_port)):
@@ -105,7 +105,7 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
     in the browser (`web`). Raises SdfsimError if there is no such recording, if there is no screen for a window, or if
     the viewer fails."""
     recording = _recording(recording)
-    port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
+    port, page_port = free_port(_GRPC_PORT), free_port(_WEB_PORT)
     if not web:
         check_screen("native")
     options = ["--web-viewer", "--web-viewer-port", str(page_port)] if web else []
@@ -133,7 +133,7 @@ def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> No
     recording = _recording(recording)
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")
-    port = _free_port()
+    port = free_port()
     viewer = _launch(port, ["--headless", "--window-size", WINDOW, str(recording.resolve())])
     try:
         _picture(viewer, _address(port), picture, at)
@@ -215,7 +215,7 @@ def _answers(port: int) -> bool:
         return probe.connect_ex((LOOPBACK, port)) == 0
 
 
-def _free_port(wanted: int = 0) -> int:
+def free_port(wanted: int = 0) -> int:
     """`wanted` if nothing listens there, else any free port."""
     if wanted and not _answers(wanted):
         return wanted

@@ -369,6 +369,7 @@ class Simulator(LiveScene):
     def _with_joints(self, new: Simulator, state: State, was: State, *, same: bool) -> State:
         """The `state` of `new` with the joints of `was`. In other units (unless `same`) the impulses are unknown, and
         numbers of motors that a user has changed are again those of the scene."""
+        assert was.joints is not None and state.joints is not None
         known = np.array([self._joint_names.index(name) for name in new._joint_names], int)
         joints = was.joints[known].copy()
         if not same:

@@ -93,15 +93,31 @@ class Browser:
         assert "exceptionDetails" not in made, made["exceptionDetails"]
         return made["result"].get("value")
 
-    def click(self, x: float, y: float) -> None:
-        """With the mouse, at a place of the window, px."""
+    def click(self, x: float, y: float, held: int = 0) -> None:
+        """With the mouse, at a place of the window, px; `held` keys: 2 is Ctrl, 8 is Shift."""
         self.move(x, y)
         for kind in ("mousePressed", "mouseReleased"):
-            self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+            self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1, modifiers=held)
 
-    def move(self, x: float, y: float) -> None:
-        """The mouse to a place of the window, px."""
-        self._call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+    def press(self, x: float, y: float, *, down: bool = True) -> None:
+        """The left button of the mouse at a place of the window, px: `down`, or up."""
+        kind = "mousePressed" if down else "mouseReleased"
+        self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def move(self, x: float, y: float, *, down: bool = False) -> None:
+        """The mouse to a place of the window, px; with the left button `down` it drags."""
+        held = {"button": "left", "buttons": 1} if down else {}
+        self._call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, **held)
+
+    def key(self, text: str, code: str) -> None:
+        """A key is pressed and let go, such as `n` of KeyN."""
+        for kind in ("keyDown", "keyUp"):
+            self._call("Input.dispatchKeyEvent", type=kind, key=text, code=code)
+
+    def choose(self, selector: str, file: Path) -> None:
+        """A file for the file field that a selector finds."""
+        node = self._call("Runtime.evaluate", expression=f"document.querySelector({selector!r})")["result"]
+        self._call("DOM.setFileInputFiles", files=[str(file)], objectId=node["objectId"])
 
     def picture(self, file: Path) -> Path:
         """A PNG of the page."""

@@ -1,0 +1,158 @@
+"""A scene as it is at a moment, as a folder with scene.yaml and its shapes; and a run of it as a run folder."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from sdfsim.apps.export import plain_names
+from sdfsim.apps.recording import is_infinite
+from sdfsim.apps.run import summary
+from sdfsim.base.console import plain as plain_report
+from sdfsim.base.files import CONFIG, check_own, check_writable, write_json, write_text
+from sdfsim.physics import pose
+from sdfsim.physics.rollout import Rollout
+from sdfsim.scene.builder import SceneBuilder, plain
+from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import WORLD, Body, Joint, Scene, fingerprints
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
+from sdfsim.shape.shape import Shape
+
+SCENE = "scene.yaml"
+
+
+def at_frame(scene: Scene, frame: Rollout) -> Scene:
+    """The scene with its bodies, joints and targets of motors as in the first frame of a recorded rollout. Paths of
+    kinematic bodies go on from there."""
+    bodies, joints = [], []
+    for k, body in enumerate(scene.bodies):
+        turn = frame.orientation[0, k]
+        place = frame.position[0, k] - pose.rotate(turn, scene.shapes[body.shape].com * body.scale)
+        path = body.path
+        if path is not None:
+            ahead = path.time > frame.time[0]
+            path = replace(
+                path, time=np.r_[0.0, path.time[ahead] - frame.time[0]],
+                position=np.r_[place[None], path.position[ahead]],
+                quat_xyzw=np.r_[turn[None], path.quat_xyzw[ahead]],
+            )  # fmt: skip
+        speeds = {"velocity": frame.velocity[0, k], "angular_velocity": frame.angular_velocity[0, k]}
+        bodies.append(replace(body, position=place, quat_xyzw=turn, path=path, **speeds))
+    for k, joint in enumerate(scene.joints):
+        if frame.joint_names and joint.kind in ("hinge", "slider"):
+            low, high = joint.limits or (-math.inf, math.inf)  # a limit gives a little
+            joint = replace(joint, start=float(np.clip(frame.joint_position[0, k], low, high)))
+        aim = float(frame.counters.get(f"target_{joint.name}", [math.nan])[0])
+        if joint.motor is not None and math.isfinite(aim):
+            which = "position" if joint.motor.speed is None else "speed"
+            joint = replace(joint, motor=replace(joint.motor, **{which: aim}))
+        joints.append(joint)
+    return replace(scene, bodies=tuple(bodies), joints=tuple(joints))
+
+
+def save_scene(scene: Scene, folder: Path) -> Path:
+    """Write a scene to `folder`/scene.yaml, with a Shape folder for each shape that is not a ball, box, capsule or
+    cylinder, and return the file. Raises SdfsimError if it cannot be written, or if an SDF has no file format."""
+    check_writable(folder)
+    effects = {name: value for name, value in vars(scene.effects).items() if value != "auto"}
+    settings: dict[str, Any] = {"gravity": scene.gravity, "duration": scene.duration, "seed": scene.seed}
+    built = SceneBuilder(**settings, **({"effects": effects} if effects else {}), model=scene.model)
+    used = {body.shape for body in scene.bodies if not is_infinite(scene.shapes[body.shape])}
+    files = plain_names([shape.name for shape in scene.shapes])
+    for number in sorted(used):
+        built.shapes[files[number]] = plain(_shape(scene.shapes[number], folder / "shapes" / files[number]))
+    built.bodies = [plain(_body(body, scene.shapes[body.shape], files[body.shape])) for body in scene.bodies]
+    built.joints = [plain(_joint(scene, joint)) for joint in scene.joints]
+    folder.mkdir(parents=True, exist_ok=True)
+    return built.save(folder / SCENE)
+
+
+def save_run(scene: Scene, rollout: Rollout, folder: Path) -> Path:
+    """Write the motion of a scene, whose bodies are as in the first frame, as a run folder that the other commands
+    read. Returns the folder. Raises SdfsimError as `save_scene` does, and if the folder holds other results."""
+    check_own(folder, "play", "rollout.npz", "report.json")
+    file = save_scene(scene, folder).resolve()
+    known = load_scene(file)  # with the rounding of the file
+    rollout = replace(rollout, time=rollout.time - rollout.time[0], meta=rollout.meta | {"scene": fingerprints(known)})
+    config = {"command": "play", "scene": str(file), "model": rollout.meta["model"], "seed": rollout.meta["seed"],
+              "seconds": float(rollout.time[-1]), "device": rollout.meta["device"]}  # fmt: skip
+    write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
+    report = summary(known, rollout, float(rollout.time[-1])) | {"status": "done", "folder": folder}
+    rollout.save(folder / "rollout.npz")
+    write_json(folder / "report.json", plain_report(report))
+    return folder
+
+
+def _shape(shape: Shape, folder: Path) -> dict[str, Any]:
+    sdf = shape.sdf
+    if set(shape.source) == {"kind"}:
+        if isinstance(sdf, SphereSdf):
+            return {"sphere": {"radius": sdf.radius}}
+        if isinstance(sdf, BoxSdf):
+            return {"box": {"size": [2.0 * half for half in sdf.half]}}
+        if isinstance(sdf, CapsuleSdf):
+            return {"capsule": {"radius": sdf.radius, "height": 2.0 * (sdf.half + sdf.radius)}}
+        if isinstance(sdf, CylinderSdf):
+            return {"cylinder": {"radius": sdf.radius, "height": 2.0 * sdf.half}}
+    return {"asset": shape.save(folder).resolve()}
+
+
+def _body(body: Body, shape: Shape, name: str) -> dict[str, Any]:
+    entry: dict[str, Any] = {"name": body.name, "friction": body.friction, "restitution": body.restitution}
+    if body.collides_with is not None:
+        entry["collides_with"] = list(body.collides_with)
+    if is_infinite(shape):
+        normal = pose.rotate(body.quat_xyzw, np.array([0.0, 0.0, 1.0]))
+        return entry | {"plane": {"normal": normal, "offset": float(normal @ body.position)}}
+    entry |= {"shape": name, "motion": body.motion, "scale": body.scale}
+    if body.path is not None:
+        poses = zip(body.path.time, body.path.position, body.path.quat_xyzw, strict=True)
+        return entry | {"path": [{"time": t, "position": place, "quat_xyzw": turn} for t, place, turn in poses]}
+    entry |= {"position": body.position, "quat_xyzw": body.quat_xyzw}
+    if body.motion == "dynamic":
+        entry |= {"velocity": body.velocity, "angular_velocity": body.angular_velocity, "mass": body.mass}
+        if body.inertia is not None:
+            even = body.mass / shape.volume * body.scale**2 * shape.inertia
+            entry["inertia_factor"] = float(np.trace(body.inertia) / np.trace(even))
+    return entry
+
+
+def _joint(scene: Scene, joint: Joint) -> dict[str, Any]:
+    """A joint in the frame of its first body, with both bodies where they are now."""
+    first, second = (WORLD if k < 0 else scene.bodies[k].name for k in joint.bodies)
+    entry: dict[str, Any] = {"name": joint.name, "type": joint.kind, "bodies": [first, second]}
+    entry |= {"frame": first, "anchor": joint.anchor[0]}
+    body, hinge, limits = scene.bodies[joint.bodies[0]], joint.kind == "hinge", joint.limits
+
+    def angles(name: str, value: Any) -> dict[str, Any]:
+        return {f"{name}_deg": np.degrees(value)} if hinge else {name: value}
+
+    if joint.kind in ("hinge", "slider"):
+        entry |= angles("start", joint.start) | ({} if limits is None else angles("limits", limits))
+    if joint.kind in ("hinge", "slider") or (joint.kind == "ball" and limits is not None):
+        entry["axis"] = pose.rotate(joint.quat_xyzw[0], np.array([1.0, 0.0, 0.0]))
+    if joint.kind == "ball" and limits is not None:
+        entry["cone_deg"] = math.degrees(limits[1])
+    if joint.kind == "distance":
+        end = joint.anchor[1]
+        if joint.bodies[1] >= 0:
+            other = scene.bodies[joint.bodies[1]]
+            end = other.position + pose.rotate(other.quat_xyzw, end)
+        entry["to"] = pose.rotate(pose.conjugate(body.quat_xyzw), end - body.position)
+        entry |= {} if joint.length is None else {"rod": joint.length}
+        entry |= {} if limits is None or joint.length is not None else {"rope": limits[1]}
+    numbers = {"restitution": joint.restitution, "damping": joint.damping, "friction": joint.friction}
+    entry |= {name: value for name, value in numbers.items() if value}
+    if joint.spring is not None:
+        entry["spring"] = {"stiffness": joint.spring.stiffness} | angles("rest", joint.spring.rest)
+    if (motor := joint.motor) is not None:
+        entry["motor"] = {"max_force": motor.max_force, "gain": motor.gain, "speed": motor.speed}
+        entry["motor"] |= {} if motor.speed is not None else {"time": motor.time}
+        entry["motor"] |= {} if motor.position is None else angles("position", motor.position)
+    loads = {"force": joint.breaks_force, "torque": joint.breaks_torque}
+    loads = {name: most for name, most in loads.items() if math.isfinite(most)}
+    entry |= {"breaks_at": loads} if loads else {}
+    return entry | ({"collide": "on"} if joint.collides else {})
