@@ -28,6 +28,8 @@ FREE = {
 # Relative to `REST_SPEED`: contacts may give a body the energy of this speed, so that bodies that overlap come apart.
 SPARE = 0.25
 
+TOUCH = 1e-4  # model units: nearer surfaces touch
+
 Edges = tuple[np.ndarray, np.ndarray]  # as `physics.solver.prepare.points_near` gives them
 
 
@@ -98,12 +100,12 @@ def stepped(
         made = network(graph, friction=options.friction)
     time, moves = options.dt / known, bodies.moves[rows]
     rows = rows[moves]
-    share = _passive(graph, made, options.gravity)[:, None]
+    made = _apart(graph, made)
+    share = _passive(graph, made, options.gravity)[moves, None]
     end, spin, mean, turn = (
-        getattr(graph, of).numpy() + share * (getattr(made, name) - getattr(graph, of)).numpy()
+        getattr(graph, of).numpy()[moves] + share * (getattr(made, name) - getattr(graph, of)).numpy()[moves]
         for name, of in FREE.items()
     )
-    end, spin, mean, turn = (values[moves] for values in _apart(graph, end, spin, mean, turn))
     orientation = before.rows_of("orientation", rows)
     moved = {
         "position": before.rows_of("position", rows) + mean * (time * options.dt),
@@ -144,26 +146,18 @@ def _passive(graph: ContactGraph, made: Velocities, gravity: np.ndarray) -> np.n
     return np.minimum(most, 1.0)[island]
 
 
-def _apart(
-    graph: ContactGraph, end: np.ndarray, spin: np.ndarray, mean: np.ndarray, turn: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """The velocities [A, 3] at the end of a step and in its mean, with the impulses that keep bodies from sinking into
-    each other. The mean motion makes no overlap deeper than it is; where that needs a push, surfaces do not approach
-    each other at the end of the step either."""
+def _apart(graph: ContactGraph, made: Velocities) -> Velocities:
+    """Velocities with the impulses that keep bodies from sinking into each other. The mean motion makes no overlap
+    deeper than it is; where that needs a push, surfaces do not approach each other at the end of the step either."""
     bodies = [getattr(graph, name).numpy() for name in ("inverse_mass", "inverse_inertia")]
-    ends, arms = (
-        [getattr(graph, f"{of}_{side}" if of else side).numpy() for side in ("first", "second")] for of in ("", "arm")
-    )
-    normal = graph.normal.numpy()
-    touching = graph.gap.numpy() + graph.when.numpy() <= 1e-4
-    ends, arms = [side[touching] for side in ends], [side[touching] for side in arms]
-    normal = normal[touching]
-    moved = np.concatenate([mean, turn], 1)
-    pushed = separated(moved, *bodies, *ends, normal, *arms, np.zeros(len(normal))) > 0.0
-    left = np.concatenate([end, spin], 1)
-    where = [array[pushed] for array in (*ends, normal, *arms)]
-    separated(left, *bodies, *where, np.zeros(int(pushed.sum())))
-    return left[:, :3], left[:, 3:], moved[:, :3], moved[:, 3:]
+    touching = graph.gap.numpy() + graph.when.numpy() <= TOUCH
+    names = "first", "second", "normal", "arm_first", "arm_second"
+    where = [getattr(graph, name).numpy()[touching] for name in names]
+    moved = np.concatenate([made.mean_velocity.numpy(), made.mean_angular.numpy()], 1)
+    pushed = separated(moved, *bodies, *where, np.zeros(len(where[0]))) > 0.0
+    left = np.concatenate([made.velocity.numpy(), made.angular.numpy()], 1)
+    separated(left, *bodies, *(array[pushed] for array in where), np.zeros(int(pushed.sum())))
+    return Velocities(*(_tensor(values) for both in (left, moved) for values in (both[:, :3], both[:, 3:])))
 
 
 def _tensor(values: np.ndarray) -> Tensor:

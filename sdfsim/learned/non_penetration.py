@@ -4,8 +4,8 @@ contact graph (projected Gauss-Seidel)."""
 import numpy as np
 from numba import njit
 
-ROUNDS = 60  # sweeps at most, forth and back by turns
-ENOUGH = 1e-7  # relative to the fastest approach: sweeps end when no contact's velocity changes by more
+ROUNDS = 100  # sweeps at most, forth and back by turns
+ENOUGH = 1e-14  # relative to the fastest approach: sweeps end when no contact's velocity changes by more
 
 
 @njit(cache=True)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation.harness import Job, Line, Panel, digest, draw, front, markdown, measure, number, peak_memory
 from sdfsim.learned.model import new_network
-from sdfsim.physics import solver as kernels
+from sdfsim.physics.solver import code_cache
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
 from tests.helpers.recordings import trajectory
@@ -44,7 +44,7 @@ def test_results_are_made_again_when_the_compiled_step_is_another_one(tmp_path, 
     ran = tmp_path / "ran"
     job = Job("case", "method", [], noted, (ran, 1.0))
     for expected, name in ((1, "one"), (1, "one"), (2, "two")):
-        monkeypatch.setattr(kernels, "_cache", lambda name=name: Path(name))
+        monkeypatch.setattr(code_cache, "code_folder", lambda name=name: Path(name))
         measure([job], tmp_path / "out")
         assert ran.read_text().count("ran") == expected
 

@@ -53,7 +53,7 @@ def test_a_motor_may_be_given_and_its_strength_changed():
     sim = free("hinge")
     joint = sim.joint("joint")
     assert joint.max_force == 0.0
-    with pytest.raises(SdfsimError, match=r"'joint': has no motor\nhint: .*set most"):
+    with pytest.raises(SdfsimError, match=r"'joint': has no motor\nhint: .*set max_force"):
         joint.target = 0.5
     joint.max_force = 20.0
     assert joint.target is None
