@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -150,13 +151,14 @@ def _apart(graph: ContactGraph, made: Velocities) -> Velocities:
     """Velocities with the impulses that keep bodies from sinking into each other. The mean motion makes no overlap
     deeper than it is; where that needs a push, surfaces do not approach each other at the end of the step either."""
     bodies = [getattr(graph, name).numpy() for name in ("inverse_mass", "inverse_inertia")]
+    apart: Any = separated
     touching = graph.gap.numpy() + graph.when.numpy() <= TOUCH
     names = "first", "second", "normal", "arm_first", "arm_second"
     where = [getattr(graph, name).numpy()[touching] for name in names]
     moved = np.concatenate([made.mean_velocity.numpy(), made.mean_angular.numpy()], 1)
-    pushed = separated(moved, *bodies, *where, np.zeros(len(where[0]))) > 0.0
+    pushed = apart(moved, *bodies, *where, np.zeros(len(where[0]))) > 0.0
     left = np.concatenate([made.velocity.numpy(), made.angular.numpy()], 1)
-    separated(left, *bodies, *(array[pushed] for array in where), np.zeros(int(pushed.sum())))
+    apart(left, *bodies, *(array[pushed] for array in where), np.zeros(int(pushed.sum())))
     return Velocities(*(_tensor(values) for both in (left, moved) for values in (both[:, :3], both[:, 3:])))
 
 

@@ -204,18 +204,19 @@ def dressed(vertices: np.ndarray, mesh: Mesh) -> Any:
     """A mesh of trimesh with the texture or the colours of `mesh`; photos contain their light, so it does not shine."""
     import trimesh
     from PIL import Image
+    from trimesh.visual import ColorVisuals, TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
     normals = with_normals(Mesh(vertices, mesh.faces))[1] if mesh.uv is None else None
     if normals is not None and len(normals) != len(vertices):
         normals = None
     made = trimesh.Trimesh(vertices, mesh.faces, vertex_normals=normals, process=False)
-    matt = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+    matt: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
     if mesh.texture is not None and mesh.uv is not None:
         image = Image.fromarray(mesh.texture)
         image.thumbnail((2048, 2048))
         uv = mesh.uv * (1, -1) + (0, 1)
-        made.visual = trimesh.visual.TextureVisuals(uv, material=PBRMaterial(baseColorTexture=image, **matt))
+        made.visual = TextureVisuals(uv, material=PBRMaterial(baseColorTexture=image, **matt))
     else:
-        made.visual = trimesh.visual.ColorVisuals(made, vertex_colors=mesh.colors)
+        made.visual = ColorVisuals(made, vertex_colors=mesh.colors)
     return made

@@ -95,7 +95,7 @@ class Compiled:
     def place(self, state: State) -> None:
         """Place static bodies as in `state`."""
         self.world = compiled_world(replace(self.bodies, shape=self._shape), state, self.shapes)
-        self.threads = np.count_nonzero(self.world.moves) >= CROWD
+        self.threads = bool(np.count_nonzero(self.world.moves) >= CROWD)
         if self.threads:
             numba.get_num_threads()  # starts the threads: cached code relies on that
         n = len(self.bodies)
@@ -113,7 +113,7 @@ class Compiled:
         )  # fmt: skip
         self.joints = joints_of(self.bodies)
         # Threads are used for all kinds of pairs alike.
-        self.surfaces = self.threads or meet_as_surfaces(self.bodies.contact)
+        self.surfaces = self.threads or bool(meet_as_surfaces(self.bodies.contact))
         self.seen: compiled.Motion | None = None  # motion in which `points_near` searches
         self.searches: Pieces | None = None  # its pieces, once they are compiled
         self._pieces: Pieces | None = None  # those of the step, once they are compiled

@@ -70,12 +70,13 @@ def _reference(typing: Any, value: types.Type) -> Any:
 
 
 @intrinsic
-def _call(typing: Any, address: types.Type, arguments: types.Type) -> Any:
+def _call(typing: Any, address: types.Type, arguments: Any) -> Any:
+    parts: Any = arguments
     if not isinstance(arguments, types.BaseTuple):
         return None
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        kinds = [context.get_value_type(each) for each in arguments]
+        kinds = [context.get_value_type(each) for each in parts.types]
         function = ir.FunctionType(context.get_value_type(types.int64), kinds)
         place = builder.inttoptr(given[0], function.as_pointer())
         return builder.call(place, cgutils.unpack_tuple(builder, given[1], len(kinds)))
