@@ -13,8 +13,6 @@ from sdfsim.physics.solver.rows import (
     CONTACT,
     IMPULSE,
     LINEAR,
-    PUSH,
-    SHARE,
     WANTED,
     respond,
     three,
@@ -42,9 +40,6 @@ AT_REST = 1e-9  # squared speed: slower tangential motion has no direction
 # Bodies that approach by more than this part of their thickness in an inner step rebound before they have touched, else
 # after: thin bodies would overlap deeply.
 THIN = 0.005
-# At most this many contacts of two bodies count for the energy that they may gain: the many points of a hollow shape
-# may gain no more than the corners of a box.
-FEW = 4
 
 
 @njit(**BARE)
@@ -79,7 +74,6 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
         bounce = world.restitution[a] * world.restitution[b] if rules.options.restitution else 0.0
         between = sub(get(position, a), get(position, b))
         thin = THIN * min(world.thickness[a], world.thickness[b])
-        first_of_pair = count
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = three(point, NORMAL)
@@ -110,17 +104,13 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
                 target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
             # An impact is over before a body has turned: the gyroscopic torque acts after it.
             before = dot(free_fall, n) if rebounds else dot(then, n)
-            deep = push = rest = 0.0
+            deep = rest = 0.0
             if phase != END:
                 if gap > TOUCH:
                     rest = -gap / h
                     target = target if rebounds else rest
-                elif gap > -rules.split:
-                    if gap < -rules.slop:
-                        push = (-gap - rules.slop) * rules.erp / h
-                        target = max(push, target)
                 else:
-                    deep = -gap * rules.erp / h
+                    deep = max(-gap - rules.slop, 0.0) * rules.erp / h
             rows.kind[count] = CONTACT
             rows.where[count, 0], rows.where[count, 1], rows.where[count, 2], rows.where[count, 3] = m, k, a, b
             write_point(row[count, 0], n, arm, other)
@@ -128,7 +118,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             row[count, 0, WANTED] = target - before
             row[count, 0, IMPULSE] = kick * point[NORMAL_IMPULSE]
             rows.deep[count], rows.parted[count], rows.friction[count] = deep, 0.0, friction
-            rows.own[count, CALM], rows.own[count, BEFORE], rows.own[count, PUSH] = rest - before, before, push
+            rows.own[count, CALM], rows.own[count, BEFORE] = rest - before, before
             for e in range(1, 3):
                 row[count, e, IMPULSE] = 0.0
             if friction > 0.0:
@@ -150,8 +140,6 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
                 row[count, 1, IMPULSE] *= share
                 row[count, 2, IMPULSE] *= share
             count += 1
-        for c in range(first_of_pair, count):
-            rows.own[c, SHARE] = min(FEW / (count - first_of_pair), 1.0)
     return count
 
 

@@ -17,14 +17,14 @@ from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot,
 
 # Columns of a row. Jacobian: the direction at the first body (its opposite at the second), and about both centres of
 # mass; response: what a unit impulse adds to both angular velocities; the effective mass (the inverse of the change of
-# the row's velocity by a unit impulse, 0 if nothing moves along it); the wanted change; the impulse so far.
-LINEAR, ANGULAR, OTHER, TURN, COUNTER, MASS, WANTED, IMPULSE, WIDTH = 0, 3, 6, 9, 12, 15, 16, 17, 18
+# the row's velocity by a unit impulse, 0 if nothing moves along it); the wanted change; the impulse so far; and that of
+# an impact with all of its rebound.
+LINEAR, ANGULAR, OTHER, TURN, COUNTER, MASS, WANTED, IMPULSE, REBOUND, WIDTH = 0, 3, 6, 9, 12, 15, 16, 17, 18, 19
 # Kinds of blocks.
 CONTACT, LIMIT, MOTOR, GRIP = range(4)
-# Columns of `Rows.own` by kind. Contacts: the wanted change along the normal without rebound and without resolving
-# penetration; the speed along it without contact; the lasting speed that resolves penetration; the point's share of the
-# energy that the points of two bodies may gain.
-CALM, BEFORE, PUSH, SHARE = range(4)
+# Columns of `Rows.own` by kind. Contacts: the wanted change along the normal without rebound, and the speed along it
+# without contact.
+CALM, BEFORE = range(2)
 # Limits: the distance to it that must be left after the inner step (infinite if it rebounds), and 1 for the lower limit
 # or -1 for the upper.
 LEFT, SIDE = range(2)

@@ -30,8 +30,7 @@ from sdfsim.physics.solver.rows import (
     CONTACT,
     IMPULSE,
     MASS,
-    PUSH,
-    SHARE,
+    REBOUND,
     WANTED,
     WIDTH,
     Delassus,
@@ -42,13 +41,10 @@ from sdfsim.physics.solver.rows import (
     velocity_of,
 )
 from sdfsim.physics.solver.tree import EQUATIONS, factor, forget_through, project, respond_through
-from sdfsim.physics.solver.vectors import BARE, FAST, norm, vector
+from sdfsim.physics.solver.vectors import BARE, FAST
 from sdfsim.physics.solver.world import END
 
-# Limits of the energy that an island may gain: a multiple of what resolving its penetrations would give each contact
-# alone; a share of the energy that its contacts bring with them; and the energy that lifts it by some slops (a stack
-# lifts everything above).
-SPARE, ROUNDING, LIFT = 4.0, 0.01, 10.0
+ROUNDING = 1e-4  # part of the energy with which contacts meet: an impact gains energy if it gains more
 # The larger the ratio of masses, the more slowly sweeps carry a load to lighter bodies. The number of sweeps of an
 # island is multiplied by its ratio divided by the first number, at most by the second.
 EVEN, OFTEN = 30.0, 30.0
@@ -132,63 +128,70 @@ def _solve_island(world, work, motion, rules, rows, joints, nothing, island, pha
         _solve_rows(world, work, motion, rules, rows, joints, reference(delassus), island, phase)
         if not held or not _recorded(world, work, motion, rules, rows, joints, island, phase):
             break
-        _clear(joints, rows, work.change, island)
+        _clear(joints, rows, work.change, island, 0.0, 0.0)
 
 
 @njit(**BARE)
 def _solve_rows(world, work, motion, rules, rows, joints, delassus, island, phase):
-    """Find the impulses of an island. If contacts would give it energy from nothing, find them again with half of the
-    rebounds and pushes, then without.
+    """Find the impulses of an island. If its rebounds would give it energy, take as much of each impulse from an impact
+    without rebounds as keeps the energy.
 
-    Otherwise contradictory contacts, as of bodies that are wedged into each other, would throw them apart.
+    Newton's rule for several contacts with friction may gain energy (Kane and Levinson 1985); that mixture cannot,
+    since energy is convex in the impulses, and it stays within the cones of friction.
     """
-    change, order = work.change, rows.order
+    order = rows.order
     lo, hi = rows.start[island], rows.start[island + 1]
     lively = deep = False
     for i in range(lo, hi):
         c = order[i]
         deep = deep or rows.deep[c] > 0.0
         lively = lively or (rows.kind[c] == CONTACT and rows.row[c, 0, WANTED] > rows.own[c, CALM])
-        for e in range(3):
-            if rows.row[c, e, IMPULSE] != 0.0:
-                give(
-                    work.inverse_mass,
-                    rows.row[c, e],
-                    change,
-                    rows.where[c, 2],
-                    rows.where[c, 3],
-                    rows.row[c, e, IMPULSE],
-                )
+    _give_all(work, rows, lo, hi)
     rounds = _sweeps(work.inverse_mass, rules, rows, island)
     if joints is not None:
         if len(delassus.change):
             _find_delassus(world, work, motion, rows, joints, delassus)
-    share = 1.0
-    while True:
-        if deep:
-            _part(work, rules, rows, joints, island, rounds)
-        _balance(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
-        if not lively or share == 0.0 or not _gains(rules, rows, change, island):
-            return
-        # The first time half of the difference remains, then none.
-        share = 0.5 if share == 1.0 else 0.0
-        for i in range(lo, hi):
-            c = order[i]
-            if rows.kind[c] == CONTACT:
-                calm = rows.own[c, CALM]
-                rows.row[c, 0, WANTED] = calm + share * (rows.row[c, 0, WANTED] - calm)
-                if rows.own[c, PUSH] > 0.0:
-                    rows.deep[c], deep = (1.0 - share) * rows.own[c, PUSH], True
-        _clear(joints, rows, change, island)
+    if deep:
+        _part(work, rules, rows, joints, island, rounds)
+    _balance(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
+    if not lively:
+        return
+    gain, brought = _gain(rows, work.change, lo, hi)
+    if gain <= ROUNDING * brought:
+        return
+    for i in range(lo, hi):
+        c = order[i]
+        for e in range(3):
+            rows.row[c, e, REBOUND] = rows.row[c, e, IMPULSE]
+        if rows.kind[c] == CONTACT:
+            rows.row[c, 0, WANTED] = rows.own[c, CALM]
+    _balance(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
+    loss, _ = _gain(rows, work.change, lo, hi)
+    share = max(loss / (loss - gain), 0.0) if loss < gain else 0.0
+    _clear(joints, rows, work.change, island, share, 1.0 - share)
+    _give_all(work, rows, lo, hi)
+    _balance(world, work, motion, rules, rows, joints, delassus, island, np.int64(0), phase)
 
 
 @njit(**BARE)
-def _clear(joints, rows, change, island):
-    """Take all impulses of an island back."""
+def _give_all(work, rows, lo, hi):
+    """Give bodies the impulses of all rows of an island."""
+    for i in range(lo, hi):
+        c = rows.order[i]
+        for e in range(3):
+            if rows.row[c, e, IMPULSE] != 0.0:
+                a, b = rows.where[c, 2], rows.where[c, 3]
+                give(work.inverse_mass, rows.row[c, e], work.change, a, b, rows.row[c, e, IMPULSE])
+
+
+@njit(**BARE)
+def _clear(joints, rows, change, island, rebound, own):
+    """Take the changes of all velocities of an island back, and give its rows these parts of their impulses with all
+    of the rebound, and of their present ones."""
     for i in range(rows.start[island], rows.start[island + 1]):
         c = rows.order[i]
         for e in range(3):
-            rows.row[c, e, IMPULSE] = 0.0
+            rows.row[c, e, IMPULSE] = rebound * rows.row[c, e, REBOUND] + own * rows.row[c, e, IMPULSE]
         for x in range(6):
             change[rows.where[c, 2], x] = change[rows.where[c, 3], x] = 0.0
     if joints is not None:
@@ -214,23 +217,21 @@ def _sweeps(mass, rules, rows, island):
 
 
 @njit(**BARE)
-def _gains(rules, rows, change, island):
-    """Whether contacts have given an island more energy than allowed: the sum of impulses times mean velocities."""
-    work = spare = 0.0
-    lift = 2.0 * norm(vector(rules.options.gravity)) * LIFT * rules.slop
-    for i in range(rows.start[island], rows.start[island + 1]):
+def _gain(rows, change, lo, hi):
+    """The energy that contacts of an island have given it, the sum of impulses times mean velocities; and that with
+    which they met."""
+    gain = brought = 0.0
+    for i in range(lo, hi):
         c = rows.order[i]
         if rows.kind[c] != CONTACT:
             continue
-        row, own, a, b = rows.row[c], rows.own[c], rows.where[c, 2], rows.where[c, 3]
-        push, before = own[PUSH], own[BEFORE]
-        if row[0, MASS] > 0.0:
-            spare += 0.5 * own[SHARE] * row[0, MASS] * (SPARE * push * push + ROUNDING * before * before + lift)
-        work += row[0, IMPULSE] * (before + 0.5 * velocity_of(row[0], change, a, b))
+        row, before, a, b = rows.row[c], rows.own[c, BEFORE], rows.where[c, 2], rows.where[c, 3]
+        brought += 0.5 * row[0, MASS] * before * before
+        gain += row[0, IMPULSE] * (before + 0.5 * velocity_of(row[0], change, a, b))
         for e in range(1, 3):
             if row[e, IMPULSE] != 0.0:
-                work += row[e, IMPULSE] * (0.5 * velocity_of(row[e], change, a, b) - row[e, WANTED])
-    return work > spare
+                gain += row[e, IMPULSE] * (0.5 * velocity_of(row[e], change, a, b) - row[e, WANTED])
+    return gain, brought
 
 
 @njit(**BARE)

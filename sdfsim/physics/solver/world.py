@@ -149,9 +149,8 @@ class Rules(NamedTuple):
     contact_margin: float = 0.02  # contacts are kept up to this distance, and until they have slid by more
     search_margin: float = 0.006  # new ones are searched up to this distance
     still: float = 1e-4  # pairs that have moved by less within a step are not tested again
-    erp: float = 0.08  # share of a penetration that an inner step resolves, by velocity
+    erp: float = 0.08  # share of a penetration that an inner step resolves
     slop: float = SLOP  # penetration that is not resolved
-    split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
     rounds: int = ROUNDS  # largest number of sweeps of sequential impulses
     exact: float = 2e-5  # sweeps end when no impulse changes a velocity by more
     apart: float = 0.03  # least distance of points of a manifold from each other
