@@ -101,6 +101,9 @@ class Bodies:
     # friction, restitution: [N] float64
     friction: np.ndarray
     restitution: np.ndarray
+    # compliance (0 if rigid), damping: [N] float64, of contacts
+    compliance: np.ndarray
+    damping: np.ndarray
     moves: np.ndarray  # [N] bool, True for dynamic bodies: they fly, and contacts push them
     bounds: np.ndarray  # [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled
     size: np.ndarray  # [N] float64, largest side of `bounds` (infinite for a plane)
@@ -219,6 +222,7 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
     inertia[moves] /= units.mass * units.length**2
     com = np.stack([s.com for s in shapes]) * scale[:, None]
     bounds = np.stack([(s.sdf.bounds - s.com) * k for s, k in zip(shapes, scale, strict=True)])
+    force = units.mass * units.length / units.time**2
     nodes = [(s.nodes - s.com) * k for s, k in zip(shapes, scale, strict=True)]
     node_start = np.concatenate([[0], np.cumsum([len(n) for n in nodes])])
     faces = [s.faces + first for s, first in zip(shapes, node_start[:-1], strict=True)]
@@ -239,6 +243,8 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         inertia=array(inertia),
         friction=array([b.friction for b in scene.bodies]),
         restitution=array([b.restitution for b in scene.bodies]),
+        compliance=array([force / units.length / b.stiffness for b in scene.bodies]),
+        damping=array([b.damping / force * units.velocity for b in scene.bodies]),
         moves=array(moves, bool),
         bounds=array(bounds),
         size=array((bounds[:, 1] - bounds[:, 0]).max(-1)),

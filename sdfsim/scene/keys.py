@@ -48,6 +48,8 @@ class BodyKeys(TypedDict, total=False):
     inertia_factor: float | None
     friction: float | None
     restitution: float | None
+    stiffness: float | None
+    damping: float | None
     collides_with: Literal["all"] | Sequence[str] | None
     avoids: Sequence[str]
     path: Sequence[Group] | None

@@ -1,5 +1,6 @@
 """`load_scene`: reads and checks a scene file, makes its shapes, and returns a `Scene`."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -175,6 +176,8 @@ def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[s
         mass=0.0,
         friction=entry.friction,
         restitution=entry.restitution,
+        stiffness=math.inf if entry.stiffness is None else entry.stiffness,
+        damping=entry.damping,
         collides_with=None if partners is None else tuple(n for p in partners for n in groups.get(p, [p])),
         path=path,
     )

@@ -60,6 +60,8 @@ class Body:
         velocity: [3] m/s, of the centre of mass.
         angular_velocity: [3] rad/s, world frame.
         mass: kg (already resolved from a density; bodies that are not dynamic have 0).
+        stiffness: N/m of its contacts; those of the two bodies act in series, and rigid bodies have infinity.
+        damping: N s/m of its contacts, if it is not rigid.
         inertia: [3, 3] kg m^2 about the centre of mass, shape axes; None means mass / volume times the shape's own.
         friction: Coulomb coefficient (a contact has the product of the two bodies').
         restitution: coefficient of restitution (likewise the product).
@@ -78,6 +80,8 @@ class Body:
     mass: float
     friction: float
     restitution: float
+    stiffness: float = math.inf
+    damping: float = 0.0
     inertia: np.ndarray | None = None
     collides_with: tuple[str, ...] | None = None
     path: Waypoints | None = None
@@ -200,11 +204,13 @@ def fingerprints(scene: Scene) -> dict[str, str]:
 
     inertia = [(k, body.inertia) for k, body in enumerate(bodies) if body.inertia is not None]
     held = [_six_digits([k for k, _ in inertia]), _six_digits([own for _, own in inertia])]
+    # Left out if all are rigid, so that such scenes keep their digests.
+    soft = [(k, b.stiffness, b.damping) for k, b in enumerate(bodies) if math.isfinite(b.stiffness)]
     moving = numbers("position", "quat_xyzw", "velocity", "angular_velocity")
     which = [[f"{body.motion} {body.name}" for body in bodies], *numbers("shape", "scale")]
     return {
         "shapes": digest([_described(shape) for shape in scene.shapes], which),
-        "bodies": digest(moving, numbers("mass", "friction", "restitution"), held, *_held(scene.joints)),
+        "bodies": digest(moving, numbers("mass", "friction", "restitution"), held, *soft, *_held(scene.joints)),
         "gravity": digest(_six_digits([scene.gravity])),
     }
 

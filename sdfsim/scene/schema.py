@@ -439,6 +439,11 @@ class BodyTable(Turned):
     restitution: Number = key(
         "coefficient of restitution; a contact has the product of both bodies', 0.25 by default", 0.5, ge=0, le=1
     )
+    stiffness: Number | None = key(
+        "of soft material such as rubber or foam: its contacts give way by the force divided by it, and rebound by "
+        "it; those of two bodies act in series; by default rigid", None, "N/m", gt=0,
+    )  # fmt: skip
+    damping: Number = key("of the contacts of soft material", 0.0, "N s/m", ge=0)
     collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(
         "`all`, or a list of names: two bodies touch where each lists the other", None
     )

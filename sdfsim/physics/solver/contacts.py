@@ -13,8 +13,12 @@ from sdfsim.physics.solver.rows import (
     CONTACT,
     IMPULSE,
     LINEAR,
+    MASS,
+    RESOLVED,
     WANTED,
     respond,
+    soften,
+    softness,
     three,
     within,
     write_point,
@@ -72,6 +76,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             continue
         friction = world.friction[a] * world.friction[b] if rules.options.friction else 0.0
         bounce = world.restitution[a] * world.restitution[b] if rules.options.restitution else 0.0
+        stiff, damping = _stiffness(world, manifolds, m, a, b)
         between = sub(get(position, a), get(position, b))
         thin = THIN * min(world.thickness[a], world.thickness[b])
         for k in range(manifolds.count[m]):
@@ -92,11 +97,13 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             too_far = gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)
             if phase == END:
                 too_far = point[NORMAL_IMPULSE] == 0.0 and (gap + h * approach > rules.slop or -approach > rules.slow)
+            if stiff < math.inf:
+                too_far = gap > 0.0
             if point[VOID] > 0.0 or too_far:
                 point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
                 continue
             # Newton's rule for all contacts of one impact: without friction and with e = 1, energy is conserved.
-            target, rebounds = 0.0, phase != END and bounce > 0.0 and abs(approach) > rules.slow
+            target, rebounds = 0.0, phase != END and bounce > 0.0 and abs(approach) > rules.slow and stiff == math.inf
             if rebounds:
                 # Bodies that rebound before they have touched get the speed that they will have here on their way back.
                 fall = 2.0 * dot(coming, n) / (kick * h) * max(gap, 0.0) * (1.0 - bounce * bounce)
@@ -105,7 +112,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             # An impact is over before a body has turned: the gyroscopic torque acts after it.
             before = dot(free_fall, n) if rebounds else dot(then, n)
             deep = rest = 0.0
-            if phase != END:
+            if phase != END and stiff == math.inf:
                 if gap > TOUCH:
                     rest = -gap / h
                     target = target if rebounds else rest
@@ -115,6 +122,13 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             rows.where[count, 0], rows.where[count, 1], rows.where[count, 2], rows.where[count, 3] = m, k, a, b
             write_point(row[count, 0], n, arm, other)
             respond(work, rules, row[count, 0], a, b)
+            if stiff < math.inf and row[count, 0, MASS] > 0.0:
+                # At the end of a step the distance is that before the last move.
+                away = -gap - (h * dot(now, n) if phase == END else 0.0)
+                coarse = max(0.0, 1.0 - RESOLVED * row[count, 0, MASS] / (stiff * h * h))
+                target, soft = softness(stiff, damping, coarse, away, dot(now, n), row[count, 0, MASS], h, phase)
+                soften(row[count, 0], soft)
+                rest = target
             row[count, 0, WANTED] = target - before
             row[count, 0, IMPULSE] = kick * point[NORMAL_IMPULSE]
             rows.deep[count], rows.parted[count], rows.friction[count] = deep, 0.0, friction
@@ -144,6 +158,21 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
 
 
 @njit(**BARE)
+def _stiffness(world, manifolds, m, a, b):
+    """The stiffness and the damping of each point of two bodies: those of both bodies in series, shared by the points
+    that touch. Infinite and 0 for rigid bodies."""
+    compliance = world.compliance[a] + world.compliance[b]
+    if compliance == 0.0:
+        return math.inf, 0.0
+    points = 0
+    for k in range(manifolds.count[m]):
+        points += manifolds.point[m, k, GAP] <= 0.0 and manifolds.point[m, k, VOID] == 0.0
+    one, other = world.compliance[a] / compliance, world.compliance[b] / compliance
+    damping = world.damping[a] * one * one + world.damping[b] * other * other
+    return 1.0 / (compliance * max(points, 1)), damping / max(points, 1)
+
+
+@njit(**BARE)
 def remember(manifolds, rows, phase):
     """Write impulses to the manifolds, as those of a whole inner step."""
     whole = 1.0 / kick_of(phase)
@@ -169,14 +198,18 @@ def met_half_way(between, arm, other):
 def _drawn_in(matrix, point, m, count, k, a, b, between):
     """Where friction acts for a point that bounds a face: nearer to the middle of the points of the same two
     patches."""
-    middle, opposite, alike = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
+    middle, opposite, total = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
+    # Each point counts as it is loaded, so that friction keeps the resultant of the load.
+    loaded = point[m, k, NORMAL_IMPULSE] > 0.0
     for e in range(count):
         if point[m, e, KEY] == point[m, k, KEY]:
-            middle, opposite = add(middle, three(point[m, e], FIRST)), add(opposite, three(point[m, e], SECOND))
-            alike += 1
+            load = point[m, e, NORMAL_IMPULSE] if loaded else 1.0
+            middle = along(middle, three(point[m, e], FIRST), load)
+            opposite = along(opposite, three(point[m, e], SECOND), load)
+            total += load
     own, share = point[m, k], point[m, k, TORSION]
-    arm = along(scale(middle, (1.0 - share) / alike), three(own, FIRST), share)
-    other = along(scale(opposite, (1.0 - share) / alike), three(own, SECOND), share)
+    arm = along(scale(middle, (1.0 - share) / total), three(own, FIRST), share)
+    other = along(scale(opposite, (1.0 - share) / total), three(own, SECOND), share)
     return met_half_way(between, turn(matrix, a, arm), turn(matrix, b, other))
 
 

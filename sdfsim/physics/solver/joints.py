@@ -44,7 +44,6 @@ from sdfsim.physics.solver.flight import drift
 from sdfsim.physics.solver.rows import (
     AIM,
     ANGULAR,
-    COMPLIANCE,
     DRAG,
     GRIP,
     IMPULSE,
@@ -53,10 +52,14 @@ from sdfsim.physics.solver.rows import (
     LINEAR,
     MASS,
     OTHER,
+    RESOLVED,
     SIDE,
     STRONGEST,
     WANTED,
+    later,
     respond,
+    soften,
+    softness,
     three,
     velocity_of,
     write_point,
@@ -82,15 +85,12 @@ from sdfsim.physics.solver.vectors import (
     turned_by,
     vector,
 )
-from sdfsim.physics.solver.world import END, START, kick_of
+from sdfsim.physics.solver.world import END, kick_of
 
 STRETCH = 1e-7  # model lengths (and rad): rows with a larger error are repaired by moving bodies
 REPAIR = 0.05  # largest repair in an inner step, model lengths (and rad)
 GIVES = 0.2  # share of an overrun limit that an inner step resolves
-# (Phase of a motor with a gain in an inner step)^2 up to which it is not damped: ten inner steps a period.
-RESOLVED = 0.4
 AHEAD = 0.05  # model lengths (and rad): nearer limits are taken into account
-RIGID = 1e-9  # least impulse of a spring for a unit of speed, relative to the row's effective mass
 
 
 class Each(NamedTuple):
@@ -259,33 +259,6 @@ def _write_held(each, held, position, matrix, j):
 
 
 @njit(**BARE)
-def _late(z):
-    """The share that the velocity after a kick has in the mean that damps exactly; `z` is the damping relative to what
-    stops the row in the kick."""
-    return 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
-
-
-@njit(**BARE)
-def _soft(stiff, damping, coarse, away, before, mass, h, phase):
-    """The impulse of a spring with damping in a kick as a row: the wanted velocity and the compliance.
-
-    The spring acts with the mean of its forces before and after each move, so that it keeps its energy for any
-    stiffness (Newmark's method with beta 1/4): with the kick k h and the row's velocities u before and v after it, the
-    impulse is k h stiff away + h^2 stiff / 4 (u - v), without u at the start of a step, where no move comes before, and
-    without v at its end. `coarse` adds damping.
-    """
-    span = kick_of(phase) * h
-    late = _late(damping * span / mass)
-    rate = damping * span * late + RIGID * mass
-    push = span * (stiff * away - damping * (1.0 - late) * before)
-    if phase != END:
-        rate += h * h * stiff * (0.25 + coarse)
-    if phase != START:
-        push += 0.25 * h * h * stiff * before
-    return push / rate, 1.0 / rate
-
-
-@njit(**BARE)
 def _write_springs(work, rules, each, held, j, phase):
     """Springs and damping of a joint as soft rows beside those that hold."""
     number, kind = each.number[j], each.kind[j]
@@ -305,7 +278,7 @@ def _write_springs(work, rules, each, held, j, phase):
         before = velocity_of(row, work.twist, a, b)
         away = number[REST] - each.state[j, COORD] if number[STIFFNESS] > 0.0 else 0.0
         held.active[j, e] = 2
-        held.wanted[j, e], held.soft[j, e] = _soft(
+        held.wanted[j, e], held.soft[j, e] = softness(
             number[STIFFNESS], number[DAMPING], 0.0, away, before, row[MASS], rules.substep_dt, phase
         )
 
@@ -536,10 +509,11 @@ def _motor(work, rules, each, rows, count, j, phase):
         _copy(row, own)
         goal = aim if part == 0 else 0.0
         own[WANTED], own[IMPULSE] = goal - free, kick * state[DRIVE]
-        mine[AIM], mine[STRONGEST], mine[DRAG], mine[COMPLIANCE] = goal, most, grip, 0.0
+        mine[AIM], mine[STRONGEST], mine[DRAG] = goal, most, grip
         if soft > 0.0:
             own[IMPULSE] = kick * (state[DRIVE + 1] if part == 0 else state[DRIVE] - state[DRIVE + 1])
-            mine[STRONGEST], mine[DRAG], mine[COMPLIANCE] = most * (1 - part), grip * part, soft * (1 - part)
+            mine[STRONGEST], mine[DRAG] = most * (1 - part), grip * part
+            soften(own, soft * (1 - part))
         count += 1
     return count
 
@@ -549,10 +523,10 @@ def _servo(motor, gain, time, target, coord, before, mass, h, phase):
     """The wanted speed and the compliance of a motor with a gain: damping towards a speed, or a spring with damping,
     with more damping where the inner step does not resolve its period."""
     if motor == TO_SPEED:
-        late = _late(gain * kick_of(phase) * h / mass)
+        late = later(gain * kick_of(phase) * h / mass)
         return (target - (1.0 - late) * before) / late, 1.0 / (kick_of(phase) * h * gain * late)
     coarse = max(0.0, 1.0 - RESOLVED * mass / (gain * h * h))
-    return _soft(gain, gain * time, coarse, target - coord, before, mass, h, phase)
+    return softness(gain, gain * time, coarse, target - coord, before, mass, h, phase)
 
 
 @njit(**BARE)

@@ -124,7 +124,7 @@ class Compiled:
     def revise(self, bodies: Bodies) -> None:
         """Take over other masses, inertias, friction and restitution of the same bodies."""
         self.bodies, world = bodies, self.world
-        for name in ("friction", "restitution", "inverse_mass", "inertia"):
+        for name in ("friction", "restitution", "compliance", "damping", "inverse_mass", "inertia"):
             getattr(world, name)[:] = getattr(bodies, name)
         self.work.inverse_mass[:-1] = bodies.inverse_mass
         world.inverse_inertia[:] = np.linalg.inv(bodies.inertia) * bodies.moves[:, None, None]
@@ -465,8 +465,8 @@ def _packed(solids: list[tuple[ConvexPiece, ...]]) -> Convex:
 def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compiled.World:
     """The bodies of a scene."""
     names = (
-        "shape", "scale", "com", "radius", "inverse_mass", "inertia", "friction", "restitution", "moves", "group",
-        "world", "bounds",
+        "shape", "scale", "com", "radius", "inverse_mass", "inertia", "friction", "restitution", "compliance",
+        "damping", "moves", "group", "world", "bounds",
     )  # fmt: skip
     # Copies: code that changes a world, such as a fit of coefficients, must not change the bodies that it was made
     # from.
@@ -499,7 +499,8 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         thickness=thickness,
         inverse_mass=array["inverse_mass"], inertia=inertia,
         inverse_inertia=np.linalg.inv(inertia) * moves[:, None, None], isotropic=isotropic,
-        friction=array["friction"], restitution=array["restitution"], moves=moves, scripted=scripted,
+        friction=array["friction"], restitution=array["restitution"], compliance=array["compliance"],
+        damping=array["damping"], moves=moves, scripted=scripted,
         group=array["group"], allowed=array["allowed"], world=array["world"],
         going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,

@@ -14,12 +14,16 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, scale, sub, turn
+from sdfsim.physics.solver.world import END, START, kick_of
 
 # Columns of a row. Jacobian: the direction at the first body (its opposite at the second), and about both centres of
 # mass; response: what a unit impulse adds to both angular velocities; the effective mass (the inverse of the change of
-# the row's velocity by a unit impulse, 0 if nothing moves along it); the wanted change; the impulse so far; and that of
-# an impact with all of its rebound.
-LINEAR, ANGULAR, OTHER, TURN, COUNTER, MASS, WANTED, IMPULSE, REBOUND, WIDTH = 0, 3, 6, 9, 12, 15, 16, 17, 18, 19
+# the row's velocity by a unit impulse and by its compliance, 0 if nothing moves along it); the wanted change; the
+# impulse so far; that of an impact with all of its rebound; and the compliance, by which the row lags behind its wanted
+# change for a unit impulse.
+LINEAR, ANGULAR, OTHER, TURN, COUNTER, MASS, WANTED, IMPULSE, REBOUND, SOFT, WIDTH = (
+    0, 3, 6, 9, 12, 15, 16, 17, 18, 19, 20,
+)  # fmt: skip
 # Kinds of blocks.
 CONTACT, LIMIT, MOTOR, GRIP = range(4)
 # Columns of `Rows.own` by kind. Contacts: the wanted change along the normal without rebound, and the speed along it
@@ -28,9 +32,12 @@ CALM, BEFORE = range(2)
 # Limits: the distance to it that must be left after the inner step (infinite if it rebounds), and 1 for the lower limit
 # or -1 for the upper.
 LEFT, SIDE = range(2)
-# Motors: the speed to reach; the largest impulses of the motor and of friction; and the compliance of a motor with a
-# gain, by which its speed lags behind for a unit impulse. Friction of balls has its largest impulse in the same column.
-AIM, STRONGEST, DRAG, COMPLIANCE = range(4)
+# Motors: the speed to reach; the largest impulses of the motor and of friction. Friction of balls has its largest
+# impulse in the same column.
+AIM, STRONGEST, DRAG = range(3)
+# (Phase of a spring in an inner step)^2 up to which it is not damped: ten inner steps a period.
+RESOLVED = 0.4
+RIGID = 1e-9  # least impulse of a spring for a unit of speed, relative to the row's effective mass
 
 
 class Rows(NamedTuple):
@@ -107,6 +114,41 @@ def respond(work, rules, row, a, b):
 
 
 @njit(**BARE)
+def later(z):
+    """The share that the velocity after a kick has in the mean that damps exactly; `z` is the damping relative to what
+    stops the row in the kick."""
+    return 0.5 + z / 12.0 if z < 0.01 else 1.0 / (1.0 - math.exp(-z)) - 1.0 / z
+
+
+@njit(**BARE)
+def softness(stiff, damping, coarse, away, before, mass, h, phase):
+    """The impulse of a spring with damping in a kick as a row: the wanted velocity and the compliance.
+
+    The spring acts with the mean of its forces before and after each move, so that it keeps its energy for any
+    stiffness (Newmark's method with beta 1/4): with the kick k h and the row's velocities u before and v after it, the
+    impulse is k h stiff away + h^2 stiff / 4 (u - v), without u at the start of a step, where no move comes before, and
+    without v at its end. `coarse` adds damping.
+    """
+    span = kick_of(phase) * h
+    late = later(damping * span / mass)
+    rate = damping * span * late + RIGID * mass
+    push = span * (stiff * away - damping * (1.0 - late) * before)
+    if phase != END:
+        rate += h * h * stiff * (0.25 + coarse)
+    if phase != START:
+        push += 0.25 * h * h * stiff * before
+    return push / rate, 1.0 / rate
+
+
+@njit(**BARE)
+def soften(row, compliance):
+    """Give a row its compliance."""
+    row[SOFT] = compliance
+    if row[MASS] > 0.0:
+        row[MASS] = 1.0 / (1.0 / row[MASS] + compliance)
+
+
+@njit(**BARE)
 def give(mass, row, twist, a, b, impulse):
     """Add the effect of an impulse along a row to velocities [N + 1, 6]."""
     one, other = impulse * mass[a], impulse * mass[b]
@@ -162,6 +204,7 @@ def _relax(where, row, mass, change, c):
     u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
     axis = three(own, LINEAR)
     short = own[WANTED] - (dot(axis, sub(v, u)) + dot(three(own, ANGULAR), w) + dot(three(own, OTHER), z))
+    short -= own[SOFT] * own[IMPULSE]
     total = max(own[IMPULSE] + short * own[MASS], 0.0)
     step = total - own[IMPULSE]
     if step == 0.0:
@@ -206,7 +249,7 @@ def _relax_friction(where, row, mass, change, c, most):
 @njit(**INLINED)
 def _short(rows, work, delassus, c, e):
     """What row e of a block lacks of its wanted change."""
-    wanted = rows.row[c, e, WANTED]
+    wanted = rows.row[c, e, WANTED] - rows.row[c, e, SOFT] * rows.row[c, e, IMPULSE]
     if len(delassus.change):
         return wanted - delassus.change[delassus.at[c] + e]
     return wanted - velocity_of(rows.row[c, e], work.change, rows.where[c, 2], rows.where[c, 3])
@@ -238,15 +281,12 @@ def _relax_one(rows, work, delassus, c):
     short, total = _short(rows, work, delassus, c, 0), 0.0
     if mass > 0.0:  # else joints allow no motion along it
         total = before + short * mass
-        if rows.kind[c] == MOTOR:
-            now = own[AIM] - short - before / mass  # the speed without it
-            if own[COMPLIANCE] > 0.0:
-                total = (own[AIM] - now) / (1.0 / mass + own[COMPLIANCE])
-                total = min(max(total, -own[STRONGEST]), own[STRONGEST])
-            else:
-                total = _driven(now, own[AIM], 1.0 / mass, own[STRONGEST], own[DRAG])
-        else:
+        if rows.kind[c] != MOTOR:
             total = max(total, 0.0)
+        elif rows.row[c, 0, SOFT] > 0.0:
+            total = min(max(total, -own[STRONGEST]), own[STRONGEST])
+        else:
+            total = _driven(own[AIM] - total / mass, own[AIM], 1.0 / mass, own[STRONGEST], own[DRAG])
     return _set(rows, work, delassus, c, 0, total)
 
 

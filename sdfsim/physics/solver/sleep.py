@@ -85,6 +85,7 @@ def put_to_sleep(world, work, motion, rules, manifolds, joints):
             join(parent, a, b)
     restless = np.zeros(n, np.bool_)
     _join_held(world, joints.each.body, parent)
+    _mark_gliding(world, motion, rules, manifolds, joints, parent, restless)
     for j in range(len(joints.each.body)):
         a = _driven_by_path(world, motion, joints.each.body, j)
         if a >= 0:
@@ -105,6 +106,22 @@ def put_to_sleep(world, work, motion, rules, manifolds, joints):
             motion.island[b] = number + root(parent, b)
             put(motion.velocity, b, (0.0, 0.0, 0.0))
             put(motion.angular, b, (0.0, 0.0, 0.0))
+
+
+@njit(**FAST)
+def _mark_gliding(world, motion, rules, manifolds, joints, parent, restless):
+    """Mark the islands of bodies that move steadily while no friction acts on them: they never come to rest."""
+    braked = np.zeros(len(world.shape), np.bool_)
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        if manifolds.count[m] and rules.options.friction and world.friction[a] * world.friction[b] > 0.0:
+            braked[a] = braked[b] = True
+    span = rules.rest * rules.substep_dt * rules.options.substeps
+    for b in world.going:
+        if world.moves[b] and motion.island[b] < 0 and not braked[b] and joints.graph.of_body[b] < 0:
+            speed = norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) * world.radius[b]
+            if speed * span > rules.drift:
+                restless[root(parent, b)] = True
 
 
 @njit(**BARE)

@@ -31,6 +31,7 @@ from sdfsim.physics.solver.rows import (
     IMPULSE,
     MASS,
     REBOUND,
+    SOFT,
     WANTED,
     WIDTH,
     Delassus,
@@ -139,8 +140,7 @@ def _solve_rows(world, work, motion, rules, rows, joints, delassus, island, phas
     Newton's rule for several contacts with friction may gain energy (Kane and Levinson 1985); that mixture cannot,
     since energy is convex in the impulses, and it stays within the cones of friction.
     """
-    order = rows.order
-    lo, hi = rows.start[island], rows.start[island + 1]
+    order, lo, hi = rows.order, rows.start[island], rows.start[island + 1]
     lively = deep = False
     for i in range(lo, hi):
         c = order[i]
@@ -151,24 +151,29 @@ def _solve_rows(world, work, motion, rules, rows, joints, delassus, island, phas
     if joints is not None:
         if len(delassus.change):
             _find_delassus(world, work, motion, rows, joints, delassus)
+    _balance(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
+    if lively:
+        _keep_energy(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
     if deep:
         _part(work, rules, rows, joints, island, rounds)
-    _balance(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
-    if not lively:
-        return
-    gain, brought = _gain(rows, work.change, lo, hi)
+
+
+@njit(**BARE)
+def _keep_energy(world, work, motion, rules, rows, joints, delassus, island, rounds, phase):
+    lo, hi, change = rows.start[island], rows.start[island + 1], work.change
+    gain, brought = _gain(rows, change, lo, hi)
     if gain <= ROUNDING * brought:
         return
     for i in range(lo, hi):
-        c = order[i]
+        c = rows.order[i]
         for e in range(3):
             rows.row[c, e, REBOUND] = rows.row[c, e, IMPULSE]
         if rows.kind[c] == CONTACT:
             rows.row[c, 0, WANTED] = rows.own[c, CALM]
     _balance(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
-    loss, _ = _gain(rows, work.change, lo, hi)
+    loss, _ = _gain(rows, change, lo, hi)
     share = max(loss / (loss - gain), 0.0) if loss < gain else 0.0
-    _clear(joints, rows, work.change, island, share, 1.0 - share)
+    _clear(joints, rows, change, island, share, 1.0 - share)
     _give_all(work, rows, lo, hi)
     _balance(world, work, motion, rules, rows, joints, delassus, island, np.int64(0), phase)
 
@@ -236,14 +241,15 @@ def _gain(rows, change, lo, hi):
 
 @njit(**BARE)
 def _part(work, rules, rows, joints, island, rounds):
-    """Separate bodies that overlap deeply, by velocities that move them once and do not last."""
+    """Separate bodies that overlap, by velocities that move them once and do not last, beside those that do."""
     for _ in range(rounds):
         worst = 0.0
         for i in range(rows.start[island], rows.start[island + 1]):
             c = rows.order[i]
             row, a, b = rows.row[c, 0], rows.where[c, 2], rows.where[c, 3]
             if rows.deep[c] > 0.0 and row[MASS] > 0.0:
-                short = rows.deep[c] - velocity_of(row, work.shift, a, b)
+                parts = max(rows.own[c, BEFORE] + velocity_of(row, work.change, a, b), 0.0)
+                short = rows.deep[c] - parts - velocity_of(row, work.shift, a, b)
                 total = max(rows.parted[c] + short * row[MASS], 0.0)
                 step = total - rows.parted[c]
                 rows.parted[c] = total
@@ -343,8 +349,8 @@ def _find_delassus(world, work, motion, rows, joints, delassus):
             d = delassus.block[q]
             own_row = rows.row[d, q - delassus.at[d]]
             delassus.matrix[r, q] = velocity_of(own_row, reply, rows.where[d, 2], rows.where[d, 3])
-        effect = delassus.matrix[r, r]
-        row[MASS] = 1.0 / effect if effect * row[MASS] > BLOCKED else 0.0
+        effect, soft = delassus.matrix[r, r], row[SOFT]
+        row[MASS] = 1.0 / (effect + soft) if effect > BLOCKED * (1.0 / row[MASS] - soft) else 0.0
         for x in range(6):
             reply[a, x] = reply[b, x] = 0.0
         forget_through(graph, reply, a, b, own)

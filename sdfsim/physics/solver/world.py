@@ -60,6 +60,9 @@ class World(NamedTuple):
     # friction, restitution: [N]
     friction: np.ndarray
     restitution: np.ndarray
+    # compliance (0 if rigid), damping: [N] of contacts
+    compliance: np.ndarray
+    damping: np.ndarray
     moves: np.ndarray  # [N] bool, dynamic
     scripted: np.ndarray  # [N] bool, kinematic
     group: np.ndarray  # [N] int64
