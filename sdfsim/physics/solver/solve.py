@@ -144,7 +144,7 @@ def _solve_rows(world, work, motion, rules, rows, joints, delassus, island, phas
     lively = deep = False
     for i in range(lo, hi):
         c = order[i]
-        deep = deep or rows.deep[c] > 0.0
+        rows.parted[c], deep = 0.0, deep or rows.deep[c] > 0.0
         lively = lively or (rows.kind[c] == CONTACT and rows.row[c, 0, WANTED] > rows.own[c, CALM])
     _give_all(work, rows, lo, hi)
     rounds = _sweeps(work.inverse_mass, rules, rows, island)
@@ -155,7 +155,7 @@ def _solve_rows(world, work, motion, rules, rows, joints, delassus, island, phas
     if lively:
         _keep_energy(world, work, motion, rules, rows, joints, delassus, island, rounds, phase)
     if deep:
-        _part(work, rules, rows, joints, island, rounds)
+        _part(work, rules, rows, joints, delassus, island, rounds)
 
 
 @njit(**BARE)
@@ -240,24 +240,40 @@ def _gain(rows, change, lo, hi):
 
 
 @njit(**BARE)
-def _part(work, rules, rows, joints, island, rounds):
+def _part(work, rules, rows, joints, delassus, island, rounds):
     """Separate bodies that overlap, by velocities that move them once and do not last, beside those that do."""
+    lo, hi, coupled = rows.start[island], rows.start[island + 1], False
+    if joints is not None:
+        coupled = len(delassus.change) > 0
+        for r in range(len(delassus.change)):
+            delassus.change[r] = 0.0
     for _ in range(rounds):
         worst = 0.0
-        for i in range(rows.start[island], rows.start[island + 1]):
+        for i in range(lo, hi):
             c = rows.order[i]
             row, a, b = rows.row[c, 0], rows.where[c, 2], rows.where[c, 3]
             if rows.deep[c] > 0.0 and row[MASS] > 0.0:
-                parts = max(rows.own[c, BEFORE] + velocity_of(row, work.change, a, b), 0.0)
-                short = rows.deep[c] - parts - velocity_of(row, work.shift, a, b)
-                total = max(rows.parted[c] + short * row[MASS], 0.0)
+                now = max(rows.own[c, BEFORE] + velocity_of(row, work.change, a, b), 0.0)
+                if delassus is None:
+                    now += velocity_of(row, work.shift, a, b)
+                else:
+                    now += delassus.change[delassus.at[c]] if coupled else velocity_of(row, work.shift, a, b)
+                total = max(rows.parted[c] + (rows.deep[c] - now) * row[MASS], 0.0)
                 step = total - rows.parted[c]
                 rows.parted[c] = total
-                give(work.inverse_mass, row, work.shift, a, b, step)
+                if not coupled:
+                    give(work.inverse_mass, row, work.shift, a, b, step)
+                elif delassus is not None:
+                    for q in range(len(delassus.change)):
+                        delassus.change[q] += step * delassus.matrix[delassus.at[c], q]
                 worst = max(worst, abs(step / row[MASS]))
         if worst <= rules.exact:
             break
     if joints is not None:
+        for i in range(lo, hi):
+            c = rows.order[i]
+            if coupled and rows.kind[c] == CONTACT and rows.parted[c] > 0.0:
+                give(work.inverse_mass, rows.row[c, 0], work.shift, rows.where[c, 2], rows.where[c, 3], rows.parted[c])
         for i in range(rows.first[island], rows.first[island + 1]):
             project(work, joints.graph, joints.factors, joints.held, rows.component[i], work.shift, False)
 
