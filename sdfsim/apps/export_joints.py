@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.physics.joint_space import spanning
 from sdfsim.scene.scene import Body, Joint, Scene
 
 NESTING = ("hinge", "slider", "ball", "fixed")  # kinds of joints by which one body can hold another in a tree
@@ -61,31 +62,10 @@ class Trees:
 
 def trees(scene: Scene) -> Trees:
     """Trees whose roots are the world and bodies that are not dynamic, then those of free bodies."""
-    at: dict[int, list[int]] = {}
-    for number, joint in enumerate(scene.joints):
-        if joint.kind in NESTING:
-            for k in joint.bodies:
-                at.setdefault(k, []).append(number)
     still = [k for k, body in enumerate(scene.bodies) if body.motion != "dynamic"]
-    above: dict[int, Held] = {}
-    reached, used = {-1, *still}, set()
-    # Bodies that are first in no joint are the natural roots of free trees.
-    free = [k for k in range(len(scene.bodies)) if k not in reached]
-    firsts = {joint.bodies[0] for joint in scene.joints if joint.kind in NESTING}
-    for seeds in ([-1, *still], *([k] for k in sorted(free, key=lambda k: k in firsts))):
-        if seeds[0] != -1 and seeds[0] in reached:
-            continue
-        queue = list(seeds)
-        reached |= set(seeds)
-        for k in queue:  # grows
-            for number in at.get(k, ()):
-                joint = scene.joints[number]
-                other = joint.bodies[1] if joint.bodies[0] == k else joint.bodies[0]
-                if other not in reached:
-                    above[other] = held(joint, other)
-                    used.add(number)
-                    reached.add(other)
-                    queue.append(other)
+    ends = [joint.bodies if joint.kind in NESTING else None for joint in scene.joints]
+    used = spanning(ends, still, len(scene.bodies))
+    above = {k: held(scene.joints[j], k) for j, k in used}
     below: dict[int, list[int]] = {}
     for k in sorted(above):
         below.setdefault(above[k].parent, []).append(k)
@@ -95,7 +75,7 @@ def trees(scene: Scene) -> Trees:
         k = stack.pop()
         order.append(k)
         stack += reversed(below.get(k, ()))
-    return Trees(tuple(order), above, tuple(j for n, j in enumerate(scene.joints) if n not in used))
+    return Trees(tuple(order), above, tuple(j for n, j in enumerate(scene.joints) if n not in dict(used)))
 
 
 def place(body: Body | None) -> tuple[np.ndarray, Rotation]:

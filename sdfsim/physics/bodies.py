@@ -2,7 +2,7 @@
 changes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -264,9 +264,8 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         orientation=orientation,
         velocity=array([b.velocity for b in scene.bodies]) / units.velocity,
         angular_velocity=array([b.angular_velocity for b in scene.bodies]) * units.time,
-        joints=None if bodies.joints is None else jointed.initial(bodies.joints, position, orientation),
     )
-    return bodies, state
+    return bodies, state if bodies.joints is None else replace(state, joints=jointed.initial(bodies.joints, state))
 
 
 def _tracks(paths: Sequence[tuple[int, Waypoints]], com: np.ndarray, *, length: float, time: float) -> Tracks | None:

@@ -23,6 +23,7 @@ from sdfsim.physics.joint_columns import (
     MOTOR,
     NUMBERS,
     REST,
+    SPEED,
     STATE,
     STIFFNESS,
     TARGET,
@@ -31,6 +32,7 @@ from sdfsim.physics.joint_columns import (
     TO_SPEED,
     TORQUE,
 )
+from sdfsim.physics.motion import Motion
 from sdfsim.scene.scene import Joint
 
 # A mode besides `TO_SPEED` and `TO_PLACE`: the motor gives a torque or force, and the target is this value. The
@@ -98,12 +100,26 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
     return Joints(body, kind, anchor, axes, number, start, target, collides)
 
 
-def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """[J, STATE] of joints at the start, when only the poses of bodies are known."""
+def initial(joints: Joints, motion: Motion) -> np.ndarray:
+    """[J, STATE] of joints at the start, when only the motion of bodies is known."""
     state = np.zeros((len(joints), STATE))
     state[:, TARGET] = joints.target
-    state[:, COORD] = coordinates(joints, joints.start, position, orientation)
+    state[:, COORD] = coordinates(joints, joints.start, motion.position, motion.orientation)
+    state[:, SPEED] = speeds(joints, motion)
     return state
+
+
+def world_frames(joints: Joints, place: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[J, 2, 3] the anchors of joints at both bodies, and [J, 2, 3, 3] the axes there, one per row, in the world, for
+    bodies at `place` [N + 1, 3] with axes `turn` [N + 1, 3, 3]; the last row is the world."""
+    matrix = turn[joints.body]
+    point = place[joints.body] + np.einsum("jsxy,jsy->jsx", matrix, joints.anchor)
+    return point, np.einsum("jsxy,jsky->jskx", matrix, joints.axes)
+
+
+def _with_world(values: np.ndarray, fill: np.ndarray | float = 0.0) -> np.ndarray:
+    """[N + 1, ...]: rows of bodies, and that of the world."""
+    return np.concatenate([values, np.broadcast_to(fill, (1, *values.shape[1:]))])
 
 
 def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
@@ -111,11 +127,8 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
     balls, the length of distances, and 0 for fixed joints, for bodies at `position` [N, 3] and `orientation` [N, 4]."""
     if not len(joints):
         return np.zeros(0)
-    known = joints.body >= 0
-    matrix = np.where(known[:, :, None, None], pose.to_matrix(orientation)[joints.body], np.eye(3))
-    place = np.where(known[:, :, None], position[joints.body], 0.0)
-    point = place + np.einsum("jsxy,jsy->jsx", matrix, joints.anchor)
-    axes = np.einsum("jsxy,jsky->jskx", matrix, joints.axes)
+    matrix = _with_world(pose.to_matrix(orientation), np.eye(3))
+    point, axes = world_frames(joints, _with_world(position), matrix)
     way = point[:, 0] - point[:, 1]
 
     def times(k: int, m: int) -> np.ndarray:
@@ -126,6 +139,24 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
     leaning = np.arctan2(np.linalg.norm(np.cross(axes[:, 0, 0], axes[:, 1, 0]), axis=-1), times(0, 0))
     along, length = (axes[:, 1, 0] * way).sum(-1), np.linalg.norm(way, axis=-1)
     return np.choose(joints.kind, [angle, along, leaning, np.zeros(len(joints)), length])
+
+
+def speeds(joints: Joints, motion: Motion) -> np.ndarray:
+    """[J] the rates at which the `coordinates` change."""
+    if not len(joints):
+        return np.zeros(0)
+    place = _with_world(motion.position)
+    point, axes = world_frames(joints, place, _with_world(pose.to_matrix(motion.orientation), np.eye(3)))
+    fast, spin = (_with_world(part)[joints.body] for part in (motion.velocity, motion.angular_velocity))
+    way, turn = point[:, 0] - point[:, 1], spin[:, 0] - spin[:, 1]
+    # As seen from the second body: its points turn with it.
+    ends = fast[:, 0] + np.cross(spin[:, 0], point[:, 0] - place[joints.body[:, 0]])
+    slide = ends - fast[:, 1] - np.cross(spin[:, 1], point[:, 0] - place[joints.body[:, 1]])
+    lean = np.cross(axes[:, 1, 0], axes[:, 0, 0])
+    ways = np.stack([axes[:, 0, 0], axes[:, 1, 0], lean, np.zeros_like(lean), way])
+    lengths = np.linalg.norm(ways, axis=-1)
+    rates = (ways * [turn, slide, turn, turn, slide]).sum(-1) / np.where(lengths > 1e-12, lengths, np.inf)
+    return rates[joints.kind, np.arange(len(joints))]
 
 
 def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -37,13 +37,14 @@ def held(
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
-    axis = np.array([1.0, 0.0, 0.0]) if axis is None else np.asarray(axis, np.float64)
-    side = np.eye(3)[np.argmin(np.abs(axis))]
-    side = np.cross(axis, side) / np.linalg.norm(np.cross(axis, side))
-    frame = Rotation.from_matrix(np.stack([axis, side, np.cross(axis, side)], 1))
+    frame = Rotation.identity()  # without an axis it has those of the world
+    if axis is not None:
+        side = np.eye(3)[np.argmin(np.abs(axis))]
+        side = np.cross(axis, side) / np.linalg.norm(np.cross(axis, side))
+        frame = Rotation.from_matrix(np.stack([axis, side, np.cross(axis, side)], 1))
     turned = frame * Rotation.from_rotvec([start, 0.0, 0.0]) if kind == "hinge" else frame
     other = np.asarray(anchor if to is None else to, np.float64)
-    other = other - start * axis if kind == "slider" else other
+    other = other - start * np.asarray(axis) if kind == "slider" else other
     anchors, frames = [], []
     for body, point, axes in zip(bodies, (np.asarray(anchor, np.float64), other), (turned, frame), strict=True):
         place, back = np.zeros(3), Rotation.identity()

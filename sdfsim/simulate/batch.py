@@ -66,7 +66,7 @@ class Copies:
         state = placed(self.start, position / u.length, orientation, velocity / u.velocity, spin * u.time)
         if self.bodies.joints is None:
             return state
-        return replace(state, joints=initial(self.bodies.joints, state.position, state.orientation))
+        return replace(state, joints=initial(self.bodies.joints, state))
 
 
 def inner_of_frame(dt: float) -> int:

@@ -31,8 +31,8 @@ from sdfsim.scene.keys import BodyKeys
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.schema import BodyTable
-from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
-from sdfsim.simulate.joint import JointHandle
+from sdfsim.simulate.body import BodyHandle, ContactPoint
+from sdfsim.simulate.joint import Jointed, JointHandle
 from sdfsim.simulate.record import Recording
 from sdfsim.simulate.steppers import Carry, FreeFlight, energies_of, stacked, stepper_of
 
@@ -65,7 +65,7 @@ class Snapshot:
     attributes: Mapping[str, Any]
 
 
-class Simulator(LiveScene):
+class Simulator(Jointed):
     """Simulates one scene.
 
         simulator = sdfsim.Simulator(sdfsim.load_scene("pile"))
@@ -244,14 +244,26 @@ class Simulator(LiveScene):
             self._carry.checked = True
         return self._carry
 
-    def reset(self) -> None:
-        """Return to the start of the scene."""
-        self.restore(self._start)
+    def reset(self, keyframe: str | None = None) -> None:
+        """Return to the start of the scene, with the joints and free bodies of a `keyframe` of the scene at rest there;
+        motors that go to a position aim at it. Raises SdfsimError if no keyframe has that name."""
+        known = self.scene.keyframes
+        if keyframe is not None and keyframe not in known:
+            there = f"keyframes are {', '.join(known)}" if known else "the scene has no keyframes"
+            raise SdfsimError(f"there is no keyframe {keyframe!r}{nearest(keyframe, known)}", there)
+        self._return(self._start)
+        if keyframe is not None:
+            self._pose_as(known[keyframe])
+        self._cut()
 
     def restore(self, state: State) -> None:
         """Continue from a state that steps have led to, in this or another simulator of the same scene. The motion
         continues as it would have there, bit by bit, and sleeping bodies sleep on. For a state that you have changed,
         set `state` instead. Raises SdfsimError for an invalid state, or a state of another scene."""
+        self._return(state)
+        self._cut()
+
+    def _return(self, state: State) -> None:
         self._fits(state)
         if broken := first_fault(state, self._options.dt):
             raise SdfsimError(self._described(broken))
@@ -260,6 +272,8 @@ class Simulator(LiveScene):
         self._changed.clear()
         self._carry, self._given = None, 0.0
         self.steps_done = round(state.time / self._options.dt)
+
+    def _cut(self) -> None:
         for recording in self._recordings:
             recording.cut(self._driven(self.initial_rollout()))
 
@@ -389,15 +403,6 @@ class Simulator(LiveScene):
             close = nearest(name, self._names)
             raise SdfsimError(f"there is no body {name!r}{close}", f"bodies are {', '.join(self._names[:20])}")
         return self._names.index(name)
-
-    def joint(self, name: str) -> JointHandle:
-        """A joint by its name. Raises SdfsimError if no joint has that name."""
-        names = [joint.name for joint in self.scene.joints]
-        if name not in names:
-            suggestion = nearest(name, names)
-            known = f"joints are {', '.join(names[:20])}" if names else "the scene has no joints"
-            raise SdfsimError(f"there is no joint {name!r}{suggestion}", known)
-        return JointHandle(self, names.index(name))
 
     def contact_points(self) -> list[ContactPoint]:
         """The points where bodies touch in the present state, as the last step of the contact solve left them. Raises
