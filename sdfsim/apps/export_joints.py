@@ -174,6 +174,7 @@ def mjcf_rest(
     out. `sites` are the elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and
     joints."""
     lines, controls = left_out(scene.joints), []
+    lines += ["keyframes"] if scene.keyframes else []
     tags = ("equality", "tendon", "actuator", "contact")
     into = {tag: Element(tag) for tag in tags}
 
@@ -212,6 +213,14 @@ def mjcf_rest(
                 )  # fmt: skip
             if joint.limits or joint.damping or joint.friction or joint.spring or joint.motor:
                 lines.append(f"limits, damping, friction, spring and motor of {joint.name}, which closes a loop")
+    for coupling in scene.couplings:
+        one, other = (scene.joints[j] for j in coupling.joints)
+        if one in tree.loops or other in tree.loops:
+            lines.append(f"the coupling of {one.name} and {other.name}: one of them closes a loop")
+            continue
+        shift = coupling.offset + coupling.ratio * other.start - one.start  # MuJoCo counts from the start
+        add(into["equality"], "joint", name=f"{names[one.name]}_coupling", joint1=names[one.name],
+            joint2=names[other.name], polycoef=numbers((shift, coupling.ratio, 0.0, 0.0, 0.0)))  # fmt: skip
     for joint in scene.joints:
         first, second = joint.bodies
         if joint.collides and any(one.joint is joint for one in tree.above.values()):
@@ -247,7 +256,7 @@ def mjcf_rest(
 
 
 def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], links: dict[int, str],
-               origin: np.ndarray) -> None:  # fmt: skip
+               origin: np.ndarray, scene: Scene) -> None:  # fmt: skip
     """Write the joint that holds a link; `origin` [3] m is that of the parent's link in the parent's body."""
     joint = one.joint
     bounded = joint.limits is not None and joint.kind != "ball"
@@ -263,6 +272,10 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
         effort = EFFORT if joint.motor is None else joint.motor.max_force
         ends = {} if joint.kind == "hinge" and not bounded else {"lower": numbers(low), "upper": numbers(high)}
         add(made, "limit", **ends, effort=numbers(effort), velocity=numbers(EFFORT))
+    for coupling in scene.couplings:
+        if scene.joints[coupling.joints[0]] is joint:
+            of = names[scene.joints[coupling.joints[1]].name]
+            add(made, "mimic", joint=of, multiplier=numbers(coupling.ratio), offset=numbers(coupling.offset))
     if joint.damping or joint.friction:
         add(made, "dynamics", damping=numbers(joint.damping), friction=numbers(joint.friction))
 
