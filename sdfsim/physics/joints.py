@@ -110,16 +110,22 @@ def initial(joints: Joints, motion: Motion) -> np.ndarray:
 
 
 def world_frames(joints: Joints, place: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[J, 2, 3] the anchors of joints at both bodies, and [J, 2, 3, 3] the axes there, one per row, in the world, for
-    bodies at `place` [N + 1, 3] with axes `turn` [N + 1, 3, 3]; the last row is the world."""
-    matrix = turn[joints.body]
-    point = place[joints.body] + np.einsum("jsxy,jsy->jsx", matrix, joints.anchor)
-    return point, np.einsum("jsxy,jsky->jskx", matrix, joints.axes)
+    """[..., J, 2, 3] the anchors of joints at both bodies, and [..., J, 2, 3, 3] the axes there, one per row, in the
+    world, for bodies at `place` [..., N + 1, 3] with axes `turn` [..., N + 1, 3, 3]; the last row is the world."""
+    matrix = turn[..., joints.body, :, :]
+    point = place[..., joints.body, :] + np.einsum("...jsxy,jsy->...jsx", matrix, joints.anchor)
+    return point, np.einsum("...jsxy,jsky->...jskx", matrix, joints.axes)
 
 
-def _with_world(values: np.ndarray, fill: np.ndarray | float = 0.0) -> np.ndarray:
-    """[N + 1, ...]: rows of bodies, and that of the world."""
-    return np.concatenate([values, np.broadcast_to(fill, (1, *values.shape[1:]))])
+def _with_world(position: np.ndarray, orientation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`place` and `turn` of `world_frames`."""
+    turn = pose.to_matrix(orientation)
+    return _and_still(position), np.concatenate([turn, np.broadcast_to(np.eye(3), (*turn.shape[:-3], 1, 3, 3))], -3)
+
+
+def _and_still(values: np.ndarray) -> np.ndarray:
+    """[..., N + 1, 3]: values of bodies, and zeros for the world."""
+    return np.concatenate([values, np.zeros((*values.shape[:-2], 1, 3))], -2)
 
 
 def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
@@ -127,8 +133,7 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
     balls, the length of distances, and 0 for fixed joints, for bodies at `position` [N, 3] and `orientation` [N, 4]."""
     if not len(joints):
         return np.zeros(0)
-    matrix = _with_world(pose.to_matrix(orientation), np.eye(3))
-    point, axes = world_frames(joints, _with_world(position), matrix)
+    point, axes = world_frames(joints, *_with_world(position, orientation))
     way = point[:, 0] - point[:, 1]
 
     def times(k: int, m: int) -> np.ndarray:
@@ -142,21 +147,20 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
 
 
 def speeds(joints: Joints, motion: Motion) -> np.ndarray:
-    """[J] the rates at which the `coordinates` change."""
-    if not len(joints):
-        return np.zeros(0)
-    place = _with_world(motion.position)
-    point, axes = world_frames(joints, place, _with_world(pose.to_matrix(motion.orientation), np.eye(3)))
-    fast, spin = (_with_world(part)[joints.body] for part in (motion.velocity, motion.angular_velocity))
-    way, turn = point[:, 0] - point[:, 1], spin[:, 0] - spin[:, 1]
-    # As seen from the second body: its points turn with it.
-    ends = fast[:, 0] + np.cross(spin[:, 0], point[:, 0] - place[joints.body[:, 0]])
-    slide = ends - fast[:, 1] - np.cross(spin[:, 1], point[:, 0] - place[joints.body[:, 1]])
-    lean = np.cross(axes[:, 1, 0], axes[:, 0, 0])
-    ways = np.stack([axes[:, 0, 0], axes[:, 1, 0], lean, np.zeros_like(lean), way])
+    """[..., J] the rates at which the `coordinates` change, at one instant or at several."""
+    place, turned = _with_world(motion.position, motion.orientation)
+    point, axes = world_frames(joints, place, turned)
+    fast, spin = (_and_still(part)[..., joints.body, :] for part in (motion.velocity, motion.angular_velocity))
+    way, turn = point[..., 0, :] - point[..., 1, :], spin[..., 0, :] - spin[..., 1, :]
+    # Both bodies at the first one's anchor: as seen from the second body, whose points turn with it.
+    ends = fast + np.cross(spin, point[..., :1, :] - place[..., joints.body, :])
+    slide = ends[..., 0, :] - ends[..., 1, :]
+    first, second = axes[..., 0, 0, :], axes[..., 1, 0, :]
+    lean = np.cross(second, first)
+    ways = np.stack([first, second, lean, np.zeros_like(lean), way])
     lengths = np.linalg.norm(ways, axis=-1)
-    rates = (ways * [turn, slide, turn, turn, slide]).sum(-1) / np.where(lengths > 1e-12, lengths, np.inf)
-    return rates[joints.kind, np.arange(len(joints))]
+    rates = (ways * np.stack([turn, slide, turn, turn, slide])).sum(-1) / np.where(lengths > 1e-12, lengths, np.inf)
+    return np.choose(joints.kind, rates)
 
 
 def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

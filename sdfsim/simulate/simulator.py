@@ -19,7 +19,8 @@ from sdfsim.base.version import __version__
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, Moment, State, Units, from_scene
-from sdfsim.physics.joint_columns import BROKEN, COORD, TARGET
+from sdfsim.physics.joint_columns import BROKEN, COORD, DRIVE, TARGET
+from sdfsim.physics.joints import speeds
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
@@ -471,7 +472,7 @@ class Simulator(Jointed):
         self._accept()
         state, counts = self._state, {} if self._carry is None else self._carry.counts
         one, given = (state, 0.0, counts, self.stepper.touching(state, self._carry)), self._given
-        first = self._rollout(stacked(state, [one], self.bodies, self._options), 0.0)
+        first = self._rollout(stacked(state, [one], self.bodies, self._options), 0.0, told=True)
         self._given = given if self._recordings else 0.0  # a recording has yet to count it
         return first
 
@@ -494,6 +495,8 @@ class Simulator(Jointed):
     def _advance(self, count: int, *, keep: bool = False) -> Rollout | None:
         """Make `count` steps, in one call if the stepper can. Returns their frames with `keep`, or if somebody
         records."""
+        if self._recordings and count > 1:  # one by one: efforts and forces are known after each
+            return self._one_by_one(count, keep=keep)
         self._accept(keep=keep)
         started = running()
         made = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep or bool(self._recordings))
@@ -503,12 +506,25 @@ class Simulator(Jointed):
         if made.frames is None:
             self._given += made.given
         else:
-            part = self._rollout(made.frames, 1e3 * (running() - started) / max(made.done, 1))
+            spent = 1e3 * (running() - started) / max(made.done, 1)
+            part = self._rollout(made.frames, spent, told=bool(self._recordings))
             for recording in self._recordings:
                 recording.add(self._driven(part))
         if made.fault is not None:
             raise self._broke(self._described(made.fault), part if keep else None)
         return part
+
+    def _one_by_one(self, count: int, *, keep: bool) -> Rollout | None:
+        parts: list[Rollout] = []
+        for _ in range(count):
+            try:
+                part = self._advance(1, keep=keep)
+            except SimulationError as error:
+                if not keep:
+                    raise
+                raise SimulationError(error.message, join([*parts, error.rollout])) from None
+            parts += [] if part is None else [part]
+        return join(parts) if keep else None
 
     def _driven(self, part: Rollout) -> Rollout:
         """The frames of steps in which motors did not change, with their targets and efforts as counters."""
@@ -554,13 +570,22 @@ class Simulator(Jointed):
         message = f"step {self.steps_done + 1}: {what}; {last}"
         return SimulationError(message, self.initial_rollout() if frames is None else frames)
 
-    def _rollout(self, frames: Frames, milliseconds: float) -> Rollout:
-        """Frames up to the present step in SI units, each of which took `milliseconds`."""
+    def _rollout(self, frames: Frames, milliseconds: float, *, told: bool = False) -> Rollout:
+        """Frames up to the present step in SI units, each of which took `milliseconds`; `told`: a single one has the
+        efforts and forces of the present state."""
         u, k = self.units, len(frames.depth)
         given = frames.energy[:, 2].copy()
         if k:
             given[0] += self._given
             self._given = 0.0
+        jointed, moved = frames.joint.shape[1] > 0, u.in_si(frames)
+        force = np.full((len(frames.pair), 3), np.nan)
+        effort = np.full(frames.joint.shape[:2], np.nan)
+        if told and k == 1 and self.stepper.forces:
+            force = np.array([contact.force for contact in self.contact_points()]).reshape(-1, 3)
+            if jointed and self._state.joints is not None:
+                strength = u.energy / np.array(self._joint_unit) * self._options.substeps / self._options.dt
+                effort = self._state.joints[None, :, DRIVE + 1] * strength
         counters = {
             "kinetic_energy": frames.energy[:, 0] * u.energy,
             "potential_energy": frames.energy[:, 1] * u.energy,
@@ -572,18 +597,26 @@ class Simulator(Jointed):
         }
         return Rollout(
             time=np.arange(self.steps_done - k + 1, self.steps_done + 1) * self.dt,
-            **u.in_si(frames),
+            **moved,
             contact_count=frames.touching,
             contact_point=frames.point * u.length,
             contact_body=frames.pair,
+            contact_force=force,
             counters=counters,
             names=self._names,
             meta=self._meta,
-            joint_names=self._joint_names if frames.joint.shape[1] else (),
-            joint_position=frames.joint[:, :, 0] * self._joint_unit if frames.joint.shape[1] else frames.joint[:, :, 0],
+            joint_names=self._joint_names if jointed else (),
+            joint_position=frames.joint[:, :, 0] * self._joint_unit if jointed else frames.joint[:, :, 0],
+            joint_velocity=self._joint_speeds(frames) if jointed else frames.joint[:, :, 0],
+            joint_effort=effort,
             joint_force=frames.joint[:, :, 1:4] * u.mass * u.acceleration,
             joint_torque=frames.joint[:, :, 4:7] * u.energy,
         )
+
+    def _joint_speeds(self, frames: Frames) -> np.ndarray:
+        """[K, J] rad/s and m/s."""
+        assert self.bodies.joints is not None
+        return speeds(self.bodies.joints, frames) * self._joint_unit / self.units.time
 
 
 def _check_inputs(scene: Scene, model: str, *, joints: bool) -> None:
