@@ -93,13 +93,23 @@ class _Reader:
                 self.root, "holds xacro macros, and xacro is not installed", f"pip install xacro, or {hint}"
             )
         xacro = importlib.import_module("xacro")
+        if find_spec("ament_index_python") is None:  # without ROS nothing else finds packages
+            importlib.import_module("xacro.substitution_args")._eval_find = self._package
         try:
             text = xacro.process_file(str(self.path)).toxml()
         except Exception as error:  # of many types
             why = " ".join(str(error).split()) or type(error).__name__
-            raise SdfsimError(f"{self.path}: xacro cannot expand it ({why})", f"in a ROS workspace {hint}") from error
+            raise SdfsimError(f"{self.path}: xacro cannot expand it ({why})", f"or {hint}") from error
         self.notes.append("xacro has expanded its macros: lines are those of the result")
         return text
+
+    def _package(self, name: str) -> str:
+        """The folder of a ROS package."""
+        places = (*self.packages, *(folder / name for folder in self.packages))
+        found = [str(place) for place in places if place.name == name and place.is_dir()]
+        if not found:
+            raise SdfsimError(f"no folder of a package {name}: give it with --packages")
+        return found[0]
 
     def _parse(self, text: str) -> Element:
         # Blanks before the first element and zero bytes after the last are not valid XML, but common.

@@ -252,7 +252,9 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         sdfs=tuple(scene.shapes[k].sdf for k in touched),
         contact=tuple(scene.shapes[k].contact for k in touched),
         tracks=_tracks(paths, com, length=units.length, time=units.time),
-        joints=jointed.joints_of(scene.joints, com, length=units.length, time=units.time, mass=units.mass)
+        joints=jointed.joints_of(
+            scene.joints, com, scene.couplings, length=units.length, time=units.time, mass=units.mass
+        )
         if scene.joints
         else None,
     )

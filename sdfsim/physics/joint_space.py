@@ -148,7 +148,7 @@ class JointSpace:
 
         The bodies that a joint holds follow it, from the roots on, which stay as they are; with `which` only those that
         these joints hold, directly or not. Where loops would open, all joints but `which` give way, by the smallest
-        change of coordinates. Raises SdfsimError if a loop cannot close.
+        change of coordinates; so they do for couplings. Raises SdfsimError if a loop cannot close.
         """
         assert self.state.joints is not None
         fixed = set(which or ())
@@ -161,25 +161,26 @@ class JointSpace:
         kept = np.concatenate([np.arange(self.size)[self.columns[j]] for j in fixed], dtype=int) if fixed else []
         free = np.setdiff1d(np.arange(self.size), kept)
         self._fold(q, moved)
-        rows = self._open(positions, fixed)[0] if self.loops else np.zeros(0)
+        closes = bool(self.loops) or len(self.joints.coupled) > 0
+        rows = self._open(q, positions, fixed)[0] if closes else np.zeros(0)
         if np.abs(rows).max(initial=0.0) > CLOSED:
             for _ in range(TRIES):
                 self._fold(q, self.tree)
-                wrong, slope, _ = self._open(positions, fixed)
+                wrong, slope, _ = self._open(q, positions, fixed)
                 if np.abs(wrong).max() <= CLOSED:
                     break
                 step = np.linalg.lstsq(slope[:, free], wrong, rcond=1e-9)[0]
                 q[free] -= step * min(1.0, STRIDE / max(np.abs(step).max(), 1e-300))
             else:
-                hint = "set the joint of the loop that is driven; the others follow it"
-                raise SdfsimError(f"joints: a loop stays open by {np.abs(wrong).max():.3g} there", hint)
+                hint = "set the joint that is driven; the others follow it"
+                raise SdfsimError(f"joints: a loop or coupling stays open by {np.abs(wrong).max():.3g} there", hint)
             moved = self.tree
-        if self.loops:
-            _, slope, own = self._open(positions, fixed)
+        if closes:
+            _, slope, own = self._open(q, positions, fixed)
             wanted = np.where(own >= 0, velocities[own], 0.0)
             v[free] -= np.linalg.lstsq(slope[:, free], slope @ v - wanted, rcond=1e-9)[0]
         fast, spin = self._motion()
-        self._carry(v[:, None], fast, spin, self.tree if self.loops else moved)
+        self._carry(v[:, None], fast, spin, self.tree if closes else moved)
         known = self.state.joints.copy()
         changed = np.array(sorted({k for _, k in moved}), int)
         orientation = self.state.orientation.copy()
@@ -261,12 +262,22 @@ class JointSpace:
         slide = fast[a] + _across(spin[a], arm) - fast[b] - _across(spin[b], reach)
         return np.concatenate([axes @ slide, axes @ (spin[a] - spin[b])])
 
-    def _open(self, q: np.ndarray, fixed: Collection[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The errors [r] of joints that close loops, and their derivatives [r, n] by the coordinates; for such joints
-        that are `fixed` also how far their coordinates are from `q`, and which these are, [r] (-1: none)."""
+    def _open(
+        self, q: np.ndarray, wanted: np.ndarray, fixed: Collection[int]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The errors [r] of couplings and of joints that close loops at coordinates `q`, and their derivatives [r, n];
+        for such joints that are `fixed` also how far they are from the coordinates `wanted`, and which these are, [r]
+        (-1: none)."""
         point, axes = self._frames()
         fast, spin = self.jacobian()
-        wrong, slope, of = [np.zeros(0)], [np.zeros((0, self.size))], [np.zeros(0, int)]
+        # A joint that closes a loop has no coordinate of its own, so its couplings are left to the solve.
+        own = ~np.isin(self.joints.coupled, self.loops).any(1)
+        starts = np.array([place.start for place in self.columns])
+        first, second = starts[self.joints.coupled[own]].T
+        ratio, offset = self.joints.coupling[own].T
+        unit = np.eye(self.size)
+        wrong, slope = [q[first] - ratio * q[second] - offset], [unit[first] - ratio[:, None] * unit[second]]
+        of = [np.full(len(first), -1)]
         for j in self.loops:
             kind, way, moves = int(self.joints.kind[j]), point[j, 0] - point[j, 1], self._relative(j, fast, spin)
             if kind == DISTANCE:
@@ -286,7 +297,7 @@ class JointSpace:
             own = np.full(6, -1)
             own[free] = np.arange(self.size)[self.columns[j]]
             if j in fixed:
-                errors[free] -= q[self.columns[j]]
+                errors[free] -= wanted[self.columns[j]]
                 errors[3:] -= 2.0 * np.pi * np.round(errors[3:] / (2.0 * np.pi))
             wrong.append(errors[rows])
             slope.append(moves[rows])

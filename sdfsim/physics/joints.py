@@ -16,6 +16,7 @@ from sdfsim.physics.joint_columns import (
     FRICTION,
     GAIN,
     HIGH,
+    HINGE,
     KINDS,
     LENGTH,
     LOW,
@@ -33,7 +34,7 @@ from sdfsim.physics.joint_columns import (
     TORQUE,
 )
 from sdfsim.physics.motion import Motion
-from sdfsim.scene.scene import Joint
+from sdfsim.scene.scene import Coupling, Joint
 
 # A mode besides `TO_SPEED` and `TO_PLACE`: the motor gives a torque or force, and the target is this value. The
 # compiled step has no such mode: it gets a motor with this maximum and a target speed that it never reaches.
@@ -53,14 +54,25 @@ class Joints:
     start: np.ndarray  # [J] angles of hinges and positions of sliders at the start
     target: np.ndarray  # [J] targets of motors
     collides: np.ndarray  # [J] bool, whether the two bodies may touch
+    # Couplings of hinges and sliders: [C, 2] int64, the first joint follows the second; [C, 2] ratio and offset
+    coupled: np.ndarray
+    coupling: np.ndarray
 
     def __len__(self) -> int:
         return len(self.body)
 
 
-def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: float, mass: float) -> Joints:
-    """The joints of a scene; `com` [N, 3] are the centres of mass from the shapes' origins, in model units of `length`
-    m, `time` s and `mass` kg."""
+def joints_of(
+    joints: Sequence[Joint],
+    com: np.ndarray,
+    couplings: Sequence[Coupling] = (),
+    *,
+    length: float,
+    time: float,
+    mass: float,
+) -> Joints:
+    """The joints of a scene with their `couplings`; `com` [N, 3] are the centres of mass from the shapes' origins, in
+    model units of `length` m, `time` s and `mass` kg."""
     count = len(joints)
     number, start, target = np.zeros((count, NUMBERS)), np.zeros(count), np.zeros(count)
     number[:, LOW], number[:, HIGH], number[:, LENGTH] = -np.inf, np.inf, -1.0
@@ -97,7 +109,12 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
     axes = np.ascontiguousarray(turned.reshape(count, 2, 3, 3).swapaxes(2, 3))
     kind = np.array([KINDS.index(joint.kind) for joint in joints], np.int64)
     collides = np.array([joint.collides for joint in joints], bool)
-    return Joints(body, kind, anchor, axes, number, start, target, collides)
+    unit = np.where(kind == HINGE, 1.0, length)
+    coupled = np.array([c.joints for c in couplings], np.int64).reshape(-1, 2)
+    first, second = unit[coupled].T
+    factors = np.array([[c.ratio, c.offset] for c in couplings]).reshape(-1, 2)
+    coupling = factors * np.stack([second / first, 1.0 / first], 1)
+    return Joints(body, kind, anchor, axes, number, start, target, collides, coupled, coupling)
 
 
 def initial(joints: Joints, motion: Motion) -> np.ndarray:

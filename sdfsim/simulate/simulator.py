@@ -30,7 +30,7 @@ from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
 from sdfsim.scene.builder import SceneBuilder, loaded, plain, validated
 from sdfsim.scene.keys import BodyKeys
 from sdfsim.scene.plan import plan
-from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene import Body, Keyframe, Scene
 from sdfsim.scene.schema import BodyTable
 from sdfsim.simulate.body import BodyHandle, ContactPoint
 from sdfsim.simulate.joint import Jointed, JointHandle
@@ -340,9 +340,23 @@ class Simulator(Jointed):
         """Remove a body and its joints while the simulation runs; bodies that lay on it wake."""
         row, scene = self._row(name), self.scene
         number = {k: k - (k > row) for k in range(-1, len(scene.bodies))} | {-1: -1}
-        joints = [replace(j, bodies=(number[j.bodies[0]], number[j.bodies[1]])) for j in scene.joints
-                  if row not in j.bodies]  # fmt: skip
-        self.become(replace(scene, bodies=scene.bodies[:row] + scene.bodies[row + 1 :], joints=tuple(joints)))
+        kept = [k for k, joint in enumerate(scene.joints) if row not in joint.bodies]
+        joints = [scene.joints[k] for k in kept]
+        joints = [replace(j, bodies=(number[j.bodies[0]], number[j.bodies[1]])) for j in joints]
+        names = {joint.name for joint in joints}
+        keys = {
+            key: Keyframe({joint: at for joint, at in known.joints.items() if joint in names},
+                          {body: at for body, at in known.bodies.items() if body != name})
+            for key, known in scene.keyframes.items()
+        }  # fmt: skip
+        self.become(replace(
+            scene, bodies=scene.bodies[:row] + scene.bodies[row + 1 :], joints=tuple(joints), keyframes=keys,
+            frames=tuple(replace(f, body=number[f.body]) for f in scene.frames if f.body != row),
+            couplings=tuple(
+                replace(c, joints=(kept.index(c.joints[0]), kept.index(c.joints[1])))
+                for c in scene.couplings if {*c.joints} <= {*kept}
+            ),
+        ))  # fmt: skip
 
     def become(self, scene: Scene) -> None:
         """Go on with another scene, in which bodies may be added at the end or removed. Bodies and joints of the same

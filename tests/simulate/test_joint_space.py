@@ -195,8 +195,20 @@ def test_a_loop_closes_when_one_of_its_joints_is_set(joint: str) -> None:
     simulator.step(20)
     assert max(np.abs(simulator["rod"].position[:2])) < 0.7
     assert before[0] != 0.0 and simulator.joint("first").broken is False
-    with pytest.raises(SdfsimError, match="a loop stays open by"):
+    with pytest.raises(SdfsimError, match="a loop or coupling stays open by"):
         simulator.joint("out").angle = -2.0
+
+
+def test_a_coupled_joint_follows_the_one_that_is_set() -> None:
+    simulator = Simulator(robot().couple("wall", "rail", ratio=3.0, offset_deg=10))
+    simulator.joint("rail").position = 0.1
+    assert simulator.joint("wall").angle == pytest.approx(0.3 + math.radians(10), abs=1e-9)
+    simulator.joint("wall").speed = 0.6
+    np.testing.assert_allclose(simulator.joint_velocities[[1, 5]], (0.2, 0.6), atol=1e-9)
+    simulator.remove("head")  # with the frame on it, and in keyframes the ball
+    assert not simulator.scene.frames and simulator.joint("wall").angle == pytest.approx(0.3 + math.radians(10))
+    simulator.reset("bent")
+    assert simulator.joint("rail").position * 3.0 + math.radians(10) == pytest.approx(simulator.joint("wall").angle)
 
 
 def test_a_keyframe_is_the_same_as_a_fresh_start_in_it() -> None:
