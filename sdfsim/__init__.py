@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sdfsim.apps.play import play, show
     from sdfsim.apps.render import render
     from sdfsim.apps.run import simulate
+    from sdfsim.apps.save_run import save_run
     from sdfsim.base.errors import SceneError, SdfsimError
     from sdfsim.evaluation.instruments import judged
     from sdfsim.physics.bodies import State
@@ -54,6 +55,7 @@ __all__ = [
     "play",
     "reconstruct",
     "render",
+    "save_run",
     "show",
     "simulate",
 ]
@@ -75,6 +77,7 @@ _HOME = {
     "show": "sdfsim.apps.play",
     "reconstruct": "pipeline.states",
     "render": "sdfsim.apps.render",
+    "save_run": "sdfsim.apps.save_run",
     "simulate": "sdfsim.apps.run",
 }
 _THERE = {"Scene": "SceneBuilder"}  # names that differ in their module

@@ -253,9 +253,10 @@ def _near(scene: Scene) -> tuple[Scene, list[str]]:
             bodies[k] = replace(body, position=middle - (middle - body.position) @ normal * normal)
     held = [[np.zeros(3) if k < 0 else arms[k] for k in joint.bodies] for joint in scene.joints]
     joints = tuple(replace(joint, anchor=joint.anchor - arm) for joint, arm in zip(scene.joints, held, strict=True))
+    frames = tuple(replace(f, position=f.position - (arms[f.body] if f.body >= 0 else 0.0)) for f in scene.frames)
     far = [(shape.name, c) for shape, c in zip(scene.shapes, middles, strict=True) if c.any()]
     notes = [f"{name} is far from its origin: poses are those of its middle, at {numbers(c)} m" for name, c in far]
-    return replace(scene, shapes=tuple(shapes), bodies=tuple(bodies), joints=joints), notes
+    return replace(scene, shapes=tuple(shapes), bodies=tuple(bodies), joints=joints, frames=frames), notes
 
 
 def plain_names(names: list[str], ascii: bool = False) -> list[str]:
@@ -648,6 +649,10 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         for solid, label in zip(solids, geoms[k], strict=True):
             add(node, "geom", name=label, **solid, **surface)
 
+    for frame in scene.frames:
+        site = add(nodes[frame.body], "site", name=frame.name, pos=numbers(frame.position), size="0.002")
+        site.set("quat", numbers(_wxyz(frame.quat_xyzw)))
+
     # Between bodies of the same material the square is the product. Other pairs are written one by one, up to a limit:
     # first those of bodies with few geoms, as the floor is one.
     pairs, apart = [], {frozenset(joint.bodies) for joint in scene.joints if not joint.collides}
@@ -701,7 +706,15 @@ def _refined(take: Take) -> tuple[Take, list[str]]:
         )
         for body in scene.bodies
     )  # fmt: skip
-    scene = replace(scene, bodies=bodies, joints=tuple(map(_refined_joint, scene.joints)), gravity=k * scene.gravity)
+    along = [1.0 if joint.kind == "hinge" else k for joint in scene.joints]
+    couplings = tuple(
+        replace(c, ratio=c.ratio * along[c.joints[0]] / along[c.joints[1]], offset=c.offset * along[c.joints[0]])
+        for c in scene.couplings
+    )
+    scene = replace(
+        scene, bodies=bodies, joints=tuple(map(_refined_joint, scene.joints)), gravity=k * scene.gravity,
+        frames=tuple(replace(frame, position=k * frame.position) for frame in scene.frames), couplings=couplings,
+    )  # fmt: skip
     fall = numbers(np.linalg.norm(scene.gravity))
     line = (
         f"metres and kilograms, as MuJoCo refuses bodies as small as {small[0]}: lengths are in mm, masses in 1e-9 kg"
@@ -810,7 +823,14 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         add(add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
         if above is not None:
             held_at = tree.above[above.parent].anchor if above.parent in tree.above else np.zeros(3)
-            jointed.urdf_joint(root, above, k, joint_names, links, held_at)
+            jointed.urdf_joint(root, above, k, joint_names, links, held_at, take.scene)
+        for frame in (f for f in take.scene.frames if f.body == k and f.name not in take.names):
+            add(root, "link", name=frame.name)
+            joint = add(root, "joint", name=f"{frame.name}_frame", type="fixed")
+            add(joint, "parent", link=name)
+            add(joint, "child", link=frame.name)
+            rpy = numbers(Rotation.from_quat(frame.quat_xyzw).as_euler("xyz"))
+            add(joint, "origin", xyz=numbers(frame.position - origin), rpy=rpy)
     for root, file in dict((id(root), (root, file)) for root, file in robots.values()).values():
         _write_xml(file, root)
     assets = [*seen.values(), *(file for found in cut.values() for file in found)]

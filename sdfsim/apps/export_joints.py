@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.physics.joint_space import spanning
 from sdfsim.scene.scene import Body, Joint, Scene
 
 NESTING = ("hinge", "slider", "ball", "fixed")  # kinds of joints by which one body can hold another in a tree
@@ -61,31 +62,10 @@ class Trees:
 
 def trees(scene: Scene) -> Trees:
     """Trees whose roots are the world and bodies that are not dynamic, then those of free bodies."""
-    at: dict[int, list[int]] = {}
-    for number, joint in enumerate(scene.joints):
-        if joint.kind in NESTING:
-            for k in joint.bodies:
-                at.setdefault(k, []).append(number)
     still = [k for k, body in enumerate(scene.bodies) if body.motion != "dynamic"]
-    above: dict[int, Held] = {}
-    reached, used = {-1, *still}, set()
-    # Bodies that are first in no joint are the natural roots of free trees.
-    free = [k for k in range(len(scene.bodies)) if k not in reached]
-    firsts = {joint.bodies[0] for joint in scene.joints if joint.kind in NESTING}
-    for seeds in ([-1, *still], *([k] for k in sorted(free, key=lambda k: k in firsts))):
-        if seeds[0] != -1 and seeds[0] in reached:
-            continue
-        queue = list(seeds)
-        reached |= set(seeds)
-        for k in queue:  # grows
-            for number in at.get(k, ()):
-                joint = scene.joints[number]
-                other = joint.bodies[1] if joint.bodies[0] == k else joint.bodies[0]
-                if other not in reached:
-                    above[other] = held(joint, other)
-                    used.add(number)
-                    reached.add(other)
-                    queue.append(other)
+    ends = [joint.bodies if joint.kind in NESTING else None for joint in scene.joints]
+    used = spanning(ends, still, len(scene.bodies))
+    above = {k: held(scene.joints[j], k) for j, k in used}
     below: dict[int, list[int]] = {}
     for k in sorted(above):
         below.setdefault(above[k].parent, []).append(k)
@@ -95,7 +75,7 @@ def trees(scene: Scene) -> Trees:
         k = stack.pop()
         order.append(k)
         stack += reversed(below.get(k, ()))
-    return Trees(tuple(order), above, tuple(j for n, j in enumerate(scene.joints) if n not in used))
+    return Trees(tuple(order), above, tuple(j for n, j in enumerate(scene.joints) if n not in dict(used)))
 
 
 def place(body: Body | None) -> tuple[np.ndarray, Rotation]:
@@ -194,6 +174,7 @@ def mjcf_rest(
     out. `sites` are the elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and
     joints."""
     lines, controls = left_out(scene.joints), []
+    lines += ["keyframes"] if scene.keyframes else []
     tags = ("equality", "tendon", "actuator", "contact")
     into = {tag: Element(tag) for tag in tags}
 
@@ -232,6 +213,14 @@ def mjcf_rest(
                 )  # fmt: skip
             if joint.limits or joint.damping or joint.friction or joint.spring or joint.motor:
                 lines.append(f"limits, damping, friction, spring and motor of {joint.name}, which closes a loop")
+    for coupling in scene.couplings:
+        one, other = (scene.joints[j] for j in coupling.joints)
+        if one in tree.loops or other in tree.loops:
+            lines.append(f"the coupling of {one.name} and {other.name}: one of them closes a loop")
+            continue
+        shift = coupling.offset + coupling.ratio * other.start - one.start  # MuJoCo counts from the start
+        add(into["equality"], "joint", name=f"{names[one.name]}_coupling", joint1=names[one.name],
+            joint2=names[other.name], polycoef=numbers((shift, coupling.ratio, 0.0, 0.0, 0.0)))  # fmt: skip
     for joint in scene.joints:
         first, second = joint.bodies
         if joint.collides and any(one.joint is joint for one in tree.above.values()):
@@ -267,7 +256,7 @@ def mjcf_rest(
 
 
 def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], links: dict[int, str],
-               origin: np.ndarray) -> None:  # fmt: skip
+               origin: np.ndarray, scene: Scene) -> None:  # fmt: skip
     """Write the joint that holds a link; `origin` [3] m is that of the parent's link in the parent's body."""
     joint = one.joint
     bounded = joint.limits is not None and joint.kind != "ball"
@@ -283,6 +272,10 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
         effort = EFFORT if joint.motor is None else joint.motor.max_force
         ends = {} if joint.kind == "hinge" and not bounded else {"lower": numbers(low), "upper": numbers(high)}
         add(made, "limit", **ends, effort=numbers(effort), velocity=numbers(EFFORT))
+    for coupling in scene.couplings:
+        if scene.joints[coupling.joints[0]] is joint:
+            of = names[scene.joints[coupling.joints[1]].name]
+            add(made, "mimic", joint=of, multiplier=numbers(coupling.ratio), offset=numbers(coupling.offset))
     if joint.damping or joint.friction:
         add(made, "dynamics", damping=numbers(joint.damping), friction=numbers(joint.friction))
 

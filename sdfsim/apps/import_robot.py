@@ -12,7 +12,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable
 from sdfsim.base.parallel import StageProgress
 
-ENDINGS = (".urdf", ".xml", ".mjcf")
+ENDINGS = (".urdf", ".xacro", ".xml", ".mjcf")
 
 
 def import_robot(
@@ -25,7 +25,8 @@ def import_robot(
     key: str | None = None,
     on_progress: StageProgress = lambda stage, fraction, message: None,
 ) -> dict[str, Any]:
-    """Write the scene.yaml `out`, and a folder of shapes beside it, from a .urdf file or MuJoCo's .xml (or .mjcf).
+    """Write the scene.yaml `out`, and a folder of shapes beside it, from a .urdf or .xacro file, or MuJoCo's .xml (or
+    .mjcf).
 
     `packages` are folders of ROS packages, `fixed` holds the root of a URDF, `floor` adds a floor at z = 0 on which
     everything stands, and `key` is the keyframe of an MJCF file to start from. Returns a report: links, joints, files,
@@ -39,7 +40,7 @@ def import_robot(
         raise SdfsimError(f"{out}: a scene ends in .yaml", "give -o scene.yaml")
     if not source.is_file():
         raise SdfsimError(f"{source}: no such file", "give a .urdf, or a .xml or .mjcf of MuJoCo")
-    if kind == ".urdf":
+    if kind in (".urdf", ".xacro"):
         if key is not None:
             raise SdfsimError(f"{source}: a URDF has no keyframes", "leave out --key")
         robot = read_urdf(source, packages=[Path(folder) for folder in packages], fixed=fixed)

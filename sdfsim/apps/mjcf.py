@@ -11,11 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.export import rebound
-from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, named, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Pose, Robot, moved, named, not_held, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.lazy import optional
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
+from sdfsim.scene.joints import joint_axes
 
 START = "start"  # the keyframe that our own exports have
 SOFTEST = 1.99  # damping ratio from which contacts count as not rebounding
@@ -27,7 +28,6 @@ COUNTED = {
     "nsensor": "sensors",
     "ncam": "cameras",
     "nlight": "lights",
-    "nsite": "sites",
     "nflex": "deformable bodies (flex)",
     "nskin": "skins",
     "nplugin": "plugins",
@@ -135,8 +135,7 @@ class _Reader:
         chosen = key if key is not None else START if START in keys else None
         if chosen is not None:
             mujoco.mj_resetDataKeyframe(model, self.data, keys.index(chosen))
-        if others := [name for name in keys if name != chosen]:
-            self.left.append(named("keyframes: give one with --key", others))
+        self.keys = keys
         self._within_limits()
         mujoco.mj_forward(model, self.data)
 
@@ -197,10 +196,90 @@ class _Reader:
         meets = self.off.isdisjoint(("contact", "constraint"))
         self._left_out([g for own in geoms for g in own] if meets else [])
         links = self._slippery(links, geoms, apart) if meets else links
+        couplings = tuple(self._couplings())
+        self.left += [not_held([first for first, *_ in couplings])] if couplings else []
+        ends = model.wrap_objid[model.wrap_type == int(self.mj.mjtWrap.mjWRAP_SITE)]  # those of tendons are no frames
+        frames = [self._frame(s) for s in range(model.nsite) if s not in ends and model.site(s).name]
         return Robot(
-            self.path.stem, tuple(links), tuple(joints), np.array(model.opt.gravity), apart,
-            tuple(self.left), tuple(self.notes), contact=meets,
+            self.path.stem, tuple(links), tuple(joints), np.array(model.opt.gravity), apart, tuple(self.left),
+            tuple(self.notes), contact=meets, frames=tuple(frames), keyframes=self._keyframes(), couplings=couplings,
         )  # fmt: skip
+
+    def _frame(self, s: int) -> tuple[str, int, np.ndarray]:
+        """A site, in its link, or in the world."""
+        model, data = self.model, self.data
+        name, k = model.site(s).name, self.link[model.site_bodyid[s]]
+        if k < 0 or model.body_weldid[model.site_bodyid[s]] == 0:
+            return name, -1, pose_of(data.site_xpos[s], Rotation.from_matrix(data.site_xmat[s].reshape(3, 3)))
+        return name, k, pose_of(model.site_pos[s], Rotation.from_quat(np.roll(model.site_quat[s], -1)))
+
+    def _keyframes(self) -> dict[str, Pose]:
+        """The keyframes of the file: joints within their limits, at rest."""
+        model, mj, found, start = self.model, self.mj, {}, self.data
+        types, moving = mj.mjtJoint, []
+        for number, name in enumerate(self.keys):
+            data = mj.MjData(model)
+            mj.mj_resetDataKeyframe(model, data, number)
+            mj.mj_kinematics(model, data)
+            joints: dict[str, Any] = {}
+            links: dict[int, np.ndarray] = {}
+            for j in range(model.njnt):
+                kind, at, b = types(int(model.jnt_type[j])), model.jnt_qposadr[j], int(model.jnt_bodyid[j])
+                turns = Rotation.from_matrix(np.stack([d.xmat[b].reshape(3, 3) for d in (start, data)]))
+                if kind == types.mjJNT_FREE:
+                    links[self.link[b]] = pose_of(data.xpos[b], turns[1])
+                elif kind == types.mjJNT_BALL:
+                    parent = model.body_parentid[b]
+                    there = Rotation.from_matrix(np.stack([d.xmat[parent].reshape(3, 3) for d in (start, data)]))
+                    turn = there[0] * there[1].inv() * turns[1] * turns[0].inv()
+                    axis = turns[0].as_matrix()[:, 0] if model.jnt_limited[j] else None
+                    axes = joint_axes(axis)
+                    joints[self._joint_name(j)] = (axes.inv() * turn * axes).as_quat()
+                else:
+                    value, ends = float(data.qpos[at]), model.jnt_range[j]
+                    joints[self._joint_name(j)] = float(np.clip(value, *ends)) if model.jnt_limited[j] else value
+            found[name] = Pose(joints, links)
+            moving += [name] if np.any(model.key_qvel[number]) else []
+        if moving:
+            self.left.append(named("velocities of keyframes", moving))
+        return found
+
+    def _couplings(self) -> Iterator[tuple[str, str, float, float]]:
+        """Equalities of two joints, and of fixed tendons between two, that are linear."""
+        model, mj = self.model, self.mj
+        for k in range(model.neq):
+            kind = mj.mjtEq(int(model.eq_type[k]))
+            first, second, data = int(model.eq_obj1id[k]), int(model.eq_obj2id[k]), model.eq_data[k]
+            if not self._couples(k):
+                continue
+            if kind == mj.mjtEq.mjEQ_JOINT:
+                ref = [float(model.qpos0[model.jnt_qposadr[j]]) for j in (first, second)]
+                yield (
+                    self._joint_name(first), self._joint_name(second), float(data[1]),
+                    float(data[0] + ref[0] - data[1] * ref[1]),
+                )  # fmt: skip
+            else:
+                at = model.tendon_adr[first]
+                one, other = (int(j) for j in model.wrap_objid[at : at + 2])
+                gear, arm = (float(value) for value in model.wrap_prm[at : at + 2])
+                offset = float(model.tendon_length0[first] + data[0]) / gear
+                yield self._joint_name(one), self._joint_name(other), -arm / gear, offset
+
+    def _couples(self, k: int) -> bool:
+        """Whether equality `k` is a linear relation between two hinges or slides."""
+        model, mj = self.model, self.mj
+        kind, ends = mj.mjtEq(int(model.eq_type[k])), [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])]
+        if not self.data.eq_active[k] or (kind == mj.mjtEq.mjEQ_JOINT and np.any(model.eq_data[k, 2:5])):
+            return False
+        if kind == mj.mjtEq.mjEQ_TENDON and ends[1] < 0:
+            at, count = int(model.tendon_adr[ends[0]]), int(model.tendon_num[ends[0]])
+            wraps = range(at, at + count)
+            if count != 2 or any(model.wrap_type[w] != int(mj.mjtWrap.mjWRAP_JOINT) for w in wraps):
+                return False
+            ends = [int(model.wrap_objid[w]) for w in wraps]
+        elif kind != mj.mjtEq.mjEQ_JOINT or ends[1] < 0:
+            return False
+        return all(model.jnt_type[j] in (int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE)) for j in ends)
 
     def _left_out(self, solid: list[int]) -> None:
         """Name every field of the model that says something and is not used. Geoms count that touch others: `solid`."""
@@ -489,7 +568,7 @@ class _Reader:
             if not self.data.eq_active[k]:
                 idle.append(name)
                 continue
-            if kind == mj.mjtEq.mjEQ_TENDON:
+            if kind == mj.mjtEq.mjEQ_TENDON or self._couples(k):
                 continue
             ends = [int(model.eq_obj1id[k]), max(int(model.eq_obj2id[k]), 0)]
             of_bodies = int(model.eq_objtype[k]) == int(mj.mjtObj.mjOBJ_BODY)
@@ -523,6 +602,8 @@ class _Reader:
             for k in range(model.neq)
             if int(model.eq_type[k]) == int(mj.mjtEq.mjEQ_TENDON) and model.eq_obj2id[k] < 0 and model.eq_active0[k]
         }
+        coupled = {int(model.eq_obj1id[k]) for k in range(model.neq)
+                   if int(model.eq_type[k]) == int(mj.mjtEq.mjEQ_TENDON) and self._couples(k)}  # fmt: skip
         found, others = [], []
         for k in range(model.ntendon):
             name, first = model.tendon(k).name or f"tendon_{k}", model.tendon_adr[k]
@@ -533,6 +614,8 @@ class _Reader:
             stiff, low = float(model.tendon_stiffness[k]), float(model.tendon_range[k, 0])
             rope = bool(model.tendon_limited[k])
             known = len(sites) == len(wraps) == 2 and moves and both[0] != both[1]
+            if k in coupled and not (rope or stiff):
+                continue
             if not known or not (rope or stiff or k in rods) or (rope and low > NEAR):
                 others.append(name)
                 continue

@@ -652,7 +652,7 @@ def tree_of(scene: Scene, rows: Sequence[int]) -> Scene:
     joints = [j for j in scene.joints if set(j.bodies) <= set(new)]
     return replace(
         scene, bodies=tuple(scene.bodies[k] for k in new), gravity=np.zeros(3),
-        joints=tuple(replace(j, bodies=(new[j.bodies[0]], new[j.bodies[1]])) for j in joints),
+        joints=tuple(replace(j, bodies=(new[j.bodies[0]], new[j.bodies[1]])) for j in joints), frames=(), couplings=(),
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from sdfsim.apps.export import plain_names
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.mesh import Mesh, convex_hull, is_closed, joined, signed_volume
+from sdfsim.geometry.skins import Painted, one_skin
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import WORLD
 from sdfsim.shape.make import analytic_shape, fit_pieces, mesh_shape
@@ -25,7 +26,6 @@ SMALL_PART = 0.02  # relative to a link's mass: mass of a ball between two of it
 EVEN = 1e-5  # relative: largest deviation from evenly spread mass at which it is written as such
 CONVEX = 1e-3  # relative: how much less volume than its hull a convex mesh may have
 OVERLAP = 2e-3  # relative to the smaller size: links that overlap deeper at the start do not touch each other
-SWATCH = 16  # pixels of a colour's patch in the texture of a shown mesh
 MOST_NAMED = 6  # names in a line of the report
 GREY = (180, 180, 185)
 UNBOUNDED = 1e6  # N m or N, for a motor without a limit in the file
@@ -88,6 +88,15 @@ class LinkJoint:
 
 
 @dataclass(frozen=True)
+class Pose:
+    """A keyframe: positions of joints (rad, m; a quaternion [4] xyzw for a ball) by their names, and poses [4, 4] in
+    the world of links that no joint holds, by their numbers."""
+
+    joints: dict[str, Any]
+    links: dict[int, np.ndarray]
+
+
+@dataclass(frozen=True)
 class Robot:
     name: str
     links: tuple[Link, ...]
@@ -98,12 +107,20 @@ class Robot:
     left_out: tuple[str, ...] = ()  # what is left out, one line each
     notes: tuple[str, ...] = ()  # what was changed, one line each
     contact: bool = True  # whether its links touch anything
+    frames: tuple[tuple[str, int, np.ndarray], ...] = ()  # a name, the number of its link, and its pose [4, 4] in it
+    keyframes: dict[str, Pose] = field(default_factory=dict)
+    couplings: tuple[tuple[str, str, float, float], ...] = ()  # first joint = number x second + number, rad or m
 
 
 def named(what: str, names: Sequence[str]) -> str:
     """`what (3: a, b, c)`, for a line of the report."""
     more = ", ..." if len(names) > MOST_NAMED else ""
     return f"{what} ({len(names)}: {', '.join(names[:MOST_NAMED])}{more})"
+
+
+def not_held(joints: Sequence[str]) -> str:
+    """The line of a report on couplings, by the joints that follow others."""
+    return named("couplings are in the scene and its exports, but the solve does not hold them", joints)
 
 
 def pose_of(place: Any = (0.0, 0.0, 0.0), turn: Rotation | None = None) -> np.ndarray:
@@ -176,7 +193,45 @@ def write_scene(
         scene.add(link.name, **entry)
     for joint in whole.joints:
         _join(scene, joint, names, lift)
+    _add_poses(scene, whole, names, poses, lift)
     return [scene.save(out), *folders], notes
+
+
+def _add_poses(scene: SceneBuilder, robot: Robot, names: list[str], poses: list[np.ndarray], lift: np.ndarray) -> None:
+    """Add frames, keyframes and couplings, for bodies called `names` at `poses`."""
+
+    def placed(pose: np.ndarray) -> dict[str, Any]:
+        quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        return {"position": _round(np.round(pose[:3, 3], 12))} | (
+            {} if abs(quat[3]) > 1 - 1e-15 else {"quat_xyzw": _round(quat)}
+        )
+
+    # A body has its origin in the middle of its primitive: the link's own frame is one more.
+    own = ((link.name, k, np.eye(4)) for k, link in enumerate(robot.links) if not np.allclose(link.pose, poses[k]))
+    taken: set[str] = set()
+    for name, k, pose in (*robot.frames, *own):
+        if name not in taken:
+            taken.add(name)
+            into = np.linalg.inv(poses[k]) @ robot.links[k].pose @ pose if k >= 0 else pose_of(lift) @ pose
+            scene.frame(name, names[k] if k >= 0 else WORLD, **placed(into))
+    kinds = {joint.name: joint.kind for joint in robot.joints}
+    for name, key in robot.keyframes.items():
+        keys: dict[str, Any] = {"angles_deg": {}, "positions": {}, "quats_xyzw": {}}
+        for joint, value in key.joints.items():
+            if kinds.get(joint) == "hinge":
+                keys["angles_deg"][joint] = _round(np.rad2deg(value))
+            elif joint in kinds:
+                keys["positions" if kinds[joint] == "slider" else "quats_xyzw"][joint] = _round(value)
+        shapes = {k: np.linalg.inv(robot.links[k].pose) @ poses[k] for k in key.links}
+        keys["bodies"] = {names[k]: placed(pose_of(lift) @ pose @ shapes[k]) for k, pose in key.links.items()}
+        scene.keyframe(name, **{what: found for what, found in keys.items() if found})
+    for first, second, ratio, given in robot.couplings:
+        offset = float(np.round(given, 12))
+        if {first, second} <= kinds.keys():
+            shift = (
+                {"offset_deg": _round(np.rad2deg(offset))} if kinds[first] == "hinge" else {"offset": _round(offset)}
+            )
+            scene.couple(first, second, ratio=_round(ratio), **(shift if offset else {}))
 
 
 def _round(values: Any) -> Any:
@@ -190,7 +245,6 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
     moves become static themselves, without a joint."""
     links, joints, notes = list(robot.links), list(robot.joints), list(robot.notes)
     into = list(range(len(links)))
-    frames: list[str] = []
 
     def home(k: int) -> int:
         while k >= 0 and into[k] != k:
@@ -205,8 +259,6 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         keep, gone = (one, other) if links[one].whole else (other, one)
         if links[gone].solid or links[gone].shown or links[gone].mass:
             notes.append(f"link {links[gone].name} is part of {links[keep].name}, to which it is fixed")
-        else:
-            frames.append(links[gone].name)
         links[keep] = _with(links[keep], links[gone])
         into[gone] = keep
         joints.remove(joint)
@@ -223,7 +275,6 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         joints = [joint for joint in joints if joint not in bound]
     # A link that never moves and is not shown is the world.
     gone = {k for k, link in enumerate(links) if into[k] != k or (link.still and not (link.solid or link.shown))}
-    frames += [links[k].name for k in sorted(gone) if into[k] == k and links[k].name != WORLD]
     kept = [k for k in range(len(links)) if k not in gone]
     number = {k: i for i, k in enumerate(kept)}
     joints = [
@@ -231,18 +282,24 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         for joint in joints
         if not links[joint.child].still
     ]
-    if frames:
-        notes.append(named("links without mass and shape are left out", frames))
+    frames = [*robot.frames, *((links[k].name, k, np.eye(4)) for k in sorted(gone) if links[k].name != WORLD)]
+    there = [(name, number.get(home(k), -1), links[k].pose @ pose if k >= 0 else pose) for name, k, pose in frames]
     apart = robot.apart
     if apart is not None:
         pairs = {tuple(sorted((number.get(home(a), -1), number.get(home(b), -1)))) for a, b in apart}
         apart = frozenset((a, b) for a, b in pairs if 0 <= a < b)
+    whole = tuple(_renamed([links[k] for k in kept], taken))
     return replace(
         robot,
-        links=tuple(_renamed([links[k] for k in kept], taken)),
+        links=whole,
         joints=tuple(joints),
         apart=apart,
         notes=tuple(notes),
+        frames=tuple((name, k, np.linalg.inv(whole[k].pose) @ pose if k >= 0 else pose) for name, k, pose in there),
+        keyframes={
+            name: Pose(key.joints, {number[k]: pose for k, pose in key.links.items() if k in number})
+            for name, key in robot.keyframes.items()
+        },
     )
 
 
@@ -439,21 +496,24 @@ def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
 
 
 def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> Shape:
-    """A shape with the shown mesh of its link, if that is not the solid itself: a mesh whose texture has a patch for
-    each colour."""
-    parts = [part for part in (link.shown if link.solid else ()) if part.kind != "plane"]
-    if not parts or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
+    """A shape with the shown mesh of its link, with its colours and textures. A single primitive without another look
+    stays as it is."""
+    parts = [part for part in (link.shown or link.solid) if part.kind != "plane"]
+    same = not link.solid or [_same(part) for part in parts] == [_same(part) for part in link.solid]
+    colored = any(part.color or (part.mesh is not None and part.mesh.colors is not None) for part in parts)
+    if not parts or (same and (not colored or (len(parts) == 1 and parts[0].mesh is None))):
         return shape
-    back = np.linalg.inv(frame)
-    meshes = [moved(_mesh(part), back) for part in parts]
-    colors = [
-        part.color
-        or (tuple(int(c) for c in part.mesh.colors.mean(0)) if part.mesh and part.mesh.colors is not None else GREY)
-        for part in parts
-    ]
-    texture = np.repeat(np.repeat(np.array([colors], np.uint8), SWATCH, 0), SWATCH, 1)
-    places = [np.tile([(k + 0.5) / len(parts), 0.5], (len(mesh.vertices), 1)) for k, mesh in enumerate(meshes)]
-    return replace(shape, skin=replace(joined(meshes), uv=np.concatenate(places), texture=texture))
+    skin = one_skin([_painted(part, np.linalg.inv(frame)) for part in parts])
+    return shape if skin is None else replace(shape, skin=skin)
+
+
+def _painted(part: Part, back: np.ndarray) -> Painted:
+    """A part with its colour, or with the texture of its mesh."""
+    mesh, own = moved(_mesh(part), back), part.mesh
+    if part.color is None and own is not None and own.uv is not None and own.texture is not None:
+        return Painted(mesh.vertices, mesh.faces, own.uv, own.texture)
+    color = part.color or (GREY if own is None or own.colors is None else own.colors.mean(0))
+    return Painted(mesh.vertices, mesh.faces, np.full((len(mesh.vertices), 2), 0.5), np.array([[color]], np.uint8))
 
 
 def _same(part: Part) -> tuple:

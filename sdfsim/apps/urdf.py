@@ -1,12 +1,14 @@
 """From URDF to links and joints, which `robot` turns into a scene."""
 
 import codecs
+import importlib
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -15,10 +17,10 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, not_held, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES, Loaded, load_textured
 from sdfsim.scene.scene import WORLD
 
 MOST_BYTES = 64 * 2**20  # largest size of a file
@@ -41,7 +43,7 @@ GEOMETRIES = ("box", "sphere", "cylinder", "capsule", "mesh", "plane")
 _ORIGIN = (0.0, 0.0, 0.0)
 _ROOT = ("link", "joint", "material")
 _OF_LINK = ("inertial", "visual", "collision", "contact")
-_OF_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics")
+_OF_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
 _OF_CONTACT = ("lateral_friction", "restitution")
 
 
@@ -69,18 +71,50 @@ class _Reader:
         self.left: Counter[str] = Counter()
         self.missed: list[str] = []
         self.notes: list[str] = []
-        self.meshes: dict[Path, Mesh] = {}
-        self.root = self._parse()
+        self.meshes: dict[Path, Loaded] = {}
+        self.root = self._parse(self._content())
+        if any(element.tag.startswith("xacro:") for element in self.root.iter()):
+            self.root = self._parse(self._expanded())
 
-    def _parse(self) -> Element:
+    def _content(self) -> str:
         try:
             if self.path.is_file() and self.path.stat().st_size > MOST_BYTES:
                 raise SdfsimError(f"{self.path}: too large for a URDF (at most {MOST_BYTES // 2**20} MiB)")
             content = self.path.read_bytes()
         except OSError as error:
             raise SdfsimError(f"{self.path}: cannot be read ({error.strerror or error})") from error
+        return self._decoded(content)
+
+    def _expanded(self) -> str:
+        """The file with its xacro macros expanded; from then on lines are those of the result."""
+        hint = "expand them first: xacro robot.urdf.xacro > robot.urdf"
+        if find_spec("xacro") is None:
+            raise self.wrong(
+                self.root, "holds xacro macros, and xacro is not installed", f"pip install xacro, or {hint}"
+            )
+        xacro = importlib.import_module("xacro")
+        if find_spec("ament_index_python") is None:  # without ROS nothing else finds packages
+            importlib.import_module("xacro.substitution_args")._eval_find = self._package
+        try:
+            text = xacro.process_file(str(self.path)).toxml()
+        except Exception as error:  # of many types
+            why = " ".join(str(error).split()) or type(error).__name__
+            raise SdfsimError(f"{self.path}: xacro cannot expand it ({why})", f"or {hint}") from error
+        self.notes.append("xacro has expanded its macros: lines are those of the result")
+        return text
+
+    def _package(self, name: str) -> str:
+        """The folder of a ROS package."""
+        places = (*self.packages, *(folder / name for folder in self.packages))
+        found = [str(place) for place in places if place.name == name and place.is_dir()]
+        if not found:
+            raise SdfsimError(f"no folder of a package {name}: give it with --packages")
+        return found[0]
+
+    def _parse(self, text: str) -> Element:
         # Blanks before the first element and zero bytes after the last are not valid XML, but common.
-        text = self._decoded(content).rstrip("\0 \t\r\n")
+        text = text.rstrip("\0 \t\r\n")
+        self.line.clear()
         skipped = text[: len(text) - len(text.lstrip())].count("\n")
         builder, parser = TreeBuilder(), expat.ParserCreate("utf-8")  # whatever the file declares
 
@@ -98,8 +132,6 @@ class _Reader:
         root = builder.close()
         if root.tag != "robot":
             raise self.wrong(root, "must be <robot>", "a URDF file has one <robot>; give MJCF the ending .xml")
-        if any(element.tag.startswith("xacro:") for element in root.iter()):
-            raise self.wrong(root, "holds xacro macros", "expand them first: xacro robot.urdf.xacro > robot.urdf")
         return root
 
     def _decoded(self, content: bytes) -> str:
@@ -215,11 +247,26 @@ class _Reader:
                 joints += made
             elif fixed or links[k].name == WORLD:
                 links[k] = replace(links[k], still=True)
+        couplings = tuple(self._mimics(given))
         left = [f"{what} ({count})" for what, count in self.left.items()]
+        left += [not_held([first for first, *_ in couplings])] if couplings else []
         return Robot(
             self.root.get("name", self.path.stem), tuple(links), tuple(joints),
-            left_out=(*left, *self.missed), notes=tuple(self.notes),
+            left_out=(*left, *self.missed), notes=tuple(self.notes), couplings=couplings,
         )  # fmt: skip
+
+    def _mimics(self, given: dict[str, Element]) -> Iterator[tuple[str, str, float, float]]:
+        for name, element in given.items():
+            mimic = self.child(element, "mimic")
+            if mimic is None:
+                continue
+            of = self.text(mimic, "joint")
+            if of not in given or of == name:
+                raise self.wrong(mimic, f"no other joint is called {of!r}{nearest(of, given)}")
+            if any(KINDS.get(given[k].get("type", "")) not in ("hinge", "slider") for k in (name, of)):
+                self.left["<mimic> between joints other than hinges and sliders"] += 1
+                continue
+            yield name, of, self.number(mimic, "multiplier", 1.0), self.number(mimic, "offset", 0.0)
 
     def _by_name(self, what: str, elements: Sequence[Element]) -> dict[str, Element]:
         """Links or joints by their names, which differ."""
@@ -327,7 +374,7 @@ class _Reader:
                 raise self.wrong(element, f"no such file: {name} (looked for {tried})", "give its folder: --packages")
             if place not in self.meshes:
                 try:
-                    self.meshes[place] = load_mesh(place)
+                    self.meshes[place] = load_textured(place)
                 except SdfsimError as error:
                     hint = error.hint or "use " + " ".join(MESH_SUFFIXES)
                     raise self.wrong(element, error.message, hint) from error
@@ -338,7 +385,8 @@ class _Reader:
             return None
         if not np.all(scale):
             raise self.wrong(element, f"scale must not be zero (got {element.get('scale')!r})")
-        mesh = moved(self.meshes[place], np.diag([*scale, 1.0]))
+        loaded = self.meshes[place]
+        mesh = moved(loaded.mesh if needed else loaded.skin or loaded.mesh, np.diag([*scale, 1.0]))
         return mesh if np.prod(scale) > 0 else replace(mesh, faces=mesh.faces[:, ::-1])
 
     def _find(self, name: str) -> Path | None:
@@ -352,7 +400,8 @@ class _Reader:
         else:
             package, _, inner = rest.partition("/")
             tried = [folder / rest for folder in self.packages]
-            tried += [folder / inner for folder in self.packages if folder.name == package]
+            # Then in folders of that name, and in the others: a checkout may have another name than its package.
+            tried += [folder / inner for folder in sorted(self.packages, key=lambda folder: folder.name != package)]
         try:
             return next((place for place in tried if place.is_file()), None)
         except (OSError, ValueError):

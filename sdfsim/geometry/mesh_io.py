@@ -9,6 +9,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.files import visible
+from sdfsim.geometry.collada import collada_surface
 from sdfsim.geometry.gltf import GltfWriter, read_gltf, read_painted
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, far_middle, require_whole
 from sdfsim.geometry.mesh_formats import (
@@ -24,11 +25,11 @@ from sdfsim.geometry.mesh_formats import (
 )
 from sdfsim.geometry.skins import Painted, one_skin, plain_parts
 
-MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
+MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off", ".dae")
 GLTF = (".glb", ".gltf")
 OTHERS: dict[str, str] = dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "USD")
 OTHERS |= {".fbx": "FBX", ".blend": "Blender's own format"}
-OTHERS |= {".dae": "COLLADA", ".3ds": "3DS", ".abc": "Alembic", ".step": "STEP", ".stp": "STEP", ".3mf": "3MF"}
+OTHERS |= {".3ds": "3DS", ".abc": "Alembic", ".step": "STEP", ".stp": "STEP", ".3mf": "3MF"}
 
 
 class Loaded(NamedTuple):
@@ -40,9 +41,9 @@ class Loaded(NamedTuple):
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
-    Raises SdfsimError if the file is missing, cut short or not a mesh, if it needs an unsupported extension, or if it
-    has no faces, vertices that are not finite or indices out of range."""
+    """Read a triangle mesh (obj, ply, glb, gltf, stl, off, dae), cleaned by `clean`; glTF has y up and is turned to z
+    up. Raises SdfsimError if the file is missing, cut short or not a mesh, if it needs an unsupported extension, or if
+    it has no faces, vertices that are not finite or indices out of range."""
     return load_textured(path).mesh
 
 
@@ -79,6 +80,8 @@ def _read(path: Path, suffix: str) -> FileMesh:
     """The triangles of a file."""
     if suffix in GLTF:
         return read_gltf(path)
+    if suffix == ".dae":
+        return collada_surface(path)
     content = path.read_bytes()
     if suffix == ".obj":
         return obj_surface(path, content)

@@ -2,7 +2,7 @@
 changes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -258,7 +258,9 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         sdfs=tuple(scene.shapes[k].sdf for k in touched),
         contact=tuple(scene.shapes[k].contact for k in touched),
         tracks=_tracks(paths, com, length=units.length, time=units.time),
-        joints=jointed.joints_of(scene.joints, com, length=units.length, time=units.time, mass=units.mass)
+        joints=jointed.joints_of(
+            scene.joints, com, scene.couplings, length=units.length, time=units.time, mass=units.mass
+        )
         if scene.joints
         else None,
     )
@@ -270,9 +272,8 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         orientation=orientation,
         velocity=array([b.velocity for b in scene.bodies]) / units.velocity,
         angular_velocity=array([b.angular_velocity for b in scene.bodies]) * units.time,
-        joints=None if bodies.joints is None else jointed.initial(bodies.joints, position, orientation),
     )
-    return bodies, state
+    return bodies, state if bodies.joints is None else replace(state, joints=jointed.initial(bodies.joints, state))
 
 
 def _tracks(paths: Sequence[tuple[int, Waypoints]], com: np.ndarray, *, length: float, time: float) -> Tracks | None:

@@ -16,6 +16,7 @@ from sdfsim.physics.joint_columns import (
     FRICTION,
     GAIN,
     HIGH,
+    HINGE,
     KINDS,
     LENGTH,
     LOW,
@@ -23,6 +24,7 @@ from sdfsim.physics.joint_columns import (
     MOTOR,
     NUMBERS,
     REST,
+    SPEED,
     STATE,
     STIFFNESS,
     TARGET,
@@ -31,7 +33,8 @@ from sdfsim.physics.joint_columns import (
     TO_SPEED,
     TORQUE,
 )
-from sdfsim.scene.scene import Joint
+from sdfsim.physics.motion import Motion
+from sdfsim.scene.scene import Coupling, Joint
 
 # A mode besides `TO_SPEED` and `TO_PLACE`: the motor gives a torque or force, and the target is this value. The
 # compiled step has no such mode: it gets a motor with this maximum and a target speed that it never reaches.
@@ -51,14 +54,25 @@ class Joints:
     start: np.ndarray  # [J] angles of hinges and positions of sliders at the start
     target: np.ndarray  # [J] targets of motors
     collides: np.ndarray  # [J] bool, whether the two bodies may touch
+    # Couplings of hinges and sliders: [C, 2] int64, the first joint follows the second; [C, 2] ratio and offset
+    coupled: np.ndarray
+    coupling: np.ndarray
 
     def __len__(self) -> int:
         return len(self.body)
 
 
-def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: float, mass: float) -> Joints:
-    """The joints of a scene; `com` [N, 3] are the centres of mass from the shapes' origins, in model units of `length`
-    m, `time` s and `mass` kg."""
+def joints_of(
+    joints: Sequence[Joint],
+    com: np.ndarray,
+    couplings: Sequence[Coupling] = (),
+    *,
+    length: float,
+    time: float,
+    mass: float,
+) -> Joints:
+    """The joints of a scene with their `couplings`; `com` [N, 3] are the centres of mass from the shapes' origins, in
+    model units of `length` m, `time` s and `mass` kg."""
     count = len(joints)
     number, start, target = np.zeros((count, NUMBERS)), np.zeros(count), np.zeros(count)
     number[:, LOW], number[:, HIGH], number[:, LENGTH] = -np.inf, np.inf, -1.0
@@ -95,15 +109,40 @@ def joints_of(joints: Sequence[Joint], com: np.ndarray, *, length: float, time: 
     axes = np.ascontiguousarray(turned.reshape(count, 2, 3, 3).swapaxes(2, 3))
     kind = np.array([KINDS.index(joint.kind) for joint in joints], np.int64)
     collides = np.array([joint.collides for joint in joints], bool)
-    return Joints(body, kind, anchor, axes, number, start, target, collides)
+    unit = np.where(kind == HINGE, 1.0, length)
+    coupled = np.array([c.joints for c in couplings], np.int64).reshape(-1, 2)
+    first, second = unit[coupled].T
+    factors = np.array([[c.ratio, c.offset] for c in couplings]).reshape(-1, 2)
+    coupling = factors * np.stack([second / first, 1.0 / first], 1)
+    return Joints(body, kind, anchor, axes, number, start, target, collides, coupled, coupling)
 
 
-def initial(joints: Joints, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """[J, STATE] of joints at the start, when only the poses of bodies are known."""
+def initial(joints: Joints, motion: Motion) -> np.ndarray:
+    """[J, STATE] of joints at the start, when only the motion of bodies is known."""
     state = np.zeros((len(joints), STATE))
     state[:, TARGET] = joints.target
-    state[:, COORD] = coordinates(joints, joints.start, position, orientation)
+    state[:, COORD] = coordinates(joints, joints.start, motion.position, motion.orientation)
+    state[:, SPEED] = speeds(joints, motion)
     return state
+
+
+def world_frames(joints: Joints, place: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[..., J, 2, 3] the anchors of joints at both bodies, and [..., J, 2, 3, 3] the axes there, one per row, in the
+    world, for bodies at `place` [..., N + 1, 3] with axes `turn` [..., N + 1, 3, 3]; the last row is the world."""
+    matrix = turn[..., joints.body, :, :]
+    point = place[..., joints.body, :] + np.einsum("...jsxy,jsy->...jsx", matrix, joints.anchor)
+    return point, np.einsum("...jsxy,jsky->...jskx", matrix, joints.axes)
+
+
+def _with_world(position: np.ndarray, orientation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`place` and `turn` of `world_frames`."""
+    turn = pose.to_matrix(orientation)
+    return _and_still(position), np.concatenate([turn, np.broadcast_to(np.eye(3), (*turn.shape[:-3], 1, 3, 3))], -3)
+
+
+def _and_still(values: np.ndarray) -> np.ndarray:
+    """[..., N + 1, 3]: values of bodies, and zeros for the world."""
+    return np.concatenate([values, np.zeros((*values.shape[:-2], 1, 3))], -2)
 
 
 def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
@@ -111,11 +150,7 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
     balls, the length of distances, and 0 for fixed joints, for bodies at `position` [N, 3] and `orientation` [N, 4]."""
     if not len(joints):
         return np.zeros(0)
-    known = joints.body >= 0
-    matrix = np.where(known[:, :, None, None], pose.to_matrix(orientation)[joints.body], np.eye(3))
-    place = np.where(known[:, :, None], position[joints.body], 0.0)
-    point = place + np.einsum("jsxy,jsy->jsx", matrix, joints.anchor)
-    axes = np.einsum("jsxy,jsky->jskx", matrix, joints.axes)
+    point, axes = world_frames(joints, *_with_world(position, orientation))
     way = point[:, 0] - point[:, 1]
 
     def times(k: int, m: int) -> np.ndarray:
@@ -126,6 +161,23 @@ def coordinates(joints: Joints, near: np.ndarray, position: np.ndarray, orientat
     leaning = np.arctan2(np.linalg.norm(np.cross(axes[:, 0, 0], axes[:, 1, 0]), axis=-1), times(0, 0))
     along, length = (axes[:, 1, 0] * way).sum(-1), np.linalg.norm(way, axis=-1)
     return np.choose(joints.kind, [angle, along, leaning, np.zeros(len(joints)), length])
+
+
+def speeds(joints: Joints, motion: Motion) -> np.ndarray:
+    """[..., J] the rates at which the `coordinates` change, at one instant or at several."""
+    place, turned = _with_world(motion.position, motion.orientation)
+    point, axes = world_frames(joints, place, turned)
+    fast, spin = (_and_still(part)[..., joints.body, :] for part in (motion.velocity, motion.angular_velocity))
+    way, turn = point[..., 0, :] - point[..., 1, :], spin[..., 0, :] - spin[..., 1, :]
+    # Both bodies at the first one's anchor: as seen from the second body, whose points turn with it.
+    ends = fast + np.cross(spin, point[..., :1, :] - place[..., joints.body, :])
+    slide = ends[..., 0, :] - ends[..., 1, :]
+    first, second = axes[..., 0, 0, :], axes[..., 1, 0, :]
+    lean = np.cross(second, first)
+    ways = np.stack([first, second, lean, np.zeros_like(lean), way])
+    lengths = np.linalg.norm(ways, axis=-1)
+    rates = (ways * np.stack([turn, slide, turn, turn, slide])).sum(-1) / np.where(lengths > 1e-12, lengths, np.inf)
+    return np.choose(joints.kind, rates)
 
 
 def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -39,6 +39,18 @@ def to_matrix(q: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rotate(q[..., None, :], np.eye(3)).swapaxes(-1, -2))
 
 
+def from_matrix(m: np.ndarray) -> np.ndarray:
+    """Unit quaternions of rotation matrices [..., 3, 3], by Bar-Itzhack's method: the eigenvector of the largest
+    eigenvalue."""
+    form = np.zeros((*m.shape[:-2], 4, 4))
+    form[..., :3, :3] = m + m.swapaxes(-1, -2)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        form[..., i, i] = m[..., i, i] - m[..., j, j] - m[..., k, k]
+        form[..., i, 3] = form[..., 3, i] = m[..., k, j] - m[..., j, k]
+    form[..., 3, 3] = np.trace(m, axis1=-2, axis2=-1)
+    return np.linalg.eigh(form)[1][..., -1]
+
+
 def from_rotvec(r: np.ndarray) -> np.ndarray:
     """Unit quaternions of rotation vectors [..., 3] rad (axis times angle)."""
     half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)

@@ -24,6 +24,8 @@ class Rollout:
         contact_point: [sum(contact_count), 3] float64 m, world, in step order: the points of their owners at which
             contacts acted, with the bodies as they are in this entry.
         contact_body: [sum(contact_count), 2] int64, (owner of the node, body it meets).
+        contact_force: [sum(contact_count), 3] N, world, on the owner, the mean in the last inner step; NaN where it is
+            not known: only `Simulator.record` keeps it.
         counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `energy_given` J (by pulls, pushes and
             changes of the state, since the frame before), `contacts`, `worst_penetration` m, `step_ms`, and other
             counts of the simulator. The penetration is the depth of the deepest of an entry's contact points within the
@@ -31,7 +33,8 @@ class Rollout:
         names: N body names.
         joint_names: J names of joints; empty if joints are off.
         joint_position: [T+1, J] the angle of hinges and balls in rad, the position of sliders and the length of
-            distances in m, 0 for fixed joints.
+            distances in m, 0 for fixed joints; joint_velocity: [T+1, J] the rates at which they change.
+        joint_effort: [T+1, J] N m or N, of the joints' motors in the last inner step; NaN as for `contact_force`.
         joint_force: [T+1, J, 3] N, world, on the joint's first body in the last inner step; joint_torque: [T+1, J, 3]
             N m, about the joint's anchor.
         meta: model, seed, versions, dt s.
@@ -49,7 +52,10 @@ class Rollout:
     names: tuple[str, ...] = ()
     meta: dict = field(default_factory=dict)
     joint_names: tuple[str, ...] = ()
+    contact_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     joint_position: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    joint_velocity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    joint_effort: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     joint_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     joint_torque: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
@@ -67,6 +73,7 @@ class Rollout:
             **{f: getattr(self, f)[cut] for f in _PER_FRAME},
             contact_point=self.contact_point[rows],
             contact_body=self.contact_body[rows],
+            contact_force=self.contact_force[rows],
             counters={k: v[cut] for k, v in self.counters.items()},
         )
 
@@ -96,15 +103,16 @@ class Rollout:
 
 
 _PER_FRAME = (
-    "time", "position", "orientation", "velocity", "angular_velocity", "contact_count", "joint_position", "joint_force",
-    "joint_torque",
+    "time", "position", "orientation", "velocity", "angular_velocity", "contact_count", "joint_position",
+    "joint_velocity", "joint_effort", "joint_force", "joint_torque",
 )  # fmt: skip
+_PER_CONTACT = ("contact_point", "contact_body", "contact_force")
 
 
 def join(frames: list[Rollout]) -> Rollout:
     """One rollout from consecutive pieces."""
     return replace(
         frames[0],
-        **{k: np.concatenate([getattr(f, k) for f in frames]) for k in (*_PER_FRAME, "contact_point", "contact_body")},
+        **{k: np.concatenate([getattr(f, k) for f in frames]) for k in (*_PER_FRAME, *_PER_CONTACT)},
         counters={k: np.concatenate([f.counters[k] for f in frames]) for k in frames[0].counters},
     )

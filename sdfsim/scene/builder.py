@@ -16,10 +16,22 @@ from sdfsim.scene.document import NOTHING, Faults, Numeral, at
 from sdfsim.scene.keys import BodyKeys, JointKeys
 from sdfsim.scene.load import checked, load_scene, read_scene, scene_of
 from sdfsim.scene.scene import WORLD, JointKind, Scene
-from sdfsim.scene.schema import VERSION, BodyTable, JointTable, SceneTable, ShapeTable, Table, meant
+from sdfsim.scene.schema import (
+    VERSION,
+    BodyTable,
+    CouplingTable,
+    FrameTable,
+    JointTable,
+    KeyframeTable,
+    SceneTable,
+    ShapeTable,
+    Table,
+    meant,
+)
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
-_LISTED = ("version", "shapes", "bodies", "joints")  # the keys of the file that are no settings
+_ENTRIES = ("shapes", "bodies", "joints", "frames", "keyframes", "couplings")
+_LISTED = ("version", *_ENTRIES)  # the keys of the file that are no settings
 _PATHS = ("asset", "mesh")
 _CONTEXT = {"folder": Path(), "allow_outside": True}  # paths start at the current folder
 
@@ -29,7 +41,8 @@ class SceneBuilder:
     top-level keys of the file: gravity, duration, seed, model, effects. Raises SceneError for an unknown key.
 
     Attributes:
-        settings, shapes, bodies, joints: what the file has, as dicts and lists of texts and numbers.
+        settings, shapes, bodies, joints, frames, keyframes, couplings: what the file has, as dicts and lists of texts
+            and numbers.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -41,6 +54,9 @@ class SceneBuilder:
         self.shapes: dict[str, dict[str, Any]] = {}
         self.bodies: list[dict[str, Any]] = []
         self.joints: list[dict[str, Any]] = []
+        self.frames: list[dict[str, Any]] = []
+        self.keyframes: dict[str, dict[str, Any]] = {}
+        self.couplings: list[dict[str, Any]] = []
 
     @classmethod
     def read(cls, path: Path | str, *, allow_outside: bool = False) -> "SceneBuilder":
@@ -49,8 +65,7 @@ class SceneBuilder:
         path = find_scene(path)
         document = plain(read_scene(path, allow_outside=allow_outside)[1].data)
         scene, home = cls(), path.parent
-        scene.shapes, scene.bodies = document.get("shapes") or {}, document["bodies"]
-        scene.joints = document.get("joints") or []
+        vars(scene).update({key: document[key] for key in _ENTRIES if document.get(key)})
         scene.settings = {key: value for key, value in document.items() if key not in _LISTED}
         for entry in scene.shapes.values():
             entry |= {key: str(home / entry[key]) for key in _PATHS if key in entry}
@@ -93,6 +108,31 @@ class SceneBuilder:
         self.joints.append(joint)
         return self
 
+    def frame(self, name: str, body: str, **keys: Any) -> "SceneBuilder":
+        """Add a named pose on a body, or on the "world", and return the scene: `position` from the body's origin, and
+        an orientation, as `frames` in docs/scene.md. Raises SceneError as `join` does."""
+        self.frames.append(self._checked(f"frame {name!r}", FrameTable, {"name": name, "body": body, **keys}))
+        return self
+
+    def keyframe(self, name: str, **keys: Any) -> "SceneBuilder":
+        """Add a pose of all joints for `Simulator.reset`, and return the scene, as in `keyframe("home",
+        angles_deg={"elbow": 90})`; docs/scene.md has the keys. Raises SceneError as `join` does."""
+        self.keyframes[name] = self._checked(f"keyframe {name!r}", KeyframeTable, keys)
+        return self
+
+    def couple(self, first: str, second: str, **keys: Any) -> "SceneBuilder":
+        """Add a coupling, by which the joint `first` follows `second`, and return the scene, with the keys of
+        `couplings` in docs/scene.md. Raises SceneError as `join` does."""
+        self.couplings.append(
+            self._checked(f"coupling of {first!r}", CouplingTable, {"joints": [first, second], **keys})
+        )
+        return self
+
+    def _checked(self, what: str, table: type[Table], keys: dict[str, Any]) -> dict[str, Any]:
+        _known(keys, list(table.model_fields), what)
+        validated(what, (table, entry := plain(keys)))
+        return entry
+
     def load(self, on_progress: Progress = silent) -> Scene:
         """The immutable scene that a simulator needs; `Simulator` calls this itself. Shapes are loaded or fitted as in
         `load_scene`. Raises SceneError with one line for every fault."""
@@ -122,7 +162,7 @@ class SceneBuilder:
             name: {key: moved(value) if key in _PATHS else value for key, value in entry.items()}
             for name, entry in self.shapes.items()
         }
-        listed = {"shapes": shapes, "bodies": self.bodies, "joints": self.joints}
+        listed = {name: getattr(self, name) for name in _ENTRIES} | {"shapes": shapes}
         return document | {key: value for key, value in listed.items() if value}
 
 

@@ -13,6 +13,18 @@ from sdfsim.scene.schema import JointTable
 NEAR = 1e-3  # relative: by how much a rod's length may differ from the distance of its ends at the start
 
 
+def joint_axes(axis: np.ndarray | None) -> Any:
+    """The axes of a joint's frame in the world at the start, as a `Rotation`: x is the `axis` [3], a unit vector;
+    without an axis they are those of the world."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    if axis is None:
+        return Rotation.identity()
+    side = np.eye(3)[np.argmin(np.abs(axis))]
+    side = np.cross(axis, side) / np.linalg.norm(np.cross(axis, side))
+    return Rotation.from_matrix(np.stack([axis, side, np.cross(axis, side)], 1))
+
+
 def held(
     name: str,
     kind: JointKind,
@@ -37,13 +49,10 @@ def held(
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
-    axis = np.array([1.0, 0.0, 0.0]) if axis is None else np.asarray(axis, np.float64)
-    side = np.eye(3)[np.argmin(np.abs(axis))]
-    side = np.cross(axis, side) / np.linalg.norm(np.cross(axis, side))
-    frame = Rotation.from_matrix(np.stack([axis, side, np.cross(axis, side)], 1))
+    frame = joint_axes(axis)
     turned = frame * Rotation.from_rotvec([start, 0.0, 0.0]) if kind == "hinge" else frame
     other = np.asarray(anchor if to is None else to, np.float64)
-    other = other - start * axis if kind == "slider" else other
+    other = other - start * np.asarray(axis) if kind == "slider" else other
     anchors, frames = [], []
     for body, point, axes in zip(bodies, (np.asarray(anchor, np.float64), other), (turned, frame), strict=True):
         place, back = np.zeros(3), Rotation.identity()

@@ -16,8 +16,8 @@ from sdfsim.base.warned import warn_once
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.document import Document, Faults
 from sdfsim.scene.joints import joints_of
-from sdfsim.scene.scene import Body, Effects, Motion, Scene, Waypoints
-from sdfsim.scene.schema import FITTED, UNITS, BodyTable, SceneTable, ShapeTable
+from sdfsim.scene.scene import WORLD, Body, Coupling, Effects, Frame, Keyframe, Motion, Scene, Waypoints
+from sdfsim.scene.schema import FITTED, UNITS, BodyTable, CouplingTable, KeyframeTable, SceneTable, ShapeTable
 from sdfsim.shape.make import analytic_shape, far_origin, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.shape import Shape, centred, load_shape, with_nodes, with_sdf, with_wall
 
@@ -97,7 +97,29 @@ def scene_of(table: SceneTable, faults: Faults, on_progress: Progress) -> Scene:
         notes=notes,
         caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
         joints=joints,
+        **_poses_of(table, bodies),
     )
+
+
+def _poses_of(table: SceneTable, bodies: list[Body]) -> dict[str, Any]:
+    """The frames, keyframes and couplings of a scene."""
+    number = {WORLD: -1} | {body.name: k for k, body in enumerate(bodies)}
+    joint = {entry.name: j for j, entry in enumerate(table.joints)}
+    frames = (Frame(f.name, number[f.body], np.array(f.position), f.rotation()) for f in table.frames)
+
+    def pose(key: KeyframeTable) -> Keyframe:
+        angles = {name: math.radians(angle) for name, angle in key.angles_deg.items()}
+        turns = {name: np.array(quat) for name, quat in key.quats_xyzw.items()}
+        there = {name: (np.array(at.position), at.rotation()) for name, at in key.bodies.items()}
+        return Keyframe(angles | key.positions | turns, there)
+
+    def coupling(of: CouplingTable) -> Coupling:
+        first, second = (joint[name] for name in of.joints)
+        turns = table.joints[first].type == "hinge"
+        return Coupling((first, second), of.ratio, math.radians(of.offset_deg) if turns else of.offset)
+
+    keyframes = {name: pose(key) for name, key in table.keyframes.items()}
+    return {"frames": tuple(frames), "keyframes": keyframes, "couplings": tuple(map(coupling, table.couplings))}
 
 
 def _load_shapes(

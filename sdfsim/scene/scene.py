@@ -1,10 +1,10 @@
 """A scene as immutable data in SI units: what loading a scene file gives."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -158,6 +158,52 @@ class Joint:
 
 
 @dataclass(frozen=True)
+class Frame:
+    """A named pose that moves with a body, such as the point between a gripper's fingers.
+
+    Attributes:
+        name: unique among the frames of the scene.
+        body: index into `Scene.bodies`; -1 for the world.
+        position: [3] m, of its origin from the origin of the body's shape, along the body's axes.
+        quat_xyzw: [4] unit quaternion, the frame's axes -> the body's.
+    """
+
+    name: str
+    body: int
+    position: np.ndarray
+    quat_xyzw: np.ndarray
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A named pose of a scene.
+
+    Attributes:
+        joints: the angle of hinges (rad), the position of sliders (m) and the quaternion [4] xyzw of balls, see
+            `JointHandle.quat_xyzw`, by names of joints; others stay as at the start.
+        bodies: position [3] m and quaternion [4] xyzw of bodies that no joint holds, by their names.
+    """
+
+    joints: Mapping[str, Any]
+    bodies: Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Keeps the coordinate of one joint at `ratio` times that of another plus `offset`.
+
+    Attributes:
+        joints: indices into `Scene.joints`, hinges or sliders; the first follows the second.
+        ratio: rad or m of the first for each rad or m of the second.
+        offset: rad or m.
+    """
+
+    joints: tuple[int, int]
+    ratio: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class Scene:
     """A complete scene.
 
@@ -165,6 +211,9 @@ class Scene:
         shapes: the shapes in use.
         bodies: every body, planes included, in file order.
         joints: the joints between bodies, in file order.
+        frames: named poses on bodies.
+        keyframes: named poses of all joints, for `Simulator.reset`.
+        couplings: joints that follow others. The solve does not hold them yet.
         gravity: [3] float64 m/s^2.
         duration: s.
         step: s, None if it follows the size of what moves.
@@ -190,6 +239,9 @@ class Scene:
     notes: tuple[str, ...] = ()
     joints: tuple[Joint, ...] = ()
     step: float | None = None
+    frames: tuple[Frame, ...] = ()
+    keyframes: Mapping[str, Keyframe] = field(default_factory=dict)
+    couplings: tuple[Coupling, ...] = ()
 
 
 def fingerprints(scene: Scene) -> dict[str, str]:

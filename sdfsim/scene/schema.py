@@ -674,8 +674,45 @@ class JointTable(Table):
                 yield ("motor", f"position{name[5:]}"), fault
 
 
-def _named(bodies: list, joints: Any) -> Iterator[tuple[Loc, str]]:
-    """The places where bodies and joints name bodies, and the names, as far as these are lists."""
+class FrameTable(Turned):
+    """A named pose that moves with a body: `simulator.frame(NAME)`."""
+
+    name: Text = key("unique among frames")
+    body: Text = key(f"name of a body, or `{WORLD}`")
+    position: Vector = key("its origin from the origin of the body's shape, along the body's axes", _ORIGIN, "m")
+
+
+class Pose(Turned):
+    """Where a keyframe has a body."""
+
+    position: Vector = key("position of the shape's own origin", unit="m")
+
+
+class KeyframeTable(Table):
+    """A pose of all joints by its name, for `simulator.reset(keyframe=NAME)`: everything is at rest in it, and motors
+    that go to a position aim at it. Joints and bodies that it leaves out stay as at the start."""
+
+    angles_deg: dict[str, Number] = key("angles of hinges, by their names", {}, "degrees")
+    positions: dict[str, Number] = key("positions of sliders", {}, "m")
+    quats_xyzw: dict[str, Quaternion] = key("rotations of balls, scalar last, from their start", {})
+    bodies: dict[str, Pose] = key("poses of bodies that no joint holds", {})
+
+
+class CouplingTable(Table):
+    """Couples two joints, hinges or sliders: the first is at `ratio` times the second plus an offset. The solve does
+    not hold couplings yet; exports contain them."""
+
+    joints: Annotated[list[Text], Field(min_length=2, max_length=2)] = key("names of two joints")
+    ratio: Number = key("radians or metres of the first for each radian or metre of the second", 1.0)
+    offset: Number = key("offset of a slider", 0.0, "m")
+    offset_deg: Number = key("offset of a hinge", 0.0, "degrees")
+
+
+def _named(bodies: list, joints: Any, frames: Any) -> Iterator[tuple[Loc, str]]:
+    """The places where bodies, joints and frames name bodies, and the names, as far as these are lists."""
+    for i, entry in enumerate(frames if isinstance(frames, list) else ()):
+        if isinstance(entry, dict) and isinstance(name := entry.get("body"), str) and name.strip():
+            yield ("frames", i, "body"), name
     named = ("bodies", bodies, "collides_with"), ("bodies", bodies, "avoids"), ("joints", joints, "bodies")
     for of, entries, key in named:
         for i, entry in enumerate(entries if isinstance(entries, list) else ()):
@@ -705,6 +742,9 @@ class SceneTable(Table):
     shapes: dict[str, ShapeTable] = key("shapes by name", {})
     bodies: Annotated[list[BodyTable], Field(min_length=1)] = key("all bodies")
     joints: list[JointTable] = key("joints between bodies", [])
+    frames: list[FrameTable] = key("named poses on bodies", [])
+    keyframes: dict[str, KeyframeTable] = key("poses of all joints by name", {})
+    couplings: list[CouplingTable] = key("joints that follow others", [])
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -721,7 +761,7 @@ class SceneTable(Table):
                 yield ("bodies", i, "shape"), f"no shape is called {shape!r}{nearest(shape, shapes) or there}"
         grouped = {entry["name"] for entry in listed if isinstance(entry, dict) and isinstance(entry.get("name"), str)
                    and {"count", "arrange"} & entry.keys()}  # fmt: skip
-        for where, name in _named(listed, data.get("joints")):
+        for where, name in _named(listed, data.get("joints"), data.get("frames")):
             if name not in first and name != WORLD and name.partition("[")[0] not in grouped:
                 yield where, _no_body(name, first)
 
@@ -745,6 +785,38 @@ class SceneTable(Table):
                     if partner not in first and partner not in copies and "[" in partner:
                         yield ("bodies", i, key, k), _no_body(partner, copies)
         yield from self._joint_faults()
+        yield from self._pose_faults()
+
+    def _pose_faults(self) -> Iterator[Fault]:
+        """Faults in frames, keyframes and couplings."""
+        kinds = {joint.name: joint.type for joint in self.joints}
+        bodies = {name for body in self.bodies for name in body.names()}
+        first: dict[str, int] = {}
+        for i, frame in enumerate(self.frames):
+            if first.setdefault(frame.name, i) != i:
+                yield (
+                    ("frames", i, "name"),
+                    f"two frames are called {frame.name!r} (the first is frames[{first[frame.name]}])",
+                )
+            if frame.body not in bodies | {WORLD}:
+                yield ("frames", i, "body"), _no_body(frame.body, bodies)
+
+        def fits(loc: Loc, name: str, *allowed: str) -> Iterator[Fault]:
+            if name not in kinds:
+                there = f"; joints are {', '.join([*kinds][:20])}" if kinds else "; the file has no joints"
+                yield loc, f"no joint is called {name!r}{nearest(name, kinds) or there}"
+            elif kinds[name] not in allowed:
+                yield loc, f"must be a {' or '.join(allowed)} (got {name!r}, a {kinds[name]})"
+
+        for key, frame in self.keyframes.items():
+            for what, kind in (("angles_deg", "hinge"), ("positions", "slider"), ("quats_xyzw", "ball")):
+                for name in getattr(frame, what):
+                    yield from fits(("keyframes", key, what, name), name, kind)
+            for name in frame.bodies.keys() - bodies:
+                yield ("keyframes", key, "bodies", name), _no_body(name, bodies)
+        for i, coupling in enumerate(self.couplings):
+            for k, name in enumerate(coupling.joints):
+                yield from fits(("couplings", i, "joints", k), name, "hinge", "slider")
 
     def _joint_faults(self) -> Iterator[Fault]:
         motion = {name: self.motion_of(body) for body in self.bodies for name in body.names()}
@@ -797,6 +869,10 @@ _SECTIONS: dict[str, type[Table]] = {
     "joints[]: spring": SpringTable,
     "joints[]: motor": MotorTable,
     "joints[]: breaks_at": BreaksTable,
+    "frames[]": FrameTable,
+    "keyframes: NAME": KeyframeTable,
+    "keyframes: NAME: bodies: NAME": Pose,
+    "couplings[]": CouplingTable,
 }
 
 

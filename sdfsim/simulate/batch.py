@@ -57,7 +57,12 @@ class Copies:
         joints = tuple(of_world(joint, w) for w in range(count) for joint in held)
         bodies = tuple(scene.bodies[k] for k in [*moving * count, *fixed])
         world = [*np.repeat(np.arange(count), len(moving)).tolist(), *[-1] * len(fixed)]
-        self.bodies, self.start = side_by_side(replace(scene, bodies=bodies, joints=joints), world, self.units)
+        couplings = tuple(
+            replace(c, joints=(c.joints[0] + w * len(held), c.joints[1] + w * len(held)))
+            for w in range(count) for c in scene.couplings if held
+        )  # fmt: skip
+        worlds = replace(scene, bodies=bodies, joints=joints, couplings=couplings)
+        self.bodies, self.start = side_by_side(worlds, world, self.units)
         self.solver = stepper_of(load_model())
 
     def begun(self, position: np.ndarray, orientation: np.ndarray, velocity: np.ndarray, spin: np.ndarray) -> State:
@@ -66,7 +71,7 @@ class Copies:
         state = placed(self.start, position / u.length, orientation, velocity / u.velocity, spin * u.time)
         if self.bodies.joints is None:
             return state
-        return replace(state, joints=initial(self.bodies.joints, state.position, state.orientation))
+        return replace(state, joints=initial(self.bodies.joints, state))
 
 
 def inner_of_frame(dt: float) -> int:

@@ -10,7 +10,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units
 from sdfsim.physics.options import Options
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Frame, Scene
 from sdfsim.simulate.steppers import Stepper
 
 Numbers = Sequence[float] | np.ndarray
@@ -131,7 +131,7 @@ class BodyHandle:
     @position.setter
     def position(self, place: Numbers) -> None:
         arm = self._arm(self._of("orientation"))
-        self._set("position", (_vector("position", place) + arm) / self._simulator.units.length)
+        self._set("position", (vector("position", place) + arm) / self._simulator.units.length)
 
     @property
     def quat_xyzw(self) -> np.ndarray:
@@ -140,7 +140,7 @@ class BodyHandle:
 
     @quat_xyzw.setter
     def quat_xyzw(self, quat: Numbers) -> None:
-        turned = _vector("quat_xyzw", quat, 4)
+        turned = vector("quat_xyzw", quat, 4)
         length = np.linalg.norm(turned)
         if not length > 0:
             raise SdfsimError("quat_xyzw: must not be zero")
@@ -153,7 +153,7 @@ class BodyHandle:
 
     @velocity.setter
     def velocity(self, velocity: Numbers) -> None:
-        self._set("velocity", _vector("velocity", velocity) / self._simulator.units.velocity)
+        self._set("velocity", vector("velocity", velocity) / self._simulator.units.velocity)
 
     @property
     def angular_velocity(self) -> np.ndarray:
@@ -162,7 +162,7 @@ class BodyHandle:
 
     @angular_velocity.setter
     def angular_velocity(self, angular: Numbers) -> None:
-        self._set("angular_velocity", _vector("angular_velocity", angular) * self._simulator.units.time)
+        self._set("angular_velocity", vector("angular_velocity", angular) * self._simulator.units.time)
 
     @property
     def mass(self) -> float:
@@ -208,11 +208,11 @@ class BodyHandle:
         """Change the body's velocities now by an impulse [3] N s that acts at the point `at` [3] m, world, or at the
         centre of mass. Raises SdfsimError if the body is not dynamic."""
         self._must_move("be pushed")
-        given = _vector("impulse", impulse)
+        given = vector("impulse", impulse)
         self.velocity = self.velocity + given / self.mass
         if at is not None and self._simulator.options.rotation:
             sim, row = self._simulator, self._row
-            turn = np.cross(_vector("at", at) - self.centre, given)
+            turn = np.cross(vector("at", at) - self.centre, given)
             axes = pose.to_matrix(sim.now.orientation[row])
             self.angular_velocity = self.angular_velocity + np.linalg.solve(axes @ self.inertia @ axes.T, turn)
 
@@ -230,9 +230,9 @@ class BodyHandle:
         sim = self._simulator
         if not sim.stepper.forces:
             raise SdfsimError("networks have no inputs for forces", "use the solver")
-        given, moment = _vector("force", force), _vector("torque", torque)
+        given, moment = vector("force", force), vector("torque", torque)
         if at is not None:
-            moment = moment + np.cross(_vector("at", at) - self.centre, given)
+            moment = moment + np.cross(vector("at", at) - self.centre, given)
         u, state = sim.units, sim.now
         load = np.zeros((len(sim.bodies), 6)) if state.load is None else state.load.copy()
         load[self._row, :3] = given / (u.mass * u.acceleration)
@@ -261,7 +261,49 @@ class BodyHandle:
             raise SdfsimError(f"body {self.name!r}: is {motion}, so it cannot {what}")
 
 
-def _vector(name: str, values: Numbers, length: int = 3) -> np.ndarray:
+class FrameHandle:
+    """A frame of a simulator, by its `name`: a pose that moves with a body."""
+
+    __slots__ = ("_frame", "_simulator", "name")
+
+    def __init__(self, simulator: LiveScene, frame: Frame) -> None:
+        self._simulator, self._frame, self.name = simulator, frame, frame.name
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] m, world."""
+        body = self._body
+        if body is None:
+            return self._frame.position + 0.0
+        return body.position + pose.rotate(body.quat_xyzw, self._frame.position)
+
+    @property
+    def quat_xyzw(self) -> np.ndarray:
+        """[4] unit quaternion, the frame's axes -> world."""
+        own, body = self._frame.quat_xyzw, self._body
+        return own + 0.0 if body is None else pose.multiply(body.quat_xyzw, own)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """[3] m/s, of the frame's origin, world."""
+        body = self._body
+        if body is None:
+            return np.zeros(3)
+        return body.velocity + np.cross(body.angular_velocity, self.position - body.centre)
+
+    @property
+    def angular_velocity(self) -> np.ndarray:
+        """[3] rad/s, world."""
+        return np.zeros(3) if self._body is None else self._body.angular_velocity
+
+    @property
+    def _body(self) -> BodyHandle | None:
+        row = self._frame.body
+        return None if row < 0 else BodyHandle(self._simulator, self._simulator.scene.bodies[row].name)
+
+
+def vector(name: str, values: Numbers, length: int = 3) -> np.ndarray:
+    """[length] float64. Raises SdfsimError for anything else than finite numbers of this count."""
     found = np.asarray(values, dtype=np.float64)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise SdfsimError(f"{name}: must be {length} finite numbers (got {values!r})")

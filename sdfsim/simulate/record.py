@@ -9,8 +9,10 @@ TOGETHER = 256  # so many parts are joined: each has some thirty arrays
 
 
 class Recording:
-    """The frames of a simulator since it began; `rollout` has them. Its counters have for each hinge and slider what
-    drives it: `target_NAME` and `effort_NAME`, see `JointHandle`, NaN where there is none."""
+    """The frames of a simulator since it began; `rollout` has them, with the forces of contacts and the efforts of
+    motors (`contact_force`, `joint_effort`). Its counters have for each hinge and slider what it was told to do:
+    `target_NAME` and `effort_NAME`, see `JointHandle`, NaN where there is none. `sdfsim.save_run` writes a recording as
+    a run folder."""
 
     def __init__(self, first: Rollout) -> None:
         self.begin(first)

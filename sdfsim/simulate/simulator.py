@@ -19,7 +19,8 @@ from sdfsim.base.version import __version__
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, Moment, State, Units, from_scene
-from sdfsim.physics.joint_columns import BROKEN, COORD, TARGET
+from sdfsim.physics.joint_columns import BROKEN, COORD, DRIVE, TARGET
+from sdfsim.physics.joints import speeds
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.options import Options
 from sdfsim.physics.rollout import Rollout, join
@@ -29,10 +30,10 @@ from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
 from sdfsim.scene.builder import SceneBuilder, loaded, plain, validated
 from sdfsim.scene.keys import BodyKeys
 from sdfsim.scene.plan import plan
-from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene import Body, Keyframe, Scene
 from sdfsim.scene.schema import BodyTable
-from sdfsim.simulate.body import BodyHandle, ContactPoint, LiveScene
-from sdfsim.simulate.joint import JointHandle
+from sdfsim.simulate.body import BodyHandle, ContactPoint
+from sdfsim.simulate.joint import Jointed, JointHandle
 from sdfsim.simulate.record import Recording
 from sdfsim.simulate.steppers import Carry, FreeFlight, energies_of, stacked, stepper_of
 
@@ -65,7 +66,7 @@ class Snapshot:
     attributes: Mapping[str, Any]
 
 
-class Simulator(LiveScene):
+class Simulator(Jointed):
     """Simulates one scene.
 
         simulator = sdfsim.Simulator(sdfsim.load_scene("pile"))
@@ -244,14 +245,26 @@ class Simulator(LiveScene):
             self._carry.checked = True
         return self._carry
 
-    def reset(self) -> None:
-        """Return to the start of the scene."""
-        self.restore(self._start)
+    def reset(self, keyframe: str | None = None) -> None:
+        """Return to the start of the scene, with the joints and free bodies of a `keyframe` of the scene at rest there;
+        motors that go to a position aim at it. Raises SdfsimError if no keyframe has that name."""
+        known = self.scene.keyframes
+        if keyframe is not None and keyframe not in known:
+            there = f"keyframes are {', '.join(known)}" if known else "the scene has no keyframes"
+            raise SdfsimError(f"there is no keyframe {keyframe!r}{nearest(keyframe, known)}", there)
+        self._return(self._start)
+        if keyframe is not None:
+            self._pose_as(known[keyframe])
+        self._cut()
 
     def restore(self, state: State) -> None:
         """Continue from a state that steps have led to, in this or another simulator of the same scene. The motion
         continues as it would have there, bit by bit, and sleeping bodies sleep on. For a state that you have changed,
         set `state` instead. Raises SdfsimError for an invalid state, or a state of another scene."""
+        self._return(state)
+        self._cut()
+
+    def _return(self, state: State) -> None:
         self._fits(state)
         if broken := first_fault(state, self._options.dt):
             raise SdfsimError(self._described(broken))
@@ -260,6 +273,8 @@ class Simulator(LiveScene):
         self._changed.clear()
         self._carry, self._given = None, 0.0
         self.steps_done = round(state.time / self._options.dt)
+
+    def _cut(self) -> None:
         for recording in self._recordings:
             recording.cut(self._driven(self.initial_rollout()))
 
@@ -325,9 +340,23 @@ class Simulator(LiveScene):
         """Remove a body and its joints while the simulation runs; bodies that lay on it wake."""
         row, scene = self._row(name), self.scene
         number = {k: k - (k > row) for k in range(-1, len(scene.bodies))} | {-1: -1}
-        joints = [replace(j, bodies=(number[j.bodies[0]], number[j.bodies[1]])) for j in scene.joints
-                  if row not in j.bodies]  # fmt: skip
-        self.become(replace(scene, bodies=scene.bodies[:row] + scene.bodies[row + 1 :], joints=tuple(joints)))
+        kept = [k for k, joint in enumerate(scene.joints) if row not in joint.bodies]
+        joints = [scene.joints[k] for k in kept]
+        joints = [replace(j, bodies=(number[j.bodies[0]], number[j.bodies[1]])) for j in joints]
+        names = {joint.name for joint in joints}
+        keys = {
+            key: Keyframe({joint: at for joint, at in known.joints.items() if joint in names},
+                          {body: at for body, at in known.bodies.items() if body != name})
+            for key, known in scene.keyframes.items()
+        }  # fmt: skip
+        self.become(replace(
+            scene, bodies=scene.bodies[:row] + scene.bodies[row + 1 :], joints=tuple(joints), keyframes=keys,
+            frames=tuple(replace(f, body=number[f.body]) for f in scene.frames if f.body != row),
+            couplings=tuple(
+                replace(c, joints=(kept.index(c.joints[0]), kept.index(c.joints[1])))
+                for c in scene.couplings if {*c.joints} <= {*kept}
+            ),
+        ))  # fmt: skip
 
     def become(self, scene: Scene) -> None:
         """Go on with another scene, in which bodies may be added at the end or removed. Bodies and joints of the same
@@ -389,15 +418,6 @@ class Simulator(LiveScene):
             close = nearest(name, self._names)
             raise SdfsimError(f"there is no body {name!r}{close}", f"bodies are {', '.join(self._names[:20])}")
         return self._names.index(name)
-
-    def joint(self, name: str) -> JointHandle:
-        """A joint by its name. Raises SdfsimError if no joint has that name."""
-        names = [joint.name for joint in self.scene.joints]
-        if name not in names:
-            suggestion = nearest(name, names)
-            known = f"joints are {', '.join(names[:20])}" if names else "the scene has no joints"
-            raise SdfsimError(f"there is no joint {name!r}{suggestion}", known)
-        return JointHandle(self, names.index(name))
 
     def contact_points(self) -> list[ContactPoint]:
         """The points where bodies touch in the present state, as the last step of the contact solve left them. Raises
@@ -466,7 +486,7 @@ class Simulator(LiveScene):
         self._accept()
         state, counts = self._state, {} if self._carry is None else self._carry.counts
         one, given = (state, 0.0, counts, self.stepper.touching(state, self._carry)), self._given
-        first = self._rollout(stacked(state, [one], self.bodies, self._options), 0.0)
+        first = self._rollout(stacked(state, [one], self.bodies, self._options), 0.0, told=True)
         self._given = given if self._recordings else 0.0  # a recording has yet to count it
         return first
 
@@ -489,6 +509,8 @@ class Simulator(LiveScene):
     def _advance(self, count: int, *, keep: bool = False) -> Rollout | None:
         """Make `count` steps, in one call if the stepper can. Returns their frames with `keep`, or if somebody
         records."""
+        if self._recordings and count > 1:  # one by one: efforts and forces are known after each
+            return self._one_by_one(count, keep=keep)
         self._accept(keep=keep)
         started = running()
         made = self.stepper.advance(self._state, self.carry, max(0, count), keep=keep or bool(self._recordings))
@@ -498,12 +520,25 @@ class Simulator(LiveScene):
         if made.frames is None:
             self._given += made.given
         else:
-            part = self._rollout(made.frames, 1e3 * (running() - started) / max(made.done, 1))
+            spent = 1e3 * (running() - started) / max(made.done, 1)
+            part = self._rollout(made.frames, spent, told=bool(self._recordings))
             for recording in self._recordings:
                 recording.add(self._driven(part))
         if made.fault is not None:
             raise self._broke(self._described(made.fault), part if keep else None)
         return part
+
+    def _one_by_one(self, count: int, *, keep: bool) -> Rollout | None:
+        parts: list[Rollout] = []
+        for _ in range(count):
+            try:
+                part = self._advance(1, keep=keep)
+            except SimulationError as error:
+                if not keep:
+                    raise
+                raise SimulationError(error.message, join([*parts, error.rollout])) from None
+            parts += [] if part is None else [part]
+        return join(parts) if keep else None
 
     def _driven(self, part: Rollout) -> Rollout:
         """The frames of steps in which motors did not change, with their targets and efforts as counters."""
@@ -549,13 +584,22 @@ class Simulator(LiveScene):
         message = f"step {self.steps_done + 1}: {what}; {last}"
         return SimulationError(message, self.initial_rollout() if frames is None else frames)
 
-    def _rollout(self, frames: Frames, milliseconds: float) -> Rollout:
-        """Frames up to the present step in SI units, each of which took `milliseconds`."""
+    def _rollout(self, frames: Frames, milliseconds: float, *, told: bool = False) -> Rollout:
+        """Frames up to the present step in SI units, each of which took `milliseconds`; `told`: a single one has the
+        efforts and forces of the present state."""
         u, k = self.units, len(frames.depth)
         given = frames.energy[:, 2].copy()
         if k:
             given[0] += self._given
             self._given = 0.0
+        jointed, moved = frames.joint.shape[1] > 0, u.in_si(frames)
+        force = np.full((len(frames.pair), 3), np.nan)
+        effort = np.full(frames.joint.shape[:2], np.nan)
+        if told and k == 1 and self.stepper.forces:
+            force = np.array([contact.force for contact in self.contact_points()]).reshape(-1, 3)
+            if jointed and self._state.joints is not None:
+                strength = u.energy / np.array(self._joint_unit) * self._options.substeps / self._options.dt
+                effort = self._state.joints[None, :, DRIVE + 1] * strength
         counters = {
             "kinetic_energy": frames.energy[:, 0] * u.energy,
             "potential_energy": frames.energy[:, 1] * u.energy,
@@ -567,18 +611,26 @@ class Simulator(LiveScene):
         }
         return Rollout(
             time=np.arange(self.steps_done - k + 1, self.steps_done + 1) * self.dt,
-            **u.in_si(frames),
+            **moved,
             contact_count=frames.touching,
             contact_point=frames.point * u.length,
             contact_body=frames.pair,
+            contact_force=force,
             counters=counters,
             names=self._names,
             meta=self._meta,
-            joint_names=self._joint_names if frames.joint.shape[1] else (),
-            joint_position=frames.joint[:, :, 0] * self._joint_unit if frames.joint.shape[1] else frames.joint[:, :, 0],
+            joint_names=self._joint_names if jointed else (),
+            joint_position=frames.joint[:, :, 0] * self._joint_unit if jointed else frames.joint[:, :, 0],
+            joint_velocity=self._joint_speeds(frames) if jointed else frames.joint[:, :, 0],
+            joint_effort=effort,
             joint_force=frames.joint[:, :, 1:4] * u.mass * u.acceleration,
             joint_torque=frames.joint[:, :, 4:7] * u.energy,
         )
+
+    def _joint_speeds(self, frames: Frames) -> np.ndarray:
+        """[K, J] rad/s and m/s."""
+        assert self.bodies.joints is not None
+        return speeds(self.bodies.joints, frames) * self._joint_unit / self.units.time
 
 
 def _check_inputs(scene: Scene, model: str, *, joints: bool) -> None:

@@ -118,7 +118,8 @@ def test_urdf_tells_what_it_leaves_out_and_what_it_made_otherwise(tmp_path: Path
     assert scene.bodies[0].motion == "static"
     assert "<transmission> (1)" in report["left_out"]
     assert any("velocity of <limit>" in line for line in report["left_out"])
-    assert any("tool0" in line for line in report["notes"])
+    (frame,) = (frame for frame in scene.frames if frame.name == "tool0")
+    assert scene.bodies[frame.body].name == "tip" and frame.position[2] == pytest.approx(0.05)  # the ball is at 0.05
     assert any("shoulder starts at 0.2 rad" in line for line in report["notes"])
 
 
@@ -712,3 +713,109 @@ def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
     frames = [turn * Rotation.from_quat(q) for turn, q in zip((arm, fore), elbow.quat_xyzw, strict=True)]
     assert (frames[1].inv() * frames[0]).as_rotvec() == pytest.approx([0.3, 0, 0], abs=1e-9)
     assert not any("elbow" in line for line in report["left_out"])
+
+
+HAND = ARM.replace(
+    '</joint>\n  <joint name="spin"',
+    '<mimic joint="shoulder" multiplier="0.5" offset="-0.1"/></joint>\n  <joint name="spin"',
+)
+COUPLED = """<mujoco><worldbody><body name="base" pos="0 0 1"><freejoint/><geom size="0.1"/>
+  <body name="a" pos="0.2 0 0"><joint name="ja" axis="0 1 0" ref="20" range="-60 60" limited="true"/>
+    <geom type="box" size="0.05 0.05 0.1" pos="0 0 0.3"/><site name="tcp" pos="0 0 0.5" euler="0 30 0"/>
+  <body name="b" pos="0 0 0.6"><joint name="jb" type="slide" axis="0 0 1"/><geom size="0.05"/>
+  <body name="c" pos="0 0 0.3"><joint name="jc" type="ball"/><geom size="0.05" pos="0 0 0.1"/></body></body></body>
+  </body></worldbody>
+  <tendon><fixed name="t"><joint joint="ja" coef="2"/><joint joint="jb" coef="-1"/></fixed></tendon>
+  <equality><joint joint1="jb" joint2="ja" polycoef="0.1 0.5 0 0 0"/><tendon tendon1="t"/></equality>
+  <actuator><position joint="ja" kp="10" kv="1"/></actuator>
+  <keyframe><key name="home" qpos="1 2 3 1 0 0 0 0.5 0.1 0.8 0.6 0 0"/><key name="zero"/></keyframe></mujoco>"""
+
+
+def test_a_mimic_is_a_coupling_here_and_in_exports(tmp_path: Path) -> None:
+    scene, report = imported(write(tmp_path, "hand.urdf", HAND), fixed=True)
+    (coupling,) = scene.couplings
+    assert [scene.joints[j].name for j in coupling.joints] == ["rail", "shoulder"]
+    assert (coupling.ratio, coupling.offset) == (0.5, -0.1)
+    assert any("couplings" in line and "rail" in line for line in report["left_out"])
+    export(scene, tmp_path / "back.urdf")
+    (back,) = imported(next(tmp_path.glob("back*.urdf")), fixed=True)[0].couplings
+    assert (back.ratio, back.offset) == (0.5, pytest.approx(-0.1))
+    export(scene, tmp_path / "hand.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "hand.xml"))
+    data = mujoco.MjData(model)
+    for angle in (0.2, 1.0):  # no violation where the coupling says
+        data.joint("shoulder").qpos, data.joint("rail").qpos = angle, 0.5 * angle - 0.1
+        mujoco.mj_forward(model, data)
+        assert np.abs(data.efc_pos[: data.ne]).max() < 1e-9
+
+
+def test_keyframes_sites_and_couplings_of_an_mjcf_are_those_of_mujoco(tmp_path: Path) -> None:
+    scene, _ = imported(write(tmp_path, "robot.xml", COUPLED))
+    simulator = Simulator(scene)
+    simulator.reset(keyframe="home")
+    model = mujoco.MjModel.from_xml_string(COUPLED)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    for name in "abc":
+        np.testing.assert_allclose(simulator[name].centre, data.body(name).xipos, atol=1e-8)
+    np.testing.assert_allclose(simulator.frame("tcp").position, data.site("tcp").xpos, atol=1e-8)
+    np.testing.assert_allclose(
+        np.abs(simulator.frame("c").quat_xyzw), np.abs(np.roll(data.body("c").xquat, -1)), atol=1e-8
+    )
+    assert simulator.joint("ja").target == pytest.approx(0.5)
+    found = [(scene.joints[c.joints[0]].name, c.ratio, c.offset) for c in scene.couplings]
+    assert found == [
+        ("jb", 0.5, pytest.approx(0.1 - 0.5 * math.radians(20))),
+        ("ja", 0.5, pytest.approx(math.radians(20))),
+    ]
+
+
+def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
+    collada = pytest.importorskip("collada")
+    file = collada.Collada()
+    effect = collada.material.Effect("e", [], "lambert", diffuse=(1.0, 0.5, 0.0, 1.0))
+    paint = collada.material.Material("m", "paint", effect)
+    file.effects.append(effect)
+    file.materials.append(paint)
+    corners = np.array([[x, y, z] for x in (0, 100) for y in (0, 100) for z in (0, 100)], float)
+    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5], [2, 3, 7], [2, 7, 6], [0, 2, 6],
+                      [0, 6, 4], [1, 7, 3], [1, 5, 7]])  # fmt: skip
+    places = collada.source.FloatSource("places", corners.ravel(), ("X", "Y", "Z"))
+    shape = collada.geometry.Geometry(file, "g", "box", [places])
+    inputs = collada.source.InputList()
+    inputs.addInput(0, "VERTEX", "#places")
+    shape.primitives.append(shape.createTriangleSet(faces.ravel(), inputs, "paint"))
+    file.geometries.append(shape)
+    used = collada.scene.GeometryNode(shape, [collada.scene.MaterialNode("paint", paint, inputs=[])])
+    moved = collada.scene.Node("n", children=[used], transforms=[collada.scene.TranslateTransform(0, 0, 50)])
+    file.scenes.append(scene := collada.scene.Scene("s", [moved]))
+    file.scene, file.assetInfo.unitname, file.assetInfo.unitmeter = scene, "mm", 0.001
+    file.write(str(tmp_path / "box.dae"))
+    mesh = '<geometry><mesh filename="box.dae"/></geometry>'
+    text = f"""<robot name="r"><link name="one"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0"
+      ixz="0" iyz="0"/></inertial><visual>{mesh}</visual><collision>{mesh}</collision></link></robot>"""
+    shape = imported(write(tmp_path, "r.urdf", text))[0].shapes[0]
+    np.testing.assert_allclose(shape.mesh.vertices.max(0), (0.1, 0.1, 0.15), atol=1e-9)
+    assert shape.volume == pytest.approx(1e-3) and shape.skin is not None and shape.skin.texture is not None
+    assert (np.abs(shape.skin.texture.reshape(-1, 3).astype(int) - (255, 128, 0)) < 6).all()
+
+
+def test_xacro_is_expanded_if_it_is_installed(tmp_path: Path) -> None:
+    head, tail = ARM.split(">", 1)
+    macro = '<xacro:property name="low" value="${0.1 * 2}"/>'
+    text = (
+        head + ' xmlns:xacro="http://www.ros.org/wiki/xacro">' + macro + tail.replace('lower="0.2"', 'lower="${low}"')
+    )
+    file = write(tmp_path, "arm.urdf.xacro", text)
+    try:
+        import xacro  # noqa: F401
+    except ModuleNotFoundError:
+        with pytest.raises(
+            SdfsimError, match=r"holds xacro macros, and xacro is not installed\nhint: pip install xacro"
+        ):
+            imported(file)
+    else:
+        scene, report = imported(file, fixed=True)
+        assert {joint.name: joint.start for joint in scene.joints}["shoulder"] == pytest.approx(0.2)
+        assert any("xacro" in line for line in report["notes"])

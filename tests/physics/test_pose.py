@@ -75,3 +75,9 @@ def test_leading_dimensions_are_batched_over(pose):
     np.testing.assert_allclose(pose.rotate(one, v), A[0].apply(v.reshape(-1, 3)).reshape(v.shape), atol=1e-13)
     for some in (quats[:0], quats[:, :0]):
         assert pose.multiply(some, some).shape == pose.from_rotvec(some[..., :3]).shape == some.shape
+
+
+def test_a_quaternion_of_a_matrix():
+    half_turns = Rotation.from_rotvec(np.pi * np.eye(3))
+    for rotation in (A, half_turns, Rotation.identity(2)):
+        same(in_numpy.from_matrix(rotation.as_matrix()), rotation)

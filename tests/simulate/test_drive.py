@@ -116,7 +116,7 @@ def test_a_target_beyond_the_limits_is_told():
         (lambda j: setattr(j, "max_force", -1), "max_force: must be a finite number of at least 0"),
         (lambda j: setattr(j, "time", -1), "time: must be a finite number of at least 0"),
         (lambda j: setattr(j, "friction", True), "friction: must be a finite number of at least 0"),
-        (lambda j: j.position, "is a hinge, which has no position\nhint: read angle"),
+        (lambda j: j.quat_xyzw, "is a hinge, which has no quat_xyzw"),
     ],
 )
 def test_what_cannot_be_told_is_refused_in_a_line(act, message):

@@ -5,7 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from sdfsim import Rollout, Scene, SdfsimError, Simulator
+from sdfsim import Scene, SdfsimError, Simulator, save_run
+from sdfsim.apps.run import read_run
 from tests.simulate.test_restore import resting, same
 
 SLOPE = 20.0  # degrees
@@ -164,8 +165,22 @@ def test_a_recording_has_what_is_done_between_steps(tmp_path):
     assert np.isnan(rollout.counters["effort_rail"][:11]).all() and rollout.counters["effort_rail"][12] == 5.0
     assert np.isnan(rollout.counters["target_rail"][12])
     assert rollout.counters["energy_given"][11] > 3.9  # J, of the push: 4^2 / (2 x 2)
-    rollout.save(tmp_path / "run.npz")
-    np.testing.assert_array_equal(Rollout.load(tmp_path / "run.npz").joint_position, rollout.joint_position)
+    # Joints' speeds, motors' efforts and contacts' forces are those of every step.
+    names, ends = rollout.joint_names, np.cumsum(rollout.contact_count)
+    door, rail = names.index("door"), names.index("rail")
+    assert rollout.joint_effort[12, rail] == pytest.approx(5.0) and rollout.joint_effort[0, rail] == 0.0
+    assert 0.0 < abs(rollout.joint_effort[20, door]) <= simulator.joint("door").max_force
+    fast = np.gradient(rollout.joint_position[:, door], rollout.time)
+    np.testing.assert_allclose(fast[14:30], rollout.joint_velocity[14:30, door], rtol=0.05)
+    last = slice(ends[-2], ends[-1])
+    carried = np.isin(rollout.contact_body[last], rollout.names.index("box")).any(1)
+    assert abs(rollout.contact_force[last][carried].sum(0)[2]) == pytest.approx(2.0 * 9.81, rel=0.05)
+    # As a run folder the commands read it.
+    save_run(simulator, run, tmp_path / "run")
+    scene, kept = read_run(tmp_path / "run")
+    for name in ("joint_position", "joint_effort", "contact_force"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(rollout, name))
+    assert scene.bodies[0].name == rollout.names[0]
     # The same steps without a recording.
     again = resting()
     again.step(3)
