@@ -12,6 +12,8 @@ HINGE, SLIDER, BALL, FIXED, DISTANCE = range(5)
 # broken; force and torque on the first body (at its anchor, world axes); the impulses at its limit, and of motor and
 # friction, of the last inner step (a ball has three of the latter; after the impulse of a motor with friction comes
 # that of the motor alone); how much its rows have to turn in an inner step so that they hold at its end; the work of
-# the motor in the step.
-COORD, SPEED, TARGET, BROKEN, PULL, TWIST, STOP, DRIVE, CURVE, GIVEN, STATE = 0, 1, 2, 3, 4, 7, 10, 11, 14, 20, 21
+# the motor in the step; the impulse of the coupling in which it follows another joint.
+COORD, SPEED, TARGET, BROKEN, PULL, TWIST, STOP, DRIVE, CURVE, GIVEN, TIE, STATE = (
+    0, 1, 2, 3, 4, 7, 10, 11, 14, 20, 21, 22,
+)  # fmt: skip
 NOTHING, TO_SPEED, TO_PLACE = range(3)  # modes of a motor

@@ -222,6 +222,10 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
         near[-1 - j] = set(bodies)
         for b in bodies:
             near.setdefault(b, set()).add(-1 - j)
+    beside: dict[int, list[int]] = {}  # what couplings connect sleeps and wakes together
+    for one, other in joints.coupled.tolist():
+        beside.setdefault(-1 - one, []).append(-1 - other)
+        beside.setdefault(-1 - other, []).append(-1 - one)
     comps: list[list[int]] = []
     seen: set[int] = set()
     for first in sorted(n for n in near if n >= 0):
@@ -232,7 +236,7 @@ def ordered(joints: Joints, moves: np.ndarray) -> Order:
         while todo:
             n = todo.pop()
             found.append(n)
-            new = near[n] - seen
+            new = near[n].union(beside.get(n, ())) - seen
             seen |= new
             todo += sorted(new)
         comps.append(found)

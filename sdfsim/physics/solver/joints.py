@@ -34,6 +34,7 @@ from sdfsim.physics.joint_columns import (
     STIFFNESS,
     STOP,
     TARGET,
+    TIE,
     TIME,
     TO_PLACE,
     TO_SPEED,
@@ -45,8 +46,10 @@ from sdfsim.physics.solver.rows import (
     AIM,
     ANGULAR,
     DRAG,
+    FOLLOWER,
     GRIP,
     IMPULSE,
+    LEADER,
     LEFT,
     LIMIT,
     LINEAR,
@@ -103,6 +106,9 @@ class Each(NamedTuple):
     number: np.ndarray  # [J, NUMBERS]
     state: np.ndarray  # [J, STATE]
     axis: np.ndarray  # [J, WIDTH] the row along which it moves
+    # Couplings: coupled [C, 2] int64, the first joint follows the second; coupling [C, 2] ratio and offset
+    coupled: np.ndarray
+    coupling: np.ndarray
 
 
 class Trial(NamedTuple):
@@ -430,7 +436,37 @@ def bounded_rows(work, motion, rules, joints, rows, count, phase):
                     count = _ball_friction(work, rules, each, rows, count, j, phase)
                 elif each.kind[j] < BALL:
                     count = _motor(work, rules, each, rows, count, j, phase)
+    for k in range(len(each.coupled)):
+        count = _coupling(work, motion, rules, joints, rows, count, k, phase)
     return count
+
+
+@njit(**BARE)
+def _coupling(work, motion, rules, joints, rows, count, k, phase):
+    each, wrong = joints.each, -joints.each.coupling[k, 1]
+    for side in range(2):
+        j = each.coupled[k, side]
+        going = each.state[j, BROKEN] == 0.0
+        for s in range(2):
+            b = each.body[j, s]
+            going = going and (b < 0 or motion.island[b] < 0)
+        if not going:
+            return count
+    for side in range(2):
+        j, factor = each.coupled[k, side], 1.0 if side == 0 else -each.coupling[k, 0]
+        row, own = each.axis[j], rows.row[count + side, 0]
+        a, b = each.body[j, 0], each.body[j, 1]
+        _begin(each, rows, count + side, FOLLOWER if side == 0 else LEADER, j)
+        rows.where[count + side, 1] = k
+        for x in range(MASS):
+            own[x] = factor * row[x]
+        own[MASS] = row[MASS] / (factor * factor) if factor != 0.0 else 0.0
+        own[WANTED] = -velocity_of(own, work.twist, a, b) - velocity_of(own, work.free, a, b)
+        own[IMPULSE] = kick_of(phase) * each.state[each.coupled[k, 0], TIE]
+        wrong += factor * each.state[j, COORD]
+    if phase != END:
+        rows.row[count, 0, WANTED] -= wrong / rules.substep_dt
+    return count + 2
 
 
 @njit(**BARE)
@@ -544,7 +580,7 @@ def record_held(work, rules, joints, c, phase):
         state[SPEED] += velocity_of(each.axis[j], work.change, a, b)
         for x in range(3):
             state[PULL + x] = state[TWIST + x] = state[DRIVE + x] = 0.0
-        state[STOP] = 0.0
+        state[STOP] = state[TIE] = 0.0
         for e in range(EQUATIONS):
             if phase != END:
                 state[CURVE + e] = held.wanted[j, e] if held.active[j, e] == 1 else 0.0
@@ -571,9 +607,11 @@ def record_bounded(work, rules, each, rows, c, phase):
     for e in range(3 if kind == GRIP else 1):
         row = rows.row[c, e]
         _add_pull(work.matrix, each, j, row, row[IMPULSE] / (kick * rules.substep_dt))
-        if kind == LIMIT:
+        if kind == FOLLOWER:
+            state[TIE] = row[IMPULSE] / kick
+        elif kind == LIMIT:
             state[STOP] += own[SIDE] * row[IMPULSE] / kick
-        else:
+        elif kind != LEADER:
             state[DRIVE + e] += row[IMPULSE] / kick  # a motor with a gain and friction are two rows
     if kind != MOTOR_ROW or own[STRONGEST] <= 0.0:
         return 0.0

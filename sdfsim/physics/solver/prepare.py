@@ -522,7 +522,7 @@ def joints_of(bodies: Bodies) -> Joints:
         factors=Factors(room(k, 6, 6), room(k, 6, 6), room(f, 6, 6), room(f, 6, 6), room(k, 6)),
         each=Each(
             joints.body, joints.kind, joints.anchor, joints.axes, joints.number.copy(), room(j, joint_columns.STATE),
-            room(j, OF_ROW),
+            room(j, OF_ROW), joints.coupled, joints.coupling,
         ),
         held=Held(
             joints.body, room(j, EQUATIONS, OF_ROW), np.zeros((j, EQUATIONS), np.int64),

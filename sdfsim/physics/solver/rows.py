@@ -24,8 +24,9 @@ from sdfsim.physics.solver.world import END, START, kick_of
 LINEAR, ANGULAR, OTHER, TURN, COUNTER, MASS, WANTED, IMPULSE, REBOUND, SOFT, WIDTH = (
     0, 3, 6, 9, 12, 15, 16, 17, 18, 19, 20,
 )  # fmt: skip
-# Kinds of blocks.
-CONTACT, LIMIT, MOTOR, GRIP = range(4)
+# Kinds of blocks. A coupling is two blocks, one for each of its joints, with one impulse: the leader's comes after
+# the follower's.
+CONTACT, LIMIT, MOTOR, GRIP, FOLLOWER, LEADER = range(6)
 # Columns of `Rows.own` by kind. Contacts: the wanted change along the normal without rebound, and the speed along it
 # without contact.
 CALM, BEFORE = range(2)
@@ -35,6 +36,7 @@ LEFT, SIDE = range(2)
 # Motors: the speed to reach; the largest impulses of the motor and of friction. Friction of balls has its largest
 # impulse in the same column.
 AIM, STRONGEST, DRAG = range(3)
+LOCKED = 1e-9  # relative to its joints alone: a coupling with less effect can move nothing
 # (Phase of a spring in an inner step)^2 up to which it is not damped: ten inner steps a period.
 RESOLVED = 0.4
 RIGID = 1e-9  # least impulse of a spring for a unit of speed, relative to the row's effective mass
@@ -177,6 +179,10 @@ def sweep(rows, work, delassus, lo, hi):
             worst = max(worst, _relax(rows.where, rows.row, work.inverse_mass, work.change, c))
         elif rows.kind[c] == GRIP:
             worst = max(worst, _relax_grip(rows, work, delassus, c))
+        elif rows.kind[c] == FOLLOWER:
+            worst = max(worst, _relax_coupling(rows, work, delassus, c))
+        elif rows.kind[c] == LEADER:
+            continue
         else:
             worst = max(worst, _relax_one(rows, work, delassus, c))
     for i in range(lo, hi):
@@ -321,6 +327,24 @@ def _relax_grip(rows, work, delassus, c):
         if row[e, MASS] > 0.0:
             worst = max(worst, abs(row[e, IMPULSE] - known[e]) / row[e, MASS])
     return worst
+
+
+@njit(**BARE)
+def _relax_coupling(rows, work, delassus, c):
+    """Relax the two rows of a coupling, whose velocities add up. Returns the largest change."""
+    mass, other = rows.row[c, 0, MASS], rows.row[c + 1, 0, MASS]
+    alone = (1.0 / mass if mass > 0.0 else 0.0) + (1.0 / other if other > 0.0 else 0.0)
+    effect = 2.0 * alone  # no less than it can be with a body in common
+    if len(delassus.change):
+        p, q = delassus.at[c], delassus.at[c + 1]
+        effect = delassus.matrix[p, p] + delassus.matrix[p, q] + delassus.matrix[q, p] + delassus.matrix[q, q]
+    if effect <= LOCKED * alone:
+        return 0.0
+    short = _short(rows, work, delassus, c, 0) + _short(rows, work, delassus, c + 1, 0)
+    total = rows.row[c, 0, IMPULSE] + short / effect
+    _set(rows, work, delassus, c, 0, total)
+    _set(rows, work, delassus, c + 1, 0, total)
+    return abs(short)
 
 
 @njit(**BARE)

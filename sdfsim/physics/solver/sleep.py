@@ -84,7 +84,7 @@ def put_to_sleep(world, work, motion, rules, manifolds, joints):
         if manifolds.count[m] and world.moves[a] and world.moves[b]:
             join(parent, a, b)
     restless = np.zeros(n, np.bool_)
-    _join_held(world, joints.each.body, parent)
+    _join_held(joints.graph, parent)
     _mark_gliding(world, motion, rules, manifolds, joints, parent, restless)
     for j in range(len(joints.each.body)):
         a = _driven_by_path(world, motion, joints.each.body, j)
@@ -125,12 +125,15 @@ def _mark_gliding(world, motion, rules, manifolds, joints, parent, restless):
 
 
 @njit(**BARE)
-def _join_held(world, joint, parent):
-    """Join the bodies that joints [J, 2] connect; -1 is the world."""
-    for j in range(len(joint)):
-        a, b = joint[j, 0], joint[j, 1]
-        if a >= 0 and b >= 0 and world.moves[a] and world.moves[b]:
-            join(parent, a, b)
+def _join_held(graph, parent):
+    """Join the bodies that joints and couplings connect."""
+    for c in range(len(graph.comp) - 1):
+        last = -1
+        for k in range(graph.comp[c], graph.comp[c + 1]):
+            if graph.node[k] >= 0:
+                if last >= 0:
+                    join(parent, last, graph.node[k])
+                last = graph.node[k]
 
 
 @njit(**BARE)

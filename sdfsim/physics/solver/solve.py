@@ -72,7 +72,7 @@ def solve(world, work, motion, rules, manifolds, joints, threads, phase):
     """
     most = most_contacts(world, motion, manifolds)
     if joints is not None:
-        most += PER_JOINT * len(joints.each.body)
+        most += PER_JOINT * len(joints.each.body) + 2 * len(joints.each.coupled)
     room = Rows(
         np.empty(most, np.int64), np.zeros((most, 4), np.int64), np.zeros((most, 3, WIDTH)), np.zeros(most),
         np.zeros((most, 4)), np.zeros(most), np.zeros(most), np.empty(0, np.int64), np.empty(0, np.int64),
