@@ -94,7 +94,7 @@ class _Reader:
             )
         xacro = importlib.import_module("xacro")
         if find_spec("ament_index_python") is None:  # without ROS nothing else finds packages
-            importlib.import_module("xacro.substitution_args")._eval_find = self._package
+            vars(importlib.import_module("xacro.substitution_args"))["_eval_find"] = self._package
         try:
             text = xacro.process_file(str(self.path)).toxml()
         except Exception as error:  # of many types

@@ -1,5 +1,6 @@
 """COLLADA files (.dae), in which most robots have their looks: triangles in metres with flat colours."""
 
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,7 @@ def collada_surface(path: Path) -> FileMesh:
     """The triangles of all instances in the file's scene, in metres. Its axes are taken as they are, whatever `up_axis`
     says: robot files rely on that, as RViz and Gazebo do it. Raises ValueError if there are none, and the errors of the
     reader if it is damaged."""
-    import collada  # few need it
-
+    collada: Any = importlib.import_module("collada")  # few need it
     file = collada.Collada(str(path), ignore=[collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError])
     vertices, faces, colors, first, textured = [], [], [], 0, False
     for instance in file.scene.objects("geometry") if file.scene is not None else ():

@@ -25,7 +25,6 @@ from sdfsim.physics.joint_columns import (
     LENGTH,
     SLIDER,
     SPEED,
-    STATE,
     TARGET,
 )
 from sdfsim.physics.joints import coordinates, speeds, world_frames
@@ -174,14 +173,13 @@ class JointSpace:
             else:
                 hint = "set the joint that is driven; the others follow it"
                 raise SdfsimError(f"joints: a loop or coupling stays open by {np.abs(wrong).max():.3g} there", hint)
-            moved = self.tree
         if closes:
             _, slope, own = self._open(q, positions, fixed)
             wanted = np.where(own >= 0, velocities[own], 0.0)
             v[free] -= np.linalg.lstsq(slope[:, free], slope @ v - wanted, rcond=1e-9)[0]
+            moved = self.tree
         fast, spin = self._motion()
-        self._carry(v[:, None], fast, spin, self.tree if closes else moved)
-        known = self.state.joints.copy()
+        self._carry(v[:, None], fast, spin, moved)
         changed = np.array(sorted({k for _, k in moved}), int)
         orientation = self.state.orientation.copy()
         made = pose.from_matrix(self.turn[changed])
@@ -190,11 +188,12 @@ class JointSpace:
             "position": self.place[:-1].copy(), "orientation": orientation, "velocity": fast[:-1, :, 0].copy(),
             "angular_velocity": spin[:-1, :, 0].copy(),
         }  # fmt: skip
-        touched = np.isin(self.joints.body, changed).any(1)
-        known[np.ix_(touched, [c for c in range(STATE) if c not in (COORD, TARGET, BROKEN)])] = 0.0
-        for j, own in enumerate(self.columns):
-            if touched[j] and own.stop - own.start == 1:
-                known[j, COORD] = q[own][0]
+        known, touched = self.state.joints.copy(), np.isin(self.joints.body, changed).any(axis=1)
+        known[touched] = 0.0  # impulses of the step before
+        for column in (TARGET, BROKEN):
+            known[:, column] = self.state.joints[:, column]
+        for j in np.flatnonzero(touched & np.isin(self.joints.kind, (HINGE, SLIDER))):
+            known[j, COORD] = q[self.columns[j].start]
         known[:, COORD] = coordinates(self.joints, known[:, COORD], after["position"], orientation)
         known[touched, SPEED] = speeds(self.joints, Motion(**after))[touched]
         return replace(self.state, **after, joints=known), changed
