@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.export import rebound
-from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Pose, Robot, moved, named, not_held, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Pose, Robot, moved, named, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.lazy import optional
 from sdfsim.geometry.mesh import Mesh
@@ -197,7 +197,6 @@ class _Reader:
         self._left_out([g for own in geoms for g in own] if meets else [])
         links = self._slippery(links, geoms, apart) if meets else links
         couplings = tuple(self._couplings())
-        self.left += [not_held([first for first, *_ in couplings])] if couplings else []
         ends = model.wrap_objid[model.wrap_type == int(self.mj.mjtWrap.mjWRAP_SITE)]  # those of tendons are no frames
         frames = [self._frame(s) for s in range(model.nsite) if s not in ends and model.site(s).name]
         return Robot(

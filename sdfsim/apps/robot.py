@@ -118,11 +118,6 @@ def named(what: str, names: Sequence[str]) -> str:
     return f"{what} ({len(names)}: {', '.join(names[:MOST_NAMED])}{more})"
 
 
-def not_held(joints: Sequence[str]) -> str:
-    """The line of a report on couplings, by the joints that follow others."""
-    return named("couplings are in the scene and its exports, but the solve does not hold them", joints)
-
-
 def pose_of(place: Any = (0.0, 0.0, 0.0), turn: Rotation | None = None) -> np.ndarray:
     """[4, 4] of a place [3] and a rotation."""
     made = np.eye(4)

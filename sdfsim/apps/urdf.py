@@ -17,7 +17,7 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, not_held, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, pose_of
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, Loaded, load_textured
@@ -249,7 +249,6 @@ class _Reader:
                 links[k] = replace(links[k], still=True)
         couplings = tuple(self._mimics(given))
         left = [f"{what} ({count})" for what, count in self.left.items()]
-        left += [not_held([first for first, *_ in couplings])] if couplings else []
         return Robot(
             self.root.get("name", self.path.stem), tuple(links), tuple(joints),
             left_out=(*left, *self.missed), notes=tuple(self.notes), couplings=couplings,

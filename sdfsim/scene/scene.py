@@ -213,7 +213,7 @@ class Scene:
         joints: the joints between bodies, in file order.
         frames: named poses on bodies.
         keyframes: named poses of all joints, for `Simulator.reset`.
-        couplings: joints that follow others. The solve does not hold them yet.
+        couplings: joints that follow others.
         gravity: [3] float64 m/s^2.
         duration: s.
         step: s, None if it follows the size of what moves.

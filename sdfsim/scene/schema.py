@@ -699,8 +699,7 @@ class KeyframeTable(Table):
 
 
 class CouplingTable(Table):
-    """Couples two joints, hinges or sliders: the first is at `ratio` times the second plus an offset. The solve does
-    not hold couplings yet; exports contain them."""
+    """Couples two hinges or sliders, as gears do: the first is at `ratio` times the second plus an offset."""
 
     joints: Annotated[list[Text], Field(min_length=2, max_length=2)] = key("names of two joints")
     ratio: Number = key("radians or metres of the first for each radian or metre of the second", 1.0)

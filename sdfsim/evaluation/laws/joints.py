@@ -521,7 +521,31 @@ def loads(at: Setting) -> Iterator[Check]:
     yield ran.most("energy gained", (ran.energy() - ran.energy()[0]).max(), 1e-3 * 10.0 * G * 0.3, "J")
 
 
+def couplings(at: Setting) -> Iterator[Check]:
+    """A joint follows another under load, and both share the effort."""
+    built = scene().add("hand", box={"size": (0.1, 0.3, 0.05)}, position=(0, 0, 1), motion="static")
+    servo = {"position": 0.03, "gain": 2000.0, "time": 0.05, "max_force": 40}
+    for side, name in ((1, "left"), (-1, "right")):
+        built.add(name, box={"size": (0.02, 0.02, 0.1)}, position=(0, 0.05 * side, 0.9), mass=0.5, avoids=["hand"])
+        keys: dict[str, Any] = {"motor": servo} if side == 1 else {}
+        built.join(name, "slider", name, "hand", anchor=(0, 0.05 * side, 0.95), axis=(0, 0.6, 0.8 * side), **keys)
+    ran = run_built(at, "fingers", built.couple("right", "left", ratio=-1.0), 3.0)
+    place = ran.rollout.joint_position
+    yield off(ran, "right and left", place[:, 1] + place[:, 0], 0.0, 1e-6, "m")
+    yield ran.near("sags by", 0.03 - place[-1, 0], 2 * 0.5 * G * 0.8 / 2000.0, 1e-3, "m")
+    built = scene(0.0)
+    for name, x, radius in (("wheel", 0.0, 0.1), ("pinion", 0.3, 0.05)):
+        built.add(name, cylinder={"radius": radius, "height": 0.05}, position=(x, 0, 0), mass=1.0)
+    built.join("wheel", "hinge", "wheel", anchor=(0, 0, 0), axis=(0, 0, 1), motor={"speed": 1e3, "max_force": 0.01})
+    built.join("pinion", "hinge", "pinion", anchor=(0.3, 0, 0), axis=(0, 0, 1)).couple("pinion", "wheel", ratio=-2.0)
+    ran = run_built(at, "gears", built, 3.0)
+    inertia = 0.5 * 0.1**2 + 2.0**2 * 0.5 * 0.05**2
+    place = ran.rollout.joint_position
+    yield off(ran, "ratio", place[:, 1], -2.0 * place[:, 0], 1e-9, "rad")
+    yield ran.near("speed", ran.rollout.angular_velocity[-1, 0, 2], 0.01 * ran.time[-1] / inertia, 1e-6, "rad/s")
+
+
 JOINTS = (
     pendulums, sliders, ropes, doors, damping, motors, levers, servos, work, sockets, blocked, breaks, double_pendulum,
-    linkages, chains, bridges, cradles, governors, loads,
+    linkages, chains, bridges, cradles, governors, loads, couplings,
 )  # fmt: skip

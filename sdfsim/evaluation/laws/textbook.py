@@ -160,4 +160,66 @@ def trays(at: Setting) -> Iterator[Check]:
         yield ran.near("behind", behind, wanted, 0.0, "m", 1e-3)
 
 
-TEXTBOOK = (bounces, head_on, slopes, plates, drops, stacks, overlaps, sleepers, trays)
+def soft(at: Setting) -> Iterator[Check]:
+    """Soft material gives way by its load over the stiffness, two of them in series, and rebounds as a spring."""
+    for stiffness in (2e3, 1e4, 1e5, 1e7):
+        damping = 0.6 * sqrt(2.0 * stiffness)
+        for name, shape in (("box", {"box": {"size": (0.2, 0.2, 0.2)}}), ("ball", {"sphere": {"radius": 0.1}})):
+            built = SceneBuilder().add("floor", plane={})
+            built.add("it", **shape, position=(0, 0, 0.1), mass=2.0, stiffness=stiffness, damping=damping)
+            ran = run_built(at, f"{name} of {stiffness:g} N/m", built, 3.0)
+            yield ran.near("rests at", 0.1 - ran.rollout.position[-1, 1, 2], 2.0 * G / stiffness, 2e-2, "m")
+    built = SceneBuilder().add("floor", plane={})
+    for k in range(2):
+        place = (0, 0, 0.1 + 0.2 * k)
+        built.add(f"{k}", box={"size": (0.2, 0.2, 0.2)}, position=place, mass=2.0, stiffness=1e4, damping=60)
+    ran = run_built(at, "two boxes", built, 3.0)
+    height = ran.rollout.position[-1, :, 2]
+    yield ran.near("floor gives way", 0.1 - height[1], 4.0 * G / 1e4, 2e-2, "m")
+    yield ran.near("both give way", 0.2 - (height[2] - height[1]), 2.0 * G / 5e3, 2e-2, "m")
+    built = SceneBuilder().add("floor", plane={})
+    built.add("it", sphere={"radius": 0.1}, position=(0, 0, 0.6), mass=0.5, stiffness=5e3)
+    ran = run_built(at, "ball without damping", built, 1.2)
+    height = ran.rollout.position[:, 1, 2]
+    yield ran.near("comes back to", height[int(np.argmin(height)) :].max(), 0.6, 0.04, "m")
+
+
+def gliding(at: Setting) -> Iterator[Check]:
+    """What nothing brakes goes on, however slowly; what is braked sleeps."""
+    for speed in (1.2e-3, 2.5e-3):
+        built = SceneBuilder().add("floor", plane={}, friction=0)
+        built.add("puck", cylinder={"radius": 0.04, "height": 0.02}, position=(0, 0, 0.01), velocity=(speed, 0, 0))
+        ran = run_built(at, f"puck at {speed:g} m/s", built, 3.0)
+        yield ran.near("way", ran.rollout.position[-1, 1, 0], speed * ran.time[-1], 1e-3, "m")
+    yaw, built = 20.0, SceneBuilder()
+    for k in range(72):
+        place = (0.25 * (k % 12) - 0.3, 0.25 * (k // 12) - 0.6, -0.05)
+        built.add(f"tile{k}", box={"size": (0.25, 0.25, 0.1)}, position=place, motion="static", friction=1)
+    built.add(
+        "slab", box={"size": (0.3, 0.15, 0.04)}, position=(0, 0, 0.02), euler_xyz_deg=(0, 0, yaw), velocity=(2, 0, 0),
+        friction=0.3,
+    )  # fmt: skip
+    ran = run_built(at, "slab on tiles", built, 1.0)
+    yield ran.near("way", ran.rollout.position[-1, -1, 0], 4.0 / (2.0 * 0.3 * G), 0.01, "m", 0.01)
+    x, y, z, w = ran.rollout.orientation[-1, -1]
+    yield ran.near("yaw", float(np.degrees(2.0 * np.arctan2(z, w))), yaw, 0.0, "degrees", 2.0)
+
+
+def parting(at: Setting) -> Iterator[Check]:
+    """Bodies that start inside each other part without speed, and a dead impact ends at the surface."""
+    for deep in (1e-3, 0.0399, 0.0401, 0.1):
+        built = SceneBuilder(gravity=(0, 0, 0)).add("floor", plane={})
+        built.add("it", box={"size": (1.4, 1.4, 1.4)}, position=(0, 0, 0.7 - deep))
+        ran = run_built(at, f"{deep:g} m deep", built, 2.0)
+        yield ran.most("speed", np.abs(ran.rollout.velocity).max(), 1e-9, "m/s")
+        yield ran.most("is still deep by", 0.7 - ran.rollout.position[-1, 1, 2], 1e-3, "m")
+    built = SceneBuilder(gravity=(0, 0, 0)).add("wall", box={"size": (0.8, 0.8, 0.8)}, motion="static", restitution=0)
+    built.add("ball", sphere={"radius": 0.4}, position=(1.2, 0.01, 0.02), velocity=(-0.2, 0, 0), restitution=0)
+    ran = run_built(at, "dead impact", built, 4.0)
+    yield ran.near("place", ran.rollout.position[-1, 1, 0], 0.8, 0.0, "m", 1e-3)
+    yield ran.most("speed", abs(ran.rollout.velocity[-1, 1, 0]), 1e-9, "m/s")
+
+
+TEXTBOOK = (
+    bounces, head_on, slopes, plates, drops, stacks, overlaps, sleepers, trays, soft, gliding, parting,
+)  # fmt: skip
