@@ -201,7 +201,7 @@ def gliding(at: Setting) -> Iterator[Check]:
     )  # fmt: skip
     ran = run_built(at, "slab on tiles", built, 1.0)
     yield ran.near("way", ran.rollout.position[-1, -1, 0], 4.0 / (2.0 * 0.3 * G), 0.01, "m", 0.01)
-    x, y, z, w = ran.rollout.orientation[-1, -1]
+    _, _, z, w = ran.rollout.orientation[-1, -1]
     yield ran.near("yaw", float(np.degrees(2.0 * np.arctan2(z, w))), yaw, 0.0, "degrees", 2.0)
 
 
