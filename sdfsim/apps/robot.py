@@ -152,6 +152,7 @@ def write_scene(
         lift[2] = -min(corners, default=0.0)
         scene.add(FLOOR, plane={}, friction=1.0, restitution=0.0)
     avoided = _avoided(whole, [shape for shape, *_ in made], poses, notes)
+    bare = [shape is None or (shape.skin is None and "color" not in keys) for shape, keys, *_ in made]
     folders: list[Path] = []
     names = [link.name for link in whole.links]
     files = dict(zip(names, plain_names(names), strict=True))
@@ -173,7 +174,9 @@ def write_scene(
         touched = {} if others is None else {"avoids": others} if others else {"collides_with": []}
         at = _round(pose[:3, 3] + lift)
         entry: dict[str, Any] = {**keys, "position": at, **turned, **motion, **surface, **touched}
-        scene.add(link.name, **entry)
+        # In a robot that has colours, a link without one is grey.
+        plain = {} if all(bare) or shape is None or shape.skin is not None else {"color": [*GREY]}
+        scene.add(link.name, **(plain | entry))
     for joint in whole.joints:
         _join(scene, joint, names, lift)
     return [scene.save(out), *folders], notes
@@ -365,7 +368,7 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
         keys: dict[str, Any] = {parts[0].kind: {key: _round(value) for key, value in parts[0].sizes.items()}}
     else:
         frame, keys, shape = np.eye(4), {"asset": link.name}, _solid(link, parts, notes)
-    shape = _dressed(link, shape, frame)
+    shape, look = _dressed(link, shape, frame)
     mass: dict[str, Any] = {}
     if not link.still:
         held = link.mass
@@ -390,7 +393,7 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
             shape = replace(shape, com=com, inertia=tensor * shape.volume / held)
     if shape.skin is not None:
         keys = {"asset": link.name}
-    return shape, keys, frame, mass
+    return shape, keys | look, frame, mass
 
 
 def _possible(link: Link, tensor: np.ndarray, even: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -438,22 +441,24 @@ def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
     return replace(shape, source=source)
 
 
-def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> Shape:
-    """A shape with the shown mesh of its link, if that is not the solid itself: a mesh whose texture has a patch for
-    each colour."""
-    parts = [part for part in (link.shown if link.solid else ()) if part.kind != "plane"]
-    if not parts or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
-        return shape
-    back = np.linalg.inv(frame)
-    meshes = [moved(_mesh(part), back) for part in parts]
-    colors = [
+def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> tuple[Shape, dict[str, Any]]:
+    """A shape with the shown mesh of its link, whose texture has a patch for each colour. If that is the solid itself,
+    in one colour, the body's key for its colour instead."""
+    parts = [part for part in link.shown or link.solid if part.kind != "plane"]
+    given = [
         part.color
-        or (tuple(int(c) for c in part.mesh.colors.mean(0)) if part.mesh and part.mesh.colors is not None else GREY)
+        or (tuple(int(c) for c in part.mesh.colors.mean(0)) if part.mesh and part.mesh.colors is not None else None)
         for part in parts
     ]
+    if not link.solid or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
+        if len(set(given)) <= 1:
+            return shape, {"color": [*given[0]]} if given and given[0] else {}
+    back = np.linalg.inv(frame)
+    meshes = [moved(_mesh(part), back) for part in parts]
+    colors = [color or GREY for color in given]
     texture = np.repeat(np.repeat(np.array([colors], np.uint8), SWATCH, 0), SWATCH, 1)
     places = [np.tile([(k + 0.5) / len(parts), 0.5], (len(mesh.vertices), 1)) for k, mesh in enumerate(meshes)]
-    return replace(shape, skin=replace(joined(meshes), uv=np.concatenate(places), texture=texture))
+    return replace(shape, skin=replace(joined(meshes), uv=np.concatenate(places), texture=texture)), {}
 
 
 def _same(part: Part) -> tuple:
