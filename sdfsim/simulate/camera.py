@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -148,8 +148,8 @@ class Camera:
             right, down, ahead = axes @ (corners - target).T
             aside = np.maximum(np.abs(right) * height / width, np.abs(down))
             away = float((aside / (_MARGIN * np.tan(np.radians(fov / 2))) - ahead).max())
-            position = target - away * axes[2]
-        return cls(position, target, camera.up, fov, width, height)
+            return replace(camera, position=target - away * axes[2])
+        return replace(camera, position=position)
 
     @cached_property
     def rotation(self) -> np.ndarray:
@@ -241,7 +241,7 @@ def _edges(label: np.ndarray) -> np.ndarray:
     edge = np.zeros(label.shape, bool)
     for axis in (0, 1):
         differs = np.diff(label, axis=axis) != 0
-        edge[: len(edge) - (axis == 0), : edge.shape[1] - (axis == 1)] |= differs
+        edge[: differs.shape[0], : differs.shape[1]] |= differs
         edge[axis == 0 :, axis == 1 :] |= differs
     return edge
 
@@ -357,7 +357,7 @@ class _Drawing:
             for shape, plane in zip(shapes, flat, strict=True)
         ]
         meshed = [k for k, model in enumerate(self.models) if model is not None and opacity[k] > 0.0]
-        planes = np.flatnonzero(flat & (opacity > 0.0))
+        planes = [k for k in range(len(bodies)) if flat[k] and opacity[k] > 0.0]
         self.layers = [  # opaque, and not
             ([k for k in meshed if (opacity[k] < 1.0) == glass], [k for k in planes if (opacity[k] < 1.0) == glass])
             for glass in (False, True)
@@ -447,7 +447,7 @@ class _Drawing:
         starts = np.searchsorted(hits.row[there], np.arange(len(self.models) + 1))
         normal, color = np.empty((len(there), 3), np.float32), np.empty((len(there), 3), np.float32)
         point = ray[there] * hits.depth[there, None]  # from the camera
-        for k in np.flatnonzero(np.diff(starts)):
+        for k in np.flatnonzero(np.diff(starts)).tolist():
             rows, model = slice(starts[k], starts[k + 1]), self.models[k]
             some = there[rows]
             if model is None:

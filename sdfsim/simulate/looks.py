@@ -16,7 +16,8 @@ from sdfsim.shape.shape import Shape
 
 STATIC_COLOR = (150, 150, 155)
 HUES = 32  # number of colours for moving bodies
-USUAL, BORDER = 0.8, 0.25  # of bodies' paths, see `extent`: a body that leaves the scene must not shrink it to a dot
+# Of bodies' paths, see `extent`: a body that leaves the scene must not shrink it to a dot.
+FARTHEST, USUAL, BORDER = 1.0, 0.5, 0.8
 _CREASE = np.cos(np.radians(40.0))
 # For a plane in which scenery lies: cells along the scenery's longer side, and points on it that show which cells it
 # covers.
@@ -48,8 +49,8 @@ def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
     """[2, 3] m: the lowest and highest coordinates that the first view must show.
 
     These are the bodies at the start, except planes; the points on planes below them, as free bodies fall there; and,
-    if the motion is known, the bodies' paths: the middle `USUAL` of all their places, and around it a border of
-    `BORDER` times its size. Beyond, a body that rolls away is not followed.
+    if the motion is known, the bodies' paths up to `FARTHEST` times the size of all this, but of these only the middle
+    `USUAL` of all places and a border of `BORDER` times its size: who rolls away from the others is not followed.
     """
     boxes: dict[int, np.ndarray] = {}
     planes = []
@@ -68,15 +69,15 @@ def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
     shown = np.concatenate([start, *below])
     low, high = shown.min(0), shown.max(0)
     if motion is not None:
-        moving = [k for k in boxes if scene.bodies[k].motion != "static"]
-        half = np.array([np.linalg.norm(np.ptp(boxes[k], axis=0)) / 2 for k in moving]).reshape(-1, 1)
-        ways = motion.position[:, moving]
-        for k in range(3 if moving else 0):
-            few = np.quantile(ways[..., k], [0.5 - USUAL / 2, 0.5 + USUAL / 2])
-            first, last = min(low[k], few[0]), max(high[k], few[1])
+        moving, size = [k for k in boxes if scene.bodies[k].motion != "static"], FARTHEST * float((high - low).max())
+        half = np.array([np.linalg.norm(np.ptp(boxes[k], axis=0)) / 2 for k in moving])[:, None]
+        ways = np.clip(motion.position[:, moving], low - size, high + size)
+        if moving:
+            few = np.quantile(ways, [0.5 - USUAL / 2, 0.5 + USUAL / 2], axis=(0, 1))
+            first, last = np.minimum(low, few[0]), np.maximum(high, few[1])
             border = BORDER * (last - first)
-            way = np.clip([ways[..., k] - half[:, 0], ways[..., k] + half[:, 0]], first - border, last + border)
-            low[k], high[k] = min(low[k], way.min()), max(high[k], way.max())
+            ways = np.clip([ways - half, ways + half], first - border, last + border)
+            low, high = np.minimum(low, ways.min((0, 1, 2))), np.maximum(high, ways.max((0, 1, 2)))
     return np.stack([low, high])
 
 

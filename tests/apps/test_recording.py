@@ -12,21 +12,18 @@ from scipy.spatial.transform import Rotation
 from sdfsim import load_scene
 from sdfsim.apps.recording import (
     COLORS,
-    FARTHEST,
     MANY,
     PLOTS,
     Playback,
     PosedPhoto,
-    framed,
     save_reconstruction,
     save_rollout,
-    shown,
-    with_normals,
 )
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import box, sphere
 from sdfsim.physics.rollout import Rollout
 from sdfsim.shape.shape import load_shape
+from sdfsim.simulate.looks import FARTHEST, framed, shown, with_normals
 from tests.helpers.runs import read
 
 STEPS = 6
