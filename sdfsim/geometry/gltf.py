@@ -430,10 +430,8 @@ class _GltfReader:
             laid = texture or gloss or bumps  # places are those of the first
             moved, places = _places(laid)
             for other, what in ((gloss, "roughness and metal maps"), (bumps, "normal maps")):
-                if other and _places(other) != (moved, places):
-                    self.lost[f"{what} that lie otherwise than the texture"] = None
-                    other.clear()
-                elif other and self._image(other["index"]) is None:
+                if other and (_places(other) != (moved, places) or self._image(other["index"]) is None):
+                    self.lost[what] = None
                     other.clear()
             image = self._image(laid["index"]) if laid else None
             if image is not None and places not in primitive["attributes"]:

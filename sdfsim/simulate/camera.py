@@ -16,7 +16,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh import Mesh, lattice
 from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder, loaded
@@ -141,14 +141,13 @@ class Camera:
         known = loaded(_needed(scene))
         centre, radius = framed(known, motion)
         camera = eye_around(centre if look_at is None else np.array(look_at), radius, -known.gravity)
-        camera = cls(camera.position, camera.look_at, camera.up, fov, width, height)
-        target, axes = np.asarray(camera.look_at), camera.rotation
+        camera = replace(camera, fov=fov, width=width, height=height)
         if position is None:  # the least distance from which all is in sight
-            corners = np.stack(np.meshgrid(*extent(known, motion).T), -1).reshape(-1, 3)
-            right, down, ahead = axes @ (corners - target).T
+            corners = lattice(*extent(known, motion).T)
+            right, down, ahead = camera.rotation @ (corners - camera.look_at).T
             aside = np.maximum(np.abs(right) * height / width, np.abs(down))
             away = float((aside / (_MARGIN * np.tan(np.radians(fov / 2))) - ahead).max())
-            return replace(camera, position=target - away * axes[2])
+            position = camera.look_at - away * camera.rotation[2]
         return replace(camera, position=position)
 
     @cached_property
@@ -284,7 +283,7 @@ class _Model:
         self.uv, self.texture = (None, None) if mesh.uv is None else (mesh.uv.astype(np.float32), mesh.texture)
         self.colors = None if mesh.colors is None else mesh.colors.astype(np.float32)
         low, high = vertices.min(0), vertices.max(0)
-        self.box = np.stack(np.meshgrid(*np.stack([low, high]).T), -1).reshape(8, 3)  # corners
+        self.box = lattice(*np.stack([low, high]).T)  # its corners
         self.middle, self.radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
     def surface(self, face: np.ndarray, uv: np.ndarray, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from itertools import cycle
 
 import numpy as np
 
-from sdfsim.geometry.mesh import Mesh, face_normals, sample_surface, vertex_normals
+from sdfsim.geometry.mesh import Mesh, face_normals, lattice, vertex_normals
 from sdfsim.geometry.primitives import plane
 from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
@@ -19,9 +19,6 @@ HUES = 32  # number of colours for moving bodies
 # Of bodies' paths, see `extent`: a body that leaves the scene must not shrink it to a dot.
 FARTHEST, USUAL, BORDER = 1.0, 0.5, 0.8
 _CREASE = np.cos(np.radians(40.0))
-# For a plane in which scenery lies: cells along the scenery's longer side, and points on it that show which cells it
-# covers.
-_FLOOR_CELLS, _FLOOR_POINTS = 48, 40_000
 _MOST_CORNER_PAIRS = 1_000_000  # with more (about 10,000 vertices) a mesh counts as smooth: splitting triples it
 
 
@@ -101,35 +98,19 @@ def shown(scene: Scene, row: int, half: float) -> Mesh:
         of = scene.shapes[other.shape]
         if other.motion == "static" and not isinstance(of.sdf, ClosedForm):
             places = other.position + pose.rotate(other.quat_xyzw, of.shown.vertices * other.scale)
-            mesh = Mesh(pose.rotate(pose.conjugate(body.quat_xyzw), places - body.position), of.shown.faces)
-            flat = mesh.faces[(np.abs(mesh.vertices[mesh.faces, 2]) < most).all(1)]
-            found += [mesh.vertices[np.abs(mesh.vertices[:, 2]) < most]]
-            if len(flat):  # also the insides of large faces
-                found += [sample_surface(Mesh(mesh.vertices, flat), _FLOOR_POINTS, np.random.default_rng(0))[0]]
+            places = pose.rotate(pose.conjugate(body.quat_xyzw), places - body.position)
+            found.append(places[np.abs(places[:, 2]) < most])
     near = np.concatenate(found)
     if not len(near):
         return plane(half)
     lower = max(0.0, 0.05 * most - float(np.quantile(near[:, 2], 0.01)))
     low, high = near[:, :2].min(0), near[:, :2].max(0)
-    cell = max(float((high - low).max()) / _FLOOR_CELLS, most)
-    count = np.ceil((high - low) / cell).astype(int) + 1
-    covered = np.zeros(count + 2, dtype=bool)  # with a border
-    covered[tuple(((near[:, :2] - low) / cell).astype(int).T + 1)] = True
-    beside = np.pad(covered, 1)  # and the cells around them, so that no gap is visible
-    beside = np.any([np.roll(beside, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)[1:-1, 1:-1]
-    x, y = (
-        np.clip(np.r_[-half, start + cell * np.arange(-1, n + 2), half], -half, half)
-        for start, n in zip(low, count, strict=True)
-    )
-    at = np.arange(len(x) * len(y)).reshape(len(x), len(y))
-    quads = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1)
-    level = np.pad(~covered, 1, constant_values=True)
-    upper, under = quads[level], quads[1:-1, 1:-1][beside] + at.size
-    corners = np.concatenate([upper, under])
-    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    vertices = np.concatenate([np.column_stack([grid, np.full(len(grid), z)]) for z in (0.0, -lower)])
-    used, label = np.unique(corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), return_inverse=True)
-    return Mesh(vertices[used], label.reshape(-1, 3))
+    # A square with a rectangular hole, and the lower part, which is larger than the hole so that no gap is visible.
+    frame = lattice(*np.clip([[-half] * 2, low - most, high + most, [half] * 2], -half, half).T, [0.0])
+    under = lattice(*np.stack([low - 2 * most, high + 2 * most], 1), [-lower])
+    corner = np.array([4 * i + j for i in range(3) for j in range(3) if (i, j) != (1, 1)])
+    quads = np.concatenate([corner[:, None] + [0, 4, 5, 1], [[16, 18, 19, 17]]])
+    return Mesh(np.concatenate([frame, under]), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
 
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:

@@ -309,7 +309,9 @@ def test_a_gltf_whose_image_is_missing_is_read_without_it(tmp_path: Path) -> Non
 
     loaded = load_textured(gltf_box(tmp_path, change))
     assert loaded.skin is None and len(loaded.mesh.vertices) == 8
-    assert loaded.notes == ("texture textures/gone.png is missing beside it: left out", "not shown: transparency")
+    assert loaded.notes == (
+        "texture textures/gone.png is missing beside it: left out", "not shown: transparency", "not shown: normal maps",
+    )  # fmt: skip
 
 
 def test_a_texture_that_is_turned_lies_turned(tmp_path: Path) -> None:
