@@ -284,7 +284,6 @@ class _Model:
         self.colors = None if mesh.colors is None else mesh.colors.astype(np.float32)
         low, high = vertices.min(0), vertices.max(0)
         self.box = lattice(*np.stack([low, high]).T)  # its corners
-        self.middle, self.radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
     def surface(self, face: np.ndarray, uv: np.ndarray, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Unit normals [R, 3] and colours [R, 3] at points of faces; `color` [3] if it has none of its own."""
@@ -444,28 +443,28 @@ class _Drawing:
         there = np.flatnonzero(hits.row >= 0)
         there = there[np.argsort(hits.row[there], kind="stable")]
         starts = np.searchsorted(hits.row[there], np.arange(len(self.models) + 1))
-        normal, color = np.empty((len(there), 3), np.float32), np.empty((len(there), 3), np.float32)
-        point = ray[there] * hits.depth[there, None]  # from the camera
+        color, toward, lift = np.empty((len(there), 3), np.float32), *np.empty((2, len(there)), np.float32)
+        point, up = ray[there] * hits.depth[there, None], self.up.astype(np.float32)  # from the camera
+        beam = self.sun[None] if sun is None or sun.ndim == 1 else sun[there]  # [1 or R, 3]
         for k in np.flatnonzero(np.diff(starts)).tolist():
-            rows, model = slice(starts[k], starts[k + 1]), self.models[k]
-            some = there[rows]
+            rows, model, turn = slice(starts[k], starts[k + 1]), self.models[k], self.turn[k].astype(np.float32)
+            some, sunny = there[rows], beam if len(beam) == 1 else beam[rows]
             if model is None:
-                above = self.turn[k][:, 2] @ self.away[k] < 0.0  # the side of the plane that is seen
-                normal[rows], color[rows] = self.turn[k][:, 2] * (1 if above else -1), self._pattern(k, point[rows])
+                above = turn[:, 2] @ self.away[k] < 0.0  # the side of the plane that is seen
+                normal, color[rows] = turn[None, :, 2] * (1 if above else -1), self._pattern(k, point[rows])
             else:
-                found, color[rows] = model.surface(hits.face[some], hits.uv[some], self.colors[k])
-                found = found @ self.turn[k].T.astype(np.float32)
-                normal[rows] = np.where(np.einsum("rc,rc->r", found, ray[some])[:, None] > 0.0, -found, found)
-                color[rows] = self.colors[k] if k >= self.count else color[rows]
-        beam = self.sun if sun is None else sun if sun.ndim == 1 else sun[there]
-        toward = normal @ beam if beam.ndim == 1 else np.einsum("rc,rc->r", normal, beam)
+                normal, shown = model.surface(hits.face[some], hits.uv[some], self.colors[k])
+                normal = normal @ turn.T
+                normal = np.where(np.einsum("rc,rc->r", normal, ray[some])[:, None] > 0.0, -normal, normal)
+                point[rows] += 1e-3 * np.minimum(hits.depth[some], np.float32(self.radius))[:, None] * normal
+                color[rows] = self.colors[k] if k >= self.count else shown
+            toward[rows] = normal @ sunny[0] if len(sunny) == 1 else (normal * sunny).sum(1)
+            lift[rows] = normal @ up
         shade = toward <= 0.0
         if sun is not None:
             lit = np.flatnonzero(~shade)
-            off = 1e-3 * np.minimum(hits.depth[there[lit]], np.float32(self.radius))[:, None]
-            shade[lit] = self._blocked(point[lit] + off * normal[lit], beam if beam.ndim == 1 else beam[lit])
-        light = _SHADE + 0.12 * (normal @ self.up.astype(np.float32))
-        light = light + np.where(shade, 0.0, (1.0 - _SHADE) * np.maximum(toward, 0.0))
+            shade[lit] = self._blocked(point[lit], beam if len(beam) == 1 else beam[lit])
+        light = _SHADE + 0.12 * lift + np.where(shade, 0.0, (1.0 - _SHADE) * np.maximum(toward, 0.0))
         # Far away the floor fades into the background.
         clear = 2.0 * (self.radius + float(np.linalg.norm(np.subtract(self.camera.look_at, self.camera.position))))
         fog = np.clip((np.sqrt(np.einsum("rc,rc->r", point, point)) / clear - 1.0) / 2.0, 0.0, 1.0)
@@ -486,23 +485,20 @@ class _Drawing:
         return self.colors[k] * (1.0 - 0.09 * (0.5 + (odd - np.float32(0.5)) * np.clip(2.0 - blur, 0.0, 1.0)))[:, None]
 
     def _blocked(self, point: np.ndarray, sun: np.ndarray) -> np.ndarray:
-        """[R] whether an opaque body is between points [R, 3] m from the camera and the sun [3] or [R, 3]."""
+        """[R] whether an opaque body is between points [R, 3] m from the camera and the sun [1 or R, 3]."""
         flat = point @ self.across
         order = np.argsort(flat[:, 0])
         flat, dark = flat[order], np.zeros(len(point), bool)
-        spread = 0.0 if sun.ndim == 1 else 4.0 * _SOFT * self.radius
+        spread = 0.0 if len(sun) == 1 else 4.0 * _SOFT * self.radius
         for k in self.layers[0][0]:
-            if (model := self.models[k]) is None:
-                continue
-            middle = (self.turn[k] @ model.middle * self.scale[k] + self.away[k]) @ self.across
-            reach = self.scale[k] * model.radius + spread
-            some = order[_inside(flat, np.array([middle - reach, middle + reach]))]
+            model, into, away = self.models[k], self.to_body[k].T.astype(np.float32), self.away[k].astype(np.float32)
+            assert model is not None
+            corners = (self.scale[k] * model.box @ self.turn[k].T + self.away[k]) @ self.across
+            some = order[_inside(flat, np.array([corners.min(0) - spread, corners.max(0) + spread]))]
             some = some[~dark[some]]
             if len(some):
-                into = self.to_body[k].T.astype(np.float32)
                 local = np.empty((len(some), 6), np.float32)
-                local[:, :3] = (point[some] - self.away[k].astype(np.float32)) @ into
-                local[:, 3:] = (sun if sun.ndim == 1 else sun[some]) @ into
+                local[:, :3], local[:, 3:] = (point[some] - away) @ into, (sun if len(sun) == 1 else sun[some]) @ into
                 dark[some] = model.caster.anything(local)
         return dark
 
