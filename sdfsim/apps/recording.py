@@ -276,11 +276,7 @@ class PosedPhoto:
 
     name: str  # its name in the viewer
     image: Path | None  # photo file, or None to show the camera alone
-    focal: float  # px
-    principal: tuple[float, float]  # (cx, cy) px
-    size: tuple[int, int]  # (width, height) px
-    rotation: np.ndarray  # [3, 3] world to camera (x right, y down, z forward)
-    translation: np.ndarray  # [3] m, world to camera
+    camera: Camera
     color: tuple[int, int, int] | None = None  # RGB of its frame, or None for the viewer's default
 
 
@@ -299,14 +295,17 @@ def save_reconstruction(
 
     stream = rr.RecordingStream("sdfsim-reconstruct")
     encoded = stream.binary_stream()
-    rotations = [np.asarray(photo.rotation) for photo in photos]
-    centres = [-turn.T @ photo.translation for turn, photo in zip(rotations, photos, strict=True)]
+    centres = [photo.camera.position for photo in photos]
     # Cameras surround the subject; sparse points also lie on things behind it.
     around = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
     low, high = (around.min(0), around.max(0)) if len(around) else (-np.ones(3), np.ones(3))
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
     # Before there is a surface, z may not be up: use the cameras, as photographers mostly hold them level.
-    up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
+    up = (
+        -np.sum([photo.camera.rotation[1] for photo in photos], axis=0)
+        if mesh is None and photos
+        else np.array([0.0, 0.0, 1.0])
+    )
     hidden = {"reconstruction": "trust"} | ({"trust": "surface"} if trust else {})
     tabs = [
         rrb.Spatial3DView(
@@ -324,14 +323,15 @@ def save_reconstruction(
     surfaces |= {f"{WORLD}/trust/{rr.escape_entity_path_part(name)}": part for name, part in trust.items()}
     for entity, surface in surfaces.items():
         stream.log(entity, _shaded(rr, surface, (200, 190, 175)), static=True)
-    for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
+    for photo in photos:
+        camera = photo.camera
         entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
-        stream.log(entity, rr.Transform3D(translation=centre_of, mat3x3=turn.T), static=True)
-        shrink = min(1.0, _PHOTO_PIXELS / max(photo.size))
+        stream.log(entity, rr.Transform3D(translation=camera.position, mat3x3=camera.rotation.T), static=True)
+        shrink = min(1.0, _PHOTO_PIXELS / max(camera.width, camera.height))
         pinhole = rr.Pinhole(
-            focal_length=photo.focal * shrink,
-            principal_point=np.array(photo.principal) * shrink,
-            resolution=[max(1, round(s * shrink)) for s in photo.size],
+            focal_length=camera.lens[0] * shrink,
+            principal_point=camera.lens[1] * shrink,
+            resolution=[max(1, round(length * shrink)) for length in (camera.width, camera.height)],
             image_plane_distance=0.1 * radius,
             color=photo.color,
         )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.base.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, lattice
 from sdfsim.physics import pose
@@ -162,7 +162,7 @@ class Camera:
         return np.stack([right, np.cross(ahead, right), ahead])
 
     @cached_property
-    def _lens(self) -> np.ndarray:
+    def lens(self) -> np.ndarray:
         """[2, 2]: focal lengths, and the principal point, px."""
         usual = self.height / 2 / np.tan(np.radians(self.fov / 2))
         return np.array([self.focal or (usual, usual), self.principal or (self.width / 2, self.height / 2)])
@@ -172,7 +172,7 @@ class Camera:
         Points that are not ahead of the camera have a depth of at most 0, and no place (nan)."""
         seen = (points - self.position) @ self.rotation.T
         ahead = seen[..., 2:]
-        return seen[..., :2] / np.where(ahead > 0, ahead, np.nan) * self._lens[0] + self._lens[1], ahead[..., 0]
+        return seen[..., :2] / np.where(ahead > 0, ahead, np.nan) * self.lens[0] + self.lens[1], ahead[..., 0]
 
     def image(
         self, motion: Simulator | Rollout, scene: Scene | SceneBuilder | None = None, *, frame: int = -1,
@@ -323,8 +323,10 @@ class _Drawing:
         opacity = np.ones(self.count)
         names = {body.name: k for k, body in enumerate(scene.bodies)}
         for name, value in style.opacity.items():
-            if name not in names or not 0.0 <= value <= 1.0:
-                raise SdfsimError(f"opacity of {name!r}: must be from 0 to 1, of a body of the scene (got {value:g})")
+            if name not in names:
+                raise SdfsimError(f"opacity: no body is called {name!r}{nearest(name, names)}")
+            if not 0.0 <= value <= 1.0:
+                raise SdfsimError(f"opacity of {name!r}: must be from 0 to 1 (got {value:g})")
             opacity[names[name]] = value
         self.radius, colors = _kept(scene, lambda of: (framed(of)[1], np.array(body_colors(of), np.float32)))
         if ghosts is not None:
@@ -384,7 +386,7 @@ class _Drawing:
             return None
         if (seen[:, 2] <= _NEAR * self.radius).any():
             return np.array([[0, 0], [camera.height, camera.width]])
-        at = (seen[:, :2] / seen[:, 2:] * camera._lens[0] + camera._lens[1])[:, ::-1]
+        at = (seen[:, :2] / seen[:, 2:] * camera.lens[0] + camera.lens[1])[:, ::-1]
         return np.clip([at.min(0) - 1.0, at.max(0) + 1.0], -1, [camera.height + 1, camera.width + 1])
 
     def look(self, at: np.ndarray, sun: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -392,7 +394,7 @@ class _Drawing:
         differ between bodies, and between light and shade; depths [R] and bodies [R]."""
         camera = self.camera
         lens = np.ones((len(at), 3), np.float32)
-        lens[:, :2] = (at - camera._lens[1]) / camera._lens[0]
+        lens[:, :2] = (at - camera.lens[1]) / camera.lens[0]
         ray = lens @ camera.rotation.astype(np.float32)  # as long as one metre of depth
         pixel = np.floor(at[:, ::-1]).astype(np.int32)
         hits = self._nearest(ray, pixel, *self.layers[0])
@@ -481,7 +483,7 @@ class _Drawing:
         odd = (square[:, 0] + square[:, 1]).astype(np.int32) & 1
         # Where a pixel is about as large as a square, the two colours mix.
         height = max(abs(float(self.turn[k][:, 2] @ self.away[k])), 1e-9)
-        blur = np.einsum("rc,rc->r", point, point) * np.float32(2.0 / (height * self.camera._lens[0, 1] * cell))
+        blur = np.einsum("rc,rc->r", point, point) * np.float32(2.0 / (height * self.camera.lens[0, 1] * cell))
         return self.colors[k] * (1.0 - 0.09 * (0.5 + (odd - np.float32(0.5)) * np.clip(2.0 - blur, 0.0, 1.0)))[:, None]
 
     def _blocked(self, point: np.ndarray, sun: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sdfsim
-from sdfsim import Simulator
+from sdfsim import SdfsimError, Simulator
 from sdfsim.apps.render import FRAMES, SIZE, picture_at, render
 from sdfsim.apps.run import ending_lines, summary
 from sdfsim.geometry.mesh import Mesh
@@ -122,6 +122,28 @@ def test_a_movie_has_its_frames_and_ends_as_the_picture_of_the_end(tmp_path):
     last = np.asarray(Image.open(tmp_path / "fall.png"), dtype=float)
     assert np.abs(frames[-1] - last).mean() < 3.0 < np.abs(frames[0].astype(float) - frames[-1]).max()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["fall.mp4", "fall.png"]
+
+
+def test_size_rate_and_background_are_as_asked(tmp_path):
+    from PIL import Image
+
+    scene, rollout = falling(position=(0, 0, 1))
+    render(scene, rollout, tmp_path / "clear.png", size=(50, 101), background="none", at=0.0)
+    pixels = np.asarray(Image.open(tmp_path / "clear.png"))
+    assert pixels.shape == (101, 50, 4) and pixels[0, 0, 3] == 0 and pixels[..., 3].max() == 255
+    render(scene, rollout, tmp_path / "navy.png", size=(40, 40), background="#202830")
+    assert np.asarray(Image.open(tmp_path / "navy.png"))[0, 0].tolist() == [0x20, 0x28, 0x30]
+    camera = Camera((0, -4, 0.5), (0, 0, 0.5), width=64, height=32)
+    render(scene, rollout, tmp_path / "small.mp4", camera=camera, fps=12.5)
+    with av.open(str(tmp_path / "small.mp4")) as movie:
+        stream = movie.streams.video[0]
+        assert (stream.width, stream.height, stream.average_rate) == (64, 32, 12.5)
+        assert sum(1 for _ in movie.decode(stream)) == round(rollout.time[-1] * 12.5) + 1
+    for wrong in ({"size": (33, 32)}, {"background": "none"}, {"fps": 0.0}):
+        with pytest.raises(SdfsimError, match="movie"):
+            render(scene, rollout, tmp_path / "no.mp4", **wrong)
+    with pytest.raises(SdfsimError, match="no such colour"):
+        render(scene, rollout, tmp_path / "no.png", background="blurple")
 
 
 def test_the_end_of_a_run_reports_who_rests_who_moves_and_who_is_gone():
