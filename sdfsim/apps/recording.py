@@ -252,7 +252,7 @@ def _crowds(scene: Scene) -> list[Crowd]:
     for number, name in enumerate(s.name for s in scene.shapes):
         members = np.flatnonzero(shape == number)
         alike: dict[Any, list[int]] = {}
-        for n, k in enumerate(members if len(members) >= MANY else ()):
+        for n, k in enumerate(members.tolist() if len(members) >= MANY else ()):
             alike.setdefault(scene.bodies[k].color or n % COLORS, []).append(k)
         for k, bodies in enumerate(alike.values()):
             called = rr.escape_entity_path_part(f"{number}_{name}")
@@ -295,7 +295,7 @@ def save_reconstruction(
 
     stream = rr.RecordingStream("sdfsim-reconstruct")
     encoded = stream.binary_stream()
-    centres = [photo.camera.position for photo in photos]
+    centres = np.array([photo.camera.position for photo in photos])
     # Cameras surround the subject; sparse points also lie on things behind it.
     around = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
     low, high = (around.min(0), around.max(0)) if len(around) else (-np.ones(3), np.ones(3))

@@ -175,7 +175,7 @@ def write_scene(
         at = _round(pose[:3, 3] + lift)
         entry: dict[str, Any] = {**keys, "position": at, **turned, **motion, **surface, **touched}
         # In a robot that has colours, a link without one is grey.
-        plain = {} if all(bare) or shape is None or shape.skin is not None else {"color": [*GREY]}
+        plain: dict[str, Any] = {} if all(bare) or shape is None or shape.skin is not None else {"color": [*GREY]}
         scene.add(link.name, **(plain | entry))
     for joint in whole.joints:
         _join(scene, joint, names, lift)
