@@ -223,6 +223,7 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     from pipeline.mesh.placement import load_placement
     from sdfsim.apps.recording import PosedPhoto, save_reconstruction
     from sdfsim.geometry.mesh_io import load_mesh, read_glb
+    from sdfsim.simulate.camera import Camera
 
     if "poses" not in done:
         return None
@@ -238,9 +239,8 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     for view in [*poses.views, *proposed]:
         image = folder / "photos" / "images" / view.name
         known = image.is_file()
-        photos.append(
-            PosedPhoto(view.source, image if known else None, view.focal, (view.cx, view.cy),
-                       (view.width, view.height), view.rotation, view.translation, None if known else PROPOSED)
-        )  # fmt: skip
+        lens = (view.focal, view.focal), view.width, view.height, (view.cx, view.cy)
+        camera = Camera.posed(view.rotation, view.translation, *lens)
+        photos.append(PosedPhoto(view.source, image if known else None, camera, None if known else PROPOSED))
     save_reconstruction(folder / RECORDING, photos, poses.sparse.xyz, poses.sparse.rgb, mesh, skins, trust)
     return folder / RECORDING

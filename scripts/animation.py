@@ -13,11 +13,11 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from sdfsim.apps.recording import framed
-from sdfsim.apps.render import Studio, eye_of
+from sdfsim.apps.render import picture_at
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError, run_main
 from sdfsim.base.files import replacing
+from sdfsim.simulate.camera import Camera, Style
 
 HEIGHT = 360  # px; a photo and a picture side by side
 RATE = 20  # frames a second
@@ -51,15 +51,14 @@ def main() -> None:
 
     seen = photos(given.room)
     scene, rollout = read_run(given.run, allow_outside=True)
-    studio = Studio(scene, eye_of(scene, rollout, given.camera, given.look_at), framed(scene, rollout)[1])
+    camera = Camera.fit(
+        rollout, scene, position=given.camera, look_at=given.look_at, width=16 * HEIGHT // 9, height=HEIGHT
+    )
     end = float(rollout.time[-1]) if given.until is None else given.until
     times = np.arange(0.0, end, 1.0 / RATE)
     moving = []
     for time in times:
-        picture = Image.fromarray(studio.picture_at(rollout, float(time)))
-        moving.append(
-            picture.resize((round(picture.width * HEIGHT / picture.height), HEIGHT), Image.Resampling.LANCZOS)
-        )
+        moving.append(Image.fromarray(picture_at(camera, scene, rollout, float(time), Style(smooth=True))))
         print(f"\r{len(moving)} of {len(times)}", end="", file=sys.stderr)
     pictures = [*[moving[0]] * round(BEFORE * RATE), *moving, *[moving[-1]] * round(AFTER * RATE)]
     frames = []

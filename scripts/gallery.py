@@ -12,12 +12,13 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from samples.large import HEAPS, write_scene
-from sdfsim.apps.render import Place, render
+from sdfsim.apps.render import render
 from sdfsim.apps.run import ending_lines, summary
 from sdfsim.base.files import replacing
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
+from sdfsim.simulate.camera import Numbers
 from sdfsim.simulate.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,7 +52,7 @@ LARGE = {
 
 
 def picture(
-    scene: Scene, rollout: Rollout, name: str, camera: Place, look_at: Place,
+    scene: Scene, rollout: Rollout, name: str, camera: Numbers, look_at: Numbers,
     at: float | None = None, size: tuple[int, int] | None = None,
 ) -> None:  # fmt: skip
     """Writes NAME.jpg, in the renderer's own size or this one."""

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sdfsim.scene.builder import SceneBuilder as Scene
     from sdfsim.scene.load import load_scene
     from sdfsim.shape.shape import Shape, load_shape
+    from sdfsim.simulate.camera import Camera, Style
     from sdfsim.simulate.simulator import Simulator
 
 # Threads of torch wait for one another by spinning. Beside other programs they take the processor from the threads that
@@ -40,6 +41,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB version")
 
 __all__ = [
+    "Camera",
     "Rollout",
     "Scene",
     "SceneError",
@@ -47,6 +49,7 @@ __all__ = [
     "Shape",
     "Simulator",
     "State",
+    "Style",
     "export",
     "fit",
     "judged",
@@ -61,6 +64,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "Camera": "sdfsim.simulate.camera",
     "Rollout": "sdfsim.physics.rollout",
     "Scene": "sdfsim.scene.builder",
     "SceneError": "sdfsim.base.errors",
@@ -68,6 +72,7 @@ _HOME = {
     "Shape": "sdfsim.shape.shape",
     "Simulator": "sdfsim.simulate.simulator",
     "State": "sdfsim.physics.bodies",
+    "Style": "sdfsim.simulate.camera",
     "judged": "sdfsim.evaluation.instruments",
     "load_scene": "sdfsim.scene.load",
     "load_shape": "sdfsim.shape.shape",

@@ -169,6 +169,21 @@ def render(
         typer.Option("--look-at", metavar="X Y Z", help="What it looks at, m (default: the middle of the scene)."),
     ] = None,
     at: Annotated[float | None, typer.Option(help="Time of a picture, s (default: the end).")] = None,
+    size: Annotated[
+        tuple[int, int] | None, typer.Option(metavar="W H", help="Width and height, px (default: 960 540).")
+    ] = None,
+    fps: Annotated[float, typer.Option(help="Frames of a movie in a second.")] = 30.0,
+    light: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Direction to the sun (default: above and beside the camera)."),
+    ] = None,
+    background: Annotated[
+        str | None, typer.Option(help="A colour, such as white or #202830; none: transparent, for pictures.")
+    ] = None,
+    opacity: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=SHARE", help="Make a body translucent, 0 (left out) to 1; repeat it for more."),
+    ] = None,
     allow_outside: Outside = False,
 ) -> None:
     """Run -> movie or picture, without a screen."""
@@ -182,7 +197,10 @@ def render(
     shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
     loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
     beside = beside_of(source, loaded)
-    room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, beside=beside, on_progress=frames)
+    room.render(
+        loaded, rollout, out, camera=camera, look_at=look_at, at=at, size=size, fps=fps, light=light,
+        background=background or room.SKY, opacity=room.shares(opacity or []), beside=beside, on_progress=frames,
+    )  # fmt: skip
     session.report({"picture" if out.suffix == ".png" else "movie": out}, [f"wrote {out}"])
 
 

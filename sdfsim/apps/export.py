@@ -23,7 +23,6 @@ from sdfsim.apps import export_joints as jointed
 from sdfsim.apps.beside import between
 from sdfsim.apps.export_joints import add, numbers
 from sdfsim.apps.observed import COLUMNS
-from sdfsim.apps.recording import body_colors, framed, is_infinite, shown, with_normals
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import cached_arrays, check_writable, digest, user_cache, write_bytes, write_text
@@ -39,6 +38,7 @@ from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Joint, Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
+from sdfsim.simulate.looks import body_colors, framed, is_infinite, shown, with_normals
 
 _log = logging.getLogger(__name__)
 
@@ -400,7 +400,9 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             arrays[form] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if (key, form) not in drawn:
-            material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8, lit=True)
+            material = file.material(
+                key, np.ones(3) if own else light(color), seen.texture, seen.maps, rough=0.8, lit=True
+            )
             drawn[key, form] = file.mesh(key, *arrays[form], material)
         place, turn = take.position[:, k] - file.origin, take.quat_xyzw[:, k]
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}

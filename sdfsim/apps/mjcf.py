@@ -417,7 +417,8 @@ class _Reader:
         pose = pose_of(model.geom_pos[g], Rotation.from_quat(np.roll(model.geom_quat[g], -1)))
         material = model.geom_matid[g]
         rgba = model.geom_rgba[g] if material < 0 else model.mat_rgba[material]
-        color: Any = tuple(round(255 * float(c)) for c in np.clip(rgba[:3], 0.0, 1.0))
+        plain = material < 0 and np.allclose(rgba, 0.5 + 0.5 * (np.arange(4) == 3))  # MuJoCo's own default
+        color: Any = None if plain else tuple(round(255 * float(c)) for c in np.clip(rgba[:3], 0.0, 1.0))
         sizes: dict[str, Any] = {}
         if kind == types.mjGEOM_PLANE:
             return Part("plane", pose, where=where, color=color)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,16 +12,15 @@ import numpy as np
 
 from sdfsim.apps.beside import COLOR, OPACITY, between, rows_in
 from sdfsim.base.files import write_bytes
-from sdfsim.geometry.mesh import Mesh, face_normals, sample_surface, vertex_normals
-from sdfsim.geometry.primitives import plane
+from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics import pose
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.steps import PHASES
 from sdfsim.physics.units import EARTH
 from sdfsim.scene.scene import Joint, Scene
-from sdfsim.sdf.closed_forms import ClosedForm
-from sdfsim.shape.shape import Shape
+from sdfsim.simulate.camera import Camera, eye_around
+from sdfsim.simulate.looks import body_colors, framed, shown, with_normals
 
 if TYPE_CHECKING:  # these are slow to load
     import rerun as rr
@@ -46,8 +43,6 @@ VIEWS = {
     "milliseconds": {"step_ms": "step", **PHASES},
 }
 PLOTS = {key: legend for view in VIEWS.values() for key, legend in view.items()}
-STATIC_COLOR = (150, 150, 155)
-HUES = 32  # number of colours for moving bodies
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _FORCE_COLOR = (255, 170, 0)
@@ -56,15 +51,9 @@ _PHOTO_PIXELS = 320
 _TEXTURE_PIXELS = 2048
 MANY = 24  # number of moving bodies of one shape from which they are drawn as a crowd
 COLORS = 4  # copies share their mesh's colour, so a crowd is split into groups of different colours
-_CREASE = np.cos(np.radians(40.0))
-# For a plane in which scenery lies: cells along the scenery's longer side, and points on it that show which cells it
-# covers.
-_FLOOR_CELLS, _FLOOR_POINTS = 48, 40_000
-_MOST_CORNER_PAIRS = 1_000_000  # with more (about 10,000 vertices) a mesh counts as smooth: splitting triples it
 LONGEST = 5.0  # longest arrow, in sizes of its body
 # Least force of an arrow, in weights; number of bodies above which only hits get arrows; the least force of a hit.
 LEAST, TOLD, MANY_LEAST = 0.05, 100, 3.0
-FARTHEST = 1.0  # in sizes of the scene: a body that leaves the scene must not shrink it to a dot
 # Of joints.
 MOST_SHOWN = 256  # largest number of joints that are shown: each takes bodies out of the crowds
 SIZE = 0.4  # size of marks, relative to the smaller of the two bodies
@@ -262,9 +251,12 @@ def _crowds(scene: Scene) -> list[Crowd]:
     shape[[k for joint in shown_joints(scene) for k in joint.bodies if k >= 0]] = -1
     for number, name in enumerate(s.name for s in scene.shapes):
         members = np.flatnonzero(shape == number)
-        for k in range(COLORS if len(members) >= MANY else 0):
+        alike: dict[Any, list[int]] = {}
+        for n, k in enumerate(members.tolist() if len(members) >= MANY else ()):
+            alike.setdefault(scene.bodies[k].color or n % COLORS, []).append(k)
+        for k, bodies in enumerate(alike.values()):
             called = rr.escape_entity_path_part(f"{number}_{name}")
-            found.append(Crowd(f"{WORLD}/crowds/{called}/{k}", number, members[k::COLORS]))
+            found.append(Crowd(f"{WORLD}/crowds/{called}/{k}", number, np.array(bodies, dtype=np.int64)))
     return found
 
 
@@ -284,11 +276,7 @@ class PosedPhoto:
 
     name: str  # its name in the viewer
     image: Path | None  # photo file, or None to show the camera alone
-    focal: float  # px
-    principal: tuple[float, float]  # (cx, cy) px
-    size: tuple[int, int]  # (width, height) px
-    rotation: np.ndarray  # [3, 3] world to camera (x right, y down, z forward)
-    translation: np.ndarray  # [3] m, world to camera
+    camera: Camera
     color: tuple[int, int, int] | None = None  # RGB of its frame, or None for the viewer's default
 
 
@@ -307,14 +295,17 @@ def save_reconstruction(
 
     stream = rr.RecordingStream("sdfsim-reconstruct")
     encoded = stream.binary_stream()
-    rotations = [np.asarray(photo.rotation) for photo in photos]
-    centres = [-turn.T @ photo.translation for turn, photo in zip(rotations, photos, strict=True)]
+    centres = np.array([photo.camera.position for photo in photos])
     # Cameras surround the subject; sparse points also lie on things behind it.
     around = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
     low, high = (around.min(0), around.max(0)) if len(around) else (-np.ones(3), np.ones(3))
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
     # Before there is a surface, z may not be up: use the cameras, as photographers mostly hold them level.
-    up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
+    up = (
+        -np.sum([photo.camera.rotation[1] for photo in photos], axis=0)
+        if mesh is None and photos
+        else np.array([0.0, 0.0, 1.0])
+    )
     hidden = {"reconstruction": "trust"} | ({"trust": "surface"} if trust else {})
     tabs = [
         rrb.Spatial3DView(
@@ -332,14 +323,15 @@ def save_reconstruction(
     surfaces |= {f"{WORLD}/trust/{rr.escape_entity_path_part(name)}": part for name, part in trust.items()}
     for entity, surface in surfaces.items():
         stream.log(entity, _shaded(rr, surface, (200, 190, 175)), static=True)
-    for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
+    for photo in photos:
+        camera = photo.camera
         entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
-        stream.log(entity, rr.Transform3D(translation=centre_of, mat3x3=turn.T), static=True)
-        shrink = min(1.0, _PHOTO_PIXELS / max(photo.size))
+        stream.log(entity, rr.Transform3D(translation=camera.position, mat3x3=camera.rotation.T), static=True)
+        shrink = min(1.0, _PHOTO_PIXELS / max(camera.width, camera.height))
         pinhole = rr.Pinhole(
-            focal_length=photo.focal * shrink,
-            principal_point=np.array(photo.principal) * shrink,
-            resolution=[max(1, round(s * shrink)) for s in photo.size],
+            focal_length=camera.lens[0] * shrink,
+            principal_point=camera.lens[1] * shrink,
+            resolution=[max(1, round(length * shrink)) for length in (camera.width, camera.height)],
             image_plane_distance=0.1 * radius,
             color=photo.color,
         )
@@ -352,79 +344,10 @@ def save_reconstruction(
     write_bytes(path, encoded.read() or b"")
 
 
-@dataclass(frozen=True)
-class Eye:
-    """The eye of a view."""
-
-    position: np.ndarray  # [3] m
-    target: np.ndarray  # [3] m, the point in the middle of the view
-    up: np.ndarray  # [3] unit vector
-
-
-def _controls(eye: Eye) -> rrb.EyeControls3D:
+def _controls(eye: Camera) -> rrb.EyeControls3D:
     import rerun.blueprint as rrb
 
-    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye.position, look_target=eye.target, eye_up=eye.up)
-
-
-def eye_around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
-    """An eye that has a ball in sight."""
-    length = np.linalg.norm(up)
-    up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
-    side /= np.linalg.norm(side)
-    away = 1.6 * np.cross(up, side) + 1.1 * side + 0.9 * up
-    return Eye(centre + radius * away, centre, up)
-
-
-def body_colors(scene: Scene) -> list[tuple[int, ...]]:
-    """An RGB colour (0 to 255) for every body: grey if it never moves, else one of `HUES`, in turn."""
-    hues = map(_color, cycle(range(HUES)))
-    return [STATIC_COLOR if body.motion == "static" else next(hues) for body in scene.bodies]
-
-
-def _color(number: int) -> tuple[int, ...]:
-    """RGB (0 to 255); the hues of consecutive numbers are a golden angle apart."""
-    rgb = colorsys.hsv_to_rgb((0.58 + number * 0.61803398875) % 1.0, 0.62, 0.9 if number % 2 == 0 else 0.75)
-    return tuple(round(255 * c) for c in rgb)
-
-
-def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
-    """Centre [3] m and radius m of a ball around `extent`."""
-    low, high = extent(scene, motion)
-    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
-
-
-def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
-    """[2, 3] m: the lowest and highest coordinates that the first view must show.
-
-    These are the bodies at the start, except planes; the points on planes below them, as free bodies fall there; and,
-    if the motion is known, the bodies' paths. A body that flies farther than `FARTHEST` times the size of all this is
-    followed only up to there.
-    """
-    boxes: dict[int, np.ndarray] = {}
-    planes = []
-    for k, body in enumerate(scene.bodies):
-        shape = scene.shapes[body.shape]
-        if is_infinite(shape):
-            planes.append((body.position, pose.rotate(body.quat_xyzw, np.array([0.0, 0.0, 1.0]))))
-        elif len(shape.mesh.vertices):
-            box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
-            corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
-            boxes[k] = body.position + pose.rotate(body.quat_xyzw, corners)
-    if not boxes:
-        return np.array([[-1.0] * 3, [1.0] * 3]) / np.sqrt(3.0)
-    start = np.concatenate(list(boxes.values()))
-    below = [start - ((start - at) @ normal)[:, None] * normal for at, normal in planes]
-    shown = np.concatenate([start, *below])
-    low, high = shown.min(0), shown.max(0)
-    if motion is not None:
-        size = float((high - low).max())
-        for k, corners in boxes.items():
-            half = np.linalg.norm(np.ptp(corners, axis=0)) / 2 if scene.bodies[k].motion != "static" else 0.0
-            way = np.clip(motion.position[:, k], low - FARTHEST * size, high + FARTHEST * size)
-            low, high = np.minimum(low, way.min(0) - half), np.maximum(high, way.max(0) + half)
-    return np.stack([low, high])
+    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye.position, look_target=eye.look_at, eye_up=eye.up)
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
@@ -448,98 +371,6 @@ def _reduced(image: Image.Image, longest: int) -> np.ndarray:
     image = image.convert("RGB")
     image.thumbnail((longest, longest))
     return np.asarray(image)
-
-
-def is_infinite(shape: Shape) -> bool:
-    return not np.isfinite(shape.sdf.bounds).all()
-
-
-def shown(scene: Scene, row: int, half: float) -> Mesh:
-    """The mesh that is shown for a body, at scale 1; for a plane a square, `half` m to each side.
-
-    A plane is shown where it collides, but lower where other scenery lies in it, such as a photographed floor in an
-    infinite one: the two would flicker.
-    """
-    body = scene.bodies[row]
-    shape = scene.shapes[body.shape]
-    if not is_infinite(shape):
-        return shape.shown
-    most = 0.02 * framed(scene)[1]
-    found = [np.zeros((0, 3))]
-    for other in scene.bodies:
-        of = scene.shapes[other.shape]
-        if other.motion == "static" and not isinstance(of.sdf, ClosedForm):
-            places = other.position + pose.rotate(other.quat_xyzw, of.shown.vertices * other.scale)
-            mesh = Mesh(pose.rotate(pose.conjugate(body.quat_xyzw), places - body.position), of.shown.faces)
-            flat = mesh.faces[(np.abs(mesh.vertices[mesh.faces, 2]) < most).all(1)]
-            found += [mesh.vertices[np.abs(mesh.vertices[:, 2]) < most]]
-            if len(flat):  # also the insides of large faces
-                found += [sample_surface(Mesh(mesh.vertices, flat), _FLOOR_POINTS, np.random.default_rng(0))[0]]
-    near = np.concatenate(found)
-    if not len(near):
-        return plane(half)
-    lower = max(0.0, 0.05 * most - float(np.quantile(near[:, 2], 0.01)))
-    low, high = near[:, :2].min(0), near[:, :2].max(0)
-    cell = max(float((high - low).max()) / _FLOOR_CELLS, most)
-    count = np.ceil((high - low) / cell).astype(int) + 1
-    covered = np.zeros(count + 2, dtype=bool)  # with a border
-    covered[tuple(((near[:, :2] - low) / cell).astype(int).T + 1)] = True
-    beside = np.pad(covered, 1)  # and the cells around them, so that no gap is visible
-    beside = np.any([np.roll(beside, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)[1:-1, 1:-1]
-    x, y = (
-        np.clip(np.r_[-half, start + cell * np.arange(-1, n + 2), half], -half, half)
-        for start, n in zip(low, count, strict=True)
-    )
-    at = np.arange(len(x) * len(y)).reshape(len(x), len(y))
-    quads = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1)
-    level = np.pad(~covered, 1, constant_values=True)
-    upper, under = quads[level], quads[1:-1, 1:-1][beside] + at.size
-    corners = np.concatenate([upper, under])
-    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    vertices = np.concatenate([np.column_stack([grid, np.full(len(grid), z)]) for z in (0.0, -lower)])
-    used, label = np.unique(corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), return_inverse=True)
-    return Mesh(vertices[used], label.reshape(-1, 3))
-
-
-def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
-    """The mesh with smooth normals [V, 3]; vertices are split along creases, so that boxes keep their edges."""
-    welded, label = mesh, np.arange(len(mesh.vertices))
-    if mesh.uv is not None:  # its vertices are doubled where the texture is cut, which is not a crease
-        _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
-        label = label.reshape(-1)
-        welded = Mesh(mesh.vertices[first], label[mesh.faces])
-    normals = _corner_normals(welded)
-    if normals is None:
-        return mesh, vertex_normals(welded)[label]
-    corners = mesh.faces.reshape(-1)
-    if mesh.uv is not None:  # only as many vertices as creases need
-        rows = np.column_stack([corners, np.round(normals, 4)])
-        _, kept, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-        kept, faces = corners[kept], place.reshape(-1, 3)
-        split = np.empty((len(kept), 3))
-        split[faces.reshape(-1)] = normals
-        return Mesh(mesh.vertices[kept], faces, None, mesh.uv[kept], mesh.texture), split
-    colors = None if mesh.colors is None else mesh.colors[corners]
-    return Mesh(mesh.vertices[corners], np.arange(len(corners)).reshape(-1, 3), colors), normals
-
-
-def _corner_normals(mesh: Mesh) -> np.ndarray | None:
-    """[3 F, 3] for every face corner the mean normal of the faces at its vertex that differ by less than the crease
-    angle. None for a mesh that is fine enough to count as smooth."""
-    owner = mesh.faces.reshape(-1)
-    order = np.argsort(owner, kind="stable")
-    valence = np.bincount(owner, minlength=len(mesh.vertices))
-    if (valence**2).sum() > _MOST_CORNER_PAIRS:
-        return None
-    start = np.cumsum(valence) - valence
-    repeats = valence[owner]
-    first = np.repeat(np.arange(len(owner)), repeats)
-    second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
-    unit, area = face_normals(mesh)
-    near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
-    total = np.zeros((len(owner), 3))
-    np.add.at(total, first[near], (area[:, None] * unit)[second[near] // 3])
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
 # --- joints: lines that stay with their bodies, so that they are logged once ---

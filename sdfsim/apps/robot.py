@@ -164,6 +164,7 @@ def write_scene(
         lift[2] = -min(corners, default=0.0)
         scene.add(FLOOR, plane={}, friction=1.0, restitution=0.0)
     avoided = _avoided(whole, [shape for shape, *_ in made], poses, notes)
+    bare = [shape is None or (shape.skin is None and "color" not in keys) for shape, keys, *_ in made]
     folders: list[Path] = []
     names = [link.name for link in whole.links]
     files = dict(zip(names, plain_names(names), strict=True))
@@ -185,7 +186,9 @@ def write_scene(
         touched = {} if others is None else {"avoids": others} if others else {"collides_with": []}
         at = _round(pose[:3, 3] + lift)
         entry: dict[str, Any] = {**keys, "position": at, **turned, **motion, **surface, **touched}
-        scene.add(link.name, **entry)
+        # In a robot that has colours, a link without one is grey.
+        plain: dict[str, Any] = {} if all(bare) or shape is None or shape.skin is not None else {"color": [*GREY]}
+        scene.add(link.name, **(plain | entry))
     for joint in whole.joints:
         _join(scene, joint, names, lift)
     _add_poses(scene, whole, names, poses, lift)
@@ -417,7 +420,7 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
         keys: dict[str, Any] = {parts[0].kind: {key: _round(value) for key, value in parts[0].sizes.items()}}
     else:
         frame, keys, shape = np.eye(4), {"asset": link.name}, _solid(link, parts, notes)
-    shape = _dressed(link, shape, frame)
+    shape, look = _dressed(link, shape, frame)
     mass: dict[str, Any] = {}
     if not link.still:
         held = link.mass
@@ -442,7 +445,7 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
             shape = replace(shape, com=com, inertia=tensor * shape.volume / held)
     if shape.skin is not None:
         keys = {"asset": link.name}
-    return shape, keys, frame, mass
+    return shape, keys | look, frame, mass
 
 
 def _possible(link: Link, tensor: np.ndarray, even: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -490,25 +493,38 @@ def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
     return replace(shape, source=source)
 
 
-def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> Shape:
-    """A shape with the shown mesh of its link, with its colours and textures. A single primitive without another look
-    stays as it is."""
+def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> tuple[Shape, dict[str, Any]]:
+    """A shape with the shown mesh of its link, with its colours and textures. If that is the solid itself, in one
+    colour, the body's key for its colour instead."""
     parts = [part for part in (link.shown or link.solid) if part.kind != "plane"]
-    same = not link.solid or [_same(part) for part in parts] == [_same(part) for part in link.solid]
-    colored = any(part.color or (part.mesh is not None and part.mesh.colors is not None) for part in parts)
-    if not parts or (same and (not colored or (len(parts) == 1 and parts[0].mesh is None))):
-        return shape
+    if not link.solid or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
+        colors = {_color(part) for part in parts}
+        if len(colors) <= 1 and not any(map(_textured, parts)):
+            (color,) = colors or {None}
+            return shape, {"color": [*color]} if color else {}
     skin = one_skin([_painted(part, np.linalg.inv(frame)) for part in parts])
-    return shape if skin is None else replace(shape, skin=skin)
+    return (shape if skin is None else replace(shape, skin=skin)), {}
+
+
+def _color(part: Part) -> tuple[int, ...] | None:
+    """The colour of a part, or the mean of its mesh's."""
+    if part.color or part.mesh is None or part.mesh.colors is None:
+        return part.color
+    return tuple(int(c) for c in part.mesh.colors.mean(0))
+
+
+def _textured(part: Part) -> bool:
+    own = part.mesh
+    return part.color is None and own is not None and own.uv is not None and own.texture is not None
 
 
 def _painted(part: Part, back: np.ndarray) -> Painted:
     """A part with its colour, or with the texture of its mesh."""
     mesh, own = moved(_mesh(part), back), part.mesh
-    if part.color is None and own is not None and own.uv is not None and own.texture is not None:
+    if own is not None and own.texture is not None and own.uv is not None and _textured(part):
         return Painted(mesh.vertices, mesh.faces, own.uv, own.texture)
-    color = part.color or (GREY if own is None or own.colors is None else own.colors.mean(0))
-    return Painted(mesh.vertices, mesh.faces, np.full((len(mesh.vertices), 2), 0.5), np.array([[color]], np.uint8))
+    color = np.array([[_color(part) or GREY]], np.uint8)
+    return Painted(mesh.vertices, mesh.faces, np.full((len(mesh.vertices), 2), 0.5), color)
 
 
 def _same(part: Part) -> tuple:

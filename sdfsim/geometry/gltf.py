@@ -18,7 +18,7 @@ import numpy as np
 
 from sdfsim.geometry.mesh import joined
 from sdfsim.geometry.mesh_formats import TEXTURES, FileMesh, looked_up, read_image, side_file, strip
-from sdfsim.geometry.skins import Painted, plain_parts
+from sdfsim.geometry.skins import USUAL, Painted, plain_parts, resized
 
 # From z up to glTF's y up: the first columns of a matrix [4, 4].
 _Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0]
@@ -39,8 +39,7 @@ TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
 MOST = 500_000_000  # vertices and corners
 WHITE = [1.0, 1.0, 1.0]
 # What is lost of a material, by the key that asks for it.
-LOST = {"normalTexture": "normal maps", "metallicRoughnessTexture": "roughness and metal maps"}
-LOST |= {"emissiveTexture": "glow maps"}
+LOST = {"emissiveTexture": "glow maps"}
 SPARSE = 2**24  # most rows of an accessor that has sparse values only
 _OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
 
@@ -85,24 +84,39 @@ class GltfWriter:
         return len(self._accessors) - 1
 
     def material(
-        self, name: str, color: np.ndarray, texture: np.ndarray | None = None, *, rough: float = 1.0, lit: bool = False
-    ) -> int:
-        """Add a material with a colour [3] (linear light), or with a texture [H, W, 3] uint8. Textures from photos
-        contain the light already, so they are shown unlit unless `lit` is set: then shadows fall on them too."""
+        self, name: str, color: np.ndarray, texture: np.ndarray | None = None, maps: np.ndarray | None = None, *,
+        rough: float = 1.0, lit: bool = False,
+    ) -> int:  # fmt: skip
+        """Add a material with a colour [3] (linear light), or with a texture [H, W, 3] uint8 and the maps of `Mesh`.
+        Textures from photos contain the light already, so they are shown unlit unless `lit` is set: then shadows fall
+        on them too."""
         surface: dict[str, Any] = {"baseColorFactor": [*map(float, color), 1.0]}
         made: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
         surface |= {"metallicFactor": 0.0, "roughnessFactor": rough}
         if texture is not None:
-            from PIL import Image
-
-            file = io.BytesIO()
-            Image.fromarray(texture).save(file, "JPEG", quality=92, subsampling=0)
-            self._images.append({"bufferView": self._view(file.getvalue()), "mimeType": "image/jpeg"})
-            surface["baseColorTexture"] = {"index": len(self._images) - 1}
+            surface["baseColorTexture"] = self._image(texture, "JPEG", quality=92, subsampling=0)
             if not lit:
                 made["extensions"] = {_UNLIT: {}}
+        if maps is not None:
+            gloss, bumps = maps[..., :2], maps[..., 2:]
+            if np.ptp(gloss, axis=(0, 1)).any():
+                surface |= {"roughnessFactor": 1.0, "metallicFactor": 1.0}
+                surface["metallicRoughnessTexture"] = self._image(np.insert(gloss, 0, 255, axis=2), "PNG")
+            else:
+                surface |= dict(zip(("roughnessFactor", "metallicFactor"), (gloss[0, 0] / 255.0).tolist(), strict=True))
+            if (bumps != USUAL[2:]).any():
+                made["normalTexture"] = self._image(bumps, "PNG")
         self.materials.append(made)
         return len(self.materials) - 1
+
+    def _image(self, pixels: np.ndarray, kind: str, **how: Any) -> dict[str, int]:
+        """Add an image, as a texture."""
+        from PIL import Image
+
+        file = io.BytesIO()
+        Image.fromarray(np.ascontiguousarray(pixels)).save(file, kind, **how)
+        self._images.append({"bufferView": self._view(file.getvalue()), "mimeType": f"image/{kind.lower()}"})
+        return {"index": len(self._images) - 1}
 
     def mesh(self, name: str, attributes: dict[str, int], corners: int, material: int) -> int:
         """Add a mesh from accessors: the attributes of its vertices, and the corners of its faces."""
@@ -400,7 +414,7 @@ class _GltfReader:
     ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
         """The product, in linear light, of texture, material colour and vertex colours: at the vertices [V, 3] uint8;
         and as places [V, 2] in an image, None if the vertices' own colours differ."""
-        factors, tint, uv, number = [], np.ones(3), np.zeros((count, 2)), -1
+        factors, tint, uv, number, maps = [], np.ones(3), np.zeros((count, 2)), -1, None
         if "material" in primitive:
             material = self.header["materials"][_index(primitive["material"])]
             surface = material.get("pbrMetallicRoughness", {})
@@ -411,19 +425,33 @@ class _GltfReader:
             tint = np.array(layer.get(f"{base}Factor", WHITE), dtype=np.float64)[:3]
             if (tint != 1.0).any():
                 factors.append(np.tile(tint, (count, 1)))
+            gloss, bumps = surface.get("metallicRoughnessTexture", {}), material.get("normalTexture", {})
             texture = layer.get(f"{base}Texture", {})
-            moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
-            places = f"TEXCOORD_{moved.get('texCoord', texture.get('texCoord', 0))}"
-            image = self._image(texture["index"]) if texture else None
+            laid = texture or gloss or bumps  # places are those of the first
+            moved, places = _places(laid)
+            for other, what in ((gloss, "roughness and metal maps"), (bumps, "normal maps")):
+                if other and (_places(other) != (moved, places) or self._image(other["index"]) is None):
+                    self.lost[what] = None
+                    other.clear()
+            image = self._image(laid["index"]) if laid else None
             if image is not None and places not in primitive["attributes"]:
                 self.notes.append(f"a texture is left out: its mesh has no {places}")
+                gloss, bumps = {}, {}
             elif image is not None:
                 uv = self.attribute(primitive, places, weights)[:, :2] * moved.get("scale", [1.0, 1.0])
                 turn = moved.get("rotation", 0.0)  # counter-clockwise, seen with v pointing down
                 across, down = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
                 uv = np.stack([uv @ across, uv @ down], axis=1) + moved.get("offset", [0.0, 0.0])
-                factors.append(light(looked_up(image, uv)))
-                number, self.textured = texture["index"], True
+                self.textured = True
+                if texture:
+                    number = texture["index"]
+                    factors.append(light(looked_up(image, uv)))
+            given = [surface.get(name) for name in ("roughnessFactor", "metallicFactor")]
+            if _UNLIT not in material.get("extensions", {}) and (gloss or bumps or given != [None, None]):
+                rough, metal = (1.0 if value is None else float(value) for value in given)
+                maps = (rough, metal, gloss.get("index", -1), bumps.get("index", -1), float(bumps.get("scale", 1.0)))
+                plain = [round(255 * rough), round(255 * metal), *maps[2:4]] == [*USUAL[:2], -1, -1]
+                maps, self.textured = (None, self.textured) if plain else (maps, True)
         own = self.attribute(primitive, "COLOR_0", weights)[:, :3] if "COLOR_0" in primitive["attributes"] else None
         own = own if own is not None and own.shape == (count, 3) else None
         factors += [own] if own is not None else []
@@ -433,17 +461,29 @@ class _GltfReader:
             if np.ptp(own, axis=0).max() > 1e-6:
                 return colors, uv, None
             tint = tint * own[0]
-        return colors, uv, self._tint(number, tint)
+        return colors, uv, self._tint(number, tint, maps)
 
-    def _tint(self, texture: int, tint: np.ndarray) -> np.ndarray:
-        """[H, W, 3] uint8 of a texture (-1: one white pixel), its light multiplied by a factor [3]."""
-        key = (texture, *tint.tolist())
+    def _tint(self, texture: int, tint: np.ndarray, maps: tuple[float, float, int, int, float] | None) -> np.ndarray:
+        """[H, W, 3] uint8 of a texture (-1: one white pixel), its light multiplied by a factor [3]; or [H, W, 8] with
+        maps: of factors for roughness and metal, their texture and a normal map (-1: none), and its scale."""
+        key = (texture, *tint.tolist(), maps)
         if key not in self._tinted:
             image = self._image(texture) if texture >= 0 else None
             image = np.full((1, 1, 3), 255, np.uint8) if image is None else image
             if not (tint == 1.0).all():
                 tables = srgb(light(np.arange(256))[:, None] * tint)  # [256, 3]
                 image = np.stack([tables[image[..., k], k] for k in range(3)], axis=-1)
+            if maps is not None:
+                rough, metal, *numbers, scale = maps
+                gloss, bumps = (self._image(number) if number >= 0 else None for number in numbers)
+                gloss = np.full((1, 1, 3), 255, np.uint8) if gloss is None else gloss
+                bumps = np.array([[USUAL[2:]]], np.uint8) if bumps is None else bumps
+                gloss = np.round(gloss[..., 1:3] * np.clip([rough, metal], 0.0, 1.0)).astype(np.uint8)
+                if scale != 1.0:
+                    bumps = np.clip(np.round((bumps - 127.5) * [scale, scale, 1.0] + 127.5), 0, 255).astype(np.uint8)
+                layers = [image, gloss, bumps]
+                tall, wide = (max(layer.shape[axis] for layer in layers) for axis in (0, 1))
+                image = np.dstack([resized(layer, wide, tall) for layer in layers])
             self._tinted[key] = image
         return self._tinted[key]
 
@@ -478,6 +518,12 @@ def _moved(part: Any, place: np.ndarray) -> Any:
     """A `FileMesh` or `Painted` at a pose [4, 4] of glTF, z up; a pose that mirrors it turns its faces over."""
     faces = part.faces[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else part.faces
     return part._replace(vertices=(part.vertices @ place[:3, :3].T + place[:3, 3]) @ Z_UP.T, faces=faces)
+
+
+def _places(texture: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """Where a texture lies: its KHR_texture_transform, and the attribute with its places."""
+    moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
+    return moved, f"TEXCOORD_{moved.get('texCoord', texture.get('texCoord', 0))}"
 
 
 def _index(number: int) -> int:

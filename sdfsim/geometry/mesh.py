@@ -23,6 +23,8 @@ class Mesh:
         colors: [V, 3] uint8 RGB, or None.
         uv: [V, 2] place of each vertex in the texture, from its upper left (0, 0) to its lower right (1, 1), or None.
         texture: [H, W, 3] uint8 RGB, or None.
+        maps: [H, W, 5] uint8, as large as the texture, or None: roughness, metal (both 0 to 255), and the normal map of
+            glTF (x, y, z). Only exports use them.
     """
 
     vertices: np.ndarray
@@ -30,11 +32,12 @@ class Mesh:
     colors: np.ndarray | None = None
     uv: np.ndarray | None = None
     texture: np.ndarray | None = None
+    maps: np.ndarray | None = None
 
     def digest(self) -> str:
         """SHA-256 of its content, in hexadecimal."""
         digest = hashlib.sha256()
-        for array in (self.vertices, self.faces, self.colors, self.uv, self.texture):
+        for array in (self.vertices, self.faces, self.colors, self.uv, self.texture, self.maps):
             if array is not None:
                 digest.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()

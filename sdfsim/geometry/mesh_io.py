@@ -23,7 +23,7 @@ from sdfsim.geometry.mesh_formats import (
     read_ply,
     stl_surface,
 )
-from sdfsim.geometry.skins import Painted, one_skin, plain_parts
+from sdfsim.geometry.skins import Painted, one_skin, painted_mesh, plain_parts
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off", ".dae")
 GLTF = (".glb", ".gltf")
@@ -159,10 +159,7 @@ def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) ->
 def read_glb(path: Path) -> dict[str, Mesh]:
     """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError if it is not readable."""
     with _reading(path):
-        found = {
-            name: Mesh(part.vertices, part.faces, None, part.uv, part.image)
-            for name, part in read_painted(path).items()
-        }
+        found = {name: painted_mesh(part) for name, part in read_painted(path).items()}
         for mesh in found.values():
             require_whole(mesh)
     return found
@@ -180,7 +177,8 @@ def write_glb(meshes: dict[str, Mesh]) -> bytes:
         assert mesh.uv is not None and mesh.texture is not None
         places = {"POSITION": file.array(mesh.vertices - file.origin), "TEXCOORD_0": file.array(mesh.uv)}
         corners = file.array(mesh.faces.reshape(-1), "<u4")
-        drawn = file.mesh(name, places, corners, file.material(name, np.ones(3), mesh.texture))
+        material = file.material(name, np.ones(3), mesh.texture, mesh.maps, lit=mesh.maps is not None)
+        drawn = file.mesh(name, places, corners, material)
         file.nodes.append({"name": name, "mesh": drawn})
     return file.to_bytes()
 

@@ -10,6 +10,7 @@ from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume
 LARGEST = 8192  # px, the longest side of the image that combines several images, or repetitions of one
 SWATCH = 8  # px, side of the patch of a plain colour beside images
 MOST_PLAIN = 1000  # colours that get such a patch each
+USUAL = (204, 0, 128, 128, 255)  # maps of a surface of which nothing is known: roughness 0.8, no metal, no relief
 EDGE = 1e-4  # relative to an image: places outside it by no more than this count as on its border
 
 
@@ -19,7 +20,8 @@ class Painted(NamedTuple):
     vertices: np.ndarray  # [V, 3] float64
     faces: np.ndarray  # [F, 3] int64
     uv: np.ndarray  # [V, 2] places in the image from its upper left (0, 0) to its lower right (1, 1); it repeats itself
-    image: np.ndarray  # [H, W, 3] uint8; one pixel for a plain colour
+    # [H, W, 3] uint8, or [H, W, 8] with the maps of `Mesh`; one pixel for a plain colour
+    image: np.ndarray
 
 
 def plain_parts(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> tuple[Painted | None, ...]:
@@ -40,8 +42,6 @@ def plain_parts(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> 
 def one_skin(parts: Sequence[Painted]) -> Mesh | None:
     """The parts as one mesh, with their images side by side if there are several. None if an image repeats too often to
     be written out."""
-    from PIL import Image
-
     places, tiles, images = [], {}, {}
     for part in parts:
         uv = np.nan_to_num(part.uv) if part.image.shape[:2] != (1, 1) else np.full(part.uv.shape, 0.5)
@@ -50,22 +50,23 @@ def one_skin(parts: Sequence[Painted]) -> Mesh | None:
         key, often = id(part.image), np.maximum(np.ceil(uv.max(0) - EDGE), 1)
         images[key], tiles[key] = part.image, np.maximum(tiles.get(key, 1), often)
     sheets = {}
+    channels = max(image.shape[2] for image in images.values())
     for key, image in images.items():
+        if image.shape[2] < channels:
+            image = np.dstack([image, np.tile(np.array(USUAL, np.uint8), (*image.shape[:2], 1))])
         if image.shape[:2] == (1, 1):
-            tiles[key], image = np.ones(2), np.broadcast_to(image, (SWATCH, SWATCH, 3))
+            tiles[key], image = np.ones(2), np.broadcast_to(image, (SWATCH, SWATCH, image.shape[2]))
         often = tiles[key].astype(int)
         if often.max() > 1 and (often * image.shape[1::-1]).max() > LARGEST:
             return None
         sheets[key] = np.tile(image, (often[1], often[0], 1))
     if len(sheets) > 1:
-        wide = sum(sheet.shape[1] for sheet in sheets.values())
-        factor = min(1.0, LARGEST / max(wide, *(sheet.shape[0] for sheet in sheets.values())))
+        longest = sum(sheet.shape[1] for sheet in sheets.values())
+        factor = min(1.0, LARGEST / max(longest, *(sheet.shape[0] for sheet in sheets.values())))
         for key, sheet in sheets.items() if factor < 1.0 else ():
-            size = [max(1, int(factor * length)) for length in sheet.shape[1::-1]]
-            sheets[key] = np.asarray(Image.fromarray(sheet).resize(size, Image.Resampling.BOX))
-    texture = np.zeros(
-        (max(s.shape[0] for s in sheets.values()), sum(s.shape[1] for s in sheets.values()), 3), np.uint8
-    )
+            sheets[key] = resized(sheet, max(1, int(factor * sheet.shape[1])), max(1, int(factor * sheet.shape[0])))
+    size = max(s.shape[0] for s in sheets.values()), sum(s.shape[1] for s in sheets.values())
+    texture = np.zeros((*size, next(iter(sheets.values())).shape[2]), np.uint8)
     left, at = 0, {}
     for key, sheet in sheets.items():
         texture[: sheet.shape[0], left : left + sheet.shape[1]] = sheet
@@ -83,4 +84,18 @@ def one_skin(parts: Sequence[Painted]) -> Mesh | None:
     welded = np.unique(whole.vertices, axis=0, return_inverse=True)[1].reshape(-1)[whole.faces]
     inside_out = is_closed(Mesh(whole.vertices, welded)) and signed_volume(whole) < 0
     faces = whole.faces[:, ::-1].copy() if inside_out else whole.faces
-    return Mesh(whole.vertices, faces, None, np.concatenate(placed), texture)
+    return painted_mesh(Painted(whole.vertices, faces, np.concatenate(placed), texture))
+
+
+def painted_mesh(part: Painted) -> Mesh:
+    """A part as a mesh."""
+    maps = part.image[..., 3:] if part.image.shape[2] > 3 else None
+    return Mesh(part.vertices, part.faces, None, part.uv, np.ascontiguousarray(part.image[..., :3]), maps)
+
+
+def resized(image: np.ndarray, wide: int, tall: int) -> np.ndarray:
+    """An image [H, W, C] uint8 in another size."""
+    from PIL import Image
+
+    layers = [Image.fromarray(layer).resize((wide, tall), Image.Resampling.BOX) for layer in np.moveaxis(image, 2, 0)]
+    return np.stack([np.asarray(layer) for layer in layers], 2)

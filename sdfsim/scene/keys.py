@@ -53,6 +53,7 @@ class BodyKeys(TypedDict, total=False):
     collides_with: Literal["all"] | Sequence[str] | None
     avoids: Sequence[str]
     path: Sequence[Group] | None
+    color: Numbers | None
     count: int | None
     arrange: Group | None
 

@@ -202,6 +202,7 @@ def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[s
         damping=entry.damping,
         collides_with=None if partners is None else tuple(n for p in partners for n in groups.get(p, [p])),
         path=path,
+        color=tuple(round(value) for value in entry.color) if entry.color else None,
     )
 
 

@@ -67,6 +67,7 @@ class Body:
         restitution: coefficient of restitution (likewise the product).
         collides_with: names of the bodies it may touch, or None for all.
         path: the waypoints of a kinematic body, else None.
+        color: RGB from 0 to 255 where its mesh has none of its own; None: by its motion, see `body_colors`.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Body:
     inertia: np.ndarray | None = None
     collides_with: tuple[str, ...] | None = None
     path: Waypoints | None = None
+    color: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -448,6 +448,9 @@ class BodyTable(Turned):
         "`all`, or a list of names: two bodies touch where each lists the other", None
     )
     avoids: list[Text] = key("names of bodies that it never touches, whatever `collides_with` says", [])
+    color: Annotated[list[Annotated[Number, Field(ge=0, le=255)]], _THREE] | None = key(
+        "red, green and blue (sRGB, 0 to 255) where its mesh has no colours; by default grey if it never moves", None
+    )
     count: Whole | None = key("number of copies; by default as many as the grid has places", None, ge=1)
     arrange: Arrange | None = key("places of the copies", None)
 

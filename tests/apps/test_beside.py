@@ -8,10 +8,10 @@ import pytest
 
 from sdfsim.apps.beside import COLOR, OPACITY, beside_of, between
 from sdfsim.apps.observed import load_beside
-from sdfsim.apps.recording import framed
-from sdfsim.apps.render import SIZE, Studio, eye_of
+from sdfsim.apps.render import SIZE, picture_at
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
+from sdfsim.simulate.camera import Camera, Style
 from tests.helpers.command import run
 from tests.helpers.runs import read, simulate
 
@@ -97,9 +97,9 @@ def test_a_picture_shows_both_and_what_is_behind(folder):
     # The recorded body stands 2 m before the simulated one, as seen along y, and to the right of it by 0.7 m.
     aside = beside.position - beside.position[:1] + rollout.position[:1, 2:] + [0.7, -2.0, 0.0]
     middle = rollout.position[0, 2]
-    eye = eye_of(scene, None, middle - [0.0, 10.0, 0.0], middle)
+    camera = Camera(middle - [0.0, 10.0, 0.0], middle)
     ghost = replace(beside, position=aside)
-    both, alone = (Studio(scene, eye, framed(scene)[1], of).picture_at(rollout, 0.0) for of in (ghost, None))
+    both, alone = (picture_at(camera, scene, rollout, 0.0, Style(smooth=True), of) for of in (ghost, None))
     pixel = SIZE[1] / 2 / np.tan(np.radians(20.0))  # at 1 m, so many pixels are a metre
 
     def at(picture: np.ndarray, x: float, away: float) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Joints in files of other programs: imports and exports, judged by MuJoCo, PyBullet, OpenUSD and by hand."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +15,12 @@ from sdfsim import Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.apps.recording import ends, marks
+from sdfsim.apps.robot import GREY
 from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
+from sdfsim.simulate.looks import body_colors
 from tests.helpers.command import run
 
 LINK = """
@@ -111,6 +114,19 @@ def test_urdf_has_the_poses_masses_and_inertias_that_mujoco_has(tmp_path: Path) 
     assert (joints["shoulder"].damping, joints["shoulder"].friction) == pytest.approx((0.3, 0.05))
     assert joints["rail"].kind == "slider" and joints["rail"].limits == pytest.approx((-0.1, 0.2))
     assert joints["spin"].kind == "hinge" and joints["spin"].limits is None
+
+
+def test_links_keep_their_colours_whether_they_move_or_not(tmp_path: Path) -> None:
+    """Also where what is shown is what collides; a link without a colour is grey beside those that have one."""
+    white = '<material name="white"><color rgba="1 1 1 1"/></material>'
+    text = re.sub(
+        r"<collision>(.*?)</collision>", rf"\g<0><visual>\g<1>{white}</visual>", ARM, count=2, flags=re.DOTALL
+    )
+    scene, _ = imported(write(tmp_path, "arm.urdf", text), fixed=True)
+    colors = dict(zip((body.name for body in scene.bodies), body_colors(scene), strict=True))
+    assert next(body for body in scene.bodies if body.name == "base").motion == "static"
+    assert [colors[name] for name in ("base", "upper", "slide")] == [(255, 255, 255), (255, 255, 255), GREY]
+    assert len(set(body_colors(imported(write(tmp_path / "plain", "arm.urdf", ARM), fixed=True)[0]))) > 2
 
 
 def test_urdf_tells_what_it_leaves_out_and_what_it_made_otherwise(tmp_path: Path) -> None:
@@ -733,7 +749,7 @@ COUPLED = """<mujoco><worldbody><body name="base" pos="0 0 1"><freejoint/><geom 
 
 
 def test_a_mimic_is_a_coupling_here_and_in_exports(tmp_path: Path) -> None:
-    scene, report = imported(write(tmp_path, "hand.urdf", HAND), fixed=True)
+    scene, _ = imported(write(tmp_path, "hand.urdf", HAND), fixed=True)
     (coupling,) = scene.couplings
     assert [scene.joints[j].name for j in coupling.joints] == ["rail", "shoulder"]
     assert (coupling.ratio, coupling.offset) == (0.5, -0.1)

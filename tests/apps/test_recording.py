@@ -12,21 +12,19 @@ from scipy.spatial.transform import Rotation
 from sdfsim import load_scene
 from sdfsim.apps.recording import (
     COLORS,
-    FARTHEST,
     MANY,
     PLOTS,
     Playback,
     PosedPhoto,
-    framed,
     save_reconstruction,
     save_rollout,
-    shown,
-    with_normals,
 )
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import box, sphere
 from sdfsim.physics.rollout import Rollout
 from sdfsim.shape.shape import load_shape
+from sdfsim.simulate.camera import Camera
+from sdfsim.simulate.looks import FARTHEST, framed, shown, with_normals
 from tests.helpers.runs import read
 
 STEPS = 6
@@ -211,7 +209,7 @@ def test_a_reconstruction_shows_cameras_photos_points_and_surface(tmp_path):
     Image.fromarray(np.full((600, 800, 3), 128, np.uint8)).save(tmp_path / "one.png")
     turn = Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix()
     photos = [
-        PosedPhoto(f"{i}.png", image, 700.0, (400.0, 300.0), (800, 600), turn, np.array([0.0, 0.0, 2.0]))
+        PosedPhoto(f"{i}.png", image, Camera.posed(turn, (0.0, 0.0, 2.0), (700.0, 700.0), 800, 600))
         for i, image in enumerate([tmp_path / "one.png", None, tmp_path / "missing.png"])
     ]
     save_reconstruction(tmp_path / "r.rrd", photos, np.random.default_rng(0).normal(size=(50, 3)), None, box())
@@ -225,7 +223,7 @@ def test_a_reconstruction_shows_cameras_photos_points_and_surface(tmp_path):
 
 
 def test_what_is_proposed_and_how_far_to_trust_the_surface_are_things_of_their_own(tmp_path):
-    photo = PosedPhoto("next1", None, 700.0, (400.0, 300.0), (800, 600), np.eye(3), np.zeros(3), (255, 40, 200))
+    photo = PosedPhoto("next1", None, Camera.posed(np.eye(3), np.zeros(3), (700.0, 700.0), 800, 600), (255, 40, 200))
     tinted = replace(box(), colors=np.full((len(box().vertices), 3), 7, np.uint8))
     save_reconstruction(tmp_path / "r.rrd", [photo], np.zeros((0, 3)), None, box(), trust={"a box": tinted})
     found = read(tmp_path / "r.rrd")

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import sdfsim
-from sdfsim import Simulator
-from sdfsim.apps.recording import framed
-from sdfsim.apps.render import FRAMES, SIZE, Studio, eye_of, render
+from sdfsim import SdfsimError, Simulator
+from sdfsim.apps.render import FRAMES, SIZE, picture_at, render
 from sdfsim.apps.run import ending_lines, summary
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
+from sdfsim.simulate.camera import Camera, Style
 
 SKY = np.array([236, 240, 245])
 
@@ -25,8 +25,8 @@ def falling(**keys) -> tuple[Scene, sdfsim.Rollout]:
 
 def seen(scene: Scene, rollout: sdfsim.Rollout, camera, look_at, time=0.0) -> np.ndarray:
     """[H, W] bool: pixels that are not sky."""
-    studio = Studio(scene, eye_of(scene, None, camera, look_at), framed(scene)[1])
-    return np.abs(studio.picture_at(rollout, time).astype(int) - SKY).max(-1) > 8
+    fitted = Camera.fit(None, scene, position=camera, look_at=look_at)
+    return np.abs(picture_at(fitted, scene, rollout, time, Style(smooth=True)).astype(int) - SKY).max(-1) > 8
 
 
 def test_a_ball_is_a_disc_of_the_right_size_in_the_middle():
@@ -74,20 +74,21 @@ def test_right_is_right_and_up_is_up(place, where):
 
 def test_what_is_between_the_floor_and_the_sun_throws_a_shadow():
     scene = sdfsim.Scene().add("floor", plane={}).add("box", box={"size": (0.4, 0.4, 0.1)}, position=(0, 0, 1.5)).load()
-    eye = eye_of(scene, None, (0.0, -4.0, 6.0), (0, 0, 0))
-    studio = Studio(scene, eye, 1.0)
-    picture = studio.picture_at(Simulator(scene).initial_rollout(), 0.0).astype(int)
+    camera, sun = Camera((0.0, -4.0, 6.0)), np.array([0.3, -0.4, 0.8])
+    picture = camera.image(Simulator(scene), style=Style(light=sun, smooth=True)).color.astype(int)
 
     def at(point: np.ndarray) -> int:
         """Brightness of a point of the floor."""
-        x, y, z = studio.axes @ (point - eye.position)
-        column, row = np.array([x, y]) / z / np.tan(np.radians(20.0)) * SIZE[1] / 2 + np.array(SIZE) / 2
+        column, row = camera.project(point)[0]
         return picture[int(row), int(column)].sum()
 
-    middle = np.array([0, 0, 1.5]) - studio.sun * 1.5 / studio.sun[2]
-    inside = [at(middle + np.array([x, y, 0])) for x in (-0.15, 0.15) for y in (-0.15, 0.15)]
-    outside = [at(middle + np.array([x, y, 0])) for x in (-0.25, 0.25) for y in (-0.25, 0.25)]
-    assert studio.sun[2] > 0.5 and max(inside) < 0.7 * min(outside)
+    middle = np.array([0, 0, 1.5]) - sun * 1.5 / sun[2]
+    inside = [at(middle + np.array([x, y, 0])) for x in (-0.13, 0.13) for y in (-0.13, 0.13)]
+    outside = [at(middle + np.array([x, y, 0])) for x in (-0.27, 0.27) for y in (-0.27, 0.27)]
+    assert max(inside) < 0.7 * min(outside)
+    # Half of the sun is hidden from the places at which its middle just disappears.
+    edge = np.mean([at(middle + 0.2 * np.array([x, y, 0])) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))])
+    assert edge == pytest.approx((np.mean(inside) + np.mean(outside)) / 2, rel=0.15)
 
 
 def test_a_texture_is_seen_where_its_places_are():
@@ -99,7 +100,7 @@ def test_a_texture_is_seen_where_its_places_are():
     shape = replace(analytic_shape("box", size=(2.0, 0.1, 2.0)), skin=sheet)
     scene, rollout = falling(position=(0, 0, 0))
     scene = replace(scene, shapes=(shape,))
-    picture = Studio(scene, eye_of(scene, None, (0, -6, 0), (0, 0, 0)), 1.0).picture_at(rollout, 0.0)
+    picture = Camera((0, -6, 0)).image(rollout, scene, frame=0).color
     middle, off = np.array(SIZE[::-1]) // 2, 60
     for (row, column), color in np.ndenumerate(np.array([["r", "g"], ["b", "y"]])):
         seen = picture[middle[0] + off * (2 * row - 1), middle[1] + off * (2 * column - 1)].astype(int)
@@ -121,6 +122,28 @@ def test_a_movie_has_its_frames_and_ends_as_the_picture_of_the_end(tmp_path):
     last = np.asarray(Image.open(tmp_path / "fall.png"), dtype=float)
     assert np.abs(frames[-1] - last).mean() < 3.0 < np.abs(frames[0].astype(float) - frames[-1]).max()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["fall.mp4", "fall.png"]
+
+
+def test_size_rate_and_background_are_as_asked(tmp_path):
+    from PIL import Image
+
+    scene, rollout = falling(position=(0, 0, 1))
+    render(scene, rollout, tmp_path / "clear.png", size=(50, 101), background="none", at=0.0)
+    pixels = np.asarray(Image.open(tmp_path / "clear.png"))
+    assert pixels.shape == (101, 50, 4) and pixels[0, 0, 3] == 0 and pixels[..., 3].max() == 255
+    render(scene, rollout, tmp_path / "navy.png", size=(40, 40), background="#202830")
+    assert np.asarray(Image.open(tmp_path / "navy.png"))[0, 0].tolist() == [0x20, 0x28, 0x30]
+    camera = Camera((0, -4, 0.5), (0, 0, 0.5), width=64, height=32)
+    render(scene, rollout, tmp_path / "small.mp4", camera=camera, fps=12.5)
+    with av.open(str(tmp_path / "small.mp4")) as movie:
+        stream = movie.streams.video[0]
+        assert (stream.width, stream.height, stream.average_rate) == (64, 32, 12.5)
+        assert sum(1 for _ in movie.decode(stream)) == round(rollout.time[-1] * 12.5) + 1
+    for wrong in ({"size": (33, 32)}, {"background": "none"}, {"fps": 0.0}):
+        with pytest.raises(SdfsimError, match="movie"):
+            render(scene, rollout, tmp_path / "no.mp4", **wrong)
+    with pytest.raises(SdfsimError, match="no such colour"):
+        render(scene, rollout, tmp_path / "no.png", background="blurple")
 
 
 def test_the_end_of_a_run_reports_who_rests_who_moves_and_who_is_gone():

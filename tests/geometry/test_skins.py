@@ -310,7 +310,7 @@ def test_a_gltf_whose_image_is_missing_is_read_without_it(tmp_path: Path) -> Non
     loaded = load_textured(gltf_box(tmp_path, change))
     assert loaded.skin is None and len(loaded.mesh.vertices) == 8
     assert loaded.notes == (
-        "texture textures/gone.png is missing beside it: left out", "not shown: normal maps", "not shown: transparency",
+        "texture textures/gone.png is missing beside it: left out", "not shown: transparency", "not shown: normal maps",
     )  # fmt: skip
 
 
@@ -334,3 +334,40 @@ def test_a_texture_far_from_the_origin_is_stored_where_it_is(tmp_path: Path) -> 
     mesh = Mesh(vertices, np.array(box.faces), None, np.zeros((24, 2)), image)
     (tmp_path / "far.glb").write_bytes(write_glb({"far": mesh}))
     np.testing.assert_allclose(read_glb(tmp_path / "far.glb")["far"].vertices, mesh.vertices, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("textured", [True, False], ids=["texture", "plain"])
+@pytest.mark.parametrize("mapped", [True, False], ids=["maps", "factors"])
+def test_roughness_metal_and_normal_maps_come_in_and_go_out(tmp_path: Path, textured: bool, mapped: bool) -> None:
+    """From a file over a shape folder to an export, as trimesh reads it."""
+    import trimesh
+
+    import sdfsim
+
+    cells = np.arange(CELLS * CELLS, dtype=np.uint8).reshape(CELLS, CELLS)
+    gloss = Image.fromarray(np.repeat(np.repeat(np.stack([0 * cells, 3 * cells, 255 - 3 * cells], 2), 8, 0), 8, 1))
+    bumps = Image.fromarray(np.repeat(np.repeat(np.stack([90 + cells, 160 - cells, 0 * cells + 240], 2), 8, 0), 8, 1))
+    box = sides(chessboard())
+    material: Any = box.visual.material
+    material.baseColorTexture = chessboard() if textured else None
+    material.roughnessFactor, material.metallicFactor = (1.0, 1.0) if mapped else (0.2, 0.6)
+    if mapped:
+        material.metallicRoughnessTexture, material.normalTexture = gloss, bumps
+    box.export(tmp_path / "box.glb")
+    loaded = load_textured(tmp_path / "box.glb")
+    assert not loaded.notes and loaded.skin is not None
+    shape = shape_from_mesh(tmp_path / "box.glb", tmp_path / "cache", sdf="grid", resolution=16)
+    scene = SceneBuilder().add("box", asset=shape.save(tmp_path / "shape"), motion="static").load()
+    sdfsim.export(scene, tmp_path / "out.glb")
+    out = next(iter(trimesh.load(tmp_path / "out.glb", process=False).geometry.values())).visual.material
+    if mapped:
+        assert (out.roughnessFactor or 1.0, out.metallicFactor or 1.0) == (1.0, 1.0)
+        for image, wanted, channels in (
+            (out.metallicRoughnessTexture, gloss, [1, 2]),
+            (out.normalTexture, bumps, [0, 1, 2]),
+        ):
+            seen = np.asarray(image.convert("RGB").resize(wanted.size, Image.Resampling.NEAREST))
+            np.testing.assert_allclose(seen[..., channels].astype(int), np.asarray(wanted)[..., channels], atol=1)
+    else:
+        assert (out.roughnessFactor, out.metallicFactor) == pytest.approx((0.2, 0.6), abs=0.003)
+        assert out.normalTexture is None and out.metallicRoughnessTexture is None
