@@ -8,7 +8,7 @@ import pytest
 
 from sdfsim import Rollout, Scene, SdfsimError, Simulator, load_scene
 from sdfsim.apps.observed import load_recordings
-from sdfsim.apps.play import Film, opened
+from sdfsim.apps.play import opened, show
 from sdfsim.apps.play import play as play_page
 from sdfsim.apps.play.session import Session
 from sdfsim.apps.run import read_run
@@ -423,14 +423,15 @@ def test_a_mesh_a_shape_a_room_and_a_robot_are_opened(tmp_path):
         opened(tmp_path)
 
 
-def test_a_film_passes_from_its_start_to_its_end(tmp_path):
+def test_a_run_is_shown_in_a_page_of_its_own(tmp_path, monkeypatch):
+    opened_pages = []
+    monkeypatch.setattr("webbrowser.open", opened_pages.append)
     scene = tabletop().load()
-    rollout = Simulator(scene).run(seconds=0.4)
-    film = Film(scene, rollout)
-    film.seek(0.2)
-    np.testing.assert_allclose(film.frame.position[0], rollout.position[0, 0])
-    k = int(np.argmin(np.abs(rollout.time - 0.2)))
-    np.testing.assert_allclose(film.frame.position[3], rollout.position[k, 3], atol=0.02)
+    show(Simulator(scene).run(seconds=0.1), scene)
+    (page,) = opened_pages
+    assert "__VISER_EMBED_DATA__" in Path(page.removeprefix("file://")).read_text()
+    with pytest.raises(SdfsimError, match="does not hold its scene"):
+        show(Simulator(scene).run(seconds=0.1))
 
 
 @pytest.mark.slow

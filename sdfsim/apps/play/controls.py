@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.apps.play.page import Batch, Page
+from sdfsim.apps.page import Batch, Page
 from sdfsim.apps.play.session import Session
 from sdfsim.apps.recording import framed, is_infinite
 from sdfsim.base.errors import SdfsimError
