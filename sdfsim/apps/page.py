@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -185,7 +186,7 @@ class Page(Drawing):
 
     def __init__(self, shown: Shown, port: int | None = None) -> None:
         self.shown, self._closed = shown, False
-        self.sent: deque[float] = deque(maxlen=1000)  # when poses were sent, s
+        self._todo: deque[Callable[[], Any]] = deque()
         self._each: list[tuple[float, Callable[[], None]]] = []  # period s, and what is done so often
         super().__init__(shown.frame.scene, port)
 
@@ -206,35 +207,48 @@ class Page(Drawing):
         """Do something again and again between poses."""
         self._each.append((seconds, work))
 
+    def later(self, work: Callable[[], Any]) -> None:
+        """Do something once between poses."""
+        self._todo.append(work)
+        with self.shown.changed:
+            self.shown.changed.notify_all()
+
+    def soon(self, act: Callable[[Any], Any]) -> Callable[[Any], None]:
+        """A callback that does `act(event)` between poses."""
+        return lambda event: self.later(lambda: act(event))
+
     def _send(self) -> None:
         number, due = -1, [0.0] * len(self._each)
         while not self._closed:
             with self.shown.changed:
-                if self.shown.frame.number == number and not self._closed:
+                if self.shown.frame.number == number and not (self._closed or self._todo):
                     self.shown.changed.wait(timeout=0.1)
             frame, began = self.shown.frame, time.perf_counter()
-            if frame.number != number:
-                number = frame.number
-                with self.server.atomic():
-                    if frame.scene is not self.scene:
-                        self.draw(frame.scene)
-                    for batch in self.batches.values():
-                        batch.place(frame.position, frame.orientation)
-                    self.followed(frame)
-                self.server.flush()
-                self.after(frame)
-                self.sent.append(time.perf_counter())
-            for k, (period, work) in enumerate(self._each):
-                if began >= due[k]:
-                    due[k] = began + period
-                    work()
+            try:
+                if frame.number != number:
+                    number = frame.number
+                    self._follow(frame)
+                while self._todo:
+                    self._todo.popleft()()
+                for k, (period, work) in enumerate(self._each):
+                    if began >= due[k]:
+                        due[k] = began + period
+                        work()
+            except Exception:  # a bug, which must not end the page
+                traceback.print_exc()
             time.sleep(max(0.0, began + 1.0 / RATE - time.perf_counter()))
+
+    def _follow(self, frame: Any) -> None:
+        with self.server.atomic():
+            if frame.scene is not self.scene:
+                self.draw(frame.scene)
+            for batch in self.batches.values():
+                batch.place(frame.position, frame.orientation)
+            self.followed(frame)
+        self.server.flush()
 
     def followed(self, frame: Any) -> None:
         """Called with each frame that is sent, before it is."""
-
-    def after(self, frame: Any) -> None:
-        """Called with each frame after it was sent."""
 
 
 def drawable(mesh: Mesh) -> Mesh:
