@@ -217,6 +217,16 @@ class Page(Drawing):
         """A callback that does `act(event)` between poses."""
         return lambda event: self.later(lambda: act(event))
 
+    def given(self, act: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """A callback that does `act(value)` between poses, with what a person has given an element of the panel."""
+
+        async def queue(event: Any) -> None:  # async: at once, before the page changes the value
+            value = event.target.value
+            if event.client is not None:  # else the page itself has set it
+                self.later(lambda: act(value))
+
+        return queue
+
     def _send(self) -> None:
         number, due = -1, [0.0] * len(self._each)
         while not self._closed:

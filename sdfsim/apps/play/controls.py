@@ -49,7 +49,6 @@ class Controls(Page):
         self.session, self.picked, self.spot = session, "", framed(session.simulator.scene)[0]
         self._uploads = tempfile.TemporaryDirectory(prefix="sdfsim-play-")
         self._over: Any = None  # the frame that follows the picked body
-        self._fields: dict[str, Any] = {}  # numbers of the picked body
         super().__init__(session, port)
         self.acts = self._acts()
         for modifier, act in ((None, self._clicked), ("shift", self._throw), ("cmd/ctrl", self._push)):
@@ -118,11 +117,14 @@ class Controls(Page):
         def now(command: Callable[..., Any], *given: Any) -> Callable[..., Any]:
             return lambda *_: self.do(command, *given)
 
+        def returned(command: Callable[..., Any], *given: Any) -> Callable[..., Any]:
+            return lambda *_: (self.do(command, *given), self._show_picked())
+
         return {
             "Play / Pause": ("space", lambda *_: self.do(session.pause, paused=session.playing)),
             "Step": ("N", now(session.one_step)),
-            "Reset": ("0", now(session.reset)),
-            "Back 1 s": ("B", now(session.back, 1.0)),
+            "Reset": ("0", returned(session.reset)),
+            "Back 1 s": ("B", returned(session.back, 1.0)),
             "Slower": ("", lambda *_: self.do(session.set_speed, 0.5 * session.speed)),
             "Real time": ("", now(session.set_speed, 1.0)),
             "Faster": ("", lambda *_: self.do(session.set_speed, 2.0 * session.speed)),
@@ -136,8 +138,7 @@ class Controls(Page):
         }
 
     def _buttons(self, label: str, *names: str) -> None:
-        act = self.soon(lambda event: self.acts[event.target.value][1]())
-        self.server.gui.add_button_group(label, names).on_click(act)
+        self.server.gui.add_button_group(label, names).on_click(self.given(lambda name: self.acts[name][1]()))
 
     def _pick(self, name: str, spot: np.ndarray) -> None:
         self.spot = spot
@@ -153,7 +154,7 @@ class Controls(Page):
         self._buttons("Time", "Play / Pause", "Step", "Reset")
         self._buttons("Speed", "Slower", "Real time", "Faster")
         self._past = gui.add_slider("Back, s", 0.0, MINUTE, 0.1, 0.0, hint="of the last minute; pauses")
-        self._past.on_update(self.soon(self._go_back))
+        self._past.on_update(self.given(self._go_back))
         self._went = 0.0  # the time from which the slider counts
         tabs = gui.add_tab_group()
         with tabs.add_tab("Body"):
@@ -170,17 +171,16 @@ class Controls(Page):
             self._with = {name: gui.add_checkbox(name, False) for name in SHOWN}
             self._height = gui.add_slider("Slice at", 0.0, 1.0, 0.02, 0.5)
             for one in (*self._with.values(), self._height):
-                one.on_update(self.soon(lambda _: self._overlays()))
+                one.on_update(self.given(lambda _: self._overlays()))
         with tabs.add_tab("Help"):
             gui.add_markdown(HELP)
 
-    def _go_back(self, event: Any) -> None:
-        if event.client is None:  # the page itself has set it
-            return
+    def _go_back(self, seconds: float) -> None:
         if self.session.playing:
             self.do(self.session.pause)
             self._went = self.session.frame.time
-        self.do(lambda: self.session.back(self.session.now + event.target.value - self._went))
+        self.do(lambda: self.session.back(self.session.now + seconds - self._went))
+        self._show_picked()
 
     def draw(self, scene: Scene) -> None:
         super().draw(scene)
@@ -192,20 +192,18 @@ class Controls(Page):
         gui, session, name = self.server.gui, self.session, self.picked
         for child in list(self._body._children.values()):
             child.remove()
-        self._body.label = name or "Click a body"
+        found = self.do(session.facts, name) if name else None
+        self._body.label = name if found else "Click a body"
         self._overlays()
-        if not name:
+        if not found:
             return
-        moves = session.movable(name)
         with self._body:
-            self._facts, self._fields = gui.add_markdown(""), {}
-            for what, (label, low, high, step) in NUMBERS.items():
-                if moves or what != "mass":
-                    field = gui.add_number(label, session.number(name, what), min=low, max=high, step=step)
-                    act = self.soon(lambda event, what=what: self.do(session.set, name, what, event.target.value))
-                    field.on_update(act)
-                    self._fields[what] = field
-            if moves:
+            self._facts = gui.add_markdown(found[0])
+            for what, value in found[1].items():
+                label, low, high, step = NUMBERS[what]
+                field = gui.add_number(label, value, min=low, max=high, step=step)
+                field.on_update(self.given(lambda value, what=what: self.do(session.set, name, what, value)))
+            if "mass" in found[1]:
                 self._buttons("", "Hold", "Copy", "Delete")
 
     def _joints(self) -> None:
@@ -225,8 +223,8 @@ class Controls(Page):
             slider = self.server.gui.add_slider(
                 f"{joint.name}, {what}", low, high, (high - low) / 500.0, min(max(aim, low), high)
             )
-            slider.on_update(self.soon(
-                lambda event, name=joint.name, unit=unit: self.do(self.session.target, name, event.target.value / unit)
+            slider.on_update(self.given(
+                lambda value, name=joint.name, unit=unit: self.do(self.session.target, name, value / unit)
             ))  # fmt: skip
 
     def _adding(self) -> None:
@@ -323,10 +321,9 @@ class Controls(Page):
         if points:
             places = np.array([contact.point for contact in found]).reshape(-1, 3)
             self.server.scene.add_point_cloud("/contacts", places, POINT, point_size=2 * size, point_shape="circle")
-        if forces and self.session.movable(self.picked):
+        if forces and self.picked and (long := self.do(self.session.metres_per_newton, self.picked)) is not None:
             mine = [(c.point, c.force if c.first == self.picked else -c.force) for c in found
                     if self.picked in (c.first, c.second)]  # fmt: skip
-            long = self.session.size(self.picked) / self.session.weight(self.picked)
             arrows = np.array([(at, at + long * force) for at, force in mine]).reshape(-1, 2, 3)
             self.server.scene.add_arrows("/forces", arrows, ARROW, shaft_radius=size, head_radius=2.5 * size,
                                          head_length=5 * size)  # fmt: skip
@@ -342,10 +339,9 @@ class Controls(Page):
         if session.playing:
             _update(self._past, "value", 0.0)
         if self.picked:
-            facts, numbers = self.do(session.facts, self.picked) or ("", {})
-            _update(self._facts, "content", facts)
-            for what, field in self._fields.items():
-                _update(field, "value", numbers.get(what, field.value))
+            found = self.do(session.facts, self.picked)
+            if found:
+                _update(self._facts, "content", found[0])
 
 
 def _update(handle: Any, what: str, value: Any) -> None:

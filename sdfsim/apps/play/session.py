@@ -299,9 +299,6 @@ class Session:
 
     # --- hands ---
 
-    def movable(self, name: str) -> bool:
-        return any(body.name == name and body.motion == "dynamic" for body in self.simulator.scene.bodies)
-
     def grab(self, name: str, point: Any, target: Any = None) -> None:
         """Take a dynamic body at a point [3] m, world, and pull this point to `target`."""
         self._need_movable(name)
@@ -477,25 +474,24 @@ class Session:
         return next(body for body in self.simulator.scene.bodies if body.name == name)
 
     def _need_movable(self, name: str) -> None:
-        if not self.movable(name):
-            raise SdfsimError(f"body {name!r}: is {self._body(name).motion}, so it cannot be moved")
+        if (motion := self._body(name).motion) != "dynamic":
+            raise SdfsimError(f"body {name!r}: is {motion}, so it cannot be moved")
 
-    def weight(self, name: str) -> float:
-        """N, of a body."""
-        return self._body(name).mass * self._strength
-
-    def number(self, name: str, what: str) -> float:
-        """The mass, friction or restitution of a body, to six digits."""
-        return float(f"{getattr(self._body(name), what):.6g}")
+    def metres_per_newton(self, name: str) -> float | None:
+        """The length of an arrow: as long as the body is its weight. None for a body that does not move."""
+        body = self._body(name)
+        return self.size(name) / (body.mass * self._strength) if body.motion == "dynamic" else None
 
     def facts(self, name: str) -> tuple[str, dict[str, float]]:
-        """A line about where a body is and how it moves, and its numbers."""
-        body, numbers = self.simulator[name], ("mass", "friction", "restitution")
+        """A line about where a body is and how it moves; and its mass, if it has one, friction and restitution, to six
+        digits."""
+        body, known = self.simulator[name], self._body(name)
         state = f"{float(np.linalg.norm(body.velocity)):.3g} m/s"
         state = "asleep" if body.asleep else "held" if name in self.hands else state
         spin = float(np.degrees(np.linalg.norm(body.angular_velocity)))
         line = "at ({:.3f}, {:.3f}, {:.3f}) m · ".format(*body.centre) + f"{state} · {spin:.3g} deg/s"
-        return line, {what: self.number(name, what) for what in numbers}
+        which = (*(["mass"] if known.motion == "dynamic" else []), "friction", "restitution")
+        return line, {what: float(f"{getattr(known, what):.6g}") for what in which}
 
     def size(self, name: str) -> float:
         """m, the longest side of a body."""
