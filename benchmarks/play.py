@@ -26,7 +26,6 @@ import numpy as np
 from benchmarks.records import ROOT, write_record
 from sdfsim import Scene, play
 from sdfsim.apps.play import Playing
-from sdfsim.apps.recording import framed
 from sdfsim.base.errors import SdfsimError
 
 SAMPLES = ("knocked_vase", "ragdoll")
@@ -167,7 +166,7 @@ def at_random(playing: Playing, client: Client, rng: np.random.Generator) -> Non
     """Do one thing by chance."""
     session = playing.session
     frame = session.frame
-    centre, radius = framed(frame.scene)
+    centre, radius = session.middle, session.wide
     rows = [k for k, body in enumerate(frame.scene.bodies) if body.motion == "dynamic"]
     if not rows:
         client.send("CommandTriggerMessage", uuid=client.keys[2])  # reset

@@ -11,7 +11,7 @@ import numpy as np
 
 from sdfsim.apps.page import Batch, Page
 from sdfsim.apps.play.session import MINUTE, Session
-from sdfsim.apps.recording import framed, is_infinite
+from sdfsim.apps.recording import is_infinite
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.physics import pose
@@ -46,7 +46,7 @@ class Controls(Page):
     """
 
     def __init__(self, session: Session, port: int | None = None) -> None:
-        self.session, self.picked, self.spot = session, "", framed(session.simulator.scene)[0]
+        self.session, self.picked, self.spot = session, "", session.middle
         self._uploads = tempfile.TemporaryDirectory(prefix="sdfsim-play-")
         self._over: Any = None  # the frame that follows the picked body
         super().__init__(session, port)
@@ -228,7 +228,7 @@ class Controls(Page):
             ))  # fmt: skip
 
     def _adding(self) -> None:
-        gui, size = self.server.gui, float(f"{0.15 * framed(self.session.simulator.scene)[1]:.2g}")
+        gui, size = self.server.gui, float(f"{0.15 * self.session.wide:.2g}")
         folders = {folder.name: folder for folder in sorted((sample_folder() / "shapes").glob("*/"))}
         kinds = gui.add_dropdown("Shape", ("box", "sphere", "cylinder", "capsule", *folders))
         wide = gui.add_number("Size, m", size, min=1e-4, step=float(f"{size / 10:.1g}"))
@@ -317,7 +317,7 @@ class Controls(Page):
         if not (points or forces) or not simulator.stepper.forces:
             return
         found = self.do(simulator.contact_points)[:MOST_POINTS]
-        size = 0.003 * framed(simulator.scene)[1]
+        size = 0.003 * self.session.wide
         if points:
             places = np.array([contact.point for contact in found]).reshape(-1, 3)
             self.server.scene.add_point_cloud("/contacts", places, POINT, point_size=2 * size, point_shape="circle")

@@ -69,6 +69,7 @@ class Session:
         playing, speed: whether time passes, and how fast relative to real time.
         ratio: simulated time over real time, in the last half second.
         broken: lines about broken laws and errors, with the time, the latest last.
+        middle, wide: centre [3] m and radius m of a ball around the scene at its start.
         frame: what is to be shown now. `changed` is notified with each.
     """
 
@@ -87,6 +88,7 @@ class Session:
         self._pulled: dict[str, float] = {}  # body -> when it was pulled last, s
         self._recorder = ExitStack()
         self._start = simulator.snapshot()
+        self.middle, self.wide = framed(simulator.scene)  # of the start: balls that were thrown fly far
         self._kept: deque[tuple[float, Snapshot, int]] = deque()  # time, snapshot, bytes
         self._passed: deque[tuple[float, float]] = deque()  # real and simulated time
         self._casters: dict[int, tuple[Shape, Caster]] = {}  # by the id of the shape, which is kept with it
@@ -305,6 +307,8 @@ class Session:
         body, known = self.simulator[name], self.hands.get(name)
         grip = pose.rotate(pose.conjugate(body.quat_xyzw), np.asarray(point, float) - body.centre)
         aim = np.asarray(point if target is None else target, float)
+        shape, scale = self.simulator.scene.shapes[self._body(name).shape], self._body(name).scale
+        grip = np.clip(grip, *(shape.sdf.bounds - shape.com) * scale)  # what is seen of a fast body is behind it
         self.hands[name] = Hand(name, grip, aim, None if known is None else known.turn, known is not None)
 
     def drag(self, name: str, target: Any) -> None:
@@ -351,7 +355,7 @@ class Session:
     def throw(self, origin: Any, direction: Any) -> str:
         """Throw a ball from `origin` [3] m so that it hits what is seen along `direction` [3]. Returns its name."""
         origin, along = np.asarray(origin, float), np.asarray(direction, float) / np.linalg.norm(direction)
-        (shape, body), (_, wide) = self._ball, framed(self.simulator.scene)
+        (shape, body), wide = self._ball, self.wide
         radius = 0.5 * largest_extent(shape)
         hit = self.seen(origin, along)
         aim = origin + along * (3.0 * wide if hit is None else hit[1])
@@ -507,7 +511,7 @@ class Session:
         """A ball to throw: not smaller than the smallest body, so that it does not change the step."""
         scene = self.simulator.scene
         sizes = [self.size(body.name) for body in scene.bodies if body.motion == "dynamic"]
-        return _alone(sphere={"radius": max(BALL * framed(scene)[1], 0.5 * min(sizes, default=0.0))})
+        return _alone(sphere={"radius": max(BALL * self.wide, 0.5 * min(sizes, default=0.0))})
 
 
 def _alone(**keys: Any) -> tuple[Shape, Body]:
