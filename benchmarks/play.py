@@ -68,6 +68,7 @@ class Client:
         from msgspec import msgpack
 
         for data in self._socket:
+            assert isinstance(data, bytes)
             end = 16 + int.from_bytes(data[8:16], "little")
             inner = zstandard.ZstdDecompressor().decompress(data[16:end], int.from_bytes(data[:8], "little"))
             for message in msgpack.decode(inner)["messages"]:

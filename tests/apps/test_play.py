@@ -409,14 +409,14 @@ def test_a_mesh_a_shape_a_room_and_a_robot_are_opened(tmp_path):
     ends = '<parent link="base"/><child link="tip"/><origin xyz="0 0 0.4"/>'
     joint = f'<joint name="hinge" type="revolute">{ends}{limit}</joint>'
     robot.write_text(f'<robot name="r">{link.format("base")}{link.format("tip")}{joint}</robot>')
-    scene = opened(robot)
-    session = Session(Simulator(scene))
+    session = Session(Simulator(opened(robot)))
+    scene = session.simulator.scene
     session.grab("tip", session.simulator["tip"].centre, (0.3, 0, 0.5))
     after(session, 0.2)
     assert [joint.name for joint in scene.joints] == ["hinge"]
     (tmp_path / "room").mkdir()
     session.save_scene(tmp_path / "room")
-    assert [body.name for body in opened(tmp_path / "room").bodies] == [body.name for body in scene.bodies]
+    assert [body.name for body in Simulator(opened(tmp_path / "room")).scene.bodies] == [body.name for body in scene.bodies]
     with pytest.raises(SdfsimError, match="neither a room"):
         opened(tmp_path)
 

@@ -84,7 +84,7 @@ def test_one_drags_throws_sets_resets_and_uploads(tmp_path):
         for k in range(30):
             browser.move(x - 10 * k, y, down=True)
         soon(lambda: "vase" in session.hands and vase.centre[2] > 0.55, lambda: f"the vase is at {vase.centre}")
-        soon(lambda: np.linalg.norm(vase.centre[:2]) > 0.6, lambda: f"the vase is still at {vase.centre}")
+        soon(lambda: bool(np.linalg.norm(vase.centre[:2]) > 0.6), lambda: f"the vase is still at {vase.centre}")
         browser.press(x - 290, y, down=False)
         soon(lambda: vase.centre[2] < 0.4 and not session.hands, lambda: f"the vase is still at {vase.centre}")
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sdfsim.apps.export import plain_names
-from sdfsim.apps.page import Page, film
+from sdfsim.apps.page import film
+from sdfsim.apps.play.controls import Controls
 from sdfsim.apps.play.session import Session
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
@@ -35,7 +36,7 @@ class Playing:
         page: the page.
     """
 
-    def __init__(self, session: Session, page: Page) -> None:
+    def __init__(self, session: Session, page: Controls) -> None:
         self.session, self.page, self.address = session, page, page.address
         session.begin()
         page.begin()
@@ -83,8 +84,6 @@ def play(
 
     Raises SdfsimError if the source cannot be read or simulated.
     """
-    from sdfsim.apps.play.controls import Controls
-
     if not isinstance(source, Simulator):
         if isinstance(source, str | Path):
             source = opened(source, allow_outside=allow_outside, on_progress=on_progress)
