@@ -416,7 +416,9 @@ def test_a_mesh_a_shape_a_room_and_a_robot_are_opened(tmp_path):
     assert [joint.name for joint in scene.joints] == ["hinge"]
     (tmp_path / "room").mkdir()
     session.save_scene(tmp_path / "room")
-    assert [body.name for body in Simulator(opened(tmp_path / "room")).scene.bodies] == [body.name for body in scene.bodies]
+    assert [body.name for body in Simulator(opened(tmp_path / "room")).scene.bodies] == [
+        body.name for body in scene.bodies
+    ]
     with pytest.raises(SdfsimError, match="neither a room"):
         opened(tmp_path)
 
