@@ -31,7 +31,6 @@ from sdfsim.base.errors import SdfsimError
 SAMPLES = ("knocked_vase", "ragdoll")
 PAUSE = 0.03  # s between two messages of a drag
 MANY = 24  # bodies, above which chance adds no more
-GROWTH = 40.0  # MiB that the process may grow from its fourth minute on: snapshots of the last minute vary
 OBJ = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
@@ -234,7 +233,7 @@ def chance(source: str, seconds: float, rng: np.random.Generator) -> dict[str, A
                         looked = now
                         recent = session.call(session.seen_since, session.frame.time - 2.0)
                         time.sleep(4.0)  # the page looks, too
-                        unsaid += session.look(*recent, seconds=np.inf)
+                        unsaid += session.look(*recent, seconds=5.0)
                         print(f"{source}: {now:.0f} s, {counts} acts, {memory():.0f} MiB, {session.broken[-1:]}",
                               unsaid[-1:], errors.getvalue()[-300:], file=sys.stdout, flush=True)  # fmt: skip
                         if int(now) // 60 > len(sizes):
