@@ -3,9 +3,9 @@
     python -m benchmarks play [--minutes 10] [--seed 0] [--large FOLDER]
 
 A drag's time is from the message's leaving to the pose that it led to being sent. In the random part, clicks, drags,
-throws, keys and the whole panel are used in two samples by turns: no error may be printed, the process must not grow
-from its fourth minute on, and each law that is broken must be on the page. Bodies in `--large` are those of
-`samples/large.py heaps`; without it this row is left out.
+throws, keys and the whole panel are used in two samples by turns: the record counts errors that were printed, MiB of
+the process, and broken laws that were on the page and that were not. `--large` is the scene.yaml of `samples/large.py
+heaps`; without it this row is left out.
 """
 
 from __future__ import annotations
