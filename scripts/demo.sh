@@ -23,9 +23,10 @@ picture="$out/rollout/rollout.png"
 cat <<TEXT
 
 A picture of it:          $picture
+Play with it:             $sdfsim play $out/scene
+a page to send:           $sdfsim export $out/rollout -o run.html
 a movie of it:            $sdfsim render $out/rollout -o movie.mp4
-Watch it:                 $sdfsim view $out/rollout
-in the browser:           $sdfsim view $out/rollout --web
+Watch it with plots:      $sdfsim view $out/rollout --web
 cameras and surface:      $sdfsim view $out/scene/reconstruction.rrd
 by the graph network:     $sdfsim simulate $out/scene/knock.yaml --model gnn -o $out/gnn
 TEXT

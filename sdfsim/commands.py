@@ -210,7 +210,9 @@ def export(
     source: Annotated[Path, typer.Argument(help="Run folder, rollout.npz, scene.yaml or Shape folder.")],
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", metavar="FILE", help="Ends in .glb .usd .usda .usdc .xml .mjcf .urdf or .csv."),
+        typer.Option(
+            "-o", "--out", metavar="FILE", help="Ends in .html .glb .usd .usda .usdc .xml .mjcf .urdf or .csv."
+        ),
     ],
     scene: OfRun = None,
     fps: Annotated[float | None, typer.Option(help="Frames of the motion in a second (default: every step).")] = None,

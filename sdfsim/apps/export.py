@@ -31,6 +31,7 @@ from sdfsim.base.parallel import StageProgress, of_stage, silent_stages
 from sdfsim.geometry.gltf import GltfWriter, light
 from sdfsim.geometry.mesh import Mesh, convex_hull, far_middle
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, wavefront
+from sdfsim.physics import pose
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.collision_filter import contact_groups
@@ -873,10 +874,29 @@ def _csv(take: Take, out: Path, on_progress: StageProgress) -> Written:
     return [out], ["everything but poses"]
 
 
+# --- a page ---
+
+
+def _html(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    """A page that plays the motion by itself. Poses are relative to a place near the scene, as viser draws in single
+    precision, and of centres of mass."""
+    from sdfsim.apps.page import film
+
+    middle, radius = framed(take.scene)
+    origin = np.round(far_middle(middle + radius * np.array([[-1.0], [1.0]])))
+    bodies = tuple(replace(body, position=body.position - origin) for body in take.scene.bodies)
+    com = np.array([body.scale * take.scene.shapes[body.shape].com for body in bodies])
+    place = take.position - origin + pose.rotate(take.quat_xyzw, com)
+    made = film(replace(take.scene, bodies=bodies), take.names, take.time, place, take.quat_xyzw)
+    write_text(out, made.as_html())
+    return [out], ["everything that is not visible, and frames between those of the run"]
+
+
 FORMATS: dict[str, Callable[[Take, Path, StageProgress], Written]] = {
     ".glb": _glb,
     **dict.fromkeys((".usd", ".usda", ".usdc"), _usd),
     **dict.fromkeys((".xml", ".mjcf"), _mjcf),
     ".urdf": _urdf,
     ".csv": _csv,
+    ".html": _html,
 }

@@ -80,6 +80,12 @@ class Browser:
         self._call("Page.navigate", url=address)
         self.wait("document.readyState === 'complete'")
 
+    def offline(self) -> None:
+        """From now on, without a network."""
+        self._call("Network.enable")
+        off = {"latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+        self._call("Network.emulateNetworkConditions", offline=True, **off)
+
     def wait(self, what: str, seconds: float = 60.0) -> None:
         """Until an expression holds in the page."""
         end = time.monotonic() + seconds

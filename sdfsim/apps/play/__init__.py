@@ -4,17 +4,14 @@ over."""
 from __future__ import annotations
 
 import tempfile
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sdfsim.apps.beside import between
-from sdfsim.apps.play.page import Page
-from sdfsim.apps.play.session import BEHIND, Frame, Session
+from sdfsim.apps.export import plain_names
+from sdfsim.apps.page import film
+from sdfsim.apps.play.controls import Controls
+from sdfsim.apps.play.session import Session
 from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import StageProgress, of_stage, silent_stages
@@ -27,7 +24,7 @@ from sdfsim.shape.shape import RECORD_FILE
 from sdfsim.simulate.simulator import Simulator
 
 ROBOTS = (".urdf", ".xml", ".mjcf")
-FPS = 60.0
+HEIGHT = 600  # px, in a notebook
 
 
 class Playing:
@@ -35,11 +32,11 @@ class Playing:
 
     Attributes:
         address: of the page, on this machine.
-        session: what is played (`Session`), or the `Film` that is shown.
+        session: what is played.
         page: the page.
     """
 
-    def __init__(self, session: Session | Film, page: Page) -> None:
+    def __init__(self, session: Session, page: Controls) -> None:
         self.session, self.page, self.address = session, page, page.address
         session.begin()
         page.begin()
@@ -47,8 +44,6 @@ class Playing:
     @property
     def simulator(self) -> Simulator:
         """The simulator that is played with. Use it in `session.call(...)`, or in the callback of each step."""
-        if isinstance(self.session, Film):
-            raise SdfsimError("a run that is over has no simulator", "use sdfsim.play")
         return self.session.simulator
 
     def close(self) -> None:
@@ -63,7 +58,7 @@ class Playing:
         self.close()
 
     def _repr_html_(self) -> str:
-        return f'<iframe src="{self.address}" width="100%" height="600" style="border:0"></iframe>'
+        return f'<iframe src="{self.address}" width="100%" height="{HEIGHT}" style="border:0"></iframe>'
 
 
 def play(
@@ -89,8 +84,6 @@ def play(
 
     Raises SdfsimError if the source cannot be read or simulated.
     """
-    from sdfsim.apps.play.controls import Controls
-
     if not isinstance(source, Simulator):
         if isinstance(source, str | Path):
             source = opened(source, allow_outside=allow_outside, on_progress=on_progress)
@@ -103,11 +96,10 @@ def play(
     return Playing(session, Controls(session, port))
 
 
-def show(
-    rollout: Rollout | Path | str, scene: Scene | SceneBuilder | Path | str | None = None, *, port: int | None = None
-) -> Playing:
-    """Open a page that shows a run: a rollout and its scene, or a run folder, whose scene is known. Returns as `play`
-    does. Raises SdfsimError if there is no run, or no scene."""
+def show(rollout: Rollout | Path | str, scene: Scene | SceneBuilder | Path | str | None = None) -> None:
+    """Open a page that plays a run: a rollout and its scene, or a run folder, whose scene is known. It appears in the
+    notebook, or in the browser. `sdfsim.export(run, "run.html")` writes the same page. Raises SdfsimError if there is
+    no run, or no scene."""
     if isinstance(rollout, Rollout):
         if scene is None:
             raise SdfsimError("a rollout does not hold its scene", "sdfsim.show(rollout, scene), or a run folder")
@@ -115,63 +107,8 @@ def show(
     else:
         file = Path(scene) if isinstance(scene, str | Path) else None
         known, motion = read_run(Path(rollout), file)
-    film = Film(known, motion)
-    page = Page(film, port)
-    gui = page.server.gui
-    playing = gui.add_checkbox("Play", True)
-    playing.on_update(lambda event: setattr(film, "playing", event.target.value))
-    speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0)
-    speed.on_update(lambda event: setattr(film, "speed", event.target.value))
-    length = max(film.length, 1e-6)
-    line = gui.add_slider("Time, s", 0.0, length, length / 1000.0, 0.0)
-
-    def sought(event: Any) -> None:
-        if event.client is not None:
-            playing.value = film.playing = False
-            film.seek(event.target.value)
-
-    def moved() -> None:
-        if film.playing:
-            line.value = min(film.frame.time, length)
-
-    line.on_update(sought)
-    page.every(0.1, moved)
-    return Playing(film, page)
-
-
-class Film:
-    """A run that is over, which passes again and again."""
-
-    def __init__(self, scene: Scene, rollout: Rollout) -> None:
-        self._scene, self._rollout = scene, rollout
-        self.playing, self.speed, self._closed = True, 1.0, False
-        self.length = float(rollout.time[-1] - rollout.time[0])
-        self.changed, self._number = threading.Condition(), 0
-        self.seek(0.0)
-
-    def seek(self, seconds: float) -> None:
-        """Show the moment `seconds` after the first frame."""
-        r, when = self._rollout, np.array([self._rollout.time[0] + seconds])
-        place, turn = between(r.time, r.position, r.orientation, when)
-        self._number += 1
-        with self.changed:
-            self.frame = Frame(self._number, self._scene, seconds, place[0], turn[0], time.perf_counter())
-            self.changed.notify_all()
-
-    def begin(self) -> None:
-        self._thread = threading.Thread(target=self._run, daemon=True, name="play film")
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._closed:
-            time.sleep(1.0 / FPS)
-            if self.playing:
-                later = self.frame.time + self.speed / FPS
-                self.seek(later if later <= self.length + BEHIND * 10 else 0.0)
-
-    def close(self) -> None:
-        self._closed = True
-        self._thread.join(timeout=5.0)
+    names = plain_names([body.name for body in known.bodies])
+    film(known, names, motion.time, motion.position, motion.orientation).show(height=HEIGHT)
 
 
 def opened(

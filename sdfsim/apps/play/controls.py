@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import tempfile
-import time
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sdfsim.apps.play.page import Batch, Page
-from sdfsim.apps.play.session import Session
-from sdfsim.apps.recording import framed, is_infinite
+from sdfsim.apps.page import Batch, Page
+from sdfsim.apps.play.session import MINUTE, Session
+from sdfsim.apps.recording import is_infinite
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.physics import pose
 from sdfsim.scene.bundled import sample_folder
+from sdfsim.scene.scene import Scene
 from sdfsim.scene.schema import UNITS
 from sdfsim.shape.shape import own_pieces
 
@@ -27,6 +25,12 @@ ANGLE = np.radians(15.0)  # that a key turns a body by
 SLICE = 96  # px of a picture of the SDF
 MOST_POINTS = 3000  # contact points that are shown
 MOST_PIECES = 64
+NUMBERS = {
+    "mass": ("mass, kg", 1e-6, 1e9, 1e-6),
+    "friction": ("friction", 0.0, 1000.0, 0.01),
+    "restitution": ("restitution", 0.0, 1.0, 0.01),
+}  # label, smallest, largest, step
+SHOWN = ("Contact points", "Forces on the body", "Nodes of the body", "Pieces of the body", "Slice of its SDF")
 
 HELP = """**Drag** a body by any point. **Click** selects, **Shift** + click throws a ball there, **Ctrl** + click
 pushes. Drag the background to turn the view, with the right button to move it.
@@ -36,18 +40,23 @@ Keys: **Space** pause · **N** one step · **0** reset · **B** back 1 s · **Z 
 
 
 class Controls(Page):
-    """The page of a session. `picked` is the name of the body that was clicked last."""
+    """The page of a session. `picked` is the name of the body that was clicked last, and `spot` [3] m where.
+
+    What a person does on the page is done in the page's thread, between two poses: other threads only queue it.
+    """
 
     def __init__(self, session: Session, port: int | None = None) -> None:
-        self.session, self.picked, self.spot = session, "", framed(session.simulator.scene)[0]
-        self.latencies: deque[float] = deque(maxlen=1000)  # s from a drag's message to the pose that it led to
-        self._dragged: tuple[float, float] | None = None  # when a drag came, and when it acted
+        self.session, self.picked, self.spot = session, "", session.middle
         self._uploads = tempfile.TemporaryDirectory(prefix="sdfsim-play-")
+        self._over: Any = None  # the frame that follows the picked body
         super().__init__(session, port)
-        for modifier, act in ((None, self._click), ("shift", self._throw), ("cmd/ctrl", self._push)):
-            self.server.scene.on_click(modifier=modifier)(act)
+        self.acts = self._acts()
+        for modifier, act in ((None, self._clicked), ("shift", self._throw), ("cmd/ctrl", self._push)):
+            self.server.scene.on_click(modifier=modifier)(self.soon(act))
+        for label, (key, act) in self.acts.items():
+            if key:
+                self.server.gui.add_command(label, hotkey=key).on_trigger(self.soon(act))
         self._panel()
-        self._keys()
         self.every(0.2, self._refresh)
         self.every(0.1, self._mark)
 
@@ -55,8 +64,9 @@ class Controls(Page):
         super().close()
         self._uploads.cleanup()
 
-    def tell(self, text: str) -> None:
+    def tell(self, error: SdfsimError | str) -> None:
         """A short notice on the page."""
+        text = error if isinstance(error, str) else ". ".join(filter(None, (error.message, error.hint)))
         for client in self.server.get_clients().values():
             client.add_notification("sdfsim", text, auto_close_seconds=8.0)
 
@@ -65,50 +75,70 @@ class Controls(Page):
         try:
             return self.session.call(lambda: command(*given, **named))
         except SdfsimError as error:
-            self.tell(f"{error.message}. {error.hint}" if error.hint else error.message)
+            self.tell(error)
 
     # --- mouse and keys ---
 
     def draggable(self, batch: Batch) -> None:
         async def drag(event: Any) -> None:  # async: phases come in their order
-            name, came = batch.names[event.instance_index or 0], time.perf_counter()
+            name, session = batch.names[event.instance_index or 0], self.session
             if event.phase == "start":
-                self.session.post(self.session.grab, name, event.start_position, event.end_position)
-                self._pick(name, np.array(event.start_position))
+                session.post(session.grab, name, event.start_position, event.end_position)
+                self.later(lambda: self._pick(name, np.array(event.start_position)))
             elif event.phase == "end":
-                self.session.post(self.session.release, name)
+                session.post(session.release, name)
             else:
-                self._note(self.session.post(self.session.drag, name, event.end_position), came)
+                session.post(session.drag, name, event.end_position)
 
         batch.handle.on_drag("left")(drag)
 
-    def _note(self, done: Future, came: float) -> None:
-        def acted(_: Future) -> None:
-            if self._dragged is None:
-                self._dragged = came, time.perf_counter()
-
-        done.add_done_callback(acted)
-
-    def after(self, frame: Any) -> None:
-        if self._dragged is not None and frame.wall > self._dragged[1]:
-            self.latencies.append(time.perf_counter() - self._dragged[0])
-            self._dragged = None
-
-    def _click(self, event: Any) -> None:
+    def _clicked(self, event: Any) -> bool:
         origin, along = np.array(event.ray_origin), np.array(event.ray_direction)
         found = self.do(self.session.seen, origin, along)
         if found is not None:
             self._pick(found[0], origin + found[1] * along)
+        return found is not None
 
     def _throw(self, event: Any) -> None:
         self.do(self.session.throw, event.ray_origin, event.ray_direction)
 
     def _push(self, event: Any) -> None:
-        origin, along = np.array(event.ray_origin), np.array(event.ray_direction)
-        found = self.do(self.session.seen, origin, along)
-        if found is not None:
-            self._pick(found[0], origin + found[1] * along)
-            self.do(self.session.push, found[0], self.spot, along)
+        if self._clicked(event):
+            self.do(self.session.push, self.picked, self.spot, event.ray_direction)
+
+    def _acts(self) -> dict[str, tuple[str, Callable[..., Any]]]:
+        """What buttons and keys do, by the names of the buttons; and the keys."""
+        session, up = self.session, self.up(self.session.simulator.scene)
+        across = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
+
+        def of_picked(command: Callable[..., Any], *more: Any) -> Callable[..., Any]:
+            return lambda *_: self.do(command, self.picked, *more) if self.picked else None
+
+        def now(command: Callable[..., Any], *given: Any) -> Callable[..., Any]:
+            return lambda *_: self.do(command, *given)
+
+        def returned(command: Callable[..., Any], *given: Any) -> Callable[..., Any]:
+            return lambda *_: (self.do(command, *given), self._show_picked())
+
+        return {
+            "Play / Pause": ("space", lambda *_: self.do(session.pause, paused=session.playing)),
+            "Step": ("N", now(session.one_step)),
+            "Reset": ("0", returned(session.reset)),
+            "Back 1 s": ("B", returned(session.back, 1.0)),
+            "Slower": ("", lambda *_: self.do(session.set_speed, 0.5 * session.speed)),
+            "Real time": ("", now(session.set_speed, 1.0)),
+            "Faster": ("", lambda *_: self.do(session.set_speed, 2.0 * session.speed)),
+            "Turn left": ("Z", of_picked(session.turn, up, ANGLE)),
+            "Turn right": ("X", of_picked(session.turn, up, -ANGLE)),
+            "Tilt": ("C", of_picked(session.turn, across, ANGLE)),
+            "Tilt back": ("V", of_picked(session.turn, across, -ANGLE)),
+            "Hold": ("H", of_picked(session.hold_or_let_go)),
+            "Copy": ("K", of_picked(session.copy)),
+            "Delete": ("delete", of_picked(session.delete)),
+        }
+
+    def _buttons(self, label: str, *names: str) -> None:
+        self.server.gui.add_button_group(label, names).on_click(self.given(lambda name: self.acts[name][1]()))
 
     def _pick(self, name: str, spot: np.ndarray) -> None:
         self.spot = spot
@@ -116,116 +146,65 @@ class Controls(Page):
             self.picked = name
             self._show_picked()
 
-    def _keys(self) -> None:
-        up = self.up(self.session.simulator.scene)
-        across = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
-
-        def of_picked(command: Callable[..., Any], *more: Any) -> Callable[[], None]:
-            return lambda: self.do(command, self.picked, *more) if self.picked else None
-
-        session = self.session
-        for key, label, act in (
-            ("space", "pause or play", self._toggle),
-            ("N", "one step", self._one_step),
-            ("0", "reset", self._reset),
-            ("B", "back 1 s", lambda: self.do(session.back, 1.0)),
-            ("Z", "turn left", of_picked(session.turn, up, ANGLE)),
-            ("X", "turn right", of_picked(session.turn, up, -ANGLE)),
-            ("C", "tilt", of_picked(session.turn, across, ANGLE)),
-            ("V", "tilt back", of_picked(session.turn, across, -ANGLE)),
-            ("H", "hold still, or let go", self._hold),
-            ("K", "copy", of_picked(session.copy)),
-            ("delete", "delete", self._delete),
-        ):
-            self.server.gui.add_command(label, hotkey=key).on_trigger(lambda _, act=act: act())
-
-    def _toggle(self) -> None:
-        self.do(self.session.pause, paused=self.session.playing)
-
-    def _faster(self, factor: float) -> None:
-        self.do(self.session.set_speed, factor * self.session.speed or 1.0)
-
-    def _one_step(self) -> None:
-        self.do(self.session.pause)
-        self.do(self.session.step)
-
-    def _reset(self) -> None:
-        self.do(self.session.reset)
-        self._show_picked()
-
-    def _hold(self) -> None:
-        if self.picked:
-            held = self.picked in self.session.hands
-            self.do(self.session.hold, self.picked, held=not held)
-
-    def _delete(self) -> None:
-        if self.picked:
-            self.do(self.session.delete, self.picked)
-            self.picked = ""
-            self._show_picked()
-
     # --- the panel ---
 
     def _panel(self) -> None:
-        gui, session = self.server.gui, self.session
+        gui, scene = self.server.gui, self.session.simulator.scene
         self._status = gui.add_markdown("")
-        acts = {
-            "Play / Pause": self._toggle, "Step": self._one_step, "Reset": self._reset,
-            "Slower": lambda: self._faster(0.5), "Real time": lambda: self._faster(0.0),
-            "Faster": lambda: self._faster(2.0),
-        }  # fmt: skip
-        for label, names in (("Time", list(acts)[:3]), ("Speed", list(acts)[3:])):
-            gui.add_button_group(label, names).on_click(lambda event: acts[event.target.value]())
-        self._past = gui.add_slider("Back, s", 0.0, 60.0, 0.1, 0.0, hint="of the last minute; pauses")
-        self._past.on_update(self._go_back)
+        self._buttons("Time", "Play / Pause", "Step", "Reset")
+        self._buttons("Speed", "Slower", "Real time", "Faster")
+        self._past = gui.add_slider("Back, s", 0.0, MINUTE, 0.1, 0.0, hint="of the last minute; pauses")
+        self._past.on_update(self.given(self._go_back))
         self._went = 0.0  # the time from which the slider counts
         tabs = gui.add_tab_group()
         with tabs.add_tab("Body"):
             self._body = gui.add_folder("Click a body")
-        if session.simulator.scene.joints:
+        if scene.joints:
             with tabs.add_tab("Joints"):
                 self._joints()
         with tabs.add_tab("Scene"):
             self._adding()
-            self._saving()
+            self._folder = gui.add_text("Folder", "played")
+            hint = "the scene as it is; the motion since its last change"
+            gui.add_button_group("Save", ("Scene", "Run"), hint=hint).on_click(self._saved)
         with tabs.add_tab("Show"):
-            self._showing()
+            self._with = {name: gui.add_checkbox(name, False) for name in SHOWN}
+            self._height = gui.add_slider("Slice at", 0.0, 1.0, 0.02, 0.5)
+            for one in (*self._with.values(), self._height):
+                one.on_update(self.given(lambda _: self._overlays()))
         with tabs.add_tab("Help"):
             gui.add_markdown(HELP)
 
-    def _go_back(self, event: Any) -> None:
-        if event.client is None:  # the page itself has set it
-            return
+    def _go_back(self, seconds: float) -> None:
         if self.session.playing:
             self.do(self.session.pause)
-            self._went = self.session.simulator.si_state().time
-        now = self.session.simulator.si_state().time
-        self.do(self.session.back, event.target.value - (self._went - now))
+            self._went = self.session.frame.time
+        self.do(lambda: self.session.back(self.session.now + seconds - self._went))
+        self._show_picked()
+
+    def draw(self, scene: Scene) -> None:
+        super().draw(scene)
+        if self.picked and self.picked not in {body.name for body in scene.bodies}:
+            self._pick("", self.spot)
 
     def _show_picked(self) -> None:
         """Fill the folder of the picked body anew."""
         gui, session, name = self.server.gui, self.session, self.picked
         for child in list(self._body._children.values()):
             child.remove()
-        bodies = [body for body in session.simulator.scene.bodies if body.name == name]
-        self._body.label = name or "Click a body"
+        found = self.do(session.facts, name) if name else None
+        self._body.label = name if found else "Click a body"
         self._overlays()
-        if not bodies:
+        if not found:
             return
         with self._body:
-            self._facts = gui.add_markdown("")
-            numbers = [("friction", 0.0, 1000.0), ("restitution", 0.0, 1.0)]
-            if bodies[0].motion == "dynamic":
-                numbers.insert(0, ("mass", 1e-6, 1e9))
-            for what, low, high in numbers:
-                value = float(f"{getattr(bodies[0], what):.6g}")
-                label = "mass, kg" if what == "mass" else what
-                field = gui.add_number(label, value, min=low, max=high, step=1e-6 if what == "mass" else 0.01)
-                field.on_update(lambda event, what=what: self.do(session.set, name, what, event.target.value))
-            if bodies[0].motion == "dynamic":
-                group = gui.add_button_group("", ("Hold", "Copy", "Delete"))
-                acts = {"Hold": self._hold, "Copy": lambda: self.do(session.copy, name), "Delete": self._delete}
-                group.on_click(lambda event: acts[event.target.value]())
+            self._facts = gui.add_markdown(found[0])
+            for what, value in found[1].items():
+                label, low, high, step = NUMBERS[what]
+                field = gui.add_number(label, value, min=low, max=high, step=step)
+                field.on_update(self.given(lambda value, what=what: self.do(session.set, name, what, value)))
+            if "mass" in found[1]:
+                self._buttons("", "Hold", "Copy", "Delete")
 
     def _joints(self) -> None:
         simulator = self.session.simulator
@@ -244,32 +223,27 @@ class Controls(Page):
             slider = self.server.gui.add_slider(
                 f"{joint.name}, {what}", low, high, (high - low) / 500.0, min(max(aim, low), high)
             )
-            slider.on_update(
-                lambda event, name=joint.name, unit=unit: self.do(self.session.target, name, event.target.value / unit)
-            )
+            slider.on_update(self.given(
+                lambda value, name=joint.name, unit=unit: self.do(self.session.target, name, value / unit)
+            ))  # fmt: skip
 
     def _adding(self) -> None:
-        gui, size = self.server.gui, 0.15 * framed(self.session.simulator.scene)[1]
-        size = float(f"{size:.2g}")
+        gui, size = self.server.gui, float(f"{0.15 * self.session.wide:.2g}")
         folders = {folder.name: folder for folder in sorted((sample_folder() / "shapes").glob("*/"))}
-        self._shape = gui.add_dropdown("Shape", ("box", "sphere", "cylinder", "capsule", *folders))
+        kinds = gui.add_dropdown("Shape", ("box", "sphere", "cylinder", "capsule", *folders))
         wide = gui.add_number("Size, m", size, min=1e-4, step=float(f"{size / 10:.1g}"))
-        add = gui.add_button("Add above the last click", icon=None)
 
         def added(_: Any) -> None:
-            kind, w = self._shape.value, float(wide.value)
+            kind, w = kinds.value, float(wide.value)
             keys: dict[str, Any] = {
                 "box": {"box": {"size": [w] * 3}}, "sphere": {"sphere": {"radius": w / 2}},
                 "cylinder": {"cylinder": {"radius": w / 4, "height": w}},
                 "capsule": {"capsule": {"radius": w / 4, "height": w}},
-            }.get(kind) or {"asset": folders[kind]}  # fmt: skip
-            if kind in folders:
-                keys["wanted"] = w
+            }.get(kind) or {"asset": folders[kind], "wanted": w}  # fmt: skip
             self._add(kind, **keys)
 
-        add.on_click(added)
+        gui.add_button("Add above the last click", icon=None).on_click(added)
         units = gui.add_dropdown("Units of a mesh", tuple(UNITS), initial_value="m")
-        upload = gui.add_upload_button("Upload a mesh", mime_type=".obj,.ply,.stl,.glb,.off")
 
         def uploaded(event: Any) -> None:
             given = event.target.value
@@ -278,45 +252,22 @@ class Controls(Page):
             self.tell(f"{file.name} becomes a shape; a first fit takes up to a minute")
             self._add(file.stem, mesh=file, units=units.value, cap=True)
 
-        upload.on_upload(uploaded)
+        gui.add_upload_button("Upload a mesh", mime_type=".obj,.ply,.stl,.glb,.off").on_upload(uploaded)
 
     def _add(self, name: str, **keys: Any) -> None:
+        """In a thread of viser's, as it may take a while."""
         try:
-            self._pick(self.session.add(name, self.spot, **keys), self.spot)
+            made = self.session.add(name, self.spot, **keys)
+            self.later(lambda: self._pick(made, self.spot))
         except SdfsimError as error:
-            self.tell(f"{error.message}. {error.hint}")
+            self.tell(error)
 
-    def _saving(self) -> None:
-        gui = self.server.gui
-        folder = gui.add_text("Folder", "played")
-        group = gui.add_button_group(
-            "Save", ("Scene", "Run"), hint="the scene as it is; the motion since its last change"
-        )
-
-        def saved(event: Any) -> None:
-            save = self.session.save_scene if event.target.value == "Scene" else self.session.save_run
-            try:
-                self.tell(f"wrote {save(Path(folder.value))}")
-            except SdfsimError as error:
-                self.tell(f"{error.message}. {error.hint}")
-
-        group.on_click(saved)
-
-    def _showing(self) -> None:
-        gui = self.server.gui
-        self._with = {
-            name: gui.add_checkbox(name, False)
-            for name in (
-                "Contact points",
-                "Forces on the body",
-                "Nodes of the body",
-                "Pieces of the body",
-                "Slice of its SDF",
-            )
-        }
-        self._height = gui.add_slider("Slice at", 0.0, 1.0, 0.02, 0.5)
-        for one in (*self._with.values(), self._height):
-            one.on_update(lambda _: self._overlays())
+    def _saved(self, event: Any) -> None:
+        save = self.session.save_scene if event.target.value == "Scene" else self.session.save_run
+        try:
+            self.tell(f"wrote {save(Path(self._folder.value))}")
+        except SdfsimError as error:
+            self.tell(error)
 
     # --- what is drawn over the bodies ---
 
@@ -326,36 +277,32 @@ class Controls(Page):
             self._over.position = frame.position[rows[0]]
             self._over.wxyz = np.roll(frame.orientation[rows[0]], 1)
 
-    _over: Any = None
-
     def _overlays(self) -> None:
         """Draw the frame that follows the picked body anew, with a box around it and what is switched on."""
-        scene, name = self.session.simulator.scene, self.picked
+        frame, name = self.session.frame, self.picked
         if self._over is not None:
             self._over.remove()
             self._over = None
-        rows = [k for k, body in enumerate(scene.bodies) if body.name == name]
-        if not rows or is_infinite(scene.shapes[scene.bodies[rows[0]].shape]):
+        body = next((body for body in frame.scene.bodies if body.name == name), None)
+        if body is None or is_infinite(frame.scene.shapes[body.shape]):
             return
-        body, drawn = scene.bodies[rows[0]], self.server.scene
-        shape, frame = scene.shapes[body.shape], self.session.frame
-        self._over = drawn.add_frame("/picked", show_axes=False, position=frame.position[rows[0]],
-                                     wxyz=np.roll(frame.orientation[rows[0]], 1))  # fmt: skip
+        shape, drawn, on = frame.scene.shapes[body.shape], self.server.scene, self._with
+        self._over = drawn.add_frame("/picked", show_axes=False)
+        self.followed(frame)
         low, high = (shape.sdf.bounds - shape.com) * body.scale
         thin = 0.006 * float((high - low).max())
         drawn.add_line_segments("/picked/box", points=_edges(low, high), colors=(255, 150, 0), thickness=thin)
-        if self._with["Nodes of the body"].value and len(shape.nodes):
-            size = 0.004 * float((high - low).max())
-            drawn.add_point_cloud("/picked/nodes", (shape.nodes - shape.com) * body.scale, NODE, point_size=2 * size,
+        if on["Nodes of the body"].value and len(shape.nodes):
+            drawn.add_point_cloud("/picked/nodes", (shape.nodes - shape.com) * body.scale, NODE, point_size=thin,
                                   point_shape="circle")  # fmt: skip
-        if self._with["Pieces of the body"].value:
+        if on["Pieces of the body"].value:
             rng = np.random.default_rng(0)
             pieces = [convex_hull(p) for p in shape.pieces] if shape.pieces else own_pieces(shape)
             for k, piece in enumerate(pieces[:MOST_PIECES]):
                 places, color = (piece.vertices - shape.com) * body.scale, tuple(rng.integers(60, 230, 3).tolist())
                 drawn.add_mesh_simple(f"/picked/pieces/{k}", places, piece.faces, color=color, opacity=0.55,
                                       flat_shading=True)  # fmt: skip
-        if self._with["Slice of its SDF"].value:
+        if on["Slice of its SDF"].value:
             image, at, width, height = _slice(shape, float(self._height.value))
             drawn.add_image("/picked/slice", image, body.scale * width, body.scale * height,
                             position=tuple((at - shape.com) * body.scale), wxyz=SIDEWAYS)  # fmt: skip
@@ -363,25 +310,23 @@ class Controls(Page):
     def _mark(self) -> None:
         """Contact points and the forces on the picked body."""
         points, forces = self._with["Contact points"].value, self._with["Forces on the body"].value
-        for name, on in (("/contacts", points), ("/forces", forces and bool(self.picked))):
+        for name, on in (("/contacts", points), ("/forces", forces and self.picked)):
             if not on and self.server.scene.get_handle_by_name(name) is not None:
                 self.server.scene.remove_by_name(name)
         simulator = self.session.simulator
         if not (points or forces) or not simulator.stepper.forces:
             return
         found = self.do(simulator.contact_points)[:MOST_POINTS]
-        size = 0.006 * framed(simulator.scene)[1]
+        size = 0.003 * self.session.wide
         if points:
             places = np.array([contact.point for contact in found]).reshape(-1, 3)
             self.server.scene.add_point_cloud("/contacts", places, POINT, point_size=2 * size, point_shape="circle")
-        if forces and self.session.movable(self.picked):
+        if forces and self.picked and (long := self.do(self.session.metres_per_newton, self.picked)) is not None:
             mine = [(c.point, c.force if c.first == self.picked else -c.force) for c in found
                     if self.picked in (c.first, c.second)]  # fmt: skip
-            body = simulator[self.picked]
-            long = self.session.size(self.picked) / (body.mass * max(np.linalg.norm(simulator.scene.gravity), 1e-9))
             arrows = np.array([(at, at + long * force) for at, force in mine]).reshape(-1, 2, 3)
-            self.server.scene.add_arrows("/forces", arrows, ARROW, shaft_radius=0.6 * size, head_radius=1.5 * size,
-                                         head_length=3 * size)  # fmt: skip
+            self.server.scene.add_arrows("/forces", arrows, ARROW, shaft_radius=size, head_radius=2.5 * size,
+                                         head_length=5 * size)  # fmt: skip
 
     def _refresh(self) -> None:
         """The numbers of the panel."""
@@ -390,21 +335,19 @@ class Controls(Page):
         speed += "" if session.speed == 1.0 else f" (wanted {session.speed:g})"
         lines = [f"{frame.time:.2f} s · {speed} · {len(frame.scene.bodies)} bodies"]
         lines += [f"<span style='color:#d33'>⚠ {line}</span>" for line in session.broken[-3:]]
-        text = "\n\n".join(lines)
-        if text != self._status.content:
-            self._status.content = text
-        if session.playing and self._past.value != 0.0:
-            self._past.value = 0.0
-        if (
-            self.picked
-            and self.picked in {body.name for body in frame.scene.bodies}
-            and self._body.label == self.picked
-        ):
-            body = session.simulator[self.picked]
-            place, speed = body.centre, float(np.linalg.norm(body.velocity))
-            state = "asleep" if body.asleep else "held" if self.picked in session.hands else f"{speed:.3g} m/s"
-            spin = float(np.degrees(np.linalg.norm(body.angular_velocity)))
-            self._facts.content = "at ({:.3f}, {:.3f}, {:.3f}) m · ".format(*place) + f"{state} · {spin:.3g} deg/s"
+        _update(self._status, "content", "\n\n".join(lines))
+        if session.playing:
+            _update(self._past, "value", 0.0)
+        if self.picked:
+            found = self.do(session.facts, self.picked)
+            if found:
+                _update(self._facts, "content", found[0])
+
+
+def _update(handle: Any, what: str, value: Any) -> None:
+    """Send a change to the page, if it is one."""
+    if getattr(handle, what) != value:
+        setattr(handle, what, value)
 
 
 SIDEWAYS = tuple(np.roll(pose.from_rotvec(np.array([0.5 * np.pi, 0.0, 0.0])), 1))  # a picture in x, y -> in x, z

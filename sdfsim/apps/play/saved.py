@@ -17,7 +17,7 @@ from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder, plain
 from sdfsim.scene.load import load_scene
-from sdfsim.scene.scene import WORLD, Body, Joint, Scene, fingerprints
+from sdfsim.scene.scene import WORLD, Body, Coupling, Frame, Joint, Keyframe, Scene, fingerprints
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
 from sdfsim.shape.shape import Shape
 
@@ -66,6 +66,9 @@ def save_scene(scene: Scene, folder: Path) -> Path:
         built.shapes[files[number]] = plain(_shape(scene.shapes[number], folder / "shapes" / files[number]))
     built.bodies = [plain(_body(body, scene.shapes[body.shape], files[body.shape])) for body in scene.bodies]
     built.joints = [plain(_joint(scene, joint)) for joint in scene.joints]
+    built.frames = [plain(_frame(scene, frame)) for frame in scene.frames]
+    built.couplings = [plain(_coupling(scene, coupling)) for coupling in scene.couplings]
+    built.keyframes = {name: plain(_keyframe(scene, keyframe)) for name, keyframe in scene.keyframes.items()}
     folder.mkdir(parents=True, exist_ok=True)
     return built.save(folder / SCENE)
 
@@ -102,6 +105,8 @@ def _shape(shape: Shape, folder: Path) -> dict[str, Any]:
 
 def _body(body: Body, shape: Shape, name: str) -> dict[str, Any]:
     entry: dict[str, Any] = {"name": body.name, "friction": body.friction, "restitution": body.restitution}
+    entry |= {} if body.color is None else {"color": [*body.color]}
+    entry |= {"stiffness": body.stiffness, "damping": body.damping} if math.isfinite(body.stiffness) else {}
     if body.collides_with is not None:
         entry["collides_with"] = list(body.collides_with)
     if is_infinite(shape):
@@ -118,6 +123,28 @@ def _body(body: Body, shape: Shape, name: str) -> dict[str, Any]:
             even = body.mass / shape.volume * body.scale**2 * shape.inertia
             entry["inertia_factor"] = float(np.trace(body.inertia) / np.trace(even))
     return entry
+
+
+def _frame(scene: Scene, frame: Frame) -> dict[str, Any]:
+    body = WORLD if frame.body < 0 else scene.bodies[frame.body].name
+    return {"name": frame.name, "body": body, "position": frame.position, "quat_xyzw": frame.quat_xyzw}
+
+
+def _coupling(scene: Scene, coupling: Coupling) -> dict[str, Any]:
+    first, second = (scene.joints[j] for j in coupling.joints)
+    offset = {"offset_deg": np.degrees(coupling.offset)} if first.kind == "hinge" else {"offset": coupling.offset}
+    return {"joints": [first.name, second.name], "ratio": coupling.ratio, **offset}
+
+
+def _keyframe(scene: Scene, keyframe: Keyframe) -> dict[str, Any]:
+    """A keyframe without its balls, whose rotations count from the saved pose."""
+    kinds = {joint.name: joint.kind for joint in scene.joints}
+    of = {kind: {n: v for n, v in keyframe.joints.items() if kinds[n] == kind} for kind in ("hinge", "slider")}
+    return {
+        "angles_deg": {name: np.degrees(angle) for name, angle in of["hinge"].items()},
+        "positions": of["slider"],
+        "bodies": {name: {"position": at, "quat_xyzw": turn} for name, (at, turn) in keyframe.bodies.items()},
+    }
 
 
 def _joint(scene: Scene, joint: Joint) -> dict[str, Any]:

@@ -31,7 +31,6 @@ from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.simulator import SimulationError, Simulator, Snapshot
 
@@ -70,6 +69,7 @@ class Session:
         playing, speed: whether time passes, and how fast relative to real time.
         ratio: simulated time over real time, in the last half second.
         broken: lines about broken laws and errors, with the time, the latest last.
+        middle, wide: centre [3] m and radius m of a ball around the scene at its start.
         frame: what is to be shown now. `changed` is notified with each.
     """
 
@@ -88,6 +88,7 @@ class Session:
         self._pulled: dict[str, float] = {}  # body -> when it was pulled last, s
         self._recorder = ExitStack()
         self._start = simulator.snapshot()
+        self.middle, self.wide = framed(simulator.scene)  # of the start: balls that were thrown fly far
         self._kept: deque[tuple[float, Snapshot, int]] = deque()  # time, snapshot, bytes
         self._passed: deque[tuple[float, float]] = deque()  # real and simulated time
         self._casters: dict[int, tuple[Shape, Caster]] = {}  # by the id of the shape, which is kept with it
@@ -160,7 +161,7 @@ class Session:
     def advance(self, seconds: float) -> int:
         """Let `seconds` of real time pass. Returns how many steps were made: as many as are due, but not more than can
         be computed before the next look at what a person wants. Simulated time that is missing is never jumped over."""
-        self._passed.append((time.perf_counter(), self.simulator.si_state().time))
+        self._passed.append((time.perf_counter(), self.now))
         while self._passed[-1][0] - self._passed[0][0] > 0.5:
             self._passed.popleft()
         (real, simulated), (now, then) = self._passed[0], self._passed[-1]
@@ -212,14 +213,19 @@ class Session:
 
     def back(self, seconds: float) -> float:
         """Return exactly to what was `seconds` ago, or to the nearest moment that is kept. Returns its time, s."""
-        wanted = self.simulator.si_state().time - seconds
+        wanted = self.now - seconds
         when, snapshot, _ = min(self._kept, key=lambda kept: abs(kept[0] - wanted))
         self._return(snapshot)
         return when
 
-    def past(self) -> float:
-        """s that one can go back."""
-        return self.simulator.si_state().time - self._kept[0][0]
+    def one_step(self) -> None:
+        self.pause()
+        self.step()
+
+    @property
+    def now(self) -> float:
+        """s of simulated time."""
+        return self.simulator.si_state().time
 
     def _return(self, snapshot: Snapshot) -> None:
         scene = self.simulator.scene
@@ -231,7 +237,7 @@ class Session:
         self._owed = 0.0
 
     def _keep(self) -> None:
-        now = self.simulator.si_state().time
+        now = self.now
         while len(self._kept) and self._kept[-1][0] > now:  # what was undone
             self._kept.pop()
         if self._kept and now - self._kept[-1][0] < EVERY:
@@ -255,12 +261,12 @@ class Session:
     # --- laws ---
 
     def _tell(self, line: str) -> None:
-        self.broken = [*self.broken[-9:], f"{self.simulator.si_state().time:.2f} s: {line}"]
+        self.broken = [*self.broken[-9:], f"{self.now:.2f} s: {line}"]
 
     def _note_pulls(self) -> None:
         load = self.simulator.now.load
         if load is not None:
-            now = self.simulator.si_state().time
+            now = self.now
             for row in np.flatnonzero(load.any(1)):
                 self._pulled[self.simulator.scene.bodies[row].name] = now
 
@@ -268,24 +274,26 @@ class Session:
         looked, took = -1.0, 0.0
         while not self._closed:
             time.sleep(max(LOOK, SELDOM * took))
-            now = self.simulator.si_state().time
+            now = self.now
             if now == looked or self._closed:
                 continue
             looked, began = now, time.perf_counter()
-            for line in self.look(*self.call(self._seen_since, now - WINDOW)):
+            for line in self.look(*self.call(self.seen_since, now - WINDOW)):
                 self.post(self._tell, line)
             took = time.perf_counter() - began
 
-    def _seen_since(self, time: float) -> tuple[Scene, Rollout, dict[str, float]]:
+    def seen_since(self, time: float) -> tuple[Scene, Rollout, dict[str, float]]:
+        """What `look` needs: the scene, its motion since a `time` s, and when bodies were pulled last."""
         return self.simulator.scene, self.recording.since(time), dict(self._pulled)
 
-    def look(self, scene: Scene, motion: Rollout, pulled: dict[str, float]) -> list[str]:
-        """The laws that a motion breaks, each once. A hand holds bodies up where nothing is near."""
+    def look(self, scene: Scene, motion: Rollout, pulled: dict[str, float], seconds: float = JUDGING) -> list[str]:
+        """The laws that a motion (of `seen_since`) breaks and that are not told yet; measuring surfaces may take
+        `seconds`. A hand holds bodies up where nothing is near."""
         if len(motion) < 2:
             return []
         held = [name for name, when in pulled.items() if when >= motion.time[0] - EVERY]
         said = {line.partition(": ")[2].partition(" by ")[0] for line in self.broken}
-        lines = judged(scene, motion, seconds=JUDGING).broken
+        lines = judged(scene, motion, seconds=seconds).broken
         lines = [
             li for li in lines if not (li.startswith("floating") and any(f"{name!r} is held" in li for name in held))
         ]
@@ -293,15 +301,14 @@ class Session:
 
     # --- hands ---
 
-    def movable(self, name: str) -> bool:
-        return any(body.name == name and body.motion == "dynamic" for body in self.simulator.scene.bodies)
-
     def grab(self, name: str, point: Any, target: Any = None) -> None:
         """Take a dynamic body at a point [3] m, world, and pull this point to `target`."""
         self._need_movable(name)
         body, known = self.simulator[name], self.hands.get(name)
         grip = pose.rotate(pose.conjugate(body.quat_xyzw), np.asarray(point, float) - body.centre)
         aim = np.asarray(point if target is None else target, float)
+        shape, scale = self.simulator.scene.shapes[self._body(name).shape], self._body(name).scale
+        grip = np.clip(grip, *(shape.sdf.bounds - shape.com) * scale)  # what is seen of a fast body is behind it
         self.hands[name] = Hand(name, grip, aim, None if known is None else known.turn, known is not None)
 
     def drag(self, name: str, target: Any) -> None:
@@ -335,6 +342,9 @@ class Session:
             self.hands[name].stays = False
             self.release(name)
 
+    def hold_or_let_go(self, name: str) -> None:
+        self.hold(name, held=name not in self.hands)
+
     def push(self, name: str, point: Any, direction: Any) -> None:
         """Push a body at a point [3] m along a direction [3]."""
         self._need_movable(name)
@@ -345,7 +355,8 @@ class Session:
     def throw(self, origin: Any, direction: Any) -> str:
         """Throw a ball from `origin` [3] m so that it hits what is seen along `direction` [3]. Returns its name."""
         origin, along = np.asarray(origin, float), np.asarray(direction, float) / np.linalg.norm(direction)
-        radius, (_, wide) = 0.5 * largest_extent(self._ball), framed(self.simulator.scene)
+        (shape, body), wide = self._ball, self.wide
+        radius = 0.5 * largest_extent(shape)
         hit = self.seen(origin, along)
         aim = origin + along * (3.0 * wide if hit is None else hit[1])
         start = aim - along * max(min(float(np.linalg.norm(aim - origin)) - radius, 1.5 * wide), 2.5 * radius)
@@ -356,8 +367,8 @@ class Session:
         if len(thrown) >= BALLS:
             self.delete(thrown[0])
         masses = [body.mass for body in self.simulator.scene.bodies if body.motion == "dynamic"]
-        mass = min(2000.0 * self._ball.volume, float(np.median(masses)) if masses else np.inf)
-        return self._put("thrown ball", self._ball, position=start, velocity=velocity, mass=mass, restitution=0.6)
+        mass = min(2000.0 * shape.volume, float(np.median(masses)) if masses else np.inf)
+        return self._put("thrown ball", shape, body, position=start, velocity=velocity, mass=mass, restitution=0.6)
 
     def seen(self, origin: np.ndarray, along: np.ndarray) -> tuple[str, float] | None:
         """The body that a ray meets first, and the distance in lengths of its direction; None if it meets none."""
@@ -393,8 +404,7 @@ class Session:
         """Add a body with the keys of `Scene.add`, above a spot [3] m; `wanted` m is its longest side, else it has the
         size of its shape. A mesh is fitted first, which may take a while: not in the thread that makes the steps.
         Returns its name."""
-        made = SceneBuilder().add("new", **keys).load()
-        (shape,), (body,) = made.shapes, made.bodies
+        shape, body = _alone(**keys)
         if wanted is not None:
             factor = wanted / largest_extent(shape)
             body = replace(body, scale=factor, mass=body.mass * factor**3)
@@ -424,18 +434,13 @@ class Session:
         scene, rollout = self.call(lambda: (self.simulator.scene, self.recording.rollout))
         return save_run(at_frame(scene, rollout), rollout, Path(folder))
 
-    def _put(self, name: str, shape: Shape, body: Body | None = None, spot: Any = None, **fields: Any) -> str:
+    def _put(self, name: str, shape: Shape, body: Body, spot: Any = None, **fields: Any) -> str:
         """Add a body of a shape; with a `spot` so high above it that it lies free."""
         scene = self.simulator.scene
         names = {body.name for body in scene.bodies}
         if name in names:
             name = next(one for one in (f"{name} {k}" for k in count(2)) if one not in names)
         known = next((k for k, one in enumerate(scene.shapes) if one is shape), len(scene.shapes))
-        if body is None:
-            usual = {key: np.zeros(3) for key in ("position", "velocity", "angular_velocity")}
-            usual["quat_xyzw"] = np.array([0.0, 0.0, 0.0, 1.0])
-            given = {"scale": 1.0, "mass": 0.0, "friction": 0.5, "restitution": 0.5} | usual
-            body = Body(name=name, shape=known, motion="dynamic", **given)  # type: ignore[arg-type]
         still = {key: np.zeros(3) for key in ("velocity", "angular_velocity")}
         body = replace(body, name=name, shape=known, collides_with=None, **still | fields)
         if spot is not None:
@@ -446,19 +451,18 @@ class Session:
         return name
 
     def _free(self, spot: np.ndarray, shape: Shape, scale: float) -> np.ndarray:
-        """A place [3] m above `spot` at which the ball around a shape meets no ball around a body that moves."""
+        """A place [3] m above `spot` at which the ball around a shape meets no body."""
         scene, moment = self.simulator.scene, self.simulator.si_state()
         up = -scene.gravity / np.linalg.norm(scene.gravity) if np.any(scene.gravity) else np.array([0.0, 0.0, 1.0])
         low, high = shape.sdf.bounds * scale
         middle, reach = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-        place = spot + 1.05 * reach * up
-        radii = self.simulator.bodies.radius * self.simulator.units.length
-        for _ in range(100):
-            apart = np.linalg.norm(moment.position - place, axis=1)
-            if not (self.simulator.bodies.moves & (apart < reach + radii)).any():
-                break
-            place = place + 0.5 * reach * up
-        return place - middle
+        places = spot + (1.05 + 0.5 * np.arange(100)[:, None]) * reach * up
+        clear = np.ones(len(places), bool)
+        for body, place, turn in zip(scene.bodies, moment.position, moment.orientation, strict=True):
+            other = scene.shapes[body.shape]
+            inside = pose.rotate(pose.conjugate(turn), places - place) / body.scale + other.com
+            clear &= body.scale * np.asarray(other.sdf(inside)[0]) > reach
+        return places[clear.argmax() if clear.any() else -1] - middle
 
     def _changed(self) -> None:
         """Begin a new recording, as the scene is another."""
@@ -474,8 +478,24 @@ class Session:
         return next(body for body in self.simulator.scene.bodies if body.name == name)
 
     def _need_movable(self, name: str) -> None:
-        if not self.movable(name):
-            raise SdfsimError(f"body {name!r}: is {self._body(name).motion}, so it cannot be moved")
+        if (motion := self._body(name).motion) != "dynamic":
+            raise SdfsimError(f"body {name!r}: is {motion}, so it cannot be moved")
+
+    def metres_per_newton(self, name: str) -> float | None:
+        """The length of an arrow: as long as the body is its weight. None for a body that does not move."""
+        body = self._body(name)
+        return self.size(name) / (body.mass * self._strength) if body.motion == "dynamic" else None
+
+    def facts(self, name: str) -> tuple[str, dict[str, float]]:
+        """A line about where a body is and how it moves; and its mass, if it has one, friction and restitution, to six
+        digits."""
+        body, known = self.simulator[name], self._body(name)
+        state = f"{float(np.linalg.norm(body.velocity)):.3g} m/s"
+        state = "asleep" if body.asleep else "held" if name in self.hands else state
+        spin = float(np.degrees(np.linalg.norm(body.angular_velocity)))
+        line = "at ({:.3f}, {:.3f}, {:.3f}) m · ".format(*body.centre) + f"{state} · {spin:.3g} deg/s"
+        which = (*(["mass"] if known.motion == "dynamic" else []), "friction", "restitution")
+        return line, {what: float(f"{getattr(known, what):.6g}") for what in which}
 
     def size(self, name: str) -> float:
         """m, the longest side of a body."""
@@ -487,12 +507,17 @@ class Session:
         return float(np.linalg.norm(self.simulator.scene.gravity)) or 9.81
 
     @cached_property
-    def _ball(self) -> Shape:
+    def _ball(self) -> tuple[Shape, Body]:
         """A ball to throw: not smaller than the smallest body, so that it does not change the step."""
         scene = self.simulator.scene
         sizes = [self.size(body.name) for body in scene.bodies if body.motion == "dynamic"]
-        radius = max(BALL * framed(scene)[1], 0.5 * min(sizes, default=0.0))
-        return analytic_shape("sphere", radius=radius, name="thrown ball")
+        return _alone(sphere={"radius": max(BALL * self.wide, 0.5 * min(sizes, default=0.0))})
+
+
+def _alone(**keys: Any) -> tuple[Shape, Body]:
+    """The shape and the body that the keys of `Scene.add` make."""
+    made = SceneBuilder().add("new", **keys).load()
+    return made.shapes[0], made.bodies[0]
 
 
 def _kind(line: str) -> str:
