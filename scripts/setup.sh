@@ -108,7 +108,15 @@ say "installing Python packages (a few minutes the first time)"
 rm -f .venv/.set-up
 .venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" \
     --config-settings editable_mode=compat --editable ".${extras:+[$extras]}"  # a path, so that type checkers find it too
-# Compiles the contact step and the search for contacts.
-.venv/bin/python -c 'import sdfsim; [sdfsim.Simulator("samples/tower.yaml", name).step(2) for name in ("solver", "gnn")]'
+# Compiles all parts of the contact step, and the search for contacts.
+.venv/bin/python - <<'PYTHON'
+import sdfsim
+
+many = sdfsim.Scene(model="solver")
+for k in range(70):
+    many.add(f"{k}", sphere={"radius": 0.1}, position=(k, 0, 0))
+for scene, model in (("tower", "solver"), ("knocked_vase", "solver"), ("door", "solver"), (many, "solver"), ("tower", "gnn")):
+    sdfsim.Simulator(f"samples/{scene}.yaml" if isinstance(scene, str) else scene, model).step(2)
+PYTHON
 printf '%s\n%s\n' "$made_from" "${extras//,/ }" >.venv/.set-up
 say "done: $(.venv/bin/python --version), $PWD/.venv"

@@ -7,6 +7,7 @@ docs/export.md lists it for each format.
 import csv
 import io
 import logging
+import math
 import tempfile
 import unicodedata
 from collections.abc import Callable, Iterable
@@ -369,6 +370,9 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
     lines = {
         "the motion: the scene is exported as at the start": take.moving and not motion,
         "the paths of kinematic bodies: they stay at their start": led and not (take.moving and motion),
+        "stiffness and damping of contacts: all bodies are rigid": any(
+            math.isfinite(body.stiffness) for body in take.scene.bodies
+        ),
         "textures and colours of single faces: colours of vertices, or one colour, are in their place": not textures
         and any(shape.skin is not None for shape in take.scene.shapes),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -638,6 +639,9 @@ def _check_inputs(scene: Scene, model: str, *, joints: bool) -> None:
     paths = [b.name for b in scene.bodies if b.motion == "kinematic"]
     if joints:
         raise SdfsimError(f"{model}: a network has no inputs for joints", f"use {SOLVER}, or set effects.joints: off")
+    if soft := [b.name for b in scene.bodies if math.isfinite(b.stiffness)]:
+        hint = f"use {SOLVER}, or leave its stiffness out"
+        raise SdfsimError(f"{model}: a network has no inputs for soft material ({soft[0]!r})", hint)
     if paths:
         raise SdfsimError(
             f"{model}: a network has no inputs for bodies on a path ({paths[0]!r})", f"use {SOLVER}, or make it static"

@@ -46,7 +46,7 @@ def advance(shapes, world, work, motion, rules, manifolds, joints, pieces, scrip
     manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, pieces)
     stirred = rules.options.sleep
     while stirred:
-        stirred = woken(world, motion, reference(manifolds), reference(near))
+        stirred = woken(world, motion, rules, reference(manifolds), reference(near))
         stirred = stirred or roused(world, motion, joints.each.body)
         if stirred:
             manifolds, near = find_near(shapes, world, work, motion, rules, span, manifolds, pieces)

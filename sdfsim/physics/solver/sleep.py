@@ -30,16 +30,29 @@ def _wake(motion, island):
 
 
 @njit(**BARE)
-def woken(world, motion, manifolds, near):
-    """Wake the islands that something awake may touch in this step. Returns whether there were any."""
+def _drift(world, motion, rules, b):
+    """How far a body moves in the time after which bodies at rest fall asleep; infinite for planes that turn."""
+    turns = norm(get(motion.angular, b))
+    speed = norm(get(motion.velocity, b)) + (turns * world.radius[b] if turns > 0.0 else 0.0)
+    return speed * rules.rest * rules.substep_dt * rules.options.substeps
+
+
+@njit(**BARE)
+def woken(world, motion, rules, manifolds, near):
+    """Wake the islands that something awake touches, or may touch in this step. Returns whether there were any.
+
+    What is beside an island, but hardly moves, does not wake it, or two such would keep each other awake.
+    """
     found = False
     for p in range(len(near.start)):
         a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
         if near.count[p, 0] + near.count[p, 1] == 0:
             continue
         for sleeper, other in ((a, b), (b, a)):
-            moving = norm(get(motion.velocity, other)) + norm(get(motion.angular, other)) > 0.0
-            if motion.island[sleeper] >= 0 and stirs(world, motion, other) and moving:
+            if motion.island[sleeper] < 0 or not stirs(world, motion, other):
+                continue
+            beside = world.moves[other] and manifolds.count[p] == 0
+            if _drift(world, motion, rules, other) > (rules.drift if beside else 0.0):
                 found = True
                 _wake(motion, motion.island[sleeper])
     return found
@@ -116,11 +129,9 @@ def _mark_gliding(world, motion, rules, manifolds, joints, parent, restless):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         if manifolds.count[m] and rules.options.friction and world.friction[a] * world.friction[b] > 0.0:
             braked[a] = braked[b] = True
-    span = rules.rest * rules.substep_dt * rules.options.substeps
     for b in world.going:
         if world.moves[b] and motion.island[b] < 0 and not braked[b] and joints.graph.of_body[b] < 0:
-            speed = norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) * world.radius[b]
-            if speed * span > rules.drift:
+            if _drift(world, motion, rules, b) > rules.drift:
                 restless[root(parent, b)] = True
 
 
