@@ -86,9 +86,9 @@ FAULTS = (
     fault(
         "overlaps are resolved by velocities that last",
         "contacts.py",
-        "overlaps",
-        "deep = -gap * rules.erp / h",
-        "target = push = -gap * rules.erp / h",
+        "parting",
+        "deep = max(-gap - rules.slop, 0.0) * rules.erp / h",
+        "target = max(-gap - rules.slop, 0.0) * rules.erp / h",
     ),
     fault(
         "friction of a face acts at its corners",
@@ -176,8 +176,8 @@ FAULTS = (
         "nothing wakes",
         "sleep.py",
         "sleepers",
-        "stirs(world, motion, other) and moving:",
-        "stirs(world, motion, other) and moving and other < 0:",
+        "if motion.island[sleeper] < 0 or not stirs(world, motion, other):",
+        "if other >= 0 or not stirs(world, motion, other):",
     ),
     fault(
         "bodies fall asleep out of balance",
@@ -202,7 +202,7 @@ FAULTS = (
     ),
     fault(
         "springs push the wrong way",
-        "joints.py",
+        "rows.py",
         "doors",
         "push = span * (stiff * away - damping",
         "push = span * (-stiff * away - damping",

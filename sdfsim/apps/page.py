@@ -13,11 +13,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sdfsim.apps.recording import body_colors, eye_around, framed, is_infinite, with_normals
 from sdfsim.apps.viewer import LOOPBACK, free_port
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics import pose
 from sdfsim.scene.scene import Scene
+from sdfsim.simulate.camera import eye_around
+from sdfsim.simulate.looks import body_colors, framed, is_infinite, with_normals
 
 PORT = 8080
 RATE = 60.0  # poses a second, at most

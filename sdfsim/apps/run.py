@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from sdfsim.apps.beside import FILE, begun, beside_of, off
-from sdfsim.apps.recording import Playback, framed, save_rollout
+from sdfsim.apps.recording import Playback, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
 from sdfsim.base.compiling import running, seconds_spent
 from sdfsim.base.console import columns, plain
@@ -39,6 +39,7 @@ from sdfsim.physics.units import EARTH
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene, fingerprints
+from sdfsim.simulate.looks import framed
 from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
 
 Viewer = Literal["none", "file", "native", "web"]

@@ -811,10 +811,11 @@ def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
     mesh = '<geometry><mesh filename="box.dae"/></geometry>'
     text = f"""<robot name="r"><link name="one"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0"
       ixz="0" iyz="0"/></inertial><visual>{mesh}</visual><collision>{mesh}</collision></link></robot>"""
-    shape = imported(write(tmp_path, "r.urdf", text))[0].shapes[0]
+    scene = imported(write(tmp_path, "r.urdf", text))[0]
+    shape = scene.shapes[0]
     np.testing.assert_allclose(shape.mesh.vertices.max(0), (0.1, 0.1, 0.15), atol=1e-9)
-    assert shape.volume == pytest.approx(1e-3) and shape.skin is not None and shape.skin.texture is not None
-    assert (np.abs(shape.skin.texture.reshape(-1, 3).astype(int) - (255, 128, 0)) < 6).all()
+    assert shape.volume == pytest.approx(1e-3) and shape.skin is None
+    assert (np.abs(np.subtract(scene.bodies[0].color, (255, 128, 0))) < 6).all()
 
 
 def test_xacro_is_expanded_if_it_is_installed(tmp_path: Path) -> None:

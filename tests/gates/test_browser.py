@@ -16,7 +16,8 @@ from pipeline.measure import measure
 from pipeline.mesh.placement import check_distance
 from pipeline.options import options_of
 from sdfsim import Scene, Simulator
-from sdfsim.apps.recording import body_colors, save_rollout
+from sdfsim.apps.recording import save_rollout
+from sdfsim.simulate.looks import body_colors
 from tests.helpers.browser import Browser
 
 ROOT = Path(__file__).resolve().parents[2]

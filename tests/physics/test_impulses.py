@@ -78,7 +78,8 @@ def known(world, work, motion, rules, manifolds) -> tuple[list[impulses.Body], l
         turns = work.matrix[pair]
         for row in rows[:count]:
             alike = rows[:count][rows[:count, KEY] == row[KEY]]
-            places = [(row[k : k + 3], alike[:, k : k + 3].mean(0)) for k in (FIRST, SECOND)]
+            load = alike[:, NORMAL_IMPULSE] if row[NORMAL_IMPULSE] > 0.0 else np.ones(len(alike))
+            places = [(row[k : k + 3], load @ alike[:, k : k + 3] / load.sum()) for k in (FIRST, SECOND)]
             share = row[TORSION]
             contacts.append(
                 impulses.Contact(

@@ -65,7 +65,7 @@ bodies:
   - {{name: table, shape: table, motion: static, position: [0, 0, {-0.05 * size}]}}
   - {{name: cup, shape: cup, {start}, mass: 0.5}}
 """
-    found = verdict(text, tmp_path, revolve(size * np.array(CUP), 72), 0.7 * size**0.5)
+    found = verdict(text, tmp_path, revolve(size * np.array(CUP), 72), 1.5 * size**0.5)
     assert found.broken == ()
     assert found.overlap is not None and found.overlap.part < 0.006
 

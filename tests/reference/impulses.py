@@ -46,11 +46,10 @@ class Contact:
     void: bool
     friction: float
     rows: "list[Row]" = field(default_factory=list)  # along the normal and two tangents, where it acts
-    deep: float = 0.0  # speed that parts what is deep in each other
+    deep: float = 0.0  # speed that parts what is in each other
     parted: float = 0.0  # its impulse so far
-    calm: float = 0.0  # the change along the normal that is wanted if nothing rebounds and nothing is pushed out
+    calm: float = 0.0  # the change along the normal that is wanted if nothing rebounds
     before: float = 0.0  # speed along the normal without contact
-    out: float = 0.0  # speed that pushes out and stays
 
 
 @dataclass
@@ -124,11 +123,10 @@ def acts(c: Contact, rules) -> bool:
     rest = -gap / rules.substep_dt if gap > TOUCH else 0.0  # what is open comes up to the surface
     if gap > TOUCH:
         target = target if rebounds else rest
-    elif gap <= -rules.split:
-        c.deep = -gap * rules.erp / rules.substep_dt
-    elif gap < -rules.slop:
-        c.out = (-gap - rules.slop) * rules.erp / rules.substep_dt
-        target = max(c.out, target)
+    else:
+        c.deep = max(-gap - rules.slop, 0.0) * rules.erp / rules.substep_dt
+        if 0.0 < -approach <= rules.slow and not rebounds:  # the surface turned inwards: along its chord
+            target = rest = min(c.deep, -approach)
     c.calm = rest - c.before
     c.rows = [Row(bodies, arms, n, target - c.before, c.push)]
     if c.friction == 0.0:
@@ -175,7 +173,8 @@ def part(island: list[Contact], rules) -> None:
         worst = 0.0
         for c in (c for c in island if c.deep > 0.0):
             r = c.rows[0]
-            total = max(c.parted + (c.deep - r.speed("shift")) * r.mass, 0.0)
+            lasts = max(c.before + r.speed(), 0.0)
+            total = max(c.parted + (c.deep - lasts - r.speed("shift")) * r.mass, 0.0)
             r.give(total - c.parted, "shift")
             worst, c.parted = max(worst, abs(total - c.parted) / r.mass), total
         if worst <= rules.exact:
@@ -203,16 +202,29 @@ def rub(c: Contact) -> float:
     return max(map(abs, changed)) / mass
 
 
-def gains(island: list[Contact], rules) -> bool:
-    """Whether contacts did more work than pushes, rounding and lifts by ten slops explain, of four points a pair."""
-    work, spare, pairs = 0.0, 0.0, [[*map(id, c.bodies)] for c in island]
+def gain(island: list[Contact]) -> float:
+    """The work of contacts: impulses times mean velocities."""
+    work = 0.0
     for c in island:
-        share = min(1.0, 4.0 / pairs.count([*map(id, c.bodies)]))
-        lift = 10.0 * rules.slop * float(np.linalg.norm(rules.options.gravity))
-        spare += share * c.rows[0].mass * (2.0 * c.out**2 + 0.005 * c.before**2 + lift)
         work += c.rows[0].impulse * (c.before + 0.5 * c.rows[0].speed())
         work += sum(r.impulse * (0.5 * r.speed() - r.wanted) for r in c.rows[1:])
-    return work > spare
+    return work
+
+
+def keep_energy(island: list[Contact], rules) -> None:
+    """If rebounds give energy, take as much of them as gives none: the energy is convex in the impulses."""
+    more, known = gain(island), [r.impulse for c in island for r in c.rows]
+    if more <= 1e-4 * sum(0.5 * c.rows[0].mass * c.before**2 for c in island):
+        return
+    for c in island:
+        c.rows[0].wanted = c.calm
+    balance(island, rules)
+    less = gain(island)
+    share = max(less / (less - more), 0.0) if less < more else 0.0
+    for r, rebound in zip((r for c in island for r in c.rows), known, strict=True):
+        changed = share * (rebound - r.impulse)
+        r.impulse += changed
+        r.give(changed)
 
 
 def solve_contacts(contacts: list[Contact], rules) -> None:
@@ -221,24 +233,12 @@ def solve_contacts(contacts: list[Contact], rules) -> None:
         if not acts(c, rules):
             c.push, c.drag = 0.0, np.zeros(3)
     for island in islands([c for c in contacts if c.rows]):
-        lively = any(c.rows[0].wanted > c.calm for c in island)
         for r in (r for c in island for r in c.rows):  # warm start
             r.give(r.impulse)
-        part(island, rules)
         balance(island, rules)
-        # Contacts that contradict each other: half of what rebounds and is pushed out, then none.
-        for share in (0.5, 0.0):
-            if not (lively and gains(island, rules)):
-                break
-            for c in island:
-                for body in c.bodies:
-                    body.change[:] = 0.0
-                for r in c.rows:
-                    r.impulse = 0.0
-                c.rows[0].wanted = c.calm + share * (c.rows[0].wanted - c.calm)
-                c.deep = (1.0 - share) * c.out if c.out > 0.0 else c.deep
-            part(island, rules)
-            balance(island, rules)
+        if any(c.rows[0].wanted > c.calm for c in island):
+            keep_energy(island, rules)
+        part(island, rules)
         for c in island:
             c.push = c.rows[0].impulse
             c.drag = sum((r.impulse * r.axis for r in c.rows[1:]), np.zeros(3))

@@ -11,7 +11,6 @@ import numpy as np
 
 from sdfsim.apps.page import Batch, Page
 from sdfsim.apps.play.session import MINUTE, Session
-from sdfsim.apps.recording import is_infinite
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.physics import pose
@@ -19,6 +18,7 @@ from sdfsim.scene.bundled import sample_folder
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.schema import UNITS
 from sdfsim.shape.shape import own_pieces
+from sdfsim.simulate.looks import is_infinite
 
 ARROW, POINT, NODE = (214, 69, 65), (214, 69, 65), (30, 90, 180)
 ANGLE = np.radians(15.0)  # that a key turns a body by

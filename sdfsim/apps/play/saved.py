@@ -9,7 +9,6 @@ import numpy as np
 import yaml
 
 from sdfsim.apps.export import plain_names
-from sdfsim.apps.recording import is_infinite
 from sdfsim.apps.run import summary
 from sdfsim.base.console import plain as plain_report
 from sdfsim.base.files import CONFIG, check_own, check_writable, write_json, write_text
@@ -20,6 +19,7 @@ from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import WORLD, Body, Coupling, Frame, Joint, Keyframe, Scene, fingerprints
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
 from sdfsim.shape.shape import Shape
+from sdfsim.simulate.looks import is_infinite
 
 SCENE = "scene.yaml"
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from sdfsim.apps.play.hand import Hand
 from sdfsim.apps.play.saved import at_frame, save_run, save_scene
-from sdfsim.apps.recording import framed, is_infinite
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation.instruments import judged
 from sdfsim.geometry.bvh import Caster
@@ -32,6 +31,7 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.shape import Shape
+from sdfsim.simulate.looks import framed, is_infinite
 from sdfsim.simulate.simulator import SimulationError, Simulator, Snapshot
 
 MINUTE = 60.0  # s that one can go back

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from math import atan, cos, radians, sin, sqrt, tan
+from typing import Any
 
 import numpy as np
 
@@ -164,7 +165,8 @@ def soft(at: Setting) -> Iterator[Check]:
     """Soft material gives way by its load over the stiffness, two of them in series, and rebounds as a spring."""
     for stiffness in (2e3, 1e4, 1e5, 1e7):
         damping = 0.6 * sqrt(2.0 * stiffness)
-        for name, shape in (("box", {"box": {"size": (0.2, 0.2, 0.2)}}), ("ball", {"sphere": {"radius": 0.1}})):
+        kinds: dict[str, Any] = {"box": {"box": {"size": (0.2, 0.2, 0.2)}}, "ball": {"sphere": {"radius": 0.1}}}
+        for name, shape in kinds.items():
             built = SceneBuilder().add("floor", plane={})
             built.add("it", **shape, position=(0, 0, 0.1), mass=2.0, stiffness=stiffness, damping=damping)
             ran = run_built(at, f"{name} of {stiffness:g} N/m", built, 3.0)

@@ -79,6 +79,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
         stiff, damping = _stiffness(world, manifolds, m, a, b)
         between = sub(get(position, a), get(position, b))
         thin = THIN * min(world.thickness[a], world.thickness[b])
+        first = count
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = three(point, NORMAL)
@@ -100,7 +101,6 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             if stiff < math.inf:
                 too_far = gap > 0.0
             if point[VOID] > 0.0 or too_far:
-                point[NORMAL_IMPULSE] = point[TANGENTIAL] = point[TANGENTIAL + 1] = point[TANGENTIAL + 2] = 0.0
                 continue
             # Newton's rule for all contacts of one impact: without friction and with e = 1, energy is conserved.
             target, rebounds = 0.0, phase != END and bounce > 0.0 and abs(approach) > rules.slow and stiff == math.inf
@@ -118,6 +118,11 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
                     target = target if rebounds else rest
                 else:
                     deep = max(-gap - rules.slop, 0.0) * rules.erp / h
+                    # What rolls along a hollow goes inwards as the surface turns. That much of the speed may last: it
+                    # leads along the chord, where moving the body alone would lift it for nothing.
+                    inwards = -dot(now, n)
+                    if 0.0 < inwards <= rules.slow and not rebounds:
+                        target = rest = min(deep, inwards)
             rows.kind[count] = CONTACT
             rows.where[count, 0], rows.where[count, 1], rows.where[count, 2], rows.where[count, 3] = m, k, a, b
             write_point(row[count, 0], n, arm, other)
@@ -154,6 +159,12 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
                 row[count, 1, IMPULSE] *= share
                 row[count, 2, IMPULSE] *= share
             count += 1
+        for k in range(manifolds.count[m]):
+            if first < count and rows.where[first, 1] == k:
+                first += 1
+            else:  # it does not act
+                for x in range(NORMAL_IMPULSE, KEY):
+                    manifolds.point[m, k, x] = 0.0
     return count
 
 

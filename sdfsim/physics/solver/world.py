@@ -152,7 +152,7 @@ class Rules(NamedTuple):
     contact_margin: float = 0.02  # contacts are kept up to this distance, and until they have slid by more
     search_margin: float = 0.006  # new ones are searched up to this distance
     still: float = 1e-4  # pairs that have moved by less within a step are not tested again
-    erp: float = 0.08  # share of a penetration that an inner step resolves
+    erp: float = 0.2  # share of a penetration that an inner step resolves
     slop: float = SLOP  # penetration that is not resolved
     rounds: int = ROUNDS  # largest number of sweeps of sequential impulses
     exact: float = 2e-5  # sweeps end when no impulse changes a velocity by more
