@@ -137,7 +137,7 @@ def test_what_is_wedged_into_each_other_is_not_thrown_apart(seed):
 
 @pytest.mark.parametrize("friction", [0.0, 0.7])
 def test_a_collision_keeps_angular_momentum(friction):
-    """To rounding, but where a deep overlap was pushed out: that moves places, and leaves velocities as they are."""
+    """To rounding, but where bodies that overlap were moved apart: that leaves velocities as they are."""
     lost = []
     for seed in range(30):
         draw, shapes = np.random.default_rng(seed), kinds()
@@ -158,4 +158,4 @@ def test_a_collision_keeps_angular_momentum(friction):
         _, angular = momentum(scene, rollout)
         size = sum(b.mass * np.linalg.norm(b.position) * np.linalg.norm(b.velocity) for b in bodies)
         lost.append(np.abs(angular - angular[0]).max() / size)
-    assert np.quantile(lost, 0.8) < 1e-6 and max(lost) < 2e-3
+    assert np.quantile(lost, 0.7) < 1e-6 and np.quantile(lost, 0.8) < 2e-5 and max(lost) < 2e-3
