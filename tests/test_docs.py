@@ -142,3 +142,9 @@ def test_presets_and_recipes_in_documents_exist():
                 assert found[2] in known[found[1]], f"{file.name}: {line}"
                 named.add((found[1], found[2]))
     assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick")} <= named
+
+
+def test_no_temporary_file_is_among_the_sources() -> None:
+    """Outputs are written to `.NAME.NUMBER-LETTERS.part` first."""
+    folders = ("docs", "samples", "benchmarks", "sdfsim", "pipeline", "tests")
+    assert not [file for folder in folders for file in (ROOT / folder).rglob(".*.part")]
