@@ -17,6 +17,7 @@ from sdfsim.base.version import __version__ as __version__
 if TYPE_CHECKING:
     from pipeline.states import reconstruct
     from sdfsim.apps.export import export
+    from sdfsim.apps.film.film import track
     from sdfsim.apps.fit import fit
     from sdfsim.apps.play import play, show
     from sdfsim.apps.render import render
@@ -61,6 +62,7 @@ __all__ = [
     "save_run",
     "show",
     "simulate",
+    "track",
 ]
 
 _HOME = {
@@ -84,6 +86,7 @@ _HOME = {
     "render": "sdfsim.apps.render",
     "save_run": "sdfsim.apps.save_run",
     "simulate": "sdfsim.apps.run",
+    "track": "sdfsim.apps.film.film",
 }
 _THERE = {"Scene": "SceneBuilder"}  # names that differ in their module
 

@@ -13,6 +13,7 @@ from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
 SceneFile = Annotated[Path, typer.Argument(help="scene.yaml, or a name of `sdfsim samples`.", show_default=False)]
 OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
+FILMS = {".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm"}
 Models = Annotated[
     list[str] | None,
     typer.Option(help="Bundled model or path; repeat it for more (default: those that run on the contact solve)."),
@@ -273,8 +274,8 @@ def identify(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Run folders, rollout.npz, CSV or npz files of poses, or folders of these (docs/identify.md); or "
-            "contactnets-cube or contactnets-elbow: public ones with their scene, downloaded once.",
+            help="Films of a fixed camera (.mp4 .mov .mkv .avi .webm); or run folders, rollout.npz, CSV or npz files of "
+            "poses, or folders of these (docs/identify.md); or contactnets-cube or contactnets-elbow: public ones with their scene, downloaded once.",
             show_default=False,
         ),
     ],
@@ -288,9 +289,18 @@ def identify(
             help="Write the scene with the values that were found, and a picture of the fit as FILE.png.",
         ),
     ] = None,
+    points: Annotated[
+        Path | None, typer.Option(help="Of a film: points of known places, see `sdfsim measure`.", show_default=False)
+    ] = None,
+    slow: Annotated[float, typer.Option(help="Of a film: how many times slower it plays than things moved.")] = 1.0,
+    start: Annotated[float | None, typer.Option(help="Of a film: where to begin, s.", show_default=False)] = None,
+    end: Annotated[float | None, typer.Option(help="Of a film: where to end, s.", show_default=False)] = None,
+    body: Annotated[
+        list[str] | None, typer.Option(help="Of a film: a body that moves in it; repeat it (default: all that move).")
+    ] = None,
     allow_outside: Outside = False,
 ) -> None:
-    """Recorded motions -> friction, restitution, sizes, masses, height and tilt of the ground."""
+    """Films or recorded motions -> friction, restitution, sizes, masses, height and tilt of the ground."""
     from sdfsim.apps.identify.optimiser import identify as identified
     from sdfsim.apps.identify.report import picture, report_lines, write_scene
     from sdfsim.apps.observed import load_recordings
@@ -300,6 +310,22 @@ def identify(
     if out is not None:
         check_writable(out.parent)
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
+    if any(path.suffix.lower() in FILMS for path in recordings):
+        from sdfsim.apps.film.film import identify_clips, only_moving
+        from sdfsim.scene.load import load_scene
+
+        if scene is None or not all(path.suffix.lower() in FILMS for path in recordings):
+            raise SdfsimError("films need their scene, and no other recordings beside them", "--scene scene.yaml")
+        known = only_moving(load_scene(scene, shapes, allow_outside=allow_outside), body or [])
+        beside = None if out is None else out.with_name("beside.mp4")
+        seen = identify_clips(
+            recordings, known, points=points, slow=slow, start=start, end=end, beside=beside, on_progress=fit
+        )
+        lines, wrote = report_lines(seen), {} if out is None else {"wrote": out, "beside": beside}
+        if out is not None:
+            lines += [*write_scene(seen, scene, out), f"wrote {out}", f"wrote {beside}: the fit's motion over the film"]
+        session.report(seen.report() | wrote, lines)
+        return
     paths = [public_tosses(path, partial(session.stage_progress, "fetch")) for path in recordings]
     public = [path for path, given in zip(paths, recordings, strict=True) if path != given]
     scene = scene or next((path / "scene.yaml" for path in public), None)

@@ -69,6 +69,13 @@ class Recording:
     noise: tuple[float, float] = (0.0, 0.0)  # m and rad, standard deviations of poses from smooth motion
     lost: int = 0  # number of poses that were missing or not numbers
     jumps: int = 0  # number of poses that were left out because no motion leads there and back
+    # Of films: small motions [6] of a pose `goal` (m and rad, world axes) and changes of the camera [C] (in standard
+    # deviations) are as likely as root [T, D, 6, 6] @ motion + rest [T, D, 6] + camera [T, D, 6, C] @ change is small.
+    # `late` [T] s: when the frame was taken, after the time of its row.
+    root: np.ndarray | None = None
+    rest: np.ndarray | None = None
+    camera: np.ndarray | None = None
+    late: np.ndarray | None = None
 
 
 def movers(scene: Scene) -> list[Body]:

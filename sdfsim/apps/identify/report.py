@@ -66,7 +66,9 @@ class Identified:
     estimates: list[Estimate]
     windows: int
     error_m: float  # root mean square over short windows
-    held_out: dict[str, Any]  # errors of whole motions that the fit has not seen; of all motions if `recordings` is 0
+    held_out: dict[
+        str, Any
+    ]  # errors of whole motions that the fit has not seen; of all motions if `recordings` is 0; empty for films
     notes: list[str]
     scene_values: dict[str, dict[str, Any]] = field(default_factory=dict)
     joint_values: dict[str, dict[str, Any]] = field(default_factory=dict)  # joint -> key -> value
@@ -85,8 +87,10 @@ class Identified:
 
 def report_lines(found: Identified) -> list[str]:
     lines = [": ".join(e.lines()) for e in found.estimates]
-    lines.append(f"{found.windows} windows, repeated with an error of {found.error_m:.2g} m")
     h = found.held_out
+    if not h:  # of films, whose notes say how far they are off
+        return [*lines, *found.notes]
+    lines.append(f"{found.windows} windows, repeated with an error of {found.error_m:.2g} m")
     who = f"{h['recordings']} whole motions that the fit has not seen" if h["recordings"] else "the same motions, whole"
     lines.append(
         "{}: {:.2g} % of the size and {:.2g} degrees off; as the scene was, {:.2g} % and {:.2g}".format(
@@ -102,7 +106,7 @@ def estimated(
     """Values with their intervals, from the curvature of the robust cost and the scatter between recordings, or windows
     if recordings are few (a sandwich estimator). No value if noise of `OUTLIER` per number would leave it
     undetermined."""
-    parameters, width = problem.parameters, problem.width
+    width = problem.width
     data, slope = errors[: -len(values)], slope[: -len(values)] * width
     weight = (1.0 + data**2) ** -0.5  # weights of the soft L1 loss
     curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(values))
@@ -116,7 +120,13 @@ def estimated(
     noise = max(1.0, float(np.mean(np.abs(data))) ** 2)
     posterior = np.linalg.inv((slope.T @ slope) * len(which) / len(group) / noise + np.eye(len(values)))
     shown = np.sqrt(np.diag(posterior)) < SHOWN
-    shown &= [p.kind != "restitution" or bool(problem.hit & set(p.bodies)) for p in parameters]
+    return estimates_of(problem, values, covariance, shown)
+
+
+def estimates_of(problem: Problem, values: np.ndarray, covariance: np.ndarray, shown: np.ndarray) -> list[Estimate]:
+    """Values with their intervals, from their covariance in widths; no value if it is not `shown` [P]."""
+    parameters, width = problem.parameters, problem.width
+    shown = shown & [p.kind != "restitution" or bool(problem.hit & set(p.bodies)) for p in parameters]
 
     def estimate(kind: str, name: str, value: float, gradient: dict[int, float]) -> Estimate:
         """The estimate of a value with these derivatives with respect to parameters."""

@@ -1,0 +1,1 @@
+"""Films of a fixed camera: where the bodies of a scene were in them. Start reading at `track`."""

@@ -1,0 +1,172 @@
+"""Where the camera of a film stood: from points of known places, or from a ball that falls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from sdfsim.apps.film.eye import WAYS, Eye
+from sdfsim.apps.film.frames import Clip
+from sdfsim.apps.film.poses import Seen
+from sdfsim.base.errors import SdfsimError
+from sdfsim.physics import pose
+
+CLICK = 1.0  # px, standard deviation of a clicked point
+LENS = 1.0, 0.35  # focal length of phones relative to the longer side, and the spread of its logarithm
+FLIGHT = 0.22  # s, of pieces in which a ball is taken to fly
+FITS = 4.0  # mean of squares up to which a piece is a flight
+LEVEL = 0.4  # rad, how much phones are tilted up or down
+LEAST = 4  # points
+WRONG = 8.0  # px, of points that do not fit together
+UNSURE = 10.0  # how many standard deviations gravity must be from nothing in a piece
+SCALE = 0.75, 1.35  # accelerations relative to gravity beyond which a piece is no flight
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray, float | None]:
+    """Pixels [N, 2] and places [N, 3] m of a YAML file, and the focal length in px if it has one. Raises SdfsimError
+    for a file that is not of this form."""
+    try:
+        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        pairs = [(one["pixel"], one["place"]) for one in data["points"]]
+        pixels, places = (np.array(part, dtype=np.float64) for part in zip(*pairs, strict=True))
+        focal = data.get("focal")
+        if pixels.shape[1:] != (2,) or places.shape[1:] != (3,) or len(pixels) < LEAST or (focal or 1.0) <= 0:
+            raise ValueError
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f"must hold points, at least {LEAST}, each with pixel: [x, y] and place: [x, y, z] (m)"
+        raise SdfsimError(f"{path}: {what}", f"sdfsim measure CLIP -o {path} writes such a file") from error
+    return pixels, places, focal
+
+
+def of_points(pixels: np.ndarray, places: np.ndarray, focal: float | None, size: tuple[int, int], name: str) -> Eye:
+    """The camera that sees points at these pixels; the focal length is found with it, by what is usual and, if given,
+    to 2 %. Raises SdfsimError if no camera does."""
+    import cv2
+    from scipy.optimize import least_squares
+
+    wide, high = size
+    longer = max(size)
+    usual, spread = (np.log(focal), 0.02) if focal else (np.log(LENS[0] * longer), LENS[1])
+    best, rest = None, None
+    for guess in [focal] if focal else np.geomspace(0.5, 2.5, 9) * longer:
+        lens = np.array([[guess, 0, wide / 2], [0, guess, high / 2], [0, 0, 1.0]])
+        for method in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP):
+            done, turn, shift = cv2.solvePnP(places, pixels, lens, None, flags=method)
+            if not done or not np.isfinite(shift).all():
+                continue
+            start = Eye(cv2.Rodrigues(turn)[0], shift[:, 0], float(guess), wide, high, np.zeros((WAYS, 0)), name)
+
+            def off(change: np.ndarray, start: Eye = start) -> np.ndarray:
+                eye = start.moved(change)
+                at = (eye.project(places) - pixels) / CLICK
+                return np.r_[np.nan_to_num(at, nan=1e3).ravel(), (np.log(eye.focal) - usual) / spread]
+
+            found = least_squares(off, np.zeros(WAYS), x_scale="jac")
+            eye = start.moved(found.x)
+            if (eye.seen(places)[:, 2] > 0).all() and (rest is None or found.cost < rest.cost):
+                best, rest = eye, found
+    mean = np.inf if rest is None else float(np.sqrt(np.square(rest.fun[:-1]).sum() / len(places)))
+    if best is None or rest is None or mean > WRONG:
+        raise SdfsimError(
+            f"{name}: no camera sees these points at these pixels ({mean:.1f} px off)", "check the points"
+        )
+    freedom = max(1, 2 * len(places) - WAYS)
+    chi = max(1.0, float(np.square(rest.fun[:-1]).sum()) / freedom)
+    normal = rest.jac.T @ rest.jac
+    covariance = np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal))) * chi
+    values, vectors = np.linalg.eigh(covariance)
+    at_best = np.eye(WAYS)  # changes about `start` are those about `best` to first order
+    doubt = at_best @ vectors * np.sqrt(np.maximum(values, 0.0))
+    return Eye(best.rotation, best.translation, best.focal, wide, high, doubt, name)
+
+
+def level(clip: Clip) -> Eye:
+    """A camera at the origin that looks along y, of a usual phone: what is taken before anything is known."""
+    high, wide = clip.pixels.shape[1:3]
+    turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    return Eye(turn, np.zeros(3), LENS[0] * max(wide, high), wide, high, np.zeros((WAYS, 0)), "a falling ball")
+
+
+def of_ball(
+    clip: Clip, eye: Eye, seen: Sequence[Seen | None], gravity: np.ndarray, start: np.ndarray, ground: float
+) -> tuple[Eye, np.ndarray, np.ndarray]:
+    """The camera of a film of a ball that bounces on level ground: down is where it accelerates to, and its lowest
+    place is on the `ground`, m above which its centre then is; it begins at `start` [3] m, seen from above.
+
+    Returns the camera, and the rotation [4] and shift [3] from the world of `eye`. Raises SdfsimError if it never
+    flies, or falls at another rate than gravity's."""
+    rows = np.array([k for k, one in enumerate(seen) if one is not None])
+    count = max(6, round(FLIGHT / clip.step))
+    strength = float(np.linalg.norm(gravity))
+    found = []
+    for a in range(0, len(rows) - count + 1, max(1, count // 3)):
+        some = [seen[k] for k in rows[a : a + count]]
+        t = clip.time[rows[a : a + count]] - clip.time[rows[a : a + count]].mean()
+        root = np.stack([one.root[:, :3] for one in some])
+        right = np.stack([one.root[:, :3] @ one.place - one.rest for one in some]).ravel()
+        matrix = np.concatenate([root, root * t[:, None, None], root * 0.5 * t[:, None, None] ** 2], 2).reshape(-1, 9)
+        fit = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        chi = max(1.0, float(np.square(matrix @ fit - right).sum()) / (3 * count - 9))
+        across = fit[6:] - eye.rotation[2] * (eye.rotation[2] @ fit[6:])
+        sure = matrix[:, 6:] - matrix[:, :6] @ np.linalg.lstsq(matrix[:, :6], matrix[:, 6:], rcond=None)[0]
+        certain = float(np.linalg.norm(sure @ across)) / np.sqrt(chi)  # standard deviations from an even speed
+        if t[-1] - t[0] < 1.5 * FLIGHT and certain > UNSURE:
+            found.append((chi, across, matrix / np.sqrt(chi), right / np.sqrt(chi)))
+    flights = [one for one in found if one[0] <= FITS]
+    pulls = [float(np.linalg.norm(across)) for _, across, *_ in flights]
+    pieces = [one for one, pull in zip(flights, pulls, strict=True) if SCALE[0] < pull / strength < SCALE[1]]
+    if not pieces:
+        usual = float(np.median(pulls or [0.0]))
+        if usual > 1e-3 * strength:
+            hint = f"a film in slow motion needs --slow, here about {np.sqrt(strength / usual):.1f}"
+            raise SdfsimError(f"{clip.path}: things fall at {usual:.2g} m/s^2, not {strength:.3g}", hint)
+        raise SdfsimError(f"{clip.path}: the ball never flies freely", "the camera needs points of known places: --points")
+    # The direction of gravity, of this strength: two angles, by Gauss-Newton; places and speeds are eliminated.
+    down = np.median([across / np.linalg.norm(across) for _, across, *_ in pieces], 0)
+    down /= np.linalg.norm(down)
+    for _ in range(30):
+        aside = np.linalg.svd(down[None])[2][1:]
+        normal, pull = np.zeros((2, 2)), np.zeros(2)
+        for _, _, matrix, right in pieces:
+            basis = np.linalg.qr(matrix[:, :6])[0]
+            rest = right - strength * matrix[:, 6:] @ down
+            slope = strength * matrix[:, 6:] @ aside.T
+            rest, slope = (x - basis @ (basis.T @ x) for x in (rest, slope))
+            normal, pull = normal + slope.T @ slope, pull + slope.T @ rest
+        ahead = eye.rotation[2]  # people hold phones about level
+        normal = normal + np.outer(aside @ ahead, aside @ ahead) / LEVEL**2 + 1e-9 * np.eye(2)
+        by = np.linalg.solve(normal, pull - aside @ ahead * (down @ ahead) / LEVEL**2)
+        down = down + by * min(1.0, 0.1 / np.linalg.norm(by)) @ aside
+        down /= np.linalg.norm(down)
+    axis = np.cross(down, [0.0, 0.0, -1.0])
+    angle = np.arctan2(np.linalg.norm(axis), -down[2])
+    turn = pose.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle)
+    matrix = pose.to_matrix(turn)
+    places = np.stack([seen[k].place for k in rows]) @ matrix.T
+    sure = np.stack([np.linalg.norm(seen[k].root[:, :3] @ matrix.T[:, 2]) for k in rows])
+    low = np.quantile(places[sure > 0.3 * np.median(sure), 2], 0.02)
+    shift = np.r_[start[:2] - places[0, :2], ground - low]
+    rotation = eye.rotation @ matrix.T
+    # Not known: which way is down (two angles about axes across it), the height, and the focal length.
+    doubt = np.zeros((WAYS, 4))
+    covariance = 2.0 * np.linalg.inv(normal)
+    values, vectors = np.linalg.eigh(covariance)
+    for k in range(2):
+        about = matrix @ np.cross(down, vectors[:, k] @ aside)
+        doubt[:3, k] = np.sqrt(values[k]) * (rotation @ about)
+    doubt[3:6, 2] = rotation @ np.array([0.0, 0.0, 0.05])
+    doubt[6, 3] = LENS[1]
+    translation = eye.translation - rotation @ shift
+    return Eye(rotation, translation, eye.focal, eye.width, eye.height, doubt, eye.source), turn, shift
+
+
+def in_world(one: Seen, turn: np.ndarray, shift: np.ndarray) -> Seen:
+    """A pose after its world was turned and shifted."""
+    back = np.kron(np.eye(2), pose.to_matrix(turn).T)
+    return replace(
+        one, place=pose.rotate(turn, one.place) + shift, turn=pose.multiply(turn, one.turn), root=one.root @ back
+    )

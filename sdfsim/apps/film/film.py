@@ -1,0 +1,169 @@
+"""From a film and a scene to a recording: the whole way, and what goes wrong on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.apps.film.background import background, checked
+from sdfsim.apps.film.camera import in_world, level, of_ball, of_points, read_points
+from sdfsim.apps.film.drawing import Look
+from sdfsim.apps.film.eye import Eye
+from sdfsim.apps.film.frames import Clip, read_clip
+from sdfsim.apps.film.recording import recording_of
+from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, find, follow, masks, shutter_of
+from sdfsim.apps.film.beside import write_beside
+from sdfsim.apps.identify.filmed import identify_films
+from sdfsim.apps.identify.report import Identified
+from sdfsim.apps.observed import Recording, movers
+from sdfsim.base.errors import SdfsimError, nearest
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.scene.builder import SceneBuilder, loaded
+from sdfsim.scene.scene import Scene
+
+FITS = 0.6  # score that most frames of a body of the right shape have
+ENOUGH = 8  # frames in which a body must be seen
+GONE = 0.25  # share of the frames after which a body may be out of the picture
+
+
+def track(
+    clip: Path | str, scene: Scene | SceneBuilder | Path | str, *, points: Path | str | None = None, slow: float = 1.0,
+    start: float | None = None, end: float | None = None, on_progress: Progress = silent,
+) -> Recording:  # fmt: skip
+    """Where the moving bodies of a scene were in a film of a fixed camera, with an uncertainty of each pose.
+
+    The camera is found from `points` of known places (a file of `sdfsim measure`), or from a single ball that bounces
+    on level ground. `slow`: how many times slower the film plays than things moved; `start` and `end` s: the part of
+    the film. Raises SdfsimError for films in which the bodies cannot be tracked.
+    """
+    return watched(
+        Path(clip), loaded(scene), points=points, slow=slow, start=start, end=end, on_progress=on_progress
+    ).recording
+
+
+def watched(
+    path: Path, scene: Scene, *, points: Path | str | None = None, slow: float = 1.0, start: float | None = None,
+    end: float | None = None, on_progress: Progress = silent,
+) -> Film:  # fmt: skip
+    """As `track`, with everything else that was found."""
+    clip = read_clip(path, slow=slow, start=start, end=end, on_progress=on_progress)
+    back = background(clip)
+    checked(clip, back)
+    bodies, size = movers(scene), (clip.pixels.shape[2], clip.pixels.shape[1])
+    looks = [Look(scene, body) for body in bodies]
+    if points is not None:
+        eye = of_points(*read_points(Path(points)), size, str(points))
+    elif len(looks) == 1 and looks[0].ball:
+        eye = level(clip)
+    else:
+        raise SdfsimError(
+            f"{path}: where the camera stood is not known (only a single ball shows it by falling)",
+            f"give points of known places: sdfsim measure {path} -o points.yaml, then --points points.yaml",
+        )
+    shutter, tracks, gravity = Shutter(0.5 * clip.step, 0.7), [], np.asarray(scene.gravity)
+    for body, look in zip(bodies, looks, strict=True):
+        place = body.position + look.com
+        k, first = find(clip, back, look, eye, place, body.quat_xyzw, body.name, on_progress, free=len(bodies) == 1)
+        tracks.append(follow(clip, back, look, eye, shutter, k, first, gravity, on_progress=on_progress))
+        _judged(clip, tracks[-1], body.name)
+    shutter = shutter_of(clip, back, eye, tracks[0])
+    covered = [masks(clip, eye, one) for one in tracks]
+    every = [_either([of[k] for of in covered]) for k in range(len(clip.time))]
+    back = background(clip, every)
+    refined = []
+    for d, one in enumerate(tracks):
+        others = [_either([of[k] for j, of in enumerate(covered) if j != d]) for k in range(len(clip.time))]
+        k = max(one.frames.tolist(), key=lambda k: one.seen[k].score)
+        full = follow(clip, back, one.look, eye, shutter, k, one.seen[k], gravity, others, on_progress)
+        refined.append(deepened(clip, eye, again(clip, back, eye, shutter, full, others)))
+    tracks = refined
+    for body, one in zip(bodies, tracks, strict=True):
+        _judged(clip, one, body.name)
+        _stays(clip, eye, one, body.name)
+    if points is None:
+        look = looks[0]
+        below = [
+            b.position[2] + b.scale * scene.shapes[b.shape].sdf.bounds[1, 2]
+            for b in scene.bodies
+            if b.motion == "static"
+        ]
+        ground = max([z if np.isfinite(z) else 0.0 for z in below], default=0.0) + look.ball
+        eye, turn, shift = of_ball(clip, eye, tracks[0].seen, np.asarray(scene.gravity), bodies[0].position, ground)
+        moved = [one and in_world(one, turn, shift) for one in tracks[0].seen]
+        tracks = [deepened(clip, eye, again(clip, back, eye, shutter, Track(look, moved)))]
+    notes = [*clip.notes, f"shutter open for {1e3 * shutter.open:.2g} ms, smeared by {shutter.spread:.2g} px"]
+    return Film(clip, eye, tracks, recording_of(clip, eye, tracks, scene), notes)
+
+
+def identify_clips(
+    paths: Sequence[Path], scene: Scene, *, points: Path | None = None, slow: float = 1.0, start: float | None = None,
+    end: float | None = None, beside: Path | None = None, on_progress: Progress = silent,
+) -> Identified:  # fmt: skip
+    """Parameters of a scene from films of it, see `track`; with `beside`, a movie of the first film with the outlines
+    of the fit's motion."""
+    films = [
+        watched(path, scene, points=points, slow=slow, start=start, end=end, on_progress=on_progress) for path in paths
+    ]
+    found, motion = identify_films([film.recording for film in films], scene, on_progress=on_progress)
+    if beside is not None:
+        first = films[0]
+        row = np.round((first.clip.time - first.clip.time[0]) / first.recording.dt).astype(int)
+
+        def made(k: int, d: int) -> tuple[np.ndarray, np.ndarray] | None:
+            now = motion.get((0, int(row[k])))
+            return now and (now[0][d], now[1][d])
+
+        write_beside(first, made, beside)
+    notes = [f"{film.clip.path.name}: {note}" for film in films for note in film.notes]
+    return replace(found, notes=[*found.notes, *notes])
+
+
+def only_moving(scene: Scene, names: Sequence[str]) -> Scene:
+    """The scene with only these of the moving bodies; all if none is named. Raises SdfsimError for a name that it does
+    not have."""
+    moving = [body.name for body in movers(scene)]
+    for name in names:
+        if name not in moving:
+            raise SdfsimError(
+                f"--body {name}: no moving body of the scene{nearest(name, moving)}", f"it has {', '.join(moving)}"
+            )
+    bodies = tuple(body for body in scene.bodies if not names or body.motion != "dynamic" or body.name in names)
+    return replace(scene, bodies=bodies) if names else scene
+
+
+def _either(found: list[np.ndarray | None]) -> np.ndarray | None:
+    there = [one for one in found if one is not None]
+    return np.logical_or.reduce(there) if there else None
+
+
+def _judged(clip: Clip, track: Track, name: str) -> None:
+    """Raises SdfsimError if a body was seen too seldom, or does not look as in the scene."""
+    rows = track.frames
+    if len(rows) < ENOUGH:
+        hint = "more light, a plainer background, or more frames a second; --start and --end choose a part"
+        raise SdfsimError(f"{clip.path}: {name!r} was found in {len(rows)} frames (at least {ENOUGH})", hint)
+    score = float(np.median([track.seen[k].score for k in rows]))
+    if score < FITS:
+        hint = "check its shape and size in the scene, and the camera"
+        raise SdfsimError(f"{clip.path}: what moves does not look like {name!r} (fits by {100 * score:.0f} %)", hint)
+
+
+def _stays(clip: Clip, eye: Eye, track: Track, name: str) -> None:
+    """Raises SdfsimError if a body leaves the picture long before the film ends."""
+    last = int(track.frames[-1])
+    one, count = track.seen[last], len(clip.time)
+    at = track.look.window(eye, one.place, one.turn, 0.0)
+    before = track.seen[int(track.frames[-2])]
+    way = eye.project(one.place) - eye.project(before.place)
+    near = (
+        at is None
+        or (np.array([at.left, at.top, eye.width - at.right, eye.height - at.bottom]) < 3 + np.abs(way).max()).any()
+    )
+    if near and count - 1 - last > max(2, GONE * count):
+        when = clip.time[last]
+        raise SdfsimError(
+            f"{clip.path}: {name!r} leaves the picture after {when:.2f} s", f"end there: --end {when:.2f}"
+        )

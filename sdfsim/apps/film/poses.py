@@ -1,0 +1,252 @@
+"""The pose of a body in one frame, by comparing the frame with what the body would cover (analysis by synthesis).
+
+A pixel is the background's colour and the body's, mixed by the share that the body covers: of the time of exposure too,
+so blur is drawn as blur. Colours of the body's flat faces are unknown, and found with the pose by least squares. Pixels
+that fit badly (a shadow's edge, a hand) count less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sdfsim.apps.film.drawing import Look, Window
+from sdfsim.apps.film.eye import WAYS, Eye
+from sdfsim.physics import pose
+
+ROUNDS = 12
+TRY = 0.3  # px, steps of derivatives
+ODD = 3.0  # standard deviations beyond which a pixel counts less
+MARGIN = 5.0  # px around a body that are compared
+FREE = 12.0  # levels by which a colour may differ from that in other frames
+SMEARED = 4.0  # radii: the longest smear
+LARGEST = 400  # px, sides of the part of a picture that is compared
+FLOOR = 0.04  # px: a pose is never more certain
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """How moving things are smeared."""
+
+    open: float  # s
+    spread: float  # px, standard deviation of what the lens and compression smear
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A body's pose in a frame. Small motions of it [6] (shift m, rotation vector rad, world axes) and of the camera
+    [WAYS] are as likely as `root` @ motion + `rest` + `camera` @ change is small, in standard deviations."""
+
+    place: np.ndarray  # [3] m, centre of mass
+    turn: np.ndarray  # [4]
+    root: np.ndarray  # [6, 6]
+    rest: np.ndarray  # [6]
+    camera: np.ndarray  # [6, WAYS]
+    color: np.ndarray  # [basis, 3] levels
+    score: float  # the share of the difference to the background that is explained
+    mean: float  # standard deviations, of the difference that remains
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a pose is compared with."""
+
+    pixels: np.ndarray  # [H, W, 3] uint8
+    still: np.ndarray  # [H, W, 3] float32, the background
+    gain: float  # how much brighter the frame is
+    noise: float
+    hidden: np.ndarray | None = None  # [H, W] bool, covered by other bodies
+
+
+def smear(cover: np.ndarray, flow: np.ndarray, spread: float) -> np.ndarray:
+    """Covers [parts, h, w] of a body that moves by `flow` [2] px while the shutter is open."""
+    length = float(np.hypot(*flow))
+    if length > 0.3:
+        half = int(np.ceil(length / 2)) + 1
+        kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+        for share in (np.arange(n := int(4 * length) + 2) + 0.5) / n - 0.5:
+            x, y = half + share * flow
+            left, top = int(x), int(y)
+            across, down = x - left, y - top
+            kernel[top : top + 2, left : left + 2] += np.outer([1 - down, down], [1 - across, across]) / n
+        cover = np.stack([cv2.filter2D(one, -1, kernel, borderType=cv2.BORDER_CONSTANT) for one in cover])
+    if spread > 0.0:
+        cover = np.stack([cv2.GaussianBlur(one, (0, 0), spread, borderType=cv2.BORDER_CONSTANT) for one in cover])
+    return cover
+
+
+class Comparison:
+    """A frame and a body, about a first guess of its pose."""
+
+    def __init__(
+        self, look: Look, eye: Eye, frame: Frame, at: Window, flow: np.ndarray, spread: float, wide: float = 0.0
+    ) -> None:
+        self.look, self.eye, self.at, self.flow, self.spread = look, eye, at, flow, float(np.hypot(spread, wide))
+        still = frame.gain * frame.still[at.rows, at.columns]
+        self.weight = np.isfinite(still[..., 0]).astype(np.float32)
+        if frame.hidden is not None:
+            self.weight *= ~frame.hidden[at.rows, at.columns]
+        self.still, now = np.nan_to_num(still), frame.pixels[at.rows, at.columns].astype(np.float32)
+        if wide:
+            self.still, now = (cv2.GaussianBlur(one, (0, 0), wide) for one in (self.still, now))
+        self.off = now - self.still
+        self.noise = frame.noise
+
+    def cover(self, place: np.ndarray, turn: np.ndarray, eye: Eye | None = None) -> np.ndarray:
+        return smear(self.look.cover(eye or self.eye, place, turn, self.at), self.flow, self.spread)
+
+    def explained(
+        self, cover: np.ndarray, color: np.ndarray | None, weight: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The best colours [basis, 3], and the remaining differences [h, w, 3] in standard deviations."""
+        basis = self.shaded(cover).reshape(-1, weight.size)
+        behind = cover.sum(0).reshape(-1, 1) * self.still.reshape(-1, 3)
+        w = weight.ravel()
+        known = np.zeros((len(basis), 3)) if color is None else color
+        pull = (1e-3 if color is None else (self.noise / FREE) ** 2) * np.eye(len(basis))
+        right = (basis * w) @ (self.off.reshape(-1, 3) + behind) + pull @ known
+        found = np.linalg.solve((basis * w) @ basis.T + pull, right)
+        rest = (self.off.reshape(-1, 3) + behind - basis.T @ found) / self.noise
+        return found, rest.reshape(self.off.shape)
+
+    def shaded(self, cover: np.ndarray) -> np.ndarray:
+        """[basis, h, w] the patterns of which the body's brightness is made: flat faces are even, and what is round is
+        brighter towards a side."""
+        if not self.look.round:
+            return cover
+        high, wide = cover.shape[1:]
+        x, y = np.arange(wide), np.arange(high)[:, None]
+        total = max(float(cover[0].sum()), 1.0)
+        size = np.sqrt(total / np.pi)
+        across, down = ((axis - (cover[0] * axis).sum() / total) / size for axis in (x, y))
+        return np.concatenate([cover, [cover[0] * across, cover[0] * down]]).astype(np.float32)
+
+    def robust(self, rest: np.ndarray) -> np.ndarray:
+        return self.weight / (1.0 + (rest**2).mean(-1) / ODD**2)
+
+    def cost(self, rest: np.ndarray) -> float:
+        return float((self.weight * np.log1p((rest**2).mean(-1) / ODD**2)).sum())
+
+
+def moved(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A pose after small motions `by` [ways], each of about a pixel: across, down, towards, and about three axes."""
+    scale = axes(look, eye, place)
+    place = place + scale[:, :3] @ by[:3]
+    if look.ways == 6:
+        turn = pose.multiply(pose.from_rotvec(scale[:, 3:] @ by[3:]), turn)
+    return place, turn
+
+
+def axes(look: Look, eye: Eye, place: np.ndarray) -> np.ndarray:
+    """[3, 6] columns: shifts in m (then rotations in rad) of the world that move the outline by about a pixel."""
+    local = eye.seen(place)
+    pixel = local[2] / eye.focal
+    large = max(look.radius / pixel, 1.0)
+    shift = np.stack([[pixel, 0, 0], [0, pixel, 0], local / large], 1)
+    return eye.rotation.T @ np.c_[shift, np.eye(3) / large]
+
+
+def fitted(
+    look: Look, eye: Eye, frame: Frame, place: np.ndarray, turn: np.ndarray, flow: np.ndarray, spread: float,
+    color: np.ndarray | None, *, rounds: int = ROUNDS, wide: float = 0.0,
+) -> Seen | None:  # fmt: skip
+    """The pose near a first guess that explains a frame best; `wide`: px by which both are smeared, for a guess that
+    is off by as much. None if the body is not in the picture."""
+    most = SMEARED * look.radius * eye.focal / max(float(eye.seen(place)[2]), look.radius)
+    flow = flow * min(1.0, most / max(float(np.hypot(*flow)), 1e-9))
+    at = look.window(eye, place, turn, MARGIN + 3.0 * wide + 0.6 * float(np.abs(flow).max()))
+    if at is None or max(at.right - at.left, at.bottom - at.top) > LARGEST:
+        return None
+    seen = Comparison(look, eye, frame, at, flow, spread, wide)
+    damping = 1e-3
+    cover = seen.cover(place, turn)
+    color_now, rest = seen.explained(cover, color, seen.weight)
+    weight = seen.robust(rest)
+    color_now, rest = seen.explained(cover, color, weight)
+    cost = seen.cost(rest)
+    slopes = _slopes(seen, place, turn, color, weight, rest)
+    for _ in range(rounds):
+        _, normal, pull = slopes
+        by = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-3), pull)
+        by *= min(1.0, (1.5 + wide) / max(np.abs(by).max(), 1e-9))
+        new = moved(look, eye, place, turn, by)
+        if eye.seen(new[0])[2] < 1.5 * look.radius:
+            return None
+        tried, left = seen.explained(seen.cover(*new), color, weight)
+        after = seen.cost(left)
+        if after < cost:
+            done = np.abs(by).max() < 0.02 or cost - after < 1e-4 * cost
+            place, turn, color_now, rest, damping, cost = *new, tried, left, damping / 4.0, after
+            weight = seen.robust(rest)
+            slopes = _slopes(seen, place, turn, color, weight, rest)
+            if done:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e2 or np.abs(by).max() < 0.02:
+                break
+    slope, normal, pull = slopes
+    return _seen(seen, place, turn, color_now, rest, weight, slope, normal, pull)
+
+
+def _slopes(seen: Comparison, place, turn, color, weight, rest) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives [ways, h, w, 3] of the differences, colours fitted again, and their normal equations."""
+    ways, slope = seen.look.ways, []
+    for k in range(ways):
+        by = np.zeros(ways)
+        by[k] = TRY
+        ends = [seen.explained(seen.cover(*moved(seen.look, seen.eye, place, turn, s * by)), color, weight)[1]
+                for s in (1.0, -1.0)]  # fmt: skip
+        slope.append((ends[0] - ends[1]) / (2.0 * TRY))
+    stacked = np.stack(slope)
+    flat = (stacked * weight[..., None]).reshape(ways, -1)
+    return stacked, flat @ stacked.reshape(ways, -1).T, flat @ rest.ravel()
+
+
+def _seen(seen: Comparison, place, turn, color, rest, weight, slope, normal, pull) -> Seen:
+    look, eye = seen.look, seen.eye
+    # How large the differences are where the pose shows: more than noise, as no model is exact.
+    edge = (slope**2).sum((0, -1)) * weight
+    mean = float((edge * (rest**2).mean(-1)).sum() / max(edge.sum(), 1e-12))
+    each = max(1.0, mean) * 2.0  # neighbouring pixels err together
+    # A camera's change, as the motion of the body's outline that it looks like.
+    like = np.zeros((look.ways, WAYS))
+    for k in range(WAYS):
+        step = np.zeros(WAYS)
+        step[k] = 1e-4
+        like[:, k] = _alike(look, eye, eye.moved(step), place, turn) / 1e-4
+    values, vectors = np.linalg.eigh(normal / each)
+    values = np.maximum(values, 0.0)
+    root = vectors * np.sqrt(values / (1.0 + values * FLOOR**2)) @ vectors.T  # per pixel-like motion
+    off = np.linalg.pinv(normal, rcond=1e-6) @ pull
+    scale = axes(look, eye, place)
+    to_world = np.zeros((6, 6))
+    to_world[:3, :3], to_world[3:, 3:] = scale[:, :3], scale[:, 3:]
+    full = np.zeros((6, 6))
+    full[: look.ways, : look.ways] = root
+    large, small = (np.abs(seen.off) ** 2).mean(-1), (rest**2).mean(-1) * seen.noise**2
+    total = float((large * seen.weight).sum())
+    score = 1.0 - float((small * seen.weight).sum()) / max(total, 1e-9)
+    if total < 4.0 * seen.noise**2 * seen.weight.size:
+        score = min(score, 0.0)
+    return Seen(place, turn, full @ np.linalg.inv(to_world), full[:, : look.ways] @ off,
+                full[:, : look.ways] @ like, color, score, np.sqrt(mean))  # fmt: skip
+
+
+def _alike(look: Look, eye: Eye, other: Eye, place, turn) -> np.ndarray:
+    """[ways] the pixel-like motion of a body that looks as the change from a camera to another."""
+    points = pose.rotate(turn, look.corners)
+    if look.ball:
+        points = np.concatenate([np.eye(3), -np.eye(3)]) @ eye.rotation * look.ball
+    base = eye.project(points + place)
+    target = other.project(points + place) - base
+    columns = []
+    for k in range(look.ways):
+        by = np.zeros(look.ways)
+        by[k] = 1e-3
+        new, turned = moved(look, eye, place, turn, by)
+        body = pose.rotate(pose.multiply(turned, pose.conjugate(turn)), points) if look.ways == 6 else points
+        columns.append(((eye.project(body + new) - base) / 1e-3).ravel())
+    return np.linalg.lstsq(np.stack(columns, 1), target.ravel(), rcond=None)[0]

@@ -1,0 +1,283 @@
+"""Follows the bodies of a scene through a film: found once, then predicted from frame to frame, in both directions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sdfsim.apps.film.background import Background
+from sdfsim.apps.film.drawing import Look, Window
+from sdfsim.apps.film.eye import Eye
+from sdfsim.apps.film.frames import Clip
+from sdfsim.apps.film.poses import Frame, Seen, Shutter, fitted
+from sdfsim.apps.observed import Recording
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.physics import pose
+
+STARTS, BLOBS, TURNS = 8, 3, 16  # frames in which a body is looked for, things that move there, and orientations
+FOREGROUND = 4.5  # standard deviations of noise, of what moves
+REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
+GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
+ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
+FAR = 6  # frames for which a lost body is looked for where it would fly
+TWIN = 0.85  # score of each of two things that may both be the body
+SHUTTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the time between frames
+SPREADS = (0.0, 0.6, 1.0, 1.6)  # px
+
+
+@dataclass
+class Track:
+    """A body through a film: what was seen of it in each frame, None where it was not found."""
+
+    look: Look
+    seen: list[Seen | None]
+
+    @property
+    def frames(self) -> np.ndarray:
+        return np.array([k for k, one in enumerate(self.seen) if one is not None], dtype=int)
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film with all that was found in it."""
+
+    clip: Clip
+    eye: Eye
+    tracks: list[Track]  # of the moving bodies
+    recording: Recording
+    notes: list[str]
+
+
+def frame_of(clip: Clip, back: Background, k: int, hidden: np.ndarray | None = None, way: int = 0) -> Frame:
+    """Frame k, with the background that is free of the body later (`way` 1), earlier (-1), or both (0)."""
+    return Frame(clip.pixels[k], (back.pixels, back.first, back.last)[way], float(back.gain[k]), back.noise, hidden)
+
+
+def blobs(frame: Frame) -> list[tuple[np.ndarray, float]]:
+    """What differs from the background, largest first: centres [2] px and areas px^2."""
+    off = np.nan_to_num(np.abs(frame.pixels - np.float32(frame.gain) * frame.still)).max(-1)
+    moves = (cv2.GaussianBlur(off, (0, 0), 1.0) > FOREGROUND * frame.noise).astype(np.uint8)
+    moves = cv2.morphologyEx(moves, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, _, stats, centres = cv2.connectedComponentsWithStats(moves)
+    order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA])[:BLOBS]
+    return [(centres[k] + 0.5, float(stats[k, cv2.CC_STAT_AREA])) for k in order if stats[k, cv2.CC_STAT_AREA] > 12]
+
+
+def guesses(
+    look: Look, eye: Eye, blob: tuple[np.ndarray, float], place: np.ndarray, turns: Sequence[np.ndarray]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Poses with their middle on a blob: a ball's depth is that of its area, others have that of `place`."""
+    at, area = blob
+    depth = float(eye.seen(place)[2])
+    if look.ball:
+        depth = eye.focal * look.ball / np.sqrt(area / np.pi)
+    local = eye.rays(*at) * max(depth, 2.0 * look.radius)
+    return [((local - eye.translation) @ eye.rotation, turn) for turn in turns]
+
+
+def find(
+    clip: Clip, back: Background, look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray, name: str,
+    on_progress: Progress = silent, free: bool = True,
+) -> tuple[int, Seen]:  # fmt: skip
+    """The frame in which a body is found best, and its pose there; `place` and `turn`: about where it begins. Raises
+    SdfsimError if nothing that moves looks like it, or two things do."""
+    rng = np.random.default_rng(0)
+    turns = [turn]
+    if not look.ball:
+        turns += [pose.normalise(q) for q in rng.standard_normal((TURNS, 4))]
+    none, found = np.zeros(2), []
+    for k in np.unique(np.linspace(0, len(clip.time) - 1, STARTS + 2)[1:-1].astype(int)).tolist():
+        frame = frame_of(clip, back, k)
+        for blob in blobs(frame):
+            tried = []
+            for guess in guesses(look, eye, blob, place, turns):
+                rough = fitted(look, eye, frame, *guess, none, 0.7, None, rounds=6, wide=2.5)
+                if rough is not None:
+                    tried.append(rough)
+                if rough is not None and rough.score > 0.9:
+                    break
+            tried.sort(key=lambda one: -one.score)
+            for rough in tried[:2]:
+                sharp = fitted(look, eye, frame, rough.place, rough.turn, none, 0.7, None)
+                if sharp is not None:
+                    found.append((sharp.score, k, sharp))
+        on_progress(0.0, f"looking for {name} in frame {k}")
+    if not found or max(score for score, *_ in found) < POOR:
+        raise SdfsimError(
+            f"{clip.path}: nothing that moves looks like {name!r}",
+            "check its shape and size in the scene, and the camera; more light may help",
+        )
+    score, k, best = max(found, key=lambda one: one[0])
+    if free and _twins(found, look):
+        raise SdfsimError(
+            f"{clip.path}: two things that move look like {name!r}",
+            "cover one of them, or add it to the scene; --start and --end choose a part of the film",
+        )
+    return k, best
+
+
+def _twins(found: list[tuple[float, int, Seen]], look: Look) -> bool:
+    """Whether two things that look like a body move in several frames. What only seems to move stays in its place: a
+    place that the body left, which the background still shows."""
+    best: dict[int, list[Seen]] = {}
+    for score, k, one in sorted(found, key=lambda item: -item[0]):
+        if score > TWIN and all(
+            np.linalg.norm(one.place - other.place) > 2.0 * look.radius for other in best.get(k, [])
+        ):
+            best.setdefault(k, []).append(one)
+    pairs = [some[:2] for some in best.values() if len(some) > 1]
+    ways = [np.ptp([pair[n].place for pair in pairs], axis=0).max() for n in range(2)] if len(pairs) > 2 else [0.0]
+    return min(ways) > 2.0 * look.radius
+
+
+def follow(
+    clip: Clip, back: Background, look: Look, eye: Eye, shutter: Shutter, k: int, first: Seen, gravity: np.ndarray,
+    hidden: Sequence[np.ndarray | None] | None = None, on_progress: Progress = silent,
+) -> Track:  # fmt: skip
+    """The body in all frames, from its pose in frame k."""
+    seen: list[Seen | None] = [None] * len(clip.time)
+    seen[k] = first
+    for way in (1, -1):
+        rows = range(k + way, len(seen) if way > 0 else -1, way)
+        for at in rows:
+            before = [j for j in range(at - way, at - way * (FAR + 1), -way) if 0 <= j < len(seen) and seen[j]][:3]
+            frame = frame_of(clip, back, at, hidden[at] if hidden else None, way)
+            seen[at] = _next(clip, look, eye, shutter, frame, at, [(j, seen[j]) for j in before], first, gravity)
+            on_progress(0.0, f"frame {at}")
+    return Track(look, seen)
+
+
+def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen | None:
+    if not before:  # lost for long: wherever something moves
+        for blob in blobs(frame):
+            for guess in guesses(look, eye, blob, first.place, [first.turn]):
+                one = fitted(look, eye, frame, *guess, np.zeros(2), shutter.spread, first.color, wide=2.5)
+                one = one and fitted(look, eye, frame, one.place, one.turn, np.zeros(2), shutter.spread, first.color)
+                if one is not None and one.score > GOOD:
+                    return one
+        return None
+    best = None
+    color = before[0][1].color
+    tries = [(*guess, 0.0) for guess in predicted(clip, eye, shutter, at, before, gravity)]
+    tries += [(*guess, 2.5) for *guess, _ in tries]
+    depth = float(eye.seen(before[0][1].place)[2])
+    for blob, _ in blobs(frame)[:2]:  # something pushed it: it may be anywhere, and rebound
+        there = (eye.rays(*blob) * depth - eye.translation) @ eye.rotation
+        tries += [(there, tries[0][1], flow, 2.5) for flow in (np.zeros(2), tries[0][2] * REBOUND)]
+    for place, turn, flow, wide in tries:
+        if best is not None and best.score > GOOD:
+            break
+        one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5 if wide else 10, wide=wide)
+        if one is not None and wide and one.score > max(POOR, best.score if best else 0.0):
+            one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
+        if one is not None and (best is None or one.score > best.score):
+            best = one
+    if best is None or best.score < POOR or at_edge(look, eye, best.place, best.turn):
+        return None
+    return best
+
+
+def predicted(clip, eye, shutter, at, before, gravity) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Places, turns, and flows while the shutter is open, from up to three frames before, the last one first: as after
+    a flight, and at the same speed."""
+    (k, last), time = before[0], clip.time
+    if len(before) == 1:
+        return [(last.place, last.turn, np.zeros(2))]
+    j, earlier = before[1]
+    later, sooner = time[at] - time[k], time[k] - time[j]
+    spin = pose.to_rotvec(pose.multiply(last.turn, pose.conjugate(earlier.turn)))
+    turn = pose.multiply(pose.from_rotvec(later / sooner * spin), last.turn)
+    speed, found = (last.place - earlier.place) / sooner, []
+    for pull in (gravity, 0.0 * gravity):
+        now = speed + 0.5 * sooner * pull  # at the last frame
+        place = last.place + later * now + 0.5 * later**2 * pull
+        way = eye.project(place + (now + later * pull) * 0.5 * shutter.open) - eye.project(
+            place - (now + later * pull) * 0.5 * shutter.open
+        )
+        found.append((place, turn, way))
+    return found
+
+
+def at_edge(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray) -> bool:
+    """Whether a part of it is outside of the picture."""
+    at = look.window(eye, place, turn, 1.0)
+    return at is None or at.left <= 0 or at.top <= 0 or at.right >= eye.width or at.bottom >= eye.height
+
+
+def flows(clip: Clip, eye: Eye, track: Track, shutter: Shutter) -> dict[int, np.ndarray]:
+    """[2] px by which the body moves while the shutter is open in each frame: the mean of the speeds before and after,
+    if both are alike."""
+    rows, found = track.frames, {}
+    at = {int(k): eye.project(track.seen[k].place) for k in rows}
+    for i, k in enumerate(rows.tolist()):
+        near = [j for j in rows[max(0, i - 1) : i + 2].tolist() if j != k and abs(j - k) <= 2]
+        speeds = [(at[j] - at[k]) / (clip.time[j] - clip.time[k]) for j in near]
+        found[k] = np.mean(speeds, 0) * shutter.open if speeds else np.zeros(2)
+    return found
+
+
+def again(
+    clip: Clip, back: Background, eye: Eye, shutter: Shutter, track: Track, hidden=None, only: Sequence[int] | None = None,
+) -> Track:  # fmt: skip
+    """The poses fitted again, with both neighbours' speeds, the film's usual colours, and another background."""
+    speed = flows(clip, eye, track, shutter)
+    color = np.median([track.seen[k].color for k in track.frames], 0)
+    seen = [None if only is not None and k not in only else one for k, one in enumerate(track.seen)]
+    for k in [k for k in track.frames.tolist() if only is None or k in only]:
+        frame, one = frame_of(clip, back, k, hidden[k] if hidden else None, 0), track.seen[k]
+        new = fitted(track.look, eye, frame, one.place, one.turn, speed[k], shutter.spread, 0.5 * (color + one.color))
+        seen[k] = None if new is None or new.score < POOR or at_edge(track.look, eye, new.place, new.turn) else new
+    return Track(track.look, seen)
+
+
+def shutter_of(clip: Clip, back: Background, eye: Eye, track: Track) -> Shutter:
+    """The shutter that explains the frames of the fastest motion best."""
+    speed = flows(clip, eye, track, Shutter(clip.step, 0.0))
+    fast = sorted(speed, key=lambda k: -float(np.hypot(*speed[k])))
+    some = fast[2 : max(10, len(fast) // 4) : max(1, len(fast) // 40)][:8]
+
+    def rest(trial: Shutter) -> float:
+        found = again(clip, back, eye, trial, track, only=some)
+        return float(np.median([found.seen[k].mean ** 2 if found.seen[k] else 1e3 for k in some]))
+
+    best = min((Shutter(share * clip.step, 0.6) for share in SHUTTERS), key=rest)
+    return min((replace(best, spread=spread) for spread in SPREADS), key=rest)
+
+
+def deepened(clip: Clip, eye: Eye, track: Track) -> Track:
+    """The track with depths as uncertain as they scatter. Blur, highlights and a dark background change how large a
+    body seems, alike in neighbouring frames, and what a single frame shows does not tell."""
+    rows = track.frames
+    depth = np.log([eye.seen(track.seen[k].place)[2] for k in rows])
+    bend = np.abs(depth[2:] - 2.0 * depth[1:-1] + depth[:-2])[(rows[2:] - rows[:-2]) == 2]
+    scatter = ALIKE * 1.48 * float(np.median(bend)) / np.sqrt(6.0) if len(bend) else 0.1
+    seen = list(track.seen)
+    for k in rows:
+        one = seen[k]
+        away = np.r_[one.place + eye.rotation.T @ eye.translation, np.zeros(3)] * scatter
+        sure = one.root.T @ one.root
+        sure = sure - np.outer(sure @ away, sure @ away) / (1.0 + away @ sure @ away)
+        values, vectors = np.linalg.eigh(sure)
+        root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        change = root @ np.linalg.pinv(one.root, rcond=1e-9)
+        seen[k] = replace(one, root=root, rest=change @ one.rest, camera=change @ one.camera)
+    return Track(track.look, seen)
+
+
+def masks(clip: Clip, eye: Eye, track: Track, wide: float = 3.0) -> list[np.ndarray | None]:
+    """[H, W] bool for each frame: where the body is, and a little around; None if that is unknown."""
+    found: list[np.ndarray | None] = []
+    for one in track.seen:
+        at: Window | None = None if one is None else track.look.window(eye, one.place, one.turn, 8.0)
+        if one is None or at is None:
+            found.append(None)
+            continue
+        mask = np.zeros(clip.pixels.shape[1:3], bool)
+        cover = track.look.cover(eye, one.place, one.turn, at).sum(0)
+        mask[at.rows, at.columns] = cv2.GaussianBlur(cover, (0, 0), wide) > 0.02
+        found.append(mask)
+    return found

@@ -1,0 +1,411 @@
+"""Parameters from recordings whose poses each have an uncertainty: those of films.
+
+A film shows some ways of a body well (across the picture) and others badly (towards the camera). So differences count by
+the uncertainty of each pose, and no velocity is taken from the poses: the start of each window is fitted with the
+parameters. What the camera is not known to is fitted too, and so is in the intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from sdfsim.apps.identify.parameters import Problem
+from sdfsim.apps.identify.report import SHOWN, Identified, estimates_of, file_values
+from sdfsim.apps.identify.residuals import Windows
+from sdfsim.apps.observed import Recording
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.physics import pose
+from sdfsim.physics.options import Options
+from sdfsim.physics.steps import Frames
+from sdfsim.scene.scene import Scene
+from sdfsim.simulate.batch import Copies, inner_of_frame
+
+SHORT, LONG = 0.4, 1.3  # s of windows for bodies of ten centimetres: the first fit, and the last
+FINE = 4  # times as many inner steps as usual: poses of films show an impact to less than one
+ROUNDS = 10
+ODD = 3.0  # standard deviations beyond which a pose counts less
+WORSE = 3.0  # how much larger the remaining differences of long windows may be than those of short ones
+SIZE = 0.1  # m, of the bodies for which windows are as long as said
+STARTS = 12  # numbers of a body's start: place, rotation, velocity, spin
+# What is known without the film, standard deviations, in the units of `Parameter`.
+KNOWN = {"inertia": 0.05, "size": 0.01, "tilt": math.radians(1.0), "mass": 1.0}
+WORST = 4  # frames that are named
+TOLD = 0.7  # share of what was known before: a film that leaves more does not show it
+TYPICAL = 0.45  # median of a mean of squares of six standard normal numbers, of which some are unseen
+TRIED = [(f, e) for e in (0.15, 0.45, 0.75) for f in (0.15, 0.5)]
+
+
+@dataclass
+class _Starts:
+    """States [W, D, *] in which windows begin, SI units."""
+
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+
+    def moved(self, by: np.ndarray) -> _Starts:
+        """After changes [W, D, 12]."""
+        turned = pose.multiply(pose.from_rotvec(by[..., 3:6]), self.orientation)
+        return _Starts(self.position + by[..., :3], turned, self.velocity + by[..., 6:9], self.spin + by[..., 9:])
+
+
+class Shots:
+    """Windows of films: pieces of these recordings that begin at these frames and last up to `length` frames."""
+
+    def __init__(self, problem: Problem, begin: Sequence[tuple[int, int]], length: int) -> None:
+        self.problem, self.begin = problem, list(begin)
+        self.many, self.dt = len(problem.moving), problem.recordings[0].dt
+        ends = [min(length, len(problem.recordings[k].known) - 1 - t) for k, t in begin]
+        self.length = max(ends)
+        shape = (len(begin), self.length + 1, self.many)
+        self.place, self.turn, self.root = np.zeros((*shape, 3)), np.zeros((*shape, 4)), np.zeros((*shape, 6, 6))
+        self.turn[..., 3] = 1.0
+        ways = problem.recordings[0].camera.shape[-1]
+        self.rest, self.camera, self.late = np.zeros((*shape, 6)), np.zeros((*shape, 6, ways)), np.zeros(shape[:2])
+        for w, ((k, t), n) in enumerate(zip(begin, ends, strict=True)):
+            r, rows = problem.recordings[k], slice(t, t + n + 1)
+            for mine, of in ((self.place, r.goal[0]), (self.turn, r.goal[1]), (self.root, r.root), (self.rest, r.rest),
+                             (self.camera, r.camera), (self.late, r.late)):  # fmt: skip
+                mine[w, : n + 1] = of[rows]
+        share = np.zeros((len(problem.recordings), max(len(r.known) for r in problem.recordings)))
+        for (k, t), n in zip(begin, ends, strict=True):
+            share[k, t : t + n + 1] += 1.0
+        for w, ((k, t), n) in enumerate(zip(begin, ends, strict=True)):  # frames of two windows count once
+            weight = np.sqrt(1.0 / share[k, t : t + n + 1])[:, None, None]
+            self.rest[w, : n + 1] *= weight
+            self.root[w, : n + 1] *= weight[..., None]
+            self.camera[w, : n + 1] *= weight[..., None]
+        self._copies: dict[int, Copies] = {}
+        size = problem.sizes
+        speed = np.sqrt(9.81 * size)
+        one = np.ones((self.many, 3))
+        self.scale = np.concatenate(
+            [one * size[:, None], one, one * speed[:, None], one * (speed / size)[:, None]], 1
+        )  # [D, 12] what is large for a start
+
+    def run(self, starts: _Starts, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[C, L + 1, D, 3] and [C, L + 1, D, 4] from C starts, which are windows times variants."""
+        count, u = len(starts.position), self.problem.units
+        if count not in self._copies:
+            self._copies[count] = Copies(self.problem.scene, count)
+        copies, dt = self._copies[count], self.dt / u.time
+        first = [
+            a.reshape(count * self.many, -1)
+            for a in (starts.position, starts.orientation, starts.velocity, starts.spin)
+        ]
+        bodies, state = self.problem.applied(values, copies.bodies, copies.begun(*first), count)
+        options = Options(np.asarray(self.problem.scene.gravity) / u.acceleration, dt, FINE * inner_of_frame(dt))
+        frames = cast(
+            "Frames",
+            copies.solver.advance(state, copies.solver.init(bodies, state, options), self.length, keep=True).frames,
+        )
+        total = count * self.many
+        kept = [np.nan_to_num(a[:, :total].reshape(self.length, count, self.many, -1).swapaxes(0, 1), nan=1e3)
+                for a in (frames.position, frames.orientation, frames.velocity)]  # fmt: skip
+        place = np.concatenate([starts.position[:, None], kept[0] * u.length], 1)
+        turn = np.concatenate([starts.orientation[:, None], kept[1]], 1)
+        speed = np.concatenate([starts.velocity[:, None], kept[2] * u.velocity], 1)
+        late = np.tile(self.late, (count // len(self.begin), 1))
+        return place + late[..., None, None] * speed, turn
+
+    def off(self, starts: _Starts, values: np.ndarray) -> np.ndarray:
+        """[V, W, L + 1, D, 6] differences in standard deviations, for V variants of the starts of windows."""
+        place, turn = self.run(starts, values)
+        shape = (-1, *self.place.shape[:3])
+        away = np.concatenate(
+            [place.reshape(*shape, 3) - self.place,
+             pose.to_rotvec(pose.multiply(turn.reshape(*shape, 4), pose.conjugate(self.turn)))], -1
+        )  # fmt: skip
+        return np.einsum("wtdij,vwtdj->vwtdi", self.root, away) + self.rest
+
+    def begun(self) -> _Starts:
+        """First guesses: parabolas through the first frames, with gravity or without, by the poses' uncertainty."""
+        count = len(self.begin)
+        found = _Starts(
+            np.zeros((count, self.many, 3)), np.zeros((count, self.many, 4)), *np.zeros((2, count, self.many, 3))
+        )
+        g = np.asarray(self.problem.scene.gravity)
+        for w in range(count):
+            for d in range(self.many):
+                rows = np.flatnonzero(np.abs(self.root[w, :, d]).sum((1, 2)) > 0)[:6]
+                time = self.dt * rows + self.late[w, rows]
+                best = None
+                for some in (rows, rows[:4]):
+                    for pull in (g, 0.0 * g):
+                        t = time[: len(some)]
+                        root, rest = self.root[w, some, d][:, :, :3], self.rest[w, some, d]
+                        level = self.place[w, some, d] - 0.5 * t[:, None] ** 2 * pull
+                        matrix = np.concatenate([root, root * t[:, None, None]], 2).reshape(-1, 6)
+                        right = (np.einsum("tij,tj->ti", root, level) - rest).ravel()
+                        weak = 1e-3 * np.linalg.norm(matrix) * np.eye(6)
+                        guess = np.linalg.lstsq(np.r_[matrix, weak * 1e-3], np.r_[right, np.zeros(6)], rcond=None)[0]
+                        chi = float(np.square(matrix @ guess - right).sum()) / len(some)
+                        if best is None or chi < 0.5 * best[0]:
+                            best = chi, guess
+                assert best is not None
+                found.position[w, d], found.velocity[w, d] = best[1][:3], best[1][3:]
+                found.orientation[w, d] = self.turn[w, rows[0], d]
+                if self.root[w, rows[0], d, 3:, 3:].any():
+                    spin = pose.to_rotvec(
+                        pose.multiply(self.turn[w, rows[1:4], d], pose.conjugate(self.turn[w, rows[:1], d]))
+                    )
+                    t = (time[1:4] - time[0])[:, None]
+                    found.spin[w, d] = (spin * t).sum(0) / (t**2).sum()
+        return found
+
+    def priors(self, starts: _Starts) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [W, D * 12] that keep what nothing shows, and their slopes [D * 12]: spins are about zero."""
+        weight = np.full((self.many, STARTS), 1e-3)
+        weight[:, 9:] = 0.5
+        off = np.zeros((len(self.begin), self.many, STARTS))
+        off[..., 9:] = starts.spin / self.scale[:, 9:]
+        return (off * weight).reshape(len(self.begin), -1), weight.ravel()
+
+
+@dataclass
+class _Fit:
+    values: np.ndarray
+    camera: np.ndarray
+    starts: _Starts
+    cost: float = math.inf
+    mean: float = math.inf  # standard deviations, of the differences
+
+
+class Fitting:
+    """Least squares of the parameters, the camera, and the starts of windows."""
+
+    def __init__(self, shots: Shots) -> None:
+        self.shots, self.problem = shots, shots.problem
+        width = self.problem.width
+        known = [KNOWN.get(p.kind, math.inf) for p in self.problem.parameters]
+        self.sure = 1.0 / np.maximum(known, 1e-9) * np.isfinite(known) + 1e-3 / width
+
+    def errors(self, fit: _Fit) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """Differences [W, L + 1, D, 6], their weights, the cost, and the mean."""
+        off = self.shots.off(fit.starts, fit.values)[0] + self.shots.camera @ fit.camera
+        square = np.square(off).mean(-1, keepdims=True)
+        seen = np.abs(self.shots.root).sum((-1, -2)) > 0
+        prior, _ = self.shots.priors(fit.starts)
+        own = self.sure * (fit.values - self.problem.start)
+        cost = 6.0 * ODD**2 * float(np.log1p(square / ODD**2).sum()) + float(
+            (prior**2).sum() + (own**2).sum() + (fit.camera**2).sum()
+        )
+        mean = float(np.sqrt(np.median(square[seen])))
+        return off, 1.0 / np.sqrt(1.0 + square / ODD**2), cost, mean
+
+    def slopes(self, fit: _Fit, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives [W, R, D * 12] by the starts, in `scale`, and [W, R, P + K] by parameters and camera."""
+        shots, count = self.shots, len(self.shots.begin)
+        step, many = 3e-3, shots.many
+        base = np.zeros((many * STARTS, 1, many, STARTS))
+        for n in range(many * STARTS):
+            base[n, 0, n // STARTS, n % STARTS] = step * shots.scale.ravel()[n]
+        both = np.concatenate([base, -base])
+        by = np.broadcast_to(both, (len(both), count, many, STARTS)).reshape(-1, many, STARTS)
+        tiled = _Starts(*(np.tile(a, (len(both), *[1] * (a.ndim - 1))) for a in vars(fit.starts).values()))
+        ends = shots.off(tiled.moved(by), fit.values)
+        own = (ends[: len(base)] - ends[len(base) :]) / (2.0 * step)
+        own = np.moveaxis(own.reshape(len(base), count, -1), 0, -1)
+        shared, (low, high) = [], self.problem.bounds
+        for k, width in enumerate(self.problem.width):
+            one, other = fit.values.copy(), fit.values.copy()
+            nudge = width * 0.02
+            one[k], other[k] = min(one[k] + nudge, high[k]), max(other[k] - nudge, low[k])
+            ends = [shots.off(fit.starts, v)[0] for v in (one, other)]
+            shared.append((ends[0] - ends[1]).reshape(count, -1) / (one[k] - other[k]))
+        camera = shots.camera.reshape(count, own.shape[1], shots.camera.shape[-1])
+        return own, np.concatenate([np.stack(shared, -1), camera], -1)
+
+    def solved(self, fit: _Fit, rounds: int, on_progress: Progress, say: str) -> _Fit:
+        damping, (low, high), many = 1e-2, self.problem.bounds, self.shots.many
+        off, weight, fit.cost, fit.mean = self.errors(fit)
+        for turn in range(rounds):
+            on_progress(min(0.95, turn / rounds), f"{say}, round {turn + 1}")
+            own, shared = self.slopes(fit, off)
+            blocks = self.blocks(fit, off, weight, own, shared)
+            better = False
+            while damping < 1e5:
+                by_shared, by_own = self.step(fit, *blocks, damping)
+                count = len(fit.values)
+                by = (by_own.reshape(-1, many, STARTS)) * self.shots.scale
+                trial = _Fit(
+                    np.clip(fit.values + by_shared[:count], low, high),
+                    fit.camera + by_shared[count:],
+                    fit.starts.moved(by),
+                )
+                off_then, weight_then, trial.cost, trial.mean = self.errors(trial)
+                if trial.cost < fit.cost:
+                    better = fit.cost - trial.cost > 1e-4 * fit.cost
+                    fit, off, weight, damping = trial, off_then, weight_then, damping / 5.0
+                    break
+                damping *= 6.0
+            if not better:
+                break
+        return fit
+
+    def blocks(self, fit: _Fit, off, weight, own, shared) -> tuple[np.ndarray, ...]:
+        """Weighted rows: [W, R + 12 D] differences and their slopes by starts and by what is shared."""
+        count = len(off)
+        w = np.broadcast_to(weight, off.shape).reshape(count, -1, 1)
+        prior, weak = self.shots.priors(fit.starts)
+        rest = np.concatenate([off.reshape(count, -1) * w[..., 0], prior], 1)
+        own = np.concatenate([own * w, np.broadcast_to(np.diag(weak), (count, len(weak), len(weak)))], 1)
+        shared = np.concatenate([shared * w, np.zeros((count, len(weak), shared.shape[-1]))], 1)
+        return rest, own, shared
+
+    def sureness(self, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
+        """What is known of shared numbers without the film: weights, and how far they are off."""
+        weight = np.r_[self.sure, np.ones(len(fit.camera))]
+        return weight, np.r_[fit.values - self.problem.start, fit.camera]
+
+    def step(self, fit: _Fit, rest, own, shared, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        ato = np.einsum("wri,wrj->wij", own, own)
+        ato = ato + damping * np.einsum("wii->wi", ato)[:, :, None] * np.eye(ato.shape[-1])
+        cross, pull = np.einsum("wri,wrj->wij", own, shared), np.einsum("wri,wr->wi", own, rest)
+        weight, away = self.sureness(fit)
+        normal = np.einsum("wri,wrj->ij", shared, shared) + np.diag(weight**2)
+        normal = normal + damping * np.diag(np.diag(normal))
+        right = np.einsum("wri,wr->i", shared, rest) + weight**2 * away
+        inner = np.linalg.solve(ato, np.concatenate([cross, pull[..., None]], -1))
+        normal = normal - np.einsum("wij,wik->jk", cross, inner[..., :-1])
+        right = right - np.einsum("wij,wi->j", cross, inner[..., -1])
+        by = -np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+        return by, -(inner[..., -1] + inner[..., :-1] @ by)
+
+
+def first_frames(r: Recording, length: int) -> list[int]:
+    """Frames where windows of `length` frames begin: every half of it, from where all bodies are seen."""
+    seen = np.flatnonzero(r.seen.all(1))
+    found, t = [], 0
+    while t + max(4, length // 3) < len(r.known):
+        later = seen[seen >= t]
+        if len(later) < 4:
+            break
+        t = int(later[0])
+        if r.seen[t : t + length].sum() >= 5 * r.seen.shape[1]:
+            found.append(t)
+        t += max(2, length // 2)
+    return found
+
+
+def identify_films(
+    recordings: Sequence[Recording], scene: Scene, *, on_progress: Progress = silent
+) -> tuple[Identified, dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]]:
+    """As `identify`, for recordings with `root`. Also returns the motion of the fit, see `motion_of`.
+
+    Raises SdfsimError for recordings that are too short, or in which nothing touches.
+    """
+    problem = Problem(recordings, scene)
+    dt = recordings[0].dt
+    scale = math.sqrt(float(np.max(problem.sizes)) / SIZE)
+    lengths = [max(8, round(span * min(2.0, max(0.6, scale)) / dt)) for span in (SHORT, LONG)]
+    begin = [(k, t) for k, r in enumerate(recordings) for t in first_frames(r, lengths[0])]
+    if not begin:
+        raise SdfsimError(
+            "the films are too short, or the bodies are seen too seldom", "film longer, at more frames a second"
+        )
+    shots = Shots(problem, begin, lengths[0])
+    starts = shots.begun()
+    problem.choose(_touched(problem, shots, starts))
+    fitting, low, high = Fitting(shots), *problem.bounds
+    best = _Fit(problem.start.copy(), np.zeros(shots.camera.shape[-1]), starts)
+    *_, best.cost, best.mean = fitting.errors(best)
+    for k, (f, e) in enumerate(TRIED):
+        on_progress(0.1 * k / len(TRIED), "a first sweep over friction and restitution")
+        alike = [{"friction": f, "restitution": e}.get(p.kind, p.start) for p in problem.parameters]
+        trial = replace(best, values=np.clip(alike, low, high))
+        *_, trial.cost, trial.mean = fitting.errors(trial)
+        best = trial if trial.cost < best.cost else best
+    best = fitting.solved(best, ROUNDS, on_progress, "short windows")
+    long_begin = [(k, t) for k, r in enumerate(recordings) for t in first_frames(r, lengths[1])]
+    if lengths[1] > lengths[0] and long_begin:
+        longer = Shots(problem, long_begin, lengths[1])
+        rows = [min((abs(t - u) + 1e6 * (j != k), w) for w, (j, u) in enumerate(begin))[1] for k, t in long_begin]
+        same = [begin[w] == one for w, one in zip(rows, long_begin, strict=True)]
+        guess = longer.begun()
+        for w, (row, alike) in enumerate(zip(rows, same, strict=True)):
+            for name in vars(guess) if alike else ():
+                getattr(guess, name)[w] = getattr(best.starts, name)[row]
+        final = Fitting(longer)
+        last = final.solved(_Fit(best.values.copy(), best.camera.copy(), guess), ROUNDS, on_progress, "long windows")
+        if last.mean < WORSE * best.mean:
+            fitting, best = final, last
+    return reported(problem, fitting, best), motion_of(fitting.shots, best)
+
+
+def _touched(problem: Problem, shots: Shots, starts: _Starts) -> list:
+    """What touches in the windows, as `Problem.choose` wants it."""
+    recordings = list(problem.recordings)
+    for w, (k, t) in enumerate(shots.begin):
+        r = recordings[k]
+        for name, of in (("position", starts.position), ("orientation", starts.orientation),
+                         ("velocity", starts.velocity), ("angular_velocity", starts.spin)):  # fmt: skip
+            getattr(r, name)[t] = of[w]
+    windows = Windows(problem, shots.length * shots.dt / problem.units.time, shots.begin)
+    touched = windows.touched()
+    if not touched:
+        raise SdfsimError(
+            "nothing touches in the films", "friction and restitution show in contacts only; check the scene"
+        )
+    return touched
+
+
+def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
+    """Values with intervals: starts and camera are fitted again for each value of a parameter."""
+    off, weight, _, _ = fitting.errors(fit)
+    own, shared = fitting.slopes(fit, off)
+    rest, own, shared = fitting.blocks(fit, off, weight, own, shared)
+    count, ways = len(fit.values), len(fit.camera)
+    # What starts can take up is taken out of each window's differences and slopes.
+    basis = np.linalg.qr(own)[0]
+    rest = rest - np.einsum("wri,wi->wr", basis, np.einsum("wri,wr->wi", basis, rest))
+    shared = shared - basis @ np.einsum("wri,wrj->wij", basis, shared)
+    weights, away = fitting.sureness(fit)
+    rows = np.concatenate([shared.reshape(-1, count + ways), np.diag(weights)])
+    right = np.r_[rest.ravel(), weights * away]
+    group = np.r_[np.repeat(np.arange(len(rest)), rest.shape[1]), len(rest) + np.arange(count + ways)]
+    if ways:  # likewise what the camera can
+        basis = np.linalg.qr(rows[:, count:])[0]
+        right, rows = right - basis @ (basis.T @ right), rows - basis @ (basis.T @ rows)
+    slope, width = rows[:, :count] * problem.width, problem.width
+    spread = max(1.0, float(np.median(np.square(off).mean(-1)[np.abs(off).sum(-1) > 0])) / TYPICAL)
+    normal = slope.T @ slope / spread
+    covariance = np.linalg.inv(normal + 1e-9 * np.eye(count))
+    sure = np.sqrt(np.diag(covariance))
+    before = np.array([KNOWN.get(p.kind, math.inf) for p in problem.parameters]) / width
+    shown = sure < np.minimum(SHOWN, TOLD * before)
+    estimates = estimates_of(problem, fit.values, covariance, shown)
+    pixels = np.sqrt(np.square(off).mean(-1))
+    notes = [
+        f"poses are off by {fit.mean:.2g} standard deviations (median) in {len(off)} windows",
+        *_worst(fitting.shots, pixels),
+    ]
+    return Identified(estimates, len(off), 0.0, {}, notes, *file_values(problem, fit.values))
+
+
+def _worst(shots: Shots, off: np.ndarray) -> list[str]:
+    """The frames that the fit is farthest from, for differences [W, L + 1, D]."""
+    found = []
+    for w, t, d in zip(*np.unravel_index(np.argsort(-off, axis=None)[:WORST], off.shape), strict=True):
+        k, first = shots.begin[w]
+        time, name = shots.dt * (first + t) + shots.late[w, t], shots.problem.moving[d].name
+        found.append(f"{name} at {time:.2f} s by {off[w, t, d]:.1f}")
+    return ["worst frames, standard deviations: " + ", ".join(dict.fromkeys(found))]
+
+
+def motion_of(shots: Shots, fit: _Fit) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
+    """(recording, row) -> the fit's centres of mass [D, 3] and orientations [D, 4]; of windows that overlap, the one
+    that began first."""
+    place, turn = shots.run(fit.starts, fit.values)
+    found: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+    for w, (k, t) in enumerate(shots.begin):
+        for row in range(min(shots.length + 1, len(shots.problem.recordings[k].known) - t)):
+            found.setdefault((k, t + row), (place[w, row], turn[w, row]))
+    return found
