@@ -274,8 +274,9 @@ def identify(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Films of a fixed camera (.mp4 .mov .mkv .avi .webm); or run folders, rollout.npz, CSV or npz files of "
-            "poses, or folders of these (docs/identify.md); or contactnets-cube or contactnets-elbow: public ones with their scene, downloaded once.",
+            help="Films of a fixed camera (.mp4 .mov .mkv .avi .webm); or run folders, rollout.npz, CSV or npz files "
+            "of poses, or folders of these (docs/identify.md); or contactnets-cube or contactnets-elbow: public ones "
+            "with their scene, downloaded once.",
             show_default=False,
         ),
     ],
@@ -290,7 +291,8 @@ def identify(
         ),
     ] = None,
     points: Annotated[
-        Path | None, typer.Option(help="Of a film: points of known places, see `sdfsim measure`.", show_default=False)
+        Path | None,
+        typer.Option(help="Of a film: YAML of points of known places (docs/identify.md).", show_default=False),
     ] = None,
     slow: Annotated[float, typer.Option(help="Of a film: how many times slower it plays than things moved.")] = 1.0,
     start: Annotated[float | None, typer.Option(help="Of a film: where to begin, s.", show_default=False)] = None,

@@ -1,6 +1,6 @@
 """Films of motions that are known: a phone's blur, noise, flicker, shadows, and a hand in front."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,9 @@ def of_rollout(rollout: Rollout) -> Motion:
     return at
 
 
-def bouncing(start: np.ndarray, velocity: np.ndarray, radius: float, restitution: float, friction: float) -> Motion:
+def bouncing(
+    start: Sequence[float], velocity: Sequence[float], radius: float, restitution: float, friction: float
+) -> Motion:
     """A ball on the plane z = 0, body 1 of two, in closed form: impulses of a rigid solid sphere."""
     pieces = [(0.0, np.array(start, float), np.array(velocity, float), np.zeros(3))]
     for _ in range(40):
@@ -57,9 +59,9 @@ def filmed(
     noise: float = 2.0, flicker: float = 0.0, hand: Callable[[float], np.ndarray | None] | None = None,
     shake: float = 0.0, light: float = 1.0, subframes: int = 4, seed: int = 0,
 ) -> Path:  # fmt: skip
-    """Write a film of `seconds`. A frame k is the mean of `subframes` pictures in an exposure of `exposure` frames about
-    the time k / fps. `flicker`: the share by which lamps at 100 Hz vary; `hand`: time -> the box (left, top, right,
-    bottom) px that it covers; `shake`: px by which the camera drifts a frame; `light`: of the picture."""
+    """Write a film of `seconds`. A frame k is the mean of `subframes` pictures in an exposure of `exposure` frames
+    about the time k / fps. `flicker`: the share by which lamps at 100 Hz vary; `hand`: time -> the box (left, top,
+    right, bottom) px that it covers; `shake`: px by which the camera drifts a frame; `light`: of the picture."""
     rng = np.random.default_rng(seed)
     style = Style(smooth=True)
 

@@ -38,7 +38,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray, float | None]:
             raise ValueError
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"must hold points, at least {LEAST}, each with pixel: [x, y] and place: [x, y, z] (m)"
-        raise SdfsimError(f"{path}: {what}", f"sdfsim measure CLIP -o {path} writes such a file") from error
+        raise SdfsimError(f"{path}: {what}", "docs/identify.md shows such a file") from error
     return pixels, places, focal
 
 
@@ -97,8 +97,8 @@ def of_ball(
     """The camera of a film of a ball that bounces on level ground: down is where it accelerates to, and its lowest
     place is on the `ground`, m above which its centre then is; it begins at `start` [3] m, seen from above.
 
-    Returns the camera, and the rotation [4] and shift [3] from the world of `eye`. Raises SdfsimError if it never
-    flies, or falls at another rate than gravity's."""
+    Returns the camera, and the matrix [3, 3] and shift [3] that lead from the world of `eye` to that of the scene.
+    Raises SdfsimError if it never flies, or falls at another rate than gravity's."""
     rows = np.array([k for k, one in enumerate(seen) if one is not None])
     count = max(6, round(FLIGHT / clip.step))
     strength = float(np.linalg.norm(gravity))
@@ -124,7 +124,8 @@ def of_ball(
         if usual > 1e-3 * strength:
             hint = f"a film in slow motion needs --slow, here about {np.sqrt(strength / usual):.1f}"
             raise SdfsimError(f"{clip.path}: things fall at {usual:.2g} m/s^2, not {strength:.3g}", hint)
-        raise SdfsimError(f"{clip.path}: the ball never flies freely", "the camera needs points of known places: --points")
+        hint = "the camera needs points of known places: --points"
+        raise SdfsimError(f"{clip.path}: the ball never flies freely", hint)
     # The direction of gravity, of this strength: two angles, by Gauss-Newton; places and speeds are eliminated.
     down = np.median([across / np.linalg.norm(across) for _, across, *_ in pieces], 0)
     down /= np.linalg.norm(down)
@@ -144,8 +145,7 @@ def of_ball(
         down /= np.linalg.norm(down)
     axis = np.cross(down, [0.0, 0.0, -1.0])
     angle = np.arctan2(np.linalg.norm(axis), -down[2])
-    turn = pose.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle)
-    matrix = pose.to_matrix(turn)
+    matrix = pose.to_matrix(pose.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle))
     places = np.stack([seen[k].place for k in rows]) @ matrix.T
     sure = np.stack([np.linalg.norm(seen[k].root[:, :3] @ matrix.T[:, 2]) for k in rows])
     low = np.quantile(places[sure > 0.3 * np.median(sure), 2], 0.02)
@@ -160,13 +160,10 @@ def of_ball(
         doubt[:3, k] = np.sqrt(values[k]) * (rotation @ about)
     doubt[3:6, 2] = rotation @ np.array([0.0, 0.0, 0.05])
     doubt[6, 3] = LENS[1]
-    translation = eye.translation - rotation @ shift
-    return Eye(rotation, translation, eye.focal, eye.width, eye.height, doubt, eye.source), turn, shift
+    translation = -rotation @ shift
+    return Eye(rotation, translation, eye.focal, eye.width, eye.height, doubt, eye.source), matrix, shift
 
 
 def in_world(one: Seen, turn: np.ndarray, shift: np.ndarray) -> Seen:
-    """A pose after its world was turned and shifted."""
-    back = np.kron(np.eye(2), pose.to_matrix(turn).T)
-    return replace(
-        one, place=pose.rotate(turn, one.place) + shift, turn=pose.multiply(turn, one.turn), root=one.root @ back
-    )
+    """A ball's pose after its world was turned and shifted; its uncertainty is to be found again."""
+    return replace(one, place=turn @ one.place + shift)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from sdfsim.apps.film.background import background, checked
+from sdfsim.apps.film.beside import write_beside
 from sdfsim.apps.film.camera import in_world, level, of_ball, of_points, read_points
 from sdfsim.apps.film.drawing import Look
 from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.frames import Clip, read_clip
 from sdfsim.apps.film.recording import recording_of
 from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, find, follow, masks, shutter_of
-from sdfsim.apps.film.beside import write_beside
 from sdfsim.apps.identify.filmed import identify_films
 from sdfsim.apps.identify.report import Identified
 from sdfsim.apps.observed import Recording, movers
@@ -26,6 +26,7 @@ from sdfsim.scene.scene import Scene
 
 FITS = 0.6  # score that most frames of a body of the right shape have
 ENOUGH = 8  # frames in which a body must be seen
+AGAIN, SETTLED = 4, 0.2  # rounds of the fit, and changes of the camera, in standard deviations, that end them
 GONE = 0.25  # share of the frames after which a body may be out of the picture
 
 
@@ -35,9 +36,9 @@ def track(
 ) -> Recording:  # fmt: skip
     """Where the moving bodies of a scene were in a film of a fixed camera, with an uncertainty of each pose.
 
-    The camera is found from `points` of known places (a file of `sdfsim measure`), or from a single ball that bounces
-    on level ground. `slow`: how many times slower the film plays than things moved; `start` and `end` s: the part of
-    the film. Raises SdfsimError for films in which the bodies cannot be tracked.
+    The camera is found from `points` of known places (a YAML file, see docs/identify.md), or from a single ball that
+    bounces on level ground. `slow`: how many times slower the film plays than things moved; `start` and `end` s: the
+    part of the film. Raises SdfsimError for films in which the bodies cannot be tracked.
     """
     return watched(
         Path(clip), loaded(scene), points=points, slow=slow, start=start, end=end, on_progress=on_progress
@@ -55,13 +56,14 @@ def watched(
     bodies, size = movers(scene), (clip.pixels.shape[2], clip.pixels.shape[1])
     looks = [Look(scene, body) for body in bodies]
     if points is not None:
-        eye = of_points(*read_points(Path(points)), size, str(points))
+        pixels, places, focal = read_points(Path(points))
+        eye = of_points(pixels / clip.smaller, places, focal and focal / clip.smaller, size, str(points))
     elif len(looks) == 1 and looks[0].ball:
         eye = level(clip)
     else:
         raise SdfsimError(
             f"{path}: where the camera stood is not known (only a single ball shows it by falling)",
-            f"give points of known places: sdfsim measure {path} -o points.yaml, then --points points.yaml",
+            "give points of known places: --points points.yaml (docs/identify.md)",
         )
     shutter, tracks, gravity = Shutter(0.5 * clip.step, 0.7), [], np.asarray(scene.gravity)
     for body, look in zip(bodies, looks, strict=True):
@@ -76,8 +78,8 @@ def watched(
     refined = []
     for d, one in enumerate(tracks):
         others = [_either([of[k] for j, of in enumerate(covered) if j != d]) for k in range(len(clip.time))]
-        k = max(one.frames.tolist(), key=lambda k: one.seen[k].score)
-        full = follow(clip, back, one.look, eye, shutter, k, one.seen[k], gravity, others, on_progress)
+        k = max(one.frames.tolist(), key=lambda k: one.at(k).score)
+        full = follow(clip, back, one.look, eye, shutter, k, one.at(k), gravity, others, on_progress)
         refined.append(deepened(clip, eye, again(clip, back, eye, shutter, full, others)))
     tracks = refined
     for body, one in zip(bodies, tracks, strict=True):
@@ -95,7 +97,7 @@ def watched(
         moved = [one and in_world(one, turn, shift) for one in tracks[0].seen]
         tracks = [deepened(clip, eye, again(clip, back, eye, shutter, Track(look, moved)))]
     notes = [*clip.notes, f"shutter open for {1e3 * shutter.open:.2g} ms, smeared by {shutter.spread:.2g} px"]
-    return Film(clip, eye, tracks, recording_of(clip, eye, tracks, scene), notes)
+    return Film(clip, back, shutter, eye, tracks, recording_of(clip, eye, tracks, scene), notes)
 
 
 def identify_clips(
@@ -107,7 +109,14 @@ def identify_clips(
     films = [
         watched(path, scene, points=points, slow=slow, start=start, end=end, on_progress=on_progress) for path in paths
     ]
-    found, motion = identify_films([film.recording for film in films], scene, on_progress=on_progress)
+    for _ in range(AGAIN):
+        found, motion, changes = identify_films([film.recording for film in films], scene, on_progress=on_progress)
+        films, start_of = [*films], 0
+        for n, film in enumerate(films):  # the camera as the motion shows it; its effect is only linear nearby
+            stop = start_of + film.eye.doubt.shape[1]
+            films[n], start_of = _seen_by(film, film.eye.moved(film.eye.doubt @ changes[start_of:stop]), scene), stop
+        if np.abs(changes).max(initial=0.0) < SETTLED:
+            break
     if beside is not None:
         first = films[0]
         row = np.round((first.clip.time - first.clip.time[0]) / first.recording.dt).astype(int)
@@ -119,6 +128,19 @@ def identify_clips(
         write_beside(first, made, beside)
     notes = [f"{film.clip.path.name}: {note}" for film in films for note in film.notes]
     return replace(found, notes=[*found.notes, *notes])
+
+
+def _seen_by(film: Film, eye: Eye, scene: Scene) -> Film:
+    """The film with another camera: the same pictures, and so bodies where they then have to be."""
+    tracks, was = [], film.eye
+    for one in film.tracks:
+        seen = list(one.seen)
+        for k in one.frames.tolist():
+            local = was.seen(seen[k].place) * (eye.focal / was.focal)
+            local[:2] *= was.focal / eye.focal
+            seen[k] = replace(seen[k], place=(local - eye.translation) @ eye.rotation)
+        tracks.append(deepened(film.clip, eye, again(film.clip, film.back, eye, film.shutter, Track(one.look, seen))))
+    return replace(film, eye=eye, tracks=tracks, recording=recording_of(film.clip, eye, tracks, scene))
 
 
 def only_moving(scene: Scene, names: Sequence[str]) -> Scene:
@@ -145,7 +167,7 @@ def _judged(clip: Clip, track: Track, name: str) -> None:
     if len(rows) < ENOUGH:
         hint = "more light, a plainer background, or more frames a second; --start and --end choose a part"
         raise SdfsimError(f"{clip.path}: {name!r} was found in {len(rows)} frames (at least {ENOUGH})", hint)
-    score = float(np.median([track.seen[k].score for k in rows]))
+    score = float(np.median([track.at(k).score for k in rows]))
     if score < FITS:
         hint = "check its shape and size in the scene, and the camera"
         raise SdfsimError(f"{clip.path}: what moves does not look like {name!r} (fits by {100 * score:.0f} %)", hint)
@@ -154,9 +176,9 @@ def _judged(clip: Clip, track: Track, name: str) -> None:
 def _stays(clip: Clip, eye: Eye, track: Track, name: str) -> None:
     """Raises SdfsimError if a body leaves the picture long before the film ends."""
     last = int(track.frames[-1])
-    one, count = track.seen[last], len(clip.time)
+    one, count = track.at(last), len(clip.time)
     at = track.look.window(eye, one.place, one.turn, 0.0)
-    before = track.seen[int(track.frames[-2])]
+    before = track.at(int(track.frames[-2]))
     way = eye.project(one.place) - eye.project(before.place)
     near = (
         at is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ class Clip:
     path: Path
     time: np.ndarray  # [T] s of the motion
     pixels: np.ndarray  # [T, H, W, 3] uint8 RGB
+    smaller: float = 1.0  # how many times smaller they are than those of the film
     notes: tuple[str, ...] = ()
 
     @property
@@ -44,9 +46,9 @@ def read_clip(
     """Read the frames from `start` to `end` s of the film; `slow`: how many times slower it plays than things moved.
     Raises SdfsimError if it cannot be read, or if too few or too many frames remain."""
     import av
-    from av.error import FFmpegError
+    from av import FFmpegError
 
-    times, pictures = [], []
+    times, pictures, small = [], [], 1.0
     try:
         with av.open(str(path)) as film:
             stream = film.streams.video[0]
@@ -68,7 +70,7 @@ def read_clip(
     if len(times) < LEAST:
         raise SdfsimError(f"{path}: {len(times)} frames (at least {LEAST})", "check --start and --end")
     time, kept, note = true_times(np.array(times), np.stack(pictures))
-    return Clip(Path(path), time / slow, np.stack([pictures[k] for k in kept]), note)
+    return Clip(Path(path), time / slow, np.stack([pictures[k] for k in kept]), 1.0 / small, note)
 
 
 def true_times(time: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -77,7 +79,8 @@ def true_times(time: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.nda
     No camera gives the same picture twice: noise differs. If single frames repeat the one before, the film was copied
     at another rate, and its times are those of the copy; the camera's own are even.
     """
-    change = np.array([np.abs(a[::2, ::2].astype(np.int16) - b[::2, ::2]).mean() for a, b in zip(pixels[1:], pixels)])
+    small = pixels[:, ::2, ::2].astype(np.int16)
+    change = np.array([np.abs(now - before).mean() for before, now in pairwise(small)])
     small = np.r_[False, change < SAME * np.median(change)]
     alone = small & ~np.r_[False, small[:-1]] & ~np.r_[small[1:], False]
     every = np.arange(len(time))
@@ -85,8 +88,8 @@ def true_times(time: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.nda
         return time, every, ()
     kept = every[~alone]
     gaps = np.diff(time[kept])
-    step = float(gaps[gaps < 1.8 * np.median(gaps)].mean())
-    number = np.r_[0, np.cumsum(np.round(gaps / step).astype(int))]
+    step = float(gaps.mean())
+    number = np.r_[0, np.cumsum([1 if SAME * step < gap < 2.5 * step else round(gap / step) for gap in gaps])]
     last = np.r_[number[1:] != number[:-1], True]  # a repetition that compression hid comes just before the next frame
     kept, number = kept[last], number[last]
     step, first = np.polyfit(number, time[kept], 1)

@@ -23,7 +23,7 @@ MARGIN = 5.0  # px around a body that are compared
 FREE = 12.0  # levels by which a colour may differ from that in other frames
 SMEARED = 4.0  # radii: the longest smear
 LARGEST = 400  # px, sides of the part of a picture that is compared
-FLOOR = 0.04  # px: a pose is never more certain
+FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
 @dataclass(frozen=True)

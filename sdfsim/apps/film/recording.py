@@ -27,12 +27,12 @@ def recording_of(clip: Clip, eye: Eye, tracks: Sequence[Track], scene: Scene) ->
     root, rest, camera = np.zeros((count, many, 6, 6)), np.zeros((count, many, 6)), np.zeros((count, many, 6, ways))
     for d, track in enumerate(tracks):
         for k in track.frames.tolist():
-            one, at = track.seen[k], row[k]
-            assert one is not None
+            one, at = track.at(k), row[k]
             seen[at, d], place[at, d], turn[at, d] = True, one.place, one.turn
             root[at, d], rest[at, d], camera[at, d] = one.root, one.rest, one.camera @ eye.doubt
     none = np.zeros_like(place)
     return Recording(
-        str(clip.path), float(dt), place.copy(), turn.copy(), none, none.copy(), seen.all(1), ~seen & False, seen,
-        (place, turn), root=root, rest=rest, camera=camera, late=late, lost=int(len(clip.time) * many - seen.sum()),
+        str(clip.path), float(dt), place.copy(), turn.copy(), none, none.copy(), np.array(seen.all(1)),
+        np.zeros_like(seen), seen, (place, turn), root=root, rest=rest, camera=camera, late=late,
+        lost=int(len(clip.time) * many - seen.sum()),
     )  # fmt: skip

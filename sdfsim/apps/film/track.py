@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,6 +37,12 @@ class Track:
     look: Look
     seen: list[Seen | None]
 
+    def at(self, k: int) -> Seen:
+        """What was seen in one of its `frames`."""
+        one = self.seen[k]
+        assert one is not None
+        return one
+
     @property
     def frames(self) -> np.ndarray:
         return np.array([k for k, one in enumerate(self.seen) if one is not None], dtype=int)
@@ -46,6 +53,8 @@ class Film:
     """A film with all that was found in it."""
 
     clip: Clip
+    back: Background
+    shutter: Shutter
     eye: Eye
     tracks: list[Track]  # of the moving bodies
     recording: Recording
@@ -111,7 +120,7 @@ def find(
             f"{clip.path}: nothing that moves looks like {name!r}",
             "check its shape and size in the scene, and the camera; more light may help",
         )
-    score, k, best = max(found, key=lambda one: one[0])
+    _, k, best = max(found, key=lambda one: one[0])
     if free and _twins(found, look):
         raise SdfsimError(
             f"{clip.path}: two things that move look like {name!r}",
@@ -162,7 +171,7 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
         return None
     best = None
     color = before[0][1].color
-    tries = [(*guess, 0.0) for guess in predicted(clip, eye, shutter, at, before, gravity)]
+    tries: list[tuple[Any, ...]] = [(*guess, 0.0) for guess in predicted(clip, eye, shutter, at, before, gravity)]
     tries += [(*guess, 2.5) for *guess, _ in tries]
     depth = float(eye.seen(before[0][1].place)[2])
     for blob, _ in blobs(frame)[:2]:  # something pushed it: it may be anywhere, and rebound
@@ -212,7 +221,7 @@ def flows(clip: Clip, eye: Eye, track: Track, shutter: Shutter) -> dict[int, np.
     """[2] px by which the body moves while the shutter is open in each frame: the mean of the speeds before and after,
     if both are alike."""
     rows, found = track.frames, {}
-    at = {int(k): eye.project(track.seen[k].place) for k in rows}
+    at = {int(k): eye.project(track.at(k).place) for k in rows}
     for i, k in enumerate(rows.tolist()):
         near = [j for j in rows[max(0, i - 1) : i + 2].tolist() if j != k and abs(j - k) <= 2]
         speeds = [(at[j] - at[k]) / (clip.time[j] - clip.time[k]) for j in near]
@@ -221,11 +230,12 @@ def flows(clip: Clip, eye: Eye, track: Track, shutter: Shutter) -> dict[int, np.
 
 
 def again(
-    clip: Clip, back: Background, eye: Eye, shutter: Shutter, track: Track, hidden=None, only: Sequence[int] | None = None,
+    clip: Clip, back: Background, eye: Eye, shutter: Shutter, track: Track,
+    hidden: Sequence[np.ndarray | None] | None = None, only: Sequence[int] | None = None,
 ) -> Track:  # fmt: skip
     """The poses fitted again, with both neighbours' speeds, the film's usual colours, and another background."""
     speed = flows(clip, eye, track, shutter)
-    color = np.median([track.seen[k].color for k in track.frames], 0)
+    color = np.median([track.at(k).color for k in track.frames], 0)
     seen = [None if only is not None and k not in only else one for k, one in enumerate(track.seen)]
     for k in [k for k in track.frames.tolist() if only is None or k in only]:
         frame, one = frame_of(clip, back, k, hidden[k] if hidden else None, 0), track.seen[k]
@@ -242,7 +252,7 @@ def shutter_of(clip: Clip, back: Background, eye: Eye, track: Track) -> Shutter:
 
     def rest(trial: Shutter) -> float:
         found = again(clip, back, eye, trial, track, only=some)
-        return float(np.median([found.seen[k].mean ** 2 if found.seen[k] else 1e3 for k in some]))
+        return float(np.median([one.mean**2 if (one := found.seen[k]) else 1e3 for k in some]))
 
     best = min((Shutter(share * clip.step, 0.6) for share in SHUTTERS), key=rest)
     return min((replace(best, spread=spread) for spread in SPREADS), key=rest)
@@ -252,7 +262,7 @@ def deepened(clip: Clip, eye: Eye, track: Track) -> Track:
     """The track with depths as uncertain as they scatter. Blur, highlights and a dark background change how large a
     body seems, alike in neighbouring frames, and what a single frame shows does not tell."""
     rows = track.frames
-    depth = np.log([eye.seen(track.seen[k].place)[2] for k in rows])
+    depth = np.log([eye.seen(track.at(k).place)[2] for k in rows])
     bend = np.abs(depth[2:] - 2.0 * depth[1:-1] + depth[:-2])[(rows[2:] - rows[:-2]) == 2]
     scatter = ALIKE * 1.48 * float(np.median(bend)) / np.sqrt(6.0) if len(bend) else 0.1
     seen = list(track.seen)

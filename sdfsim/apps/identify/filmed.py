@@ -1,7 +1,7 @@
 """Parameters from recordings whose poses each have an uncertainty: those of films.
 
-A film shows some ways of a body well (across the picture) and others badly (towards the camera). So differences count by
-the uncertainty of each pose, and no velocity is taken from the poses: the start of each window is fitted with the
+A film shows some ways of a body well (across the picture) and others badly (towards the camera). So differences count
+by the uncertainty of each pose, and no velocity is taken from the poses: the start of each window is fitted with the
 parameters. What the camera is not known to is fitted too, and so is in the intervals.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -35,10 +35,12 @@ SIZE = 0.1  # m, of the bodies for which windows are as long as said
 STARTS = 12  # numbers of a body's start: place, rotation, velocity, spin
 # What is known without the film, standard deviations, in the units of `Parameter`.
 KNOWN = {"inertia": 0.05, "size": 0.01, "tilt": math.radians(1.0), "mass": 1.0}
+SLACK = 0.004  # of coefficients, which no film is expected to show better
+LIKELY = 6.0  # rise of the cost beyond which a value is unlikely
 WORST = 4  # frames that are named
 TOLD = 0.7  # share of what was known before: a film that leaves more does not show it
 TYPICAL = 0.45  # median of a mean of squares of six standard normal numbers, of which some are unseen
-TRIED = [(f, e) for e in (0.15, 0.45, 0.75) for f in (0.15, 0.5)]
+TRIED = [(0.3, 0.15), (0.3, 0.5), (0.3, 0.8), (0.8, 0.65)]
 
 
 @dataclass
@@ -67,12 +69,13 @@ class Shots:
         shape = (len(begin), self.length + 1, self.many)
         self.place, self.turn, self.root = np.zeros((*shape, 3)), np.zeros((*shape, 4)), np.zeros((*shape, 6, 6))
         self.turn[..., 3] = 1.0
-        ways = problem.recordings[0].camera.shape[-1]
-        self.rest, self.camera, self.late = np.zeros((*shape, 6)), np.zeros((*shape, 6, ways)), np.zeros(shape[:2])
+        films = cast("list[Any]", problem.recordings)
+        ways = np.cumsum([0, *(r.camera.shape[-1] for r in films)])  # each film has its own camera
+        self.rest, self.camera, self.late = np.zeros((*shape, 6)), np.zeros((*shape, 6, ways[-1])), np.zeros(shape[:2])
         for w, ((k, t), n) in enumerate(zip(begin, ends, strict=True)):
-            r, rows = problem.recordings[k], slice(t, t + n + 1)
+            r, rows = films[k], slice(t, t + n + 1)
             for mine, of in ((self.place, r.goal[0]), (self.turn, r.goal[1]), (self.root, r.root), (self.rest, r.rest),
-                             (self.camera, r.camera), (self.late, r.late)):  # fmt: skip
+                             (self.camera[..., ways[k] : ways[k + 1]], r.camera), (self.late, r.late)):  # fmt: skip
                 mine[w, : n + 1] = of[rows]
         share = np.zeros((len(problem.recordings), max(len(r.known) for r in problem.recordings)))
         for (k, t), n in zip(begin, ends, strict=True):
@@ -186,6 +189,7 @@ class Fitting:
         width = self.problem.width
         known = [KNOWN.get(p.kind, math.inf) for p in self.problem.parameters]
         self.sure = 1.0 / np.maximum(known, 1e-9) * np.isfinite(known) + 1e-3 / width
+        self.mean = self.problem.start.copy()
 
     def errors(self, fit: _Fit) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Differences [W, L + 1, D, 6], their weights, the cost, and the mean."""
@@ -193,7 +197,7 @@ class Fitting:
         square = np.square(off).mean(-1, keepdims=True)
         seen = np.abs(self.shots.root).sum((-1, -2)) > 0
         prior, _ = self.shots.priors(fit.starts)
-        own = self.sure * (fit.values - self.problem.start)
+        own = self.sure * (fit.values - self.mean)
         cost = 6.0 * ODD**2 * float(np.log1p(square / ODD**2).sum()) + float(
             (prior**2).sum() + (own**2).sum() + (fit.camera**2).sum()
         )
@@ -263,7 +267,7 @@ class Fitting:
     def sureness(self, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
         """What is known of shared numbers without the film: weights, and how far they are off."""
         weight = np.r_[self.sure, np.ones(len(fit.camera))]
-        return weight, np.r_[fit.values - self.problem.start, fit.camera]
+        return weight, np.r_[fit.values - self.mean, fit.camera]
 
     def step(self, fit: _Fit, rest, own, shared, damping: float) -> tuple[np.ndarray, np.ndarray]:
         ato = np.einsum("wri,wrj->wij", own, own)
@@ -297,13 +301,16 @@ def first_frames(r: Recording, length: int) -> list[int]:
 
 def identify_films(
     recordings: Sequence[Recording], scene: Scene, *, on_progress: Progress = silent
-) -> tuple[Identified, dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]]:
-    """As `identify`, for recordings with `root`. Also returns the motion of the fit, see `motion_of`.
+) -> tuple[Identified, dict[tuple[int, int], tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    """As `identify`, for recordings with `root`. Also returns the motion of the fit, see `motion_of`, and how the
+    cameras of all films were changed [C], in standard deviations.
 
     Raises SdfsimError for recordings that are too short, or in which nothing touches.
     """
     problem = Problem(recordings, scene)
     dt = recordings[0].dt
+    if max(abs(r.dt - dt) for r in recordings) > 1e-3 * dt:
+        raise SdfsimError("the films have different numbers of frames a second", "identify from each alone")
     scale = math.sqrt(float(np.max(problem.sizes)) / SIZE)
     lengths = [max(8, round(span * min(2.0, max(0.6, scale)) / dt)) for span in (SHORT, LONG)]
     begin = [(k, t) for k, r in enumerate(recordings) for t in first_frames(r, lengths[0])]
@@ -317,12 +324,12 @@ def identify_films(
     fitting, low, high = Fitting(shots), *problem.bounds
     best = _Fit(problem.start.copy(), np.zeros(shots.camera.shape[-1]), starts)
     *_, best.cost, best.mean = fitting.errors(best)
-    for k, (f, e) in enumerate(TRIED):
-        on_progress(0.1 * k / len(TRIED), "a first sweep over friction and restitution")
+    tries = [best]
+    for f, e in TRIED:  # a few rounds each: starts are known too badly to tell before they are fitted
         alike = [{"friction": f, "restitution": e}.get(p.kind, p.start) for p in problem.parameters]
         trial = replace(best, values=np.clip(alike, low, high))
-        *_, trial.cost, trial.mean = fitting.errors(trial)
-        best = trial if trial.cost < best.cost else best
+        tries.append(fitting.solved(trial, 3, on_progress, "a first sweep over friction and restitution"))
+    best = min(tries, key=lambda one: one.cost)
     best = fitting.solved(best, ROUNDS, on_progress, "short windows")
     long_begin = [(k, t) for k, r in enumerate(recordings) for t in first_frames(r, lengths[1])]
     if lengths[1] > lengths[0] and long_begin:
@@ -337,7 +344,7 @@ def identify_films(
         last = final.solved(_Fit(best.values.copy(), best.camera.copy(), guess), ROUNDS, on_progress, "long windows")
         if last.mean < WORSE * best.mean:
             fitting, best = final, last
-    return reported(problem, fitting, best), motion_of(fitting.shots, best)
+    return reported(problem, fitting, best), motion_of(fitting.shots, best), best.camera
 
 
 def _touched(problem: Problem, shots: Shots, starts: _Starts) -> list:
@@ -370,17 +377,29 @@ def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
     weights, away = fitting.sureness(fit)
     rows = np.concatenate([shared.reshape(-1, count + ways), np.diag(weights)])
     right = np.r_[rest.ravel(), weights * away]
-    group = np.r_[np.repeat(np.arange(len(rest)), rest.shape[1]), len(rest) + np.arange(count + ways)]
     if ways:  # likewise what the camera can
         basis = np.linalg.qr(rows[:, count:])[0]
         right, rows = right - basis @ (basis.T @ right), rows - basis @ (basis.T @ rows)
     slope, width = rows[:, :count] * problem.width, problem.width
-    spread = max(1.0, float(np.median(np.square(off).mean(-1)[np.abs(off).sum(-1) > 0])) / TYPICAL)
-    normal = slope.T @ slope / spread
-    covariance = np.linalg.inv(normal + 1e-9 * np.eye(count))
-    sure = np.sqrt(np.diag(covariance))
+    seen = np.abs(off).sum(-1) > 0
+    spread = max(1.0, float(np.median(np.square(off).mean(-1)[seen])) / TYPICAL)
+    normal = slope.T @ slope + 1e-9 * np.eye(count)
+    covariance = spread * np.linalg.inv(normal)
+    # What the laws of contact do not say (restitution that changes with speed) shows in how windows differ.
+    size = len(own[0])
+    if len(own) > 2:
+        left = []
+        for w in range(len(own)):
+            part, some = slope[w * size : (w + 1) * size], right[w * size : (w + 1) * size]
+            left.append(np.linalg.solve(normal - part.T @ part + 1e-3 * np.diag(np.diag(normal)), part.T @ some))
+        covariance = covariance + (len(own) - 1) * np.cov(np.array(left).T, bias=True).reshape(count, count)
+    exact = np.array([SLACK if p.kind in ("friction", "restitution") else 0.0 for p in problem.parameters]) / width
+    covariance = covariance + np.diag(exact**2)
     before = np.array([KNOWN.get(p.kind, math.inf) for p in problem.parameters]) / width
-    shown = sure < np.minimum(SHOWN, TOLD * before)
+    shown = np.sqrt(np.diag(covariance)) < np.minimum(SHOWN, TOLD * before)
+    for k, p in enumerate(problem.parameters):
+        if p.kind == "friction" and shown[k]:
+            shown[k] = all(_worse(fitting, fit, k, share, spread) for share in (0.6, 1.7))
     estimates = estimates_of(problem, fit.values, covariance, shown)
     pixels = np.sqrt(np.square(off).mean(-1))
     notes = [
@@ -390,11 +409,22 @@ def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
     return Identified(estimates, len(off), 0.0, {}, notes, *file_values(problem, fit.values))
 
 
+def _worse(fitting: Fitting, fit: _Fit, k: int, share: float, spread: float) -> bool:
+    """Whether a film shows that a coefficient is not this share of what was found: what sticks, sticks with any larger
+    friction, which slopes do not tell."""
+    sure, mean, start = fitting.sure.copy(), fitting.mean.copy(), fit.values.copy()
+    start[k] = np.clip(share * fit.values[k], *(bound[k] for bound in fitting.problem.bounds))
+    fitting.sure[k], fitting.mean[k] = 1e5, start[k]
+    tried = fitting.solved(replace(fit, values=start), 3, silent, "")
+    fitting.sure, fitting.mean = sure, mean
+    return tried.cost - fit.cost > LIKELY * spread
+
+
 def _worst(shots: Shots, off: np.ndarray) -> list[str]:
     """The frames that the fit is farthest from, for differences [W, L + 1, D]."""
     found = []
     for w, t, d in zip(*np.unravel_index(np.argsort(-off, axis=None)[:WORST], off.shape), strict=True):
-        k, first = shots.begin[w]
+        _, first = shots.begin[w]
         time, name = shots.dt * (first + t) + shots.late[w, t], shots.problem.moving[d].name
         found.append(f"{name} at {time:.2f} s by {off[w, t, d]:.1f}")
     return ["worst frames, standard deviations: " + ", ".join(dict.fromkeys(found))]

@@ -1,0 +1,197 @@
+"""What films show is found again: rendered ones of motions in closed form. Films that show nothing end in a line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+import cli
+import sdfsim
+from sdfsim import Camera
+from sdfsim.apps.film.camera import of_points
+from sdfsim.apps.film.film import identify_clips
+from sdfsim.apps.film.frames import read_clip, true_times
+from sdfsim.base.errors import SdfsimError
+from sdfsim.scene.scene import Scene
+from tests.helpers.clips import GRAVITY, bouncing, filmed
+
+CAMERA = Camera((1.2, -1.6, 0.6), look_at=(0, 0, 0.3), fov=40, width=320, height=240)
+PLACES = np.array([[-0.4, -0.3, 0], [0.4, -0.3, 0], [0.4, 0.3, 0], [-0.4, 0.3, 0], [0, 0, 0], [-0.3, 0.2, 0.25]])
+LEVEL = [0.0, 0.0, 0.0, 1.0]
+
+
+def ball_scene() -> sdfsim.Scene:
+    floor = sdfsim.Scene(model="solver").add("floor", plane={})
+    return floor.add("ball", sphere={"radius": 0.05}, position=[-0.3, 0, 0.7], mass=0.1, color=[200, 60, 40])
+
+
+def box_scene() -> sdfsim.Scene:
+    floor = sdfsim.Scene(model="solver").add("floor", plane={}, friction=1.0, restitution=1.0)
+    return floor.add("box", box={"size": [0.12, 0.09, 0.06]}, position=[-0.35, 0, 0.03], mass=0.3, color=[60, 90, 190])
+
+
+def write_points(path: Path, camera: Camera) -> Path:
+    pixels, _ = camera.project(PLACES)
+    points = [{"pixel": p.round(1).tolist(), "place": q.tolist()} for p, q in zip(pixels, PLACES, strict=True)]
+    path.write_text(yaml.safe_dump({"points": points}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def bounces(tmp_path_factory) -> tuple[Path, Scene]:
+    """A ball that bounces with restitution 0.75, filmed at 30 frames a second with blur and noise."""
+    folder, scene = tmp_path_factory.mktemp("film"), ball_scene()
+    motion = bouncing([-0.3, 0, 0.7], [0.35, 0.1, 0], 0.05, 0.75, 0.4)
+    scene.save(folder / "scene.yaml")
+    return filmed(folder / "clip.mp4", scene.load(), motion, CAMERA, 1.3, 30, subframes=3), scene.load()
+
+
+@pytest.mark.slow
+def test_a_ball_alone_shows_its_restitution(bounces, tmp_path):
+    """Without anything about the camera: gravity gives the scale. The command writes the scene and the film."""
+    clip, _ = bounces
+    out = tmp_path / "identified.yaml"
+    args = ["identify", str(clip), "--scene", str(clip.with_name("scene.yaml")), "-o", str(out), "--json"]
+    done = CliRunner().invoke(cli.app, args)
+    assert done.exit_code == 0, done.output
+    report = yaml.safe_load(done.stdout)
+    found = report["restitution"]["ball / floor"]
+    assert found["value"] == pytest.approx(0.75, abs=0.03)
+    assert found["interval"][0] < 0.75 < found["interval"][1]
+    assert report["friction"]["ball / floor"]["value"] is None  # it sticks in every impact
+    assert (tmp_path / "beside.mp4").stat().st_size > 10_000
+    assert sdfsim.load_scene(out).bodies[1].name == "ball"
+
+
+@pytest.mark.slow
+def test_poses_of_a_ball_are_exact(bounces, tmp_path):
+    """With points of known places, most poses are within half a pixel across the picture."""
+    clip, scene = bounces
+    recording = sdfsim.track(clip, scene, points=write_points(tmp_path / "points.yaml", CAMERA))
+    motion = bouncing([-0.3, 0, 0.7], [0.35, 0.1, 0], 0.05, 0.75, 0.4)
+    rows = np.flatnonzero(recording.seen[:, 0])
+    true = np.array([motion(recording.dt * k)[0][1] for k in rows])
+    off = np.linalg.norm(CAMERA.project(recording.goal[0][rows, 0])[0] - CAMERA.project(true)[0], axis=1)
+    assert len(rows) > 35
+    assert np.median(off) < 0.25
+    assert np.quantile(off, 0.9) < 0.6
+
+
+@pytest.mark.slow
+def test_a_box_that_slides_shows_its_friction(tmp_path):
+    friction, speed = 0.35, 1.6
+    turn = Rotation.from_rotvec([0, 0, 0.4]).as_quat()
+
+    def motion(time: float) -> tuple[np.ndarray, np.ndarray]:
+        t = min(time, speed / (friction * GRAVITY))
+        place = [-0.35 + speed * t - 0.5 * friction * GRAVITY * t**2, 0, 0.03]
+        return np.array([[0, 0, 0], place]), np.array([LEVEL, turn])
+
+    camera = Camera((0.5, -1.1, 0.6), look_at=(0, 0, 0), fov=45, width=320, height=240)
+    scene = box_scene().load()
+    clip = filmed(tmp_path / "clip.mp4", scene, motion, camera, 1.0, 30, subframes=2)
+    found = identify_clips([clip], scene, points=write_points(tmp_path / "points.yaml", camera))
+    value = {(e.kind, e.name): e for e in found.estimates}
+    slid = value["friction", "box / floor"]
+    assert slid.value == pytest.approx(friction, abs=0.03)
+    assert slid.interval is not None
+    assert slid.interval[0] < friction < slid.interval[1]
+    assert value["restitution", "box / floor"].value is None
+
+
+def test_points_of_known_places_show_the_camera():
+    pixels, _ = CAMERA.project(PLACES)
+    eye = of_points(pixels, PLACES, None, (320, 240), "points")
+    assert eye.focal == pytest.approx(CAMERA.lens[0, 0], rel=0.02)
+    assert np.allclose(-eye.rotation.T @ eye.translation, CAMERA.position, atol=0.03)
+    with pytest.raises(SdfsimError, match="no camera sees these points"):
+        of_points(pixels[::-1], PLACES, None, (320, 240), "points")
+
+
+def test_frames_that_repeat_others_are_left_out():
+    """Of a film at 25 frames a second that was copied at 30, to times that jitter."""
+    rng = np.random.default_rng(0)
+    taken = rng.integers(0, 255, (50, 12, 16, 3)).astype(np.uint8)
+    order = np.sort(np.concatenate([np.arange(50), np.arange(4, 50, 5)]))
+    time = np.arange(len(order)) / 30 + rng.uniform(-0.004, 0.004, len(order))
+    true, kept, notes = true_times(time, taken[order])
+    assert np.array_equal(order[kept], np.arange(50))
+    assert np.diff(true) == pytest.approx(1 / 25, rel=0.01)
+    assert "10 of 60 frames" in notes[0]
+    assert true_times(time[:50], taken)[1].tolist() == list(range(50))
+
+
+def steady(place: list[float]):
+    return lambda time: (np.array([[0, 0, 0], place]), np.array([LEVEL, LEVEL]))
+
+
+def thrown(time: float) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([[0, 0, 0], [-0.5 + 1.1 * time, 0, 0.3 + 2.0 * time - 4.9 * time**2]]), np.array([LEVEL, LEVEL])
+
+
+def test_a_camera_that_moves_is_said(tmp_path):
+    clip = filmed(
+        tmp_path / "clip.mp4", ball_scene().load(), steady([0, 0, 0.3]), CAMERA, 0.5, 24, shake=1, subframes=1
+    )
+    with pytest.raises(SdfsimError, match="the camera moves"):
+        sdfsim.track(clip, ball_scene())
+
+
+def test_a_dark_film_is_said(tmp_path):
+    clip = filmed(tmp_path / "clip.mp4", ball_scene().load(), thrown, CAMERA, 0.4, 24, light=0.03, subframes=1)
+    with pytest.raises(SdfsimError, match="too dark"):
+        sdfsim.track(clip, ball_scene())
+
+
+def test_a_film_without_the_body_is_said(tmp_path):
+    clip = filmed(tmp_path / "clip.mp4", ball_scene().load(), steady([0, 0, 0.3]), CAMERA, 0.5, 24, subframes=1)
+    with pytest.raises(SdfsimError, match="nothing that moves looks like 'ball'"):
+        sdfsim.track(clip, ball_scene())
+
+
+def test_a_body_that_leaves_the_picture_is_said(tmp_path):
+    camera = Camera((0, -1.5, 0.3), look_at=(0, 0, 0.3), fov=40, width=320, height=240)
+
+    def away(time: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([[0, 0, 0], [-0.5 + 2.2 * time, 0, 0.35]]), np.array([LEVEL, LEVEL])
+
+    clip = filmed(tmp_path / "clip.mp4", ball_scene().load(), away, camera, 1.0, 30, subframes=1)
+    with pytest.raises(SdfsimError, match="leaves the picture after"):
+        sdfsim.track(clip, ball_scene())
+
+
+def test_two_things_that_look_alike_are_said(tmp_path):
+    scene = ball_scene().add("twin", sphere={"radius": 0.05}, position=[0.3, 0, 0.5], mass=0.1, color=[200, 60, 40])
+
+    def both(time: float) -> tuple[np.ndarray, np.ndarray]:
+        place, turn = thrown(time)
+        return np.r_[place, place[1:] + np.array([0.25, 0.2, 0.05])], np.r_[turn, turn[1:]]
+
+    clip = filmed(tmp_path / "clip.mp4", scene.load(), both, CAMERA, 0.5, 30, subframes=1)
+    with pytest.raises(SdfsimError, match="two things that move look like 'ball'"):
+        sdfsim.track(clip, ball_scene())
+
+
+def test_a_wrong_shape_is_said(tmp_path):
+    def slides(time: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([[0, 0, 0], [-0.35 + 0.8 * time, 0, 0.2]]), np.array([LEVEL, LEVEL])
+
+    scene = sdfsim.Scene(model="solver").add("floor", plane={}).add("rod", box={"size": [0.5, 0.03, 0.03]}, mass=1)
+    clip = filmed(tmp_path / "clip.mp4", scene.load(), slides, CAMERA, 0.6, 24, subframes=1)
+    with pytest.raises(SdfsimError, match=r"looks? like 'ball'"):
+        sdfsim.track(clip, ball_scene())
+
+
+def test_what_is_no_film_or_has_no_camera_is_said(tmp_path, bounces):
+    (tmp_path / "clip.mp4").write_text("not a film")
+    with pytest.raises(SdfsimError, match="not a film"):
+        read_clip(tmp_path / "clip.mp4")
+    with pytest.raises(SdfsimError, match="where the camera stood is not known"):
+        sdfsim.track(bounces[0], box_scene())
+    points = tmp_path / "points.yaml"
+    points.write_text("points: [{pixel: [1, 2]}]")
+    with pytest.raises(SdfsimError, match="must hold points"):
+        sdfsim.track(bounces[0], box_scene(), points=points)
