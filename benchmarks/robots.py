@@ -9,7 +9,7 @@ scene's links, over the start and 20 random positions of all joints; the largest
 import math
 import re
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 from xml.etree import ElementTree
@@ -22,8 +22,6 @@ from benchmarks.records import Cell, progress, write_record
 from sdfsim import load_scene
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.base.errors import SdfsimError
-from sdfsim.physics.bodies import Units, from_scene
-from sdfsim.physics.joint_space import JointSpace
 from sdfsim.scene.scene import Joint, Scene
 
 TRIES = 20
@@ -33,15 +31,32 @@ FREE = 1.0  # rad or m to each side, of joints without limits
 def poses(scene: Scene, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies of a scene of trees, in the world: roots at their start
     poses, joints at `q` (rad, m; a rotation vector for a ball), by name."""
-    trees = replace(scene, joints=tuple(joint for joint in scene.joints if not joint.collides), couplings=())
-    bodies, state = from_scene(trees, Units(1.0, 1.0, 1.0))
-    if bodies.joints is not None:
-        space = JointSpace(bodies, state)
-        values = np.zeros(space.size)
-        for joint, place in zip(trees.joints, space.columns, strict=True):
-            values[place] = q.get(joint.name, 0.0)
-        state = space.set(values, np.zeros(space.size))[0]
-    return state.position, Rotation.from_quat(state.orientation).as_matrix()
+    held: dict[int, Joint] = {joint.bodies[0]: joint for joint in scene.joints if not joint.collides}
+    found: dict[int, tuple[np.ndarray, Rotation]] = {-1: (np.zeros(3), Rotation.identity())}
+
+    def pose(k: int) -> tuple[np.ndarray, Rotation]:
+        if k not in found:
+            body = scene.bodies[k]
+            found[k] = body.position, Rotation.from_quat(body.quat_xyzw)
+            if k in held:
+                joint, value = held[k], q.get(held[k].name, 0.0)
+                place, turn = pose(joint.bodies[1])
+                theirs, own = (Rotation.from_quat(frame) for frame in joint.quat_xyzw[::-1])
+                frame, origin = turn * theirs, place + turn.apply(joint.anchor[1])
+                if joint.kind == "hinge":
+                    frame = frame * Rotation.from_rotvec([value, 0.0, 0.0])
+                elif joint.kind == "slider":
+                    origin = origin + frame.apply([value, 0.0, 0.0])
+                elif joint.kind == "ball":
+                    frame = frame * Rotation.from_rotvec(np.zeros(3) + value)
+                axes = frame * own.inv()
+                found[k] = origin - axes.apply(joint.anchor[0]), axes
+        return found[k]
+
+    places, axes = zip(*(pose(k) for k in range(len(scene.bodies))), strict=True)
+    turns = np.stack([turn.as_matrix() for turn in axes])
+    com = np.stack([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
+    return np.stack(places) + np.einsum("nij,nj->ni", turns, com), turns
 
 
 @dataclass(frozen=True)
