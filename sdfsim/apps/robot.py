@@ -90,10 +90,13 @@ class LinkJoint:
 @dataclass(frozen=True)
 class Pose:
     """A keyframe: positions of joints (rad, m; a quaternion [4] xyzw for a ball) by their names, and poses [4, 4] in
-    the world of links that no joint holds, by their numbers."""
+    the world of links that no joint holds with their velocities [3] m/s, of the centre of mass, and angular velocities
+    [3] rad/s, by their numbers; speeds of joints, and targets of their motors."""
 
     joints: dict[str, Any]
-    links: dict[int, np.ndarray]
+    links: dict[int, tuple[np.ndarray, ...]]
+    speeds: dict[str, Any]
+    targets: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -221,7 +224,15 @@ def _add_poses(scene: SceneBuilder, robot: Robot, names: list[str], poses: list[
             elif joint in kinds:
                 keys["positions" if kinds[joint] == "slider" else "quats_xyzw"][joint] = _round(value)
         shapes = {k: np.linalg.inv(robot.links[k].pose) @ poses[k] for k in key.links}
-        keys["bodies"] = {names[k]: placed(pose_of(lift) @ pose @ shapes[k]) for k, pose in key.links.items()}
+        for joint, speed in key.speeds.items():
+            if joint in kinds:
+                keys.setdefault("spins" if kinds[joint] == "ball" else "speeds", {})[joint] = _round(speed)
+        keys["targets"] = {joint: _round(value) for joint, value in key.targets.items() if joint in kinds}
+        keys["bodies"] = {
+            names[k]: placed(pose_of(lift) @ pose @ shapes[k])
+            | {what: _round(v) for what, v in zip(("velocity", "angular_velocity"), fast, strict=True) if np.any(v)}
+            for k, (pose, *fast) in key.links.items()
+        }
         scene.keyframe(name, **{what: found for what, found in keys.items() if found})
     for first, second, ratio, given in robot.couplings:
         offset = float(np.round(given, 12))
@@ -295,7 +306,7 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         notes=tuple(notes),
         frames=tuple((name, k, np.linalg.inv(whole[k].pose) @ pose if k >= 0 else pose) for name, k, pose in there),
         keyframes={
-            name: Pose(key.joints, {number[k]: pose for k, pose in key.links.items() if k in number})
+            name: replace(key, links={number[k]: pose for k, pose in key.links.items() if k in number})
             for name, key in robot.keyframes.items()
         },
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from sdfsim.physics import pose
 from sdfsim.physics.joint_columns import (
+    ARMATURE,
     BOUNCE,
     BROKEN,
     COORD,
@@ -89,6 +90,7 @@ def joints_of(
         row[BOUNCE] = joint.restitution
         row[DAMPING] = joint.damping / (effort / unit * time)
         row[FRICTION] = joint.friction / effort
+        row[ARMATURE] = joint.armature * unit / (effort * time**2)
         if joint.spring is not None:
             row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
         if (motor := joint.motor) is not None:

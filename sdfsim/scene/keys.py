@@ -75,6 +75,7 @@ class JointKeys(TypedDict, total=False):
     restitution: float | None
     damping: float | None
     friction: float | None
+    armature: float | None
     spring: Group | None
     motor: Group | None
     breaks_at: Group | None

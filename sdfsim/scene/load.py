@@ -110,8 +110,11 @@ def _poses_of(table: SceneTable, bodies: list[Body]) -> dict[str, Any]:
     def pose(key: KeyframeTable) -> Keyframe:
         angles = {name: math.radians(angle) for name, angle in key.angles_deg.items()}
         turns = {name: np.array(quat) for name, quat in key.quats_xyzw.items()}
-        there = {name: (np.array(at.position), at.rotation()) for name, at in key.bodies.items()}
-        return Keyframe(angles | key.positions | turns, there)
+        there = {
+            name: (np.array(at.position), at.rotation(), np.array(at.velocity), np.array(at.angular_velocity))
+            for name, at in key.bodies.items()
+        }
+        return Keyframe(angles | key.positions | turns, there, key.speeds | key.spins, key.targets)
 
     def coupling(of: CouplingTable) -> Coupling:
         first, second = (joint[name] for name in of.joints)

@@ -625,6 +625,10 @@ class JointTable(Table):
     friction: Number = key(
         "torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0, of="hinge slider ball"
     )
+    armature: Number = key(
+        "inertia of a motor's rotor, as the joint feels it, in kg m^2 for hinges and balls, in kg for sliders; part of "
+        "the mass matrix and of MJCF, but not of the motion here", 0.0, ge=0, of="hinge slider ball",
+    )  # fmt: skip
     spring: SpringTable | None = key("a spring that pulls back", None, of="hinge slider distance")
     motor: MotorTable | None = key("a motor that drives it", None, of="hinge slider")
     breaks_at: BreaksTable | None = key("load at which it breaks", None)
@@ -689,15 +693,25 @@ class Pose(Turned):
     """Where a keyframe has a body."""
 
     position: Vector = key("position of the shape's own origin", unit="m")
+    velocity: Vector = key("velocity of the centre of mass", _ORIGIN, "m/s")
+    angular_velocity: Vector = key("angular velocity in world axes", _ORIGIN, "rad/s")
 
 
 class KeyframeTable(Table):
-    """A pose of all joints by its name, for `simulator.reset(keyframe=NAME)`: everything is at rest in it, and motors
-    that go to a position aim at it. Joints and bodies that it leaves out stay as at the start."""
+    """A pose of all joints by its name, for `simulator.reset(keyframe=NAME)`. What it gives no speed is at rest, and
+    motors that go to a position aim at it. Joints and bodies that it leaves out stay as at the start."""
 
     angles_deg: dict[str, Number] = key("angles of hinges, by their names", {}, "degrees")
     positions: dict[str, Number] = key("positions of sliders", {}, "m")
     quats_xyzw: dict[str, Quaternion] = key("rotations of balls, scalar last, from their start", {})
+    speeds: dict[str, Number] = key("speeds of hinges in rad/s, of sliders in m/s", {})
+    spins: dict[str, Vector] = key(
+        "angular velocities of balls: of the first body relative to the second, in its axes, which are those of the "
+        "world at the start; with a cone, x is its axis", {}, "rad/s",
+    )  # fmt: skip
+    targets: dict[str, Number] = key(
+        "targets of motors, in place of the position: rad or m, or rad/s or m/s for those that keep a speed", {}
+    )
     bodies: dict[str, Pose] = key("poses of bodies that no joint holds", {})
 
 
@@ -810,10 +824,15 @@ class SceneTable(Table):
             elif kinds[name] not in allowed:
                 yield loc, f"must be a {' or '.join(allowed)} (got {name!r}, a {kinds[name]})"
 
+        moving, driven = ("hinge", "slider"), {joint.name for joint in self.joints if joint.motor}
+        of = {"angles_deg": moving[:1], "positions": moving[1:], "quats_xyzw": ("ball",), "speeds": moving,
+              "spins": ("ball",)}  # fmt: skip
         for key, frame in self.keyframes.items():
-            for what, kind in (("angles_deg", "hinge"), ("positions", "slider"), ("quats_xyzw", "ball")):
+            for what, allowed in {**of, "targets": moving}.items():
                 for name in getattr(frame, what):
-                    yield from fits(("keyframes", key, what, name), name, kind)
+                    yield from fits(("keyframes", key, what, name), name, *allowed)
+            for name in frame.targets.keys() & kinds.keys() - driven:
+                yield ("keyframes", key, "targets", name), f"joint {name!r} has no motor"
             for name in frame.bodies.keys() - bodies:
                 yield ("keyframes", key, "bodies", name), _no_body(name, bodies)
         for i, coupling in enumerate(self.couplings):

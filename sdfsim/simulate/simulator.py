@@ -346,8 +346,10 @@ class Simulator(Jointed):
         joints = [replace(j, bodies=(number[j.bodies[0]], number[j.bodies[1]])) for j in joints]
         names = {joint.name for joint in joints}
         keys = {
-            key: Keyframe({joint: at for joint, at in known.joints.items() if joint in names},
-                          {body: at for body, at in known.bodies.items() if body != name})
+            key: Keyframe(**{
+                field: {of: value for of, value in values.items() if of in names or (field == "bodies" and of != name)}
+                for field, values in vars(known).items()
+            })
             for key, known in scene.keyframes.items()
         }  # fmt: skip
         self.become(replace(
