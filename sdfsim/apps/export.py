@@ -686,7 +686,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         add(contact, "pair", **pair)
     if scene.joints:
         ends = [nodes[k] for k in range(len(take.names))] + [world]
-        left_out += jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names)
+        left_out += jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names, STEP)
     keys = {name: jointed.mjcf_state(scene, at, tree) for name, at in {"start": scene, **posed}.items()}
     if keys["start"]:
         element = add(root, "keyframe")

@@ -193,10 +193,12 @@ def mjcf_state(scene: Scene, posed: Scene, tree: Trees) -> dict[str, str]:
 
 
 def mjcf_rest(
-    root: Element, sites: Sequence[Element], scene: Scene, tree: Trees, bodies: Sequence[str], names: dict[str, str]
-) -> list[str]:
+    root: Element, sites: Sequence[Element], scene: Scene, tree: Trees, bodies: Sequence[str], names: dict[str, str],
+    step: float,
+) -> list[str]:  # fmt: skip
     """Write loops, distances, motors and excluded contacts. Returns what is left out. `sites` are the
-    elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and joints."""
+    elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and joints, `step`
+    [s] is MuJoCo's."""
     lines = left_out(scene, mjcf=True)
     tags = ("equality", "tendon", "actuator", "contact")
     into = {tag: Element(tag) for tag in tags}
@@ -263,6 +265,8 @@ def mjcf_rest(
             add(into["actuator"], "motor", **keys)
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
         lines.append("that a cone bounds only the lean of a ball: MuJoCo bounds its whole rotation")
+    for held_so in into["equality"]:  # as stiff as the step allows: here they are rigid
+        held_so.attrib |= {"solref": numbers(2.0 * step, 1.0), "solimp": "0.99 0.999 0.001"}
     for tag in tags:
         before = root.find(tag)
         if len(into[tag]) and before is not None:

@@ -11,12 +11,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.export import rebound
-from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Pose, Robot, moved, named, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Pose, Robot, named
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.lazy import optional
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
 from sdfsim.scene.joints import joint_axes
+from sdfsim.shape.parts import Part, moved, pose_of
 
 START = "start"  # the keyframe that our own exports have
 SOFTEST = 1.99  # damping ratio from which contacts count as not rebounding

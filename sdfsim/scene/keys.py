@@ -26,6 +26,7 @@ class BodyKeys(TypedDict, total=False):
     box: Group | None
     cylinder: Group | None
     plane: Group | None
+    parts: Sequence[Group] | None
     units: Literal["m", "cm", "mm", "in"] | None
     cap: Switch | None
     thicken: float | None

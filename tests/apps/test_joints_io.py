@@ -16,11 +16,11 @@ from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.apps.play.saved import at_frame, save_scene
 from sdfsim.apps.recording import ends, marks
-from sdfsim.apps.robot import GREY
 from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.parts import GREY
 from sdfsim.simulate.looks import body_colors
 from tests.helpers.command import run
 
