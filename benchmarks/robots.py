@@ -1,15 +1,18 @@
-"""Imports the robots in PyBullet's data, and compares the poses of their links with MuJoCo's.
+"""Imports robots, and compares the poses of their links, and their motion after an export, with MuJoCo's.
 
     python -m benchmarks robots [FILE ...]     # else all of pybullet_data but its random solids
 
 For each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
-scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
+scene's links, over the start and 20 random positions of all joints; the same distance after `set_joints`; the largest
+relative difference of masses. For MJCF with actuators, MuJoCo also runs the file and its export for 2 s from the first
+keyframe, without contacts: the largest difference of a hinge (rad) or slide (m) at the end, and how often the forces of
+actuators change their sign in each.
 """
 
 import math
 import re
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 from xml.etree import ElementTree
@@ -19,12 +22,13 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from benchmarks.records import Cell, progress, write_record
-from sdfsim import load_scene
+from sdfsim import Simulator, export, load_scene
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.scene import Joint, Scene
 
 TRIES = 20
+SECONDS = 2.0  # of motion in MuJoCo
 FREE = 1.0  # rad or m to each side, of joints without limits
 
 
@@ -66,6 +70,7 @@ class Judged:
     links: int  # in both
     apart: float  # m, the largest
     turned: float  # rad, the largest
+    set: float  # m, the largest, with joints set in a simulator
     mass: float  # relative, the largest
 
 
@@ -93,7 +98,9 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     places, turns = poses(scene, start)
     first = [(data.xmat[k].reshape(3, 3).copy(), turns[i]) for k, i in both]
     axes = {k: ours.T @ theirs for (k, _), (theirs, ours) in zip(both, first, strict=True)}
-    apart = turned = 0.0
+    apart = turned = placed = 0.0
+    trees = replace(scene, joints=tuple(j for j in scene.joints if not j.collides), couplings=(), keyframes={})
+    simulator = Simulator(replace(trees, model="solver"))
     # MuJoCo fixes the root of a URDF at the origin; in a scene it is free at its own pose.
     for trial in range(tries + 1):
         values = start if trial == 0 else _set(mujoco, model, data, joints, by_name, rng, axes)
@@ -102,8 +109,44 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
             apart = max(apart, float(np.linalg.norm(data.xipos[k] - places[i])))
             change = data.xmat[k].reshape(3, 3) @ theirs.T @ (turns[i] @ ours.T).T
             turned = max(turned, float(np.linalg.norm(Rotation.from_matrix(change).as_rotvec())))
+        if trees.joints:
+            q = simulator.joint_positions
+            for name, place in simulator.joint_columns.items():
+                q[place] = values.get(name, 0.0)
+            simulator.set_joints(q)
+        placed = max(placed, *(np.linalg.norm(data.xipos[k] - simulator[scene.bodies[i].name].centre) for k, i in both))
     mass = max((abs(_mass(scene, i) / model.body_mass[k] - 1.0) for k, i in both), default=0.0)
-    return Judged(len(both), apart, turned, mass)
+    return Judged(len(both), apart, turned, float(placed), mass)
+
+
+def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
+    """The largest difference (rad, m) of a joint's position after `SECONDS` in MuJoCo between an MJCF file and an
+    export of the `scene` made from it, and how often in each forces of actuators change their sign by more than a
+    thousandth of the largest. None if it has no actuators."""
+    import mujoco
+
+    export(scene, scene.with_suffix(".xml"), collide="sdf")  # nothing touches: no need to cut meshes
+    ends, turns, start = [], [], {}
+    for file in (scene.with_suffix(".xml"), source):
+        model = mujoco.MjModel.from_xml_path(str(file))
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        data, forces = mujoco.MjData(model), []
+        if not model.nu:
+            return None
+        if model.nkey:
+            mujoco.mj_resetDataKeyframe(model, data, 0)
+        # Hinges and slides, all from the export's start, which is within limits.
+        single = {model.joint(j).name: model.jnt_qposadr[j] for j in np.flatnonzero(model.jnt_type > 1)}
+        for name, at in single.items():
+            data.qpos[at] = start.setdefault(name, float(data.qpos[at]))
+        while data.time < SECONDS - 1e-9:
+            mujoco.mj_step(model, data)
+            forces.append(data.actuator_force.copy())
+        force = np.array(forces)
+        sign = np.sign(np.where(np.abs(force) > 1e-3 * np.abs(force).max(), force, 0.0))
+        turns.append(int((sign[1:] * sign[:-1] < 0).sum()))
+        ends.append({name: float(data.qpos[at]) for name, at in single.items()})
+    return max(abs(ends[0][name] - end) for name, end in ends[1].items() if name in ends[0]), turns[1], turns[0]
 
 
 def _mass(scene: Scene, k: int) -> float:
@@ -127,8 +170,8 @@ def _set(
     """Set joints to the scene's start, or at random within limits, and return their positions; `shape_axes` by body map
     the axes of its link to those of its shape."""
     mujoco.mj_resetData(model, data)
-    if "start" in (keys := [model.key(k).name for k in range(model.nkey)]):
-        mujoco.mj_resetDataKeyframe(model, data, keys.index("start"))
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
     values: dict[str, float | np.ndarray] = {}
     for j, name in joints.items():
         at, kind = int(model.jnt_qposadr[j]), mujoco.mjtJoint(int(model.jnt_type[j]))
@@ -168,24 +211,39 @@ def main(files: Annotated[list[Path] | None, typer.Argument()] = None) -> None:
     rows: list[tuple[Cell, ...]] = []
     files = files or _all()
     for k, file in enumerate(files):
-        progress(k / len(files), file.name)
+        progress(k / len(files), name := f"{file.parent.name}/{file.name}")
         with tempfile.TemporaryDirectory() as folder:
             try:
-                import_robot(file, Path(folder) / "scene.yaml")
-                scene = load_scene(Path(folder) / "scene.yaml")
-            except SdfsimError as error:
-                refused.append((file.name, *[""] * 6, error.message.replace(f"{file.parent}/", "")[:150]))
+                key = None if file.suffix == ".urdf" else _first_key(file)
+                import_robot(file, out := Path(folder) / "scene.yaml", key=key)
+                moved = there_and_back(file, out) if file.suffix != ".urdf" else None
+                scene = load_scene(out)
+            except (SdfsimError, ValueError) as error:
+                message = error.message if isinstance(error, SdfsimError) else f"MuJoCo: {str(error).splitlines()[0]}"
+                refused.append((name, *[""] * 9, message.replace(f"{file.parent}/", "")[:150]))
                 continue
-        counts = (file.name, len(scene.bodies), len(scene.joints))
+        counts = (name, len(scene.bodies), len(scene.joints))
         try:
             found = judge(file, scene)
         except ValueError as error:
-            refused.append((*counts, *[""] * 4, f"MuJoCo: {str(error).splitlines()[0][:100]}"))
+            refused.append((*counts, *[""] * 7, f"MuJoCo: {str(error).splitlines()[0][:100]}"))
             continue
-        rows.append((*counts, found.links, 1e3 * found.apart, math.degrees(found.turned), found.mass, ""))
-    columns = ("file", "bodies", "joints", "links compared", "apart, mm", "turned, degrees", "masses, relative")
+        apart = 1e3 * found.apart, math.degrees(found.turned), 1e3 * found.set
+        there = ("", "") if moved is None else (moved[0], f"{moved[1]} / {moved[2]}")
+        rows.append((*counts, found.links, *apart, found.mass, *there, ""))
+    columns = (
+        "file", "bodies", "joints", "links compared", "apart, mm", "turned, degrees", "set, mm", "masses, relative",
+        "after 2 s of the export", "sign changes",
+    )  # fmt: skip
     measured = f"Largest differences from MuJoCo's models, over the start and {TRIES} random joint configurations."
     write_record("robots", "python -m benchmarks robots", measured, (*columns, "refused"), [*refused, *rows])
+
+
+def _first_key(file: Path) -> str | None:
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(file))
+    return (model.key(0).name or "key 0") if model.nkey else None
 
 
 def _all() -> list[Path]:

@@ -374,7 +374,7 @@ class _Reader:
                 raise self.wrong(element, f"no such file: {name} (looked for {tried})", "give its folder: --packages")
             if place not in self.meshes:
                 try:
-                    self.meshes[place] = load_textured(place)
+                    self.meshes[place] = load_textured(place, upright=False)
                 except SdfsimError as error:
                     hint = error.hint or "use " + " ".join(MESH_SUFFIXES)
                     raise self.wrong(element, error.message, hint) from error

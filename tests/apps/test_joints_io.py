@@ -17,6 +17,7 @@ from sdfsim.apps.import_robot import import_robot
 from sdfsim.apps.play.saved import at_frame, save_scene
 from sdfsim.apps.recording import ends, marks
 from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.mesh_io import load_mesh
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
@@ -864,7 +865,9 @@ def test_a_tendon_of_coupled_joints_is_a_motor_of_the_one_they_follow(tmp_path: 
         assert found == pytest.approx(data.qpos, abs=3e-4)
 
 
-def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("up", ["X_UP", "Y_UP", "Z_UP"])
+def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path, up: str) -> None:
+    """In a robot their axes are what they are, as in trimesh, MoveIt and RViz; else their up axis becomes z."""
     collada = pytest.importorskip("collada")
     file = collada.Collada()
     effect = collada.material.Effect("e", [], "lambert", diffuse=(1.0, 0.5, 0.0, 1.0))
@@ -883,7 +886,7 @@ def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
     used = collada.scene.GeometryNode(shape, [collada.scene.MaterialNode("paint", paint, inputs=[])])
     moved = collada.scene.Node("n", children=[used], transforms=[collada.scene.TranslateTransform(0, 0, 50)])
     file.scenes.append(scene := collada.scene.Scene("s", [moved]))
-    file.scene, file.assetInfo.unitname, file.assetInfo.unitmeter = scene, "mm", 0.001
+    file.assetInfo.upaxis, file.scene, file.assetInfo.unitname, file.assetInfo.unitmeter = up, scene, "mm", 0.001
     file.write(str(tmp_path / "box.dae"))
     mesh = '<geometry><mesh filename="box.dae"/></geometry>'
     text = f"""<robot name="r"><link name="one"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0"
@@ -891,6 +894,15 @@ def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
     scene = imported(write(tmp_path, "r.urdf", text))[0]
     shape = scene.shapes[0]
     np.testing.assert_allclose(shape.mesh.vertices.max(0), (0.1, 0.1, 0.15), atol=1e-9)
+    theirs = pytest.importorskip("trimesh").load(tmp_path / "box.dae", force="mesh")
+    np.testing.assert_allclose(
+        shape.mesh.vertices.max(0), theirs.vertices.max(0) * (0.001 if theirs.extents.max() > 1 else 1)
+    )
+    # Of the file's box, its z goes from 50 to 150 mm, the others from 0 to 100.
+    alone = load_mesh(tmp_path / "box.dae").vertices
+    ends = {"X_UP": ((-0.1, -0.15, 0), (0, -0.05, 0.1)), "Y_UP": ((0, -0.15, 0), (0.1, -0.05, 0.1)),
+            "Z_UP": ((0, 0, 0.05), (0.1, 0.1, 0.15))}  # fmt: skip
+    np.testing.assert_allclose((alone.min(0), alone.max(0)), ends[up], atol=1e-9)
     assert shape.volume == pytest.approx(1e-3) and shape.skin is None
     assert (np.abs(np.subtract(scene.bodies[0].color, (255, 128, 0))) < 6).all()
 
