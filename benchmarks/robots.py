@@ -3,7 +3,7 @@
     python -m benchmarks robots [FILE ...]     # else all of pybullet_data but its random solids
 
 For each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
-scene's links, over the start and 20 random positions of all joints; the same distance after `set_joints`; the largest
+scene's links, which `Simulator.set_joints` moves, over the start and 20 random positions of all joints; the largest
 relative difference of masses. For MJCF with actuators, MuJoCo also runs the file and its export for 2 s from the first
 keyframe, without contacts: the largest difference of a hinge (rad) or slide (m) at the end, and how often the forces of
 actuators change their sign in each.
@@ -32,35 +32,23 @@ SECONDS = 2.0  # of motion in MuJoCo
 FREE = 1.0  # rad or m to each side, of joints without limits
 
 
-def poses(scene: Scene, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies of a scene of trees, in the world: roots at their start
+def simulator_of(scene: Scene) -> Simulator:
+    """A simulator of a scene without what closes loops or couples joints."""
+    trees = tuple(joint for joint in scene.joints if not joint.collides)
+    return Simulator(replace(scene, model="solver", joints=trees, couplings=(), keyframes={}))
+
+
+def poses(simulator: Simulator, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies, in the world, after `set_joints`: roots at their start
     poses, joints at `q` (rad, m; a rotation vector for a ball), by name."""
-    held: dict[int, Joint] = {joint.bodies[0]: joint for joint in scene.joints if not joint.collides}
-    found: dict[int, tuple[np.ndarray, Rotation]] = {-1: (np.zeros(3), Rotation.identity())}
-
-    def pose(k: int) -> tuple[np.ndarray, Rotation]:
-        if k not in found:
-            body = scene.bodies[k]
-            found[k] = body.position, Rotation.from_quat(body.quat_xyzw)
-            if k in held:
-                joint, value = held[k], q.get(held[k].name, 0.0)
-                place, turn = pose(joint.bodies[1])
-                theirs, own = (Rotation.from_quat(frame) for frame in joint.quat_xyzw[::-1])
-                frame, origin = turn * theirs, place + turn.apply(joint.anchor[1])
-                if joint.kind == "hinge":
-                    frame = frame * Rotation.from_rotvec([value, 0.0, 0.0])
-                elif joint.kind == "slider":
-                    origin = origin + frame.apply([value, 0.0, 0.0])
-                elif joint.kind == "ball":
-                    frame = frame * Rotation.from_rotvec(np.zeros(3) + value)
-                axes = frame * own.inv()
-                found[k] = origin - axes.apply(joint.anchor[0]), axes
-        return found[k]
-
-    places, axes = zip(*(pose(k) for k in range(len(scene.bodies))), strict=True)
-    turns = np.stack([turn.as_matrix() for turn in axes])
-    com = np.stack([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
-    return np.stack(places) + np.einsum("nij,nj->ni", turns, com), turns
+    if simulator.scene.joints:
+        values = simulator.joint_positions
+        for name, place in simulator.joint_columns.items():
+            values[place] = q.get(name, 0.0)
+        simulator.set_joints(values)
+    bodies = [simulator[body.name] for body in simulator.scene.bodies]
+    turns = Rotation.from_quat([body.quat_xyzw for body in bodies]).as_matrix()
+    return np.stack([body.centre for body in bodies]), turns
 
 
 @dataclass(frozen=True)
@@ -70,7 +58,6 @@ class Judged:
     links: int  # in both
     apart: float  # m, the largest
     turned: float  # rad, the largest
-    set: float  # m, the largest, with joints set in a simulator
     mass: float  # relative, the largest
 
 
@@ -95,28 +82,21 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     joints = {j: model.joint(j).name or _named(model, j) for j in range(model.njnt)}
     rng = np.random.default_rng(seed)
     start = _set(mujoco, model, data, joints, by_name, None)
-    places, turns = poses(scene, start)
+    simulator = simulator_of(scene)
+    turns = poses(simulator, start)[1]
     first = [(data.xmat[k].reshape(3, 3).copy(), turns[i]) for k, i in both]
     axes = {k: ours.T @ theirs for (k, _), (theirs, ours) in zip(both, first, strict=True)}
-    apart = turned = placed = 0.0
-    trees = replace(scene, joints=tuple(j for j in scene.joints if not j.collides), couplings=(), keyframes={})
-    simulator = Simulator(replace(trees, model="solver"))
+    apart = turned = 0.0
     # MuJoCo fixes the root of a URDF at the origin; in a scene it is free at its own pose.
     for trial in range(tries + 1):
         values = start if trial == 0 else _set(mujoco, model, data, joints, by_name, rng, axes)
-        places, turns = poses(scene, values)
+        places, turns = poses(simulator, values)
         for (k, i), (theirs, ours) in zip(both, first, strict=True):
             apart = max(apart, float(np.linalg.norm(data.xipos[k] - places[i])))
             change = data.xmat[k].reshape(3, 3) @ theirs.T @ (turns[i] @ ours.T).T
             turned = max(turned, float(np.linalg.norm(Rotation.from_matrix(change).as_rotvec())))
-        if trees.joints:
-            q = simulator.joint_positions
-            for name, place in simulator.joint_columns.items():
-                q[place] = values.get(name, 0.0)
-            simulator.set_joints(q)
-        placed = max(placed, *(np.linalg.norm(data.xipos[k] - simulator[scene.bodies[i].name].centre) for k, i in both))
     mass = max((abs(_mass(scene, i) / model.body_mass[k] - 1.0) for k, i in both), default=0.0)
-    return Judged(len(both), apart, turned, float(placed), mass)
+    return Judged(len(both), apart, turned, mass)
 
 
 def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
@@ -127,14 +107,16 @@ def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
 
     export(scene, scene.with_suffix(".xml"), collide="sdf")  # nothing touches: no need to cut meshes
     ends, turns, start = [], [], {}
+    keys = mujoco.MjModel.from_xml_path(str(source))
+    key = (keys.key(0).name or "key 0") if keys.nkey else "start"
     for file in (scene.with_suffix(".xml"), source):
         model = mujoco.MjModel.from_xml_path(str(file))
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         data, forces = mujoco.MjData(model), []
         if not model.nu:
             return None
-        if model.nkey:
-            mujoco.mj_resetDataKeyframe(model, data, 0)
+        if number := [k for k in range(model.nkey) if (model.key(k).name or f"key {k}") == key]:
+            mujoco.mj_resetDataKeyframe(model, data, number[0])
         # Hinges and slides, all from the export's start, which is within limits.
         single = {model.joint(j).name: model.jnt_qposadr[j] for j in np.flatnonzero(model.jnt_type > 1)}
         for name, at in single.items():
@@ -170,8 +152,8 @@ def _set(
     """Set joints to the scene's start, or at random within limits, and return their positions; `shape_axes` by body map
     the axes of its link to those of its shape."""
     mujoco.mj_resetData(model, data)
-    if model.nkey:
-        mujoco.mj_resetDataKeyframe(model, data, 0)
+    if "start" in (keys := [model.key(k).name for k in range(model.nkey)]):
+        mujoco.mj_resetDataKeyframe(model, data, keys.index("start"))
     values: dict[str, float | np.ndarray] = {}
     for j, name in joints.items():
         at, kind = int(model.jnt_qposadr[j]), mujoco.mjtJoint(int(model.jnt_type[j]))
@@ -214,36 +196,28 @@ def main(files: Annotated[list[Path] | None, typer.Argument()] = None) -> None:
         progress(k / len(files), name := f"{file.parent.name}/{file.name}")
         with tempfile.TemporaryDirectory() as folder:
             try:
-                key = None if file.suffix == ".urdf" else _first_key(file)
-                import_robot(file, out := Path(folder) / "scene.yaml", key=key)
+                import_robot(file, out := Path(folder) / "scene.yaml")
                 moved = there_and_back(file, out) if file.suffix != ".urdf" else None
                 scene = load_scene(out)
             except (SdfsimError, ValueError) as error:
                 message = error.message if isinstance(error, SdfsimError) else f"MuJoCo: {str(error).splitlines()[0]}"
-                refused.append((name, *[""] * 9, message.replace(f"{file.parent}/", "")[:150]))
+                refused.append((name, *[""] * 8, message.replace(f"{file.parent}/", "")[:150]))
                 continue
         counts = (name, len(scene.bodies), len(scene.joints))
         try:
             found = judge(file, scene)
         except ValueError as error:
-            refused.append((*counts, *[""] * 7, f"MuJoCo: {str(error).splitlines()[0][:100]}"))
+            refused.append((*counts, *[""] * 6, f"MuJoCo: {str(error).splitlines()[0][:100]}"))
             continue
-        apart = 1e3 * found.apart, math.degrees(found.turned), 1e3 * found.set
+        apart = 1e3 * found.apart, math.degrees(found.turned)
         there = ("", "") if moved is None else (moved[0], f"{moved[1]} / {moved[2]}")
         rows.append((*counts, found.links, *apart, found.mass, *there, ""))
     columns = (
-        "file", "bodies", "joints", "links compared", "apart, mm", "turned, degrees", "set, mm", "masses, relative",
+        "file", "bodies", "joints", "links compared", "apart, mm", "turned, degrees", "masses, relative",
         "after 2 s of the export", "sign changes",
     )  # fmt: skip
     measured = f"Largest differences from MuJoCo's models, over the start and {TRIES} random joint configurations."
     write_record("robots", "python -m benchmarks robots", measured, (*columns, "refused"), [*refused, *rows])
-
-
-def _first_key(file: Path) -> str | None:
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(file))
-    return (model.key(0).name or "key 0") if model.nkey else None
 
 
 def _all() -> list[Path]:

@@ -698,23 +698,13 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
 
 def _posed(scene: Scene, keyframe: str) -> Scene:
     """The scene with its bodies, joints and targets of motors as in a keyframe."""
+    from sdfsim.simulate.record import at_frame
     from sdfsim.simulate.simulator import Simulator
 
-    simulator, bodies, joints = Simulator(replace(scene, model="solver", effects=Effects())), [], []
+    simulator = Simulator(replace(scene, model="solver", effects=Effects()))
     simulator.reset(keyframe=keyframe)
-    for body in scene.bodies:
-        now = simulator[body.name]
-        place = {"position": now.position, "quat_xyzw": now.quat_xyzw}
-        bodies.append(replace(body, **place, velocity=now.velocity, angular_velocity=now.angular_velocity))
-    for joint in scene.joints:
-        now = simulator.joint(joint.name)
-        if joint.kind in ("hinge", "slider"):
-            joint = replace(joint, start=now.position)
-        if joint.motor is not None and now.target is not None:
-            aim = {"position" if joint.motor.speed is None else "speed": now.target}
-            joint = replace(joint, motor=replace(joint.motor, **aim))
-        joints.append(joint)
-    return replace(scene, bodies=tuple(bodies), joints=tuple(joints))
+    with simulator.record() as run:
+        return at_frame(scene, run.rollout)
 
 
 def _refined(take: Take) -> tuple[Take, list[str]]:

@@ -192,12 +192,10 @@ class _Reader:
         couplings = tuple(self._couplings())
         motors = {} if "actuation" in self.off else self._motors(couplings)
         joints = [replace(joint, motor=motors.get(joint.name)) for joint in joints]
-        free = [j for j in range(model.njnt) if model.jnt_type[j] == int(self.mj.mjtJoint.mjJNT_FREE)]
         rotors = sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(model.dof_armature)})
-        what = "armature of free joints", "armature of joints in the motion: the mass matrix and exports have it"
-        for said, those in zip(what, (set(rotors) & set(free), set(rotors) - set(free)), strict=True):
-            if those:
-                self.left.append(named(said, list(map(self._joint_name, sorted(those)))))
+        if rotors:
+            self.left.append(named("armature in the motion (the mass matrix and exports have it, but not that of free "
+                                   "joints)", list(map(self._joint_name, rotors))))  # fmt: skip
         joints += [*self._loops(), *self._ropes()]
         apart = self._apart(geoms)
         meets = self.off.isdisjoint(("contact", "constraint"))

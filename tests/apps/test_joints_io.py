@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.robots import poses
+from benchmarks.robots import poses, simulator_of
 from sdfsim import Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
-from sdfsim.apps.play.saved import at_frame, save_scene
+from sdfsim.apps.play.saved import save_scene
 from sdfsim.apps.recording import ends, marks
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh_io import load_mesh
@@ -23,6 +23,7 @@ from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.parts import GREY
 from sdfsim.simulate.looks import body_colors
+from sdfsim.simulate.record import at_frame
 from tests.helpers.command import run
 
 LINK = """
@@ -73,7 +74,7 @@ def imported(file: Path, **options) -> tuple[Scene, dict]:
 
 def centres(scene: Scene, q: dict[str, float]) -> dict[str, np.ndarray]:
     """By body: its centre of mass [3] with joints at `q`, roots as they are at the start."""
-    return dict(zip((body.name for body in scene.bodies), poses(scene, q)[0], strict=True))
+    return dict(zip((body.name for body in scene.bodies), poses(simulator_of(scene), q)[0], strict=True))
 
 
 def inertia(scene: Scene, name: str) -> np.ndarray:
