@@ -79,7 +79,7 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     both = [(k, number[name]) for k, name in ids.items() if name in number and model.body_mass[k] > 0]
     both = [(k, i) for k, i in both if scene.bodies[i].motion == "dynamic"]
     by_name = {joint.name: joint for joint in scene.joints}
-    joints = {j: model.joint(j).name or _named(model, j) for j in range(model.njnt)}
+    joints = {j: model.joint(j).name for j in range(model.njnt)}  # those without a name stay at zero
     rng = np.random.default_rng(seed)
     start = _set(mujoco, model, data, joints, by_name, None)
     simulator = simulator_of(scene)
@@ -137,12 +137,6 @@ def _mass(scene: Scene, k: int) -> float:
     balls = [b for b in scene.bodies if b.collides_with == () and b.name.startswith(f"{name}_")]
     chain = [b for b in balls if b.name.removeprefix(f"{name}_") in {joint.name for joint in scene.joints}]
     return scene.bodies[k].mass + sum(b.mass for b in chain)
-
-
-def _named(model, j: int) -> str:
-    body = int(model.jnt_bodyid[j])
-    count = j - int(model.body_jntadr[body])
-    return f"{model.body(body).name or f'body_{body}'}_joint" + (f"_{count}" if count else "")
 
 
 def _set(

@@ -436,19 +436,12 @@ def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> tuple[Shape, dict[s
     """A shape with the shown mesh of its link, with its colours and textures. If that is the solid itself, in one
     colour, the body's key for its colour instead."""
     parts = [part for part in (link.shown or link.solid) if part.kind != "plane"]
-    if not link.solid or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
+    if not link.solid or [mesh_of(part).digest() for part in parts] == [mesh_of(part).digest() for part in link.solid]:
         colors = {color_of(part) for part in parts}
         if len(colors) <= 1 and not any(map(textured, parts)):
             (color,) = colors or {None}
             return shape, {"color": [*color]} if color else {}
     return replace(shape, skin=skin_of(parts, frame)), {}
-
-
-def _same(part: Part) -> tuple:
-    """A key that is equal for equal parts."""
-    mesh = None if part.mesh is None else part.mesh.digest()
-    sizes = [(key, np.round(value, 9).tolist()) for key, value in sorted(part.sizes.items())]
-    return part.kind, tuple(np.round(part.pose, 9).ravel() + 0.0), str(sizes), mesh
 
 
 # --- which links touch ---

@@ -194,21 +194,20 @@ def _load_shape(name: str, entry: ShapeTable, scales: list[float], on_progress: 
 def _of_parts(name: str, entries: Sequence[PartTable]) -> Shape:
     from scipy.spatial.transform import Rotation  # slow to import
 
-    def parts(without: str) -> list[Part]:
-        found = []
-        for k, one in enumerate(entries):
-            kind: Any = next(kind for kind in OF_PART if getattr(one, kind) is not None)
-            at, mesh = pose_of(one.position, Rotation.from_quat(one.rotation())), None
-            color = one.color and tuple(map(round, one.color))
-            if kind == "mesh":
-                loaded = load_textured(one.mesh)
-                mesh = moved(loaded.skin or loaded.mesh if without == "touch" else loaded.mesh, one.scale * np.eye(4))
-            sizes = {} if mesh else dict(getattr(one, kind))
-            found += [Part(kind, at, sizes, mesh, f"parts[{k}]", color)] if one.use != without else []
-        return found
+    def part(k: int, *, seen: bool) -> Part:
+        one, mesh, sizes = entries[k], None, {}
+        kind: Any = next(kind for kind in OF_PART if getattr(one, kind) is not None)
+        if kind == "mesh":
+            loaded = load_textured(one.mesh)
+            mesh = moved((loaded.skin if seen else None) or loaded.mesh, one.scale * np.eye(4))
+        else:
+            sizes = dict(getattr(one, kind))
+        color = one.color and tuple(map(round, one.color))
+        return Part(kind, pose_of(one.position, Rotation.from_quat(one.rotation())), sizes, mesh, f"parts[{k}]", color)
 
-    shape, seen = solid_of(parts("shown"), name), parts("touch")
-    plain = all(one.use == "both" and color_of(part) is None for one, part in zip(entries, seen, strict=False))
+    shape = solid_of([part(k, seen=False) for k, one in enumerate(entries) if one.use != "shown"], name)
+    seen = [part(k, seen=True) for k, one in enumerate(entries) if one.use != "touch"]
+    plain = all(one.use == "both" for one in entries) and not any(map(color_of, seen))
     return shape if plain or not seen else replace(shape, skin=skin_of(seen, np.eye(4)))
 
 

@@ -381,14 +381,13 @@ class Jointed(LiveScene):
 
     def _pose_as(self, key: Keyframe) -> None:
         """Move all bodies and joints to a keyframe, with its speeds."""
-        if self.bodies.joints is not None:
-            places, q = self.joint_columns, self.joint_positions
+        q = self.joint_positions if self.bodies.joints is not None else np.zeros(0)
         for name, (position, quat, velocity, spin) in key.bodies.items():
             body = BodyHandle(self, name)
             body.quat_xyzw, body.position, body.velocity, body.angular_velocity = quat, position, velocity, spin
         if self.bodies.joints is None:
             return
-        v = np.zeros(len(q))
+        v, places = np.zeros(len(q)), self.joint_columns
         for name, value in key.joints.items():
             q[places[name]] = pose.to_rotvec(value) if np.ndim(value) else value
             handle = self.joint(name)
