@@ -101,8 +101,9 @@ def main(folder: Path, name: str) -> None:
             grip = moving.frame("grip").position
             print(f"grip at {np.round(grip, 4)} m, {name} at {np.round(moving[name].position, 4)} m")
     sdfsim.save_run(moving, run, folder / "grasp")
-    view = {"camera": neck + np.array([-0.75, -1.15, 0.45]), "look_at": neck + np.array([-0.2, 0.05, -0.05])}
-    sdfsim.render(moving.scene, run.rollout, folder / "grasp.mp4", **view, fps=15, size=(640, 360))
+    camera, look_at = neck + np.array([-0.75, -1.15, 0.45]), neck + np.array([-0.2, 0.05, -0.05])
+    film = folder / "grasp.mp4"
+    sdfsim.render(moving.scene, run.rollout, film, camera=camera, look_at=look_at, fps=15, size=(640, 360))
 
 
 if __name__ == "__main__":

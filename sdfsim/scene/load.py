@@ -197,12 +197,12 @@ def _of_parts(name: str, entries: Sequence[PartTable]) -> Shape:
     def part(k: int, *, seen: bool) -> Part:
         one, mesh, sizes = entries[k], None, {}
         kind: Any = next(kind for kind in OF_PART if getattr(one, kind) is not None)
-        if kind == "mesh":
+        if one.mesh is not None:
             loaded = load_textured(one.mesh)
             mesh = moved((loaded.skin if seen else None) or loaded.mesh, one.scale * np.eye(4))
         else:
             sizes = dict(getattr(one, kind))
-        color = one.color and tuple(map(round, one.color))
+        color: Any = one.color and tuple(map(round, one.color))
         return Part(kind, pose_of(one.position, Rotation.from_quat(one.rotation())), sizes, mesh, f"parts[{k}]", color)
 
     shape = solid_of([part(k, seen=False) for k, one in enumerate(entries) if one.use != "shown"], name)
