@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 GLANCE = 0.1  # s between two progress reports
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
-VARIED = ("position", "quat_xyzw", "velocity", "angular_velocity", "mass", "friction", "restitution")
+VARIED = ("position", "quat_xyzw", "velocity", "angular_velocity", "mass", "friction", "restitution", "scale")
 CHUNKS = 16  # largest number of pieces that variants are cut into, so that all cores finish together
 
 
@@ -726,8 +726,8 @@ def _changed(body: Body, fields: Mapping[str, Any], what: str) -> Body:
     (table,) = validated(what, (BodyTable, plain({"name": body.name, "shape": "its own", **fields})))
     values = {name: getattr(table, name) for name in fields}
     new: dict[str, Any] = {name: np.array(v) if isinstance(v, list) else v for name, v in values.items()}
-    if "mass" in new and body.inertia is not None:
-        new["inertia"] = body.inertia * (new["mass"] / body.mass)
+    if body.inertia is not None:
+        new["inertia"] = body.inertia * (new.get("mass", body.mass) / body.mass) * (new.get("scale", body.scale) / body.scale) ** 2
     return replace(body, **new)
 
 
