@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numba import int64, typeof
@@ -29,12 +29,10 @@ from sdfsim.physics.worlds import Stored, Told, run_worlds, untouched
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Frame, Scene
+from sdfsim.simulate.camera import Camera, Image, Style
 from sdfsim.simulate.joint import JointHandle
 from sdfsim.simulate.simulator import Simulator, Variant, varied
 from sdfsim.simulate.steppers import Solver
-
-if TYPE_CHECKING:
-    from sdfsim.simulate.camera import Camera, Image, Style
 
 # Numbers in each field of a body's motion.
 WIDTHS = {"position": 3, "quat_xyzw": 4, "velocity": 3, "angular_velocity": 3}
@@ -80,7 +78,8 @@ class Batch:
         scenes: for each world its scene, with what was drawn except poses and velocities.
         failed: [W] bool, worlds whose state became invalid, as of bodies that are too fast. They go back to the state
             before that call, and stand still until their reset.
-        scene, units, dt: as those of a `Simulator`.
+        draws: [W] how often each world has drawn.
+        scene, units, dt, simulator: those of a single simulator of the scene, at its start.
 
     Raises:
         SdfsimError: unknown names or fields, impossible values, or a scene that the contact solve cannot run.
@@ -93,7 +92,7 @@ class Batch:
     ) -> None:  # fmt: skip
         if isinstance(worlds, bool) or not isinstance(worlds, int | np.integer) or worlds < 1:
             raise SdfsimError(f"worlds: must be a whole number above 0 (got {worlds!r})")
-        self._one = one = Simulator(scene, "solver", dt=dt)
+        self.simulator = one = Simulator(scene, "solver", dt=dt)
         if not isinstance(one.stepper, Solver):
             raise SdfsimError("a batch needs the contact solve", "switch on effects.contact, or add joints")
         self.scene, self.units, self.dt, self.seed = one.scene, one.units, one.dt, seed
@@ -113,7 +112,7 @@ class Batch:
         self._pieces, self._rules = model.pieces, compiled_rules(self._options)
         count, n, j = int(worlds), len(one.bodies), 0 if self._start.joints is None else len(self._start.joints)
         self.scenes, self.drawn = [self.scene] * count, [dict[str, Any]()] * count
-        self._draws, self.failed, self._fixed = np.zeros(count, np.int64), np.zeros(count, bool), np.zeros(count, bool)
+        self.draws, self.failed, self._fixed = np.zeros(count, np.int64), np.zeros(count, bool), np.zeros(count, bool)
         self._com, self._wrench = np.tile(one.bodies.com, (count, 1, 1)), np.zeros((count, n, 6))
         self._number, self._joint = np.zeros((count, j, col.NUMBERS)), np.zeros((count, j, col.STATE))
         self._told = Told(
@@ -150,14 +149,14 @@ class Batch:
         `vary`, unless `variants` has values for it. A `seed` begins the draws anew, too. Returns the observations of
         all worlds, [W, O]. Raises SdfsimError for unknown names or fields and impossible values."""
         if seed is not None:
-            self.seed, self._draws[:] = seed, 0
+            self.seed, self.draws[:] = seed, 0
         rows = np.arange(len(self))[slice(None) if worlds is None else np.asarray(worlds)]
         if variants is not None and len(variants) != len(rows):
             raise SdfsimError(f"variants: must be one for each world ({len(rows)}, got {len(variants)})")
         for k, w in enumerate(rows.tolist()):
-            rng = np.random.default_rng([self.seed, w, self._draws[w]])
+            rng = np.random.default_rng([self.seed, w, self.draws[w]])
             self._begin(w, self._draw(self._vary if variants is None else self._checked(variants[k]), rng))
-            self._draws[w] += variants is None
+            self.draws[w] += variants is None
         return self.observe()
 
     def step(self, actions: np.ndarray | None = None, count: int = 1) -> np.ndarray:
@@ -173,10 +172,10 @@ class Batch:
         found = [self._read(*entry) for entry in self._seen]
         return np.concatenate([np.zeros((len(self), 0)), *found], 1)
 
-    def image(self, camera: Camera, world: int, style: Style | None = None) -> Image:
+    def image(self, camera: Camera, world: int, style: Style = Style()) -> Image:
         """What a camera sees of a world."""
         place = self._motion.position[world] * self.units.length
-        return camera.picture(self.scenes[world], place, self._motion.orientation[world], style or Style())
+        return camera.picture(self.scenes[world], place, self._motion.orientation[world], style)
 
     # --- names ---
 
@@ -191,13 +190,13 @@ class Batch:
                 raise SdfsimError(f"{what}: {entry!r}: no such kind{nearest(kind, kinds)}", f"kinds are {known}")
             frame = next((f for f in self.scene.frames if f.name == name and kind in WIDTHS), None)
             if kind in ("target", "effort") or kind.startswith("joint_"):
-                handle: Any = self._one.joint(name)
+                handle: Any = self.simulator.joint(name)
                 handle._need(kind, *AXES)
                 _ = handle._told, handle._aim if kind == "target" else 0.0  # joints are on, and it has a motor
                 row = handle._row
             else:
-                row = self._one._row(name) if frame is None else frame.body
-            if row < 0 or (what == "act" and kind in ("force", "torque") and not self._one.bodies.moves[row]):
+                row = self.simulator._row(name) if frame is None else frame.body
+            if row < 0 or (what == "act" and kind in ("force", "torque") and not self.simulator.bodies.moves[row]):
                 raise SdfsimError(f"{what}: {entry!r}: {name!r} does not move")
             places[entry] = slice(start, start + kinds[kind])
             found.append((kind, row, frame if what == "observe" else places[entry]))
@@ -210,7 +209,7 @@ class Batch:
         """[W, 1, 3 or 4] of a body, frame or joint, SI units."""
         u, motion = self.units, self._motion
         if kind.startswith("joint_"):
-            unit = self._one._joint_unit[row]
+            unit = self.simulator._joint_unit[row]
             known = self._joint[:, row, [col.COORD if kind == "joint_position" else col.SPEED]] * unit
             return known if kind == "joint_position" else known / u.time
         if kind == "force":
@@ -244,7 +243,7 @@ class Batch:
                 changed[:, row] |= (known != new).any(1)
                 known[:] = new
                 continue
-            handle: Any = JointHandle(self._one, row)
+            handle: Any = JointHandle(self.simulator, row)
             number, target, value = self._number[:, row], self._joint[:, row, col.TARGET], values[:, 0]
             before = np.column_stack([number, target])
             if kind == "target":
@@ -257,11 +256,11 @@ class Batch:
                 target[:] = NEVER * np.sign(value)
             new = (before != np.column_stack([number, target])).any(1)
             for body in self.scene.joints[row].bodies:
-                if body >= 0 and self._one.bodies.moves[body]:
+                if body >= 0 and self.simulator.bodies.moves[body]:
                     changed[:, body] |= new
 
     def _advance(self, count: int) -> None:
-        tracks = self._one.bodies.tracks
+        tracks = self.simulator.bodies.tracks
         if tracks is not None and len(self._script.pose) < self._ended + count:
             ends = tracks.time[np.isfinite(tracks.time)]
             self._ended = math.ceil(ends.max() / self._options.dt) + 2
@@ -284,8 +283,8 @@ class Batch:
         for name, fields in ranges.items():
             for field, value in fields.items():
                 place = f"vary: {name!r}: {field}"
-                held = name in self._one._joint_names
-                if held and (field != "position" or self.scene.joints[self._one.joint(name)._row].kind not in AXES):
+                held = name in self.simulator._joint_names
+                if held and (field != "position" or self.scene.joints[self.simulator.joint(name)._row].kind not in AXES):
                     raise SdfsimError(f"{place}: of a joint, only the position of a hinge or slider can vary")
                 shape = (WIDTHS[field],) if field in WIDTHS and not held else ()
                 try:
@@ -300,7 +299,7 @@ class Batch:
         for k in range(2):
             varied(self.scene, {
                 name: {field: ends[k].tolist() for field, ends in fields.items() if field != "yaw"}
-                for name, fields in found.items() if name not in self._one._joint_names
+                for name, fields in found.items() if name not in self.simulator._joint_names
             })  # fmt: skip
         return found
 
@@ -310,7 +309,7 @@ class Batch:
         for name, fields in ranges.items():
             found = {field: low + (high - low) * rng.random(low.shape) for field, (low, high) in fields.items()}
             if "yaw" in found:
-                base = found.get("quat_xyzw", self.scene.bodies[self._one._row(name)].quat_xyzw)
+                base = found.get("quat_xyzw", self.scene.bodies[self.simulator._row(name)].quat_xyzw)
                 turned = pose.multiply(pose.from_rotvec(np.array([0.0, 0.0, float(found.pop("yaw"))])), base)
                 found["quat_xyzw"] = pose.normalise(turned)
             variant[name] = {field: v if v.ndim else float(v) for field, v in found.items()}
@@ -318,7 +317,7 @@ class Batch:
 
     def _begin(self, w: int, variant: Variant) -> None:
         """Put a world at its start, with these values."""
-        one, scene, start = self._one, self.scene, self._start
+        one, scene, start = self.simulator, self.scene, self._start
         of_bodies = {name: fields for name, fields in variant.items() if name in one._names}
         posed = varied(scene, of_bodies)
         bodies, state = one.bodies, start

@@ -89,7 +89,7 @@ def test_each_world_moves_as_a_simulator_does(case):
     rng, single = np.random.default_rng(0), {}
 
     def begin(w: int) -> None:
-        drawn = {k: v for k, v in batch.drawn[w].items() if k in batch._one._names}
+        drawn = {k: v for k, v in batch.drawn[w].items() if k in batch.simulator._names}
         single[w] = sdfsim.Simulator(varied(batch.scene, drawn), units=batch.units)
         for name, fields in batch.drawn[w].items():
             if name not in drawn:
