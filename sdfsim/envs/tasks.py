@@ -57,13 +57,15 @@ class Push(Task):
         return np.concatenate([10.0 * np.concatenate(away, 1), seen[f"velocity {self.body}"], seen["velocity tool"]], 1)
 
     def score(self, seen: Seen, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Metres to the goal, and of the tool to the place behind the body from which it pushes towards the goal."""
+        """How far the body is from the goal; and the tool from behind the body, from where it pushes towards the goal:
+        along a circle around the body, so that it does not get stuck on the other side."""
         body, tool = seen[f"position {self.body}"], seen["position tool"][:, :2]
-        way = goal + self.start - body[:, :2]
-        far = np.linalg.norm(way, axis=1)
-        behind = body[:, :2] - way / np.maximum(far, 1e-9)[:, None] * (self.half + self.radius)
-        aside = np.linalg.norm(tool - behind, axis=1) * np.minimum(1.0, far / WITHIN)
-        return -10.0 * far - 3.0 * aside, far < WITHIN, body[:, 2] < self.floor - 0.02
+        way, back = goal + self.start - body[:, :2], tool - body[:, :2]
+        far, away = np.linalg.norm(way, axis=1), np.linalg.norm(back, axis=1)
+        angle = np.arccos(np.clip((-way * back).sum(1) / np.maximum(far * away, 1e-9), -1.0, 1.0))
+        reach = self.half + self.radius
+        aside = reach * angle + np.abs(away - reach - 0.02 * np.minimum(angle, 1.0))
+        return -10.0 * far - 3.0 * aside * np.minimum(1.0, far / WITHIN), far < WITHIN, body[:, 2] < self.floor - 0.02
 
 
 class Grasp(Task):

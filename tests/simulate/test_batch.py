@@ -113,3 +113,127 @@ def test_each_world_moves_as_a_simulator_does(case):
             np.testing.assert_array_equal(found[w], seen(single[w]), f"world {w}, round {k}")
     assert not batch.failed.any()
     assert len(np.unique(found, axis=0)) == WORLDS
+
+
+def test_the_order_of_resets_and_the_number_of_threads_change_nothing():
+    """World 2 draws and moves the same, whenever others begin again and however many threads there are."""
+    found = []
+    for threads, order in ((1, ([0, 1, 2, 3], [2])), (2, ([3], [2], [0, 1], [2]))):
+        batch = sdfsim.Batch(table(), 4, act=["target x"], vary={"can": POSES}, seed=7, threads=threads)
+        for rows in order:
+            batch.reset(rows)
+        found.append(batch.step(np.full((4, 1), 0.1), 30)[2])
+    np.testing.assert_array_equal(*found)
+    assert (batch.reset([2], seed=7)[2] != found[0]).any()
+    np.testing.assert_array_equal(batch.reset([2], seed=7), batch.reset([2], [batch.drawn[2]]))
+
+
+def test_contact_forces_and_frames_are_those_of_the_simulator():
+    scene = table()
+    observe = ["force box", "force table", "position tip", "quat_xyzw tip", "velocity tip", "angular_velocity tip"]
+    batch, single = sdfsim.Batch(scene, 2, act=["target x"], observe=observe), sdfsim.Simulator(scene)
+    batch.reset()
+    single.joint("x").target = 0.15
+    seen = batch.step(np.full((2, 1), 0.15), 60)[1]
+    single.step(60)
+    total = {name: np.zeros(3) for name in ("box", "table")}
+    for contact in single.contact_points():
+        for name, sign in ((contact.first, 1.0), (contact.second, -1.0)):
+            if name in total:
+                total[name] += sign * contact.force
+    np.testing.assert_allclose(seen[batch.observed["force box"]], total["box"], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(seen[batch.observed["force table"]], total["table"], rtol=1e-9, atol=1e-12)
+    weight = 9.81 * (0.3 + 0.4)
+    assert seen[batch.observed["force table"]][2] == pytest.approx(-weight, rel=0.2)
+    tip = single.frame("tip")
+    np.testing.assert_array_equal(seen[6:], [*tip.position, *tip.quat_xyzw, *tip.velocity, *tip.angular_velocity])
+
+
+def test_bodies_at_rest_sleep_and_an_action_wakes_them():
+    batch = sdfsim.Batch(table(), 2, act=["force box"])
+    batch.reset()
+    rest = batch.step(np.zeros((2, 3)), 200)
+    np.testing.assert_array_equal(batch.step(np.zeros((2, 3)), 50), rest)
+    moved = batch.step(np.array([[3.0, 0, 0], [0, 0, 0]]), 20)
+    assert (moved[0] != rest[0]).any() and (moved[1] == rest[1]).all()
+
+
+def test_a_world_that_fails_stands_still_until_its_reset():
+    batch = sdfsim.Batch(table(), 3, act=["force box"])
+    start = batch.reset()
+    for _ in range(3):
+        seen = batch.step(np.array([[0, 0, 0], [0, 0, 1e12], [0, 0, 0]]), 50)
+    assert batch.failed.tolist() == [False, True, False]
+    np.testing.assert_array_equal(seen[1], start[1])
+    assert np.isfinite(seen).all()
+    batch.reset([1])
+    assert not batch.failed.any()
+    np.testing.assert_array_equal(batch.step(np.zeros((3, 3)), 20)[1], alone(20))
+
+
+def alone(steps: int) -> np.ndarray:
+    single = sdfsim.Simulator(table())
+    single.step(steps)
+    return seen(single)
+
+
+def test_intervals_of_a_fit_become_ranges(tmp_path):
+    report = {
+        "friction": {"can": {"value": 0.4, "interval": [0.36, 0.44]}}, "mass": {"can": {"value": 0.5, "interval": None}},
+        "scene": {"can": {"friction": 0.8, "mass": 0.5}},
+    }  # fmt: skip
+    (tmp_path / "identify.json").write_text(json.dumps(report))
+    batch = sdfsim.Batch(table(), 40, vary=tmp_path / "identify.json")
+    batch.reset()
+    drawn = [variant["can"]["friction"] for variant in batch.drawn]
+    assert {*batch.drawn[0]["can"]} == {"friction"}
+    assert 0.72 <= min(drawn) < 0.75 and 0.85 < max(drawn) <= 0.88
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"worlds": 0}, "worlds: must be a whole number above 0"),
+        ({"act": ["targets x"]}, "no such kind .did you mean 'target'"),
+        ({"act": ["target z"]}, "there is no joint 'z'"),
+        ({"act": ["force table"]}, "'table' does not move"),
+        ({"observe": ["position bax"]}, "there is no body 'bax' .did you mean 'box'"),
+        ({"vary": {"box": {"colour": 1}}}, "colour: no such field"),
+        ({"vary": {"box": {"mass": (0.2, 0.1)}}}, r"mass: must be a number, or a pair \(lowest, highest\)"),
+        ({"vary": {"box": {"mass": (-1, 0.1)}}}, "mass: must be > 0"),
+        ({"vary": {"box": {"position": (0.1, 0.2)}}}, "position: must be 3 numbers"),
+        ({"vary": {"x": {"speed": 1}}}, "only the position of a hinge or slider"),
+        ({"vary": {"bax": {"mass": 1}}}, "there is no body 'bax'"),
+    ],
+)
+def test_wrong_input_is_one_clear_line(options, message):
+    with pytest.raises(SdfsimError, match=message):
+        sdfsim.Batch(table(), **{"worlds": 2, **options})
+
+
+def test_wrong_actions_are_refused():
+    batch = sdfsim.Batch(table(), 2, act=["target x"])
+    for wrong in (np.zeros((2, 2)), np.zeros(2), np.full((2, 1), np.nan)):
+        with pytest.raises(SdfsimError, match=r"actions: must be finite numbers \[2, 1\]"):
+            batch.step(wrong)
+    with pytest.raises(SdfsimError, match="a batch needs the contact solve"):
+        sdfsim.Batch(sdfsim.Scene().add("ball", sphere={"radius": 0.1}, mass=1.0), 2)
+
+
+def test_memory_stays_flat():
+    """Ten thousand steps of worlds, and hundreds of resets with other masses."""
+    batch = sdfsim.Batch(table(), 20, act=["target x"], vary={"box": {"mass": (0.1, 0.5)}})
+
+    def pages() -> int:
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1])
+
+    def run(rounds: int) -> None:
+        for k in range(rounds):
+            batch.reset(np.arange(20) % 2 == k % 2)
+            batch.step(np.full((20, 1), 0.1 * (-1) ** k), 10)
+
+    run(20)
+    before = pages()
+    run(50)
+    assert pages() - before < 512  # 2 MiB

@@ -249,7 +249,9 @@ def scripted(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: i
     for k, (one, other) in enumerate([*((k, k + 1) for k in range(count)), (count + 1, count + 2)]):
         speeds[:, k, :, :3] = place[:, other] - place[:, one]
         speeds[:, k, :, 3:] = pose.to_rotvec(pose.multiply(turn[:, other], pose.conjugate(turn[:, one])))
-    return Script(tracks.body, np.concatenate([place, turn], -1)[:, count], speeds / inner), times[-1]
+    # An array of another layout would cause another compilation.
+    ends = np.ascontiguousarray(np.concatenate([place, turn], -1)[:, count])
+    return Script(tracks.body, ends, speeds / inner), times[-1]
 
 
 def _at(tracks: Tracks, instants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
