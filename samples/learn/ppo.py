@@ -107,7 +107,6 @@ def update(policy: Policy, optimiser: torch.optim.Optimizer, *batch: torch.Tenso
             loss = 0.5 * miss - gain - ENTROPY * chosen.entropy().sum(1).mean()
             optimiser.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(policy.parameters(), 0.5)
             optimiser.step()
 
 

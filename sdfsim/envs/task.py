@@ -19,6 +19,7 @@ from sdfsim.simulate.camera import Camera
 from sdfsim.simulate.worlds import Batch
 
 Seen = Mapping[str, np.ndarray]  # entry of `observe` -> [W, n]
+BONUS = 0.1
 OBS_TYPES = ("state", "pixels", "pixels_agent_pos")
 
 
@@ -26,8 +27,8 @@ class Task(VectorEnv):
     """Many worlds of one scene, in which a policy acts; `single` is one of them as a `gymnasium.Env`.
 
     A subclass names what acts, what is observed and what varies, as for `sdfsim.Batch`, and writes the methods below.
-    Actions are numbers from -1 to 1. The reward is what the score gains in a step, and 1 more in each step with
-    success; an episode ends when it is lost, or after `seconds`.
+    Actions are numbers from -1 to 1. The reward is what the score gains in a step, and `BONUS` more with success; an
+    episode ends when it is lost, or after `seconds`.
 
     Args:
         num_envs: number of worlds, W.
@@ -44,8 +45,8 @@ class Task(VectorEnv):
     }  # fmt: skip
     act: Sequence[str] = ()
     observe: Sequence[str] = ()
-    vary: Mapping[str, Mapping[str, Any]] = {}  # noqa: RUF012
-    goal: tuple[Sequence[float], Sequence[float]] = ((), ())  # the lowest and highest of the numbers that an episode draws
+    vary: Mapping[str, Mapping[str, Any]] = {}
+    goal: tuple[Sequence[float], Sequence[float]] = ((), ())  # lowest and highest of the numbers that an episode draws
     actions = 0  # their number
     dt, period, seconds = 0.01, 0.1, 4.0  # s: the step, the time between two actions, an episode
     task_description = ""
@@ -112,7 +113,7 @@ class Task(VectorEnv):
         self.batch.step(command, round(self.period / self.batch.dt))
         self._steps += 1
         score, success, lost = self.score(self.seen, self.goals)
-        reward, self._scores = score - self._scores + success, score
+        reward, self._scores = score - self._scores + BONUS * success, score
         lost, late = lost | self.batch.failed, self._steps >= self.limit
         infos: dict[str, Any] = {"is_success": success, "_is_success": np.ones(self.num_envs, bool)}
         found, over = self._observation(), lost | late
@@ -168,7 +169,8 @@ class _Single(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         found, reward, lost, late, infos = self.many.step(np.asarray(action)[None])
-        return _of(found, 0), float(reward[0]), bool(lost[0]), bool(late[0]), {"is_success": bool(infos["is_success"][0])}
+        told = {"is_success": bool(infos["is_success"][0])}
+        return _of(found, 0), float(reward[0]), bool(lost[0]), bool(late[0]), told
 
     def render(self) -> Any:
         pictures = self.many.render()

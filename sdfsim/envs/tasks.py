@@ -14,6 +14,7 @@ from sdfsim.scene.builder import SceneBuilder, loaded
 from sdfsim.scene.scene import Scene
 
 WITHIN = 0.05  # m of the goal: success
+FLAT, SIDE, UP = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 class Push(Task):
@@ -32,9 +33,9 @@ class Push(Task):
         self.body, start, low, high = stands(made, body)
         tall = float(high[2] - low[2])
         self.half, self.radius, self.floor = float((high - low)[:2].max()) / 2, max(0.02, 0.25 * tall), low[2]
-        place = np.array([*start[:2] - (0.2, 0.0), low[2] + max(0.4 * tall, 1.1 * self.radius)])
+        place = np.array([start[0] - 0.2, start[1], low[2] + max(0.4 * tall, 1.1 * self.radius)])
         cart = {"size": [0.05, 0.05, 0.05]}
-        made.add("cart", box=cart, position=place + (0, 0, 0.3), mass=0.5, collides_with=[])
+        made.add("cart", box=cart, position=place + 0.3 * UP, mass=0.5, collides_with=[])
         made.add("tool", sphere={"radius": self.radius}, position=place, mass=0.5, collides_with=[self.body])
         motor = {"max_force": 30.0, "position": 0.0, "time": 0.05}
         made.join("rail_x", "slider", "cart", axis=(1, 0, 0), motor=motor)
@@ -42,7 +43,7 @@ class Push(Task):
         self.start, self.rail = start[:2], place[:2]
         self.observe = [f"{kind} {name}" for name in (self.body, "tool") for kind in ("position", "velocity")]
         self.observe += ["joint_position rail_x", "joint_position rail_y"]
-        near = {"position": (start - (0.1, 0.1, 0.0), start + (0.1, 0.1, 0.0)), "yaw": (-np.pi, np.pi)}
+        near = {"position": (start - 0.1 * FLAT, start + 0.1 * FLAT), "yaw": (-np.pi, np.pi)}
         self.vary = {self.body: near | {"friction": (0.3, 0.7), "mass": (0.2, 0.4)}}
         return made
 
@@ -81,12 +82,12 @@ class Grasp(Task):
         self.body, start, low, high = stands(made, body)
         self.start, self.ground = start, low[2]
         wide = float((high - low)[1]) / 2 + self.opening
-        top = start * (1, 1, 0) + (0, 0, high[2] + 0.06)
+        top = start * FLAT + (high[2] + 0.06) * UP
         size = {"size": [0.04, 0.01, 0.08]}
         for name, up in (("cart_x", 0.3), ("cart_y", 0.2), ("hand", 0.1)):
-            made.add(name, box={"size": [0.04, 0.04, 0.04]}, position=top + (0, 0, up), mass=0.5, collides_with=[])
+            made.add(name, box={"size": [0.04, 0.04, 0.04]}, position=top + up * UP, mass=0.5, collides_with=[])
         for name, side in (("left", -1.0), ("right", 1.0)):
-            place = top + (0.0, side * (wide + 0.005), 0.0)
+            place = top + side * (wide + 0.005) * SIDE
             made.add(f"finger_{name}", box=size, position=place, mass=0.1, friction=1.0, collides_with=[self.body])
         motor = {"max_force": 60.0, "position": 0.0, "time": 0.05}
         made.join("rail_x", "slider", "cart_x", axis=(1, 0, 0), motor=motor)
@@ -97,7 +98,7 @@ class Grasp(Task):
         self.rails = ["joint_position rail_x", "joint_position rail_y", "joint_position lift"]
         self.observe = [f"position {self.body}", f"velocity {self.body}", "position hand", *self.rails,
                         "joint_position left", "joint_position right"]  # fmt: skip
-        self.vary = {self.body: {"position": (start - (0.05, 0.05, 0), start + (0.05, 0.05, 0)), "mass": (0.1, 0.3)}}
+        self.vary = {self.body: {"position": (start - 0.05 * FLAT, start + 0.05 * FLAT), "mass": (0.1, 0.3)}}
         return made
 
     def command(self, seen: Seen, actions: np.ndarray) -> np.ndarray:
@@ -108,7 +109,7 @@ class Grasp(Task):
     def score(self, seen: Seen, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Metres from the hand's place above the body, and of height."""
         body = seen[f"position {self.body}"]
-        away = np.linalg.norm(seen["position hand"] - (0, 0, 0.1) - body, axis=1)
+        away = np.linalg.norm(seen["position hand"] - 0.1 * UP - body, axis=1)
         lifted = body[:, 2] - self.start[2]
         return 20.0 * np.minimum(lifted, goal[:, 0]) - 5.0 * away, lifted > goal[:, 0] - 0.01, lifted < -0.05
 
@@ -128,8 +129,8 @@ class Drop(Task):
         self.start, self.floor, self.force = start, low[2], 0.5 * 9.81 * known.mass
         self.act = [f"force {self.body}"]
         self.observe = [f"{kind} {self.body}" for kind in ("position", "quat_xyzw", "velocity", "angular_velocity")]
-        above = start + (0, 0, height)
-        self.vary = {self.body: {"position": (above - (0.1, 0.1, 0), above + (0.1, 0.1, 0)), "yaw": (-np.pi, np.pi)}}
+        above = start + height * UP
+        self.vary = {self.body: {"position": (above - 0.1 * FLAT, above + 0.1 * FLAT), "yaw": (-np.pi, np.pi)}}
         return made
 
     def command(self, seen: Seen, actions: np.ndarray) -> np.ndarray:

@@ -39,6 +39,7 @@ WIDTHS = {"position": 3, "quat_xyzw": 4, "velocity": 3, "angular_velocity": 3}
 AXES = ("hinge", "slider")
 ACTS = {"target": 1, "effort": 1, "force": 3, "torque": 3}
 OBSERVED = {**WIDTHS, "force": 3, "joint_position": 1, "joint_velocity": 1}
+PLAIN = Style()
 PIECES = 4  # of the worlds for each thread, so that all threads finish together
 Ranges = Mapping[str, Mapping[str, Any]]
 
@@ -172,7 +173,7 @@ class Batch:
         found = [self._read(*entry) for entry in self._seen]
         return np.concatenate([np.zeros((len(self), 0)), *found], 1)
 
-    def image(self, camera: Camera, world: int, style: Style = Style()) -> Image:
+    def image(self, camera: Camera, world: int, style: Style = PLAIN) -> Image:
         """What a camera sees of a world."""
         place = self._motion.position[world] * self.units.length
         return camera.picture(self.scenes[world], place, self._motion.orientation[world], style)
@@ -284,7 +285,7 @@ class Batch:
             for field, value in fields.items():
                 place = f"vary: {name!r}: {field}"
                 held = name in self.simulator._joint_names
-                if held and (field != "position" or self.scene.joints[self.simulator.joint(name)._row].kind not in AXES):
+                if held and (field != "position" or self.simulator.joint(name)._joint.kind not in AXES):
                     raise SdfsimError(f"{place}: of a joint, only the position of a hinge or slider can vary")
                 shape = (WIDTHS[field],) if field in WIDTHS and not held else ()
                 try:
@@ -338,8 +339,8 @@ class Batch:
         state = replace(state, **arrays)
         if bodies.joints is not None:
             state = replace(state, joints=initial(bodies.joints, state))
-            moved = {one.joint(name)._row: fields["position"] for name, fields in variant.items() if name not in of_bodies}
-            if moved:
+            held = [name for name in variant if name not in of_bodies]
+            if moved := {one.joint(name)._row: variant[name]["position"] for name in held}:
                 space = JointSpace(bodies, state)
                 positions, places = space.positions, [*one.joint_columns.values()]
                 for row, value in moved.items():
@@ -368,8 +369,9 @@ def _intervals(report: Path) -> Ranges:
     """The intervals of `sdfsim identify --json`, as ranges of the bodies' own values."""
     found, ranges = read_json(report), {}
     for name, values in found.get("scene", {}).items():
-        for kind, key in (("friction", "friction"), ("restitution", "restitution"), ("mass", "mass"), ("size", "scale")):
-            known = found.get(kind, {}).get(name)
+        for key, kinds in {"friction": "own_friction friction", "restitution": "own_restitution restitution",
+                           "mass": "mass", "scale": "size"}.items():  # fmt: skip
+            known = next((e for kind in kinds.split() if (e := found.get(kind, {}).get(name))), None)
             if key in values and known and known["interval"] and known["value"]:
-                ranges.setdefault(name, {})[key] = tuple(values[key] * end / known["value"] for end in known["interval"])
+                ranges.setdefault(name, {})[key] = [values[key] * end / known["value"] for end in known["interval"]]
     return ranges

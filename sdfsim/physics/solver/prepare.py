@@ -286,7 +286,7 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, moved: np.ndarr
     are those that slept with them or on them. Pose or velocities of the bodies `moved` [N] have changed, not only what
     acts on them."""
     touch = state.touch
-    if bodies.joints is not None and state.joints is not None and changed.any():
+    if bodies.joints is not None and state.joints is not None and moved.any():
         place = jointed.coordinates(
             bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
         )
