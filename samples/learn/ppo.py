@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-HORIZON, EPOCHS, MINIBATCH = 40, 8, 512
+HORIZON, EPOCHS, MINIBATCH = 40, 10, 320
 DISCOUNT, TRACE, CLIP, RATE, ENTROPY = 0.97, 0.95, 0.2, 1e-3, 2e-3
 
 

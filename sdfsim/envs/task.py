@@ -55,7 +55,7 @@ class Task(VectorEnv):
         """The scene; may set the names above by its bodies."""
         raise NotImplementedError
 
-    def command(self, seen: Seen, actions: np.ndarray) -> np.ndarray:
+    def command(self, seen: Seen, goal: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """[W, A] what acts, from actions of -1 to 1."""
         raise NotImplementedError
 
@@ -109,7 +109,7 @@ class Task(VectorEnv):
         the last observation), and "is_success" tells which are as wanted."""
         if np.shape(actions) != self.action_space.shape:
             raise SdfsimError(f"actions: must be {list(self.action_space.shape)} (got {list(np.shape(actions))})")
-        command = self.command(self.seen, np.clip(np.asarray(actions, float), -1.0, 1.0))
+        command = self.command(self.seen, self.goals, np.clip(np.asarray(actions, float), -1.0, 1.0))
         self.batch.step(command, round(self.period / self.batch.dt))
         self._steps += 1
         score, success, lost = self.score(self.seen, self.goals)

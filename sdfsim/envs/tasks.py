@@ -47,26 +47,35 @@ class Push(Task):
         self.vary = {self.body: near | {"friction": (0.3, 0.7), "mass": (0.2, 0.4)}}
         return made
 
-    def command(self, seen: Seen, actions: np.ndarray) -> np.ndarray:
-        ahead = seen["position tool"][:, :2] + self.stride * actions - self.start
-        return np.clip(ahead, -self.area, self.area) + self.start - self.rail
+    def axes(self, seen: Seen, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[W] m from the body to the goal, and [W, 2, 2] the axes along this way and to its left, in which the policy
+        sees and acts: all directions are alike to it."""
+        way = goal + self.start - seen[f"position {self.body}"][:, :2]
+        far = np.linalg.norm(way, axis=1)
+        ahead = way / np.maximum(far, 1e-9)[:, None]
+        return far, np.stack([ahead, ahead[:, ::-1] * (-1.0, 1.0)], 1)
+
+    def command(self, seen: Seen, goal: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        moved = np.einsum("wij,wi->wj", self.axes(seen, goal)[1], actions)
+        place = seen["position tool"][:, :2] + self.stride * moved - self.start
+        return np.clip(place, -self.area, self.area) + self.start - self.rail
 
     def look(self, seen: Seen, goal: np.ndarray) -> np.ndarray:
         body, tool = (seen[f"position {name}"] for name in (self.body, "tool"))
-        here = body[:, :2] - self.start
-        away = [here, goal - here, tool[:, :2] - body[:, :2], body[:, 2:] - self.floor]
-        return np.concatenate([10.0 * np.concatenate(away, 1), seen[f"velocity {self.body}"], seen["velocity tool"]], 1)
+        far, axes = self.axes(seen, goal)
+        ways = (10.0 * (tool - body), seen[f"velocity {self.body}"], seen["velocity tool"])
+        flat = [np.einsum("wij,wj->wi", axes, way[:, :2]) for way in ways]
+        return np.concatenate([10.0 * far[:, None], 10.0 * (body[:, 2:] - self.floor), *flat], 1)
 
     def score(self, seen: Seen, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """How far the body is from the goal; and the tool from behind the body, from where it pushes towards the goal:
         along a circle around the body, so that it does not get stuck on the other side."""
-        body, tool = seen[f"position {self.body}"], seen["position tool"][:, :2]
-        way, back = goal + self.start - body[:, :2], tool - body[:, :2]
-        far, away = np.linalg.norm(way, axis=1), np.linalg.norm(back, axis=1)
-        angle = np.arccos(np.clip((-way * back).sum(1) / np.maximum(far * away, 1e-9), -1.0, 1.0))
-        reach = self.half + self.radius
-        aside = reach * angle + np.abs(away - reach - 0.02 * np.minimum(angle, 1.0))
-        return -10.0 * far - 3.0 * aside * np.minimum(1.0, far / WITHIN), far < WITHIN, body[:, 2] < self.floor - 0.02
+        body, (far, axes) = seen[f"position {self.body}"], self.axes(seen, goal)
+        back = seen["position tool"][:, :2] - body[:, :2]
+        along, across = np.einsum("wij,wj->iw", axes, back)
+        angle, reach = np.arctan2(np.abs(across), -along), self.half + self.radius
+        aside = reach * angle + np.abs(np.hypot(along, across) - reach - 0.02 * np.minimum(angle, 1.0))
+        return -20.0 * far - 3.0 * aside * np.minimum(1.0, far / WITHIN), far < WITHIN, body[:, 2] < self.floor - 0.02
 
 
 class Grasp(Task):
@@ -101,7 +110,7 @@ class Grasp(Task):
         self.vary = {self.body: {"position": (start - 0.05 * FLAT, start + 0.05 * FLAT), "mass": (0.1, 0.3)}}
         return made
 
-    def command(self, seen: Seen, actions: np.ndarray) -> np.ndarray:
+    def command(self, seen: Seen, goal: np.ndarray, actions: np.ndarray) -> np.ndarray:
         here = np.concatenate([seen[entry] for entry in self.rails], 1)
         shut = self.opening * (1.0 + actions[:, 3:])
         return np.concatenate([np.clip(here + self.stride * actions[:, :3], -0.2, 0.2), shut, shut], 1)
@@ -133,7 +142,7 @@ class Drop(Task):
         self.vary = {self.body: {"position": (above - 0.1 * FLAT, above + 0.1 * FLAT), "yaw": (-np.pi, np.pi)}}
         return made
 
-    def command(self, seen: Seen, actions: np.ndarray) -> np.ndarray:
+    def command(self, seen: Seen, goal: np.ndarray, actions: np.ndarray) -> np.ndarray:
         return self.force * actions
 
     def score(self, seen: Seen, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

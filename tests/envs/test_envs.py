@@ -60,21 +60,17 @@ def test_one_world_is_the_first_of_many():
 
 
 def pushed(env: sdfsim.envs.Push) -> np.ndarray:
-    """Success of a policy by hand: behind the body, then towards the goal."""
-    env.reset(seed=0)
+    """Success of a policy by hand: around the body until the tool is behind it, then towards the goal."""
+    seen, _ = env.reset(seed=0)
+    reach = 10.0 * (env.half + env.radius)
     for _ in range(env.limit - 1):
-        body, tool = (env.seen[f"position {name}"][:, :2] for name in (env.body, "tool"))
-        way = env.goals + env.start - body
-        far = np.linalg.norm(way, axis=1, keepdims=True)
-        ahead, back = way / far, tool - body
-        reach = env.half + env.radius
-        behind = (back * ahead).sum(1, keepdims=True) < -0.9 * np.linalg.norm(back, axis=1, keepdims=True)
-        side = np.stack([-back[:, 1], back[:, 0]], 1)
-        side *= np.sign((side * -ahead).sum(1, keepdims=True)) / np.linalg.norm(side, axis=1, keepdims=True)
-        out = back / np.linalg.norm(back, axis=1, keepdims=True)
-        around = side + 10.0 * out * (1.4 * reach - np.linalg.norm(back, axis=1, keepdims=True))
-        aim = np.where(behind, np.minimum(1.0, 10.0 * far) * ahead, around)
-        *_, infos = env.step(np.where(far < 0.03, 0.0, aim).astype(np.float32))
+        far, back = seen[:, :1], seen[:, 2:4]  # tenths of a metre, along the way to the goal and to its left
+        away = np.linalg.norm(back, axis=1, keepdims=True)
+        out = back / away
+        side = out[:, ::-1] * (-1.0, 1.0) * np.where(out[:, 1:] >= 0.0, 1.0, -1.0)
+        around = side + out * (1.4 * reach - away)
+        aim = np.where(out[:, :1] < -0.95, np.minimum(1.0, far) * (1.0, 0.0) - (0.0, 1.0) * back, around)
+        seen, *_, infos = env.step(np.where(far < 0.3, 0.0, aim).astype(np.float32))
     return infos["is_success"]
 
 
