@@ -1,8 +1,8 @@
 """Learn to push a mug to a place on a table, in about a quarter of an hour on two cores.
 
-    python samples/learn/push.py                              # trains; writes push/: policy, curve, film; again: goes on
-    python samples/learn/push.py --scene room/scene.yaml --body mug      # on your own table
-    python samples/learn/push.py --mujoco                     # the same policy in MuJoCo, on the exported scene
+    python samples/learn/push.py                        # trains, or goes on; writes policy, curve and film to push/
+    python samples/learn/push.py --scene room/scene.yaml --body mug     # on your own table
+    python samples/learn/push.py --mujoco               # the same policy in MuJoCo, on the exported scene
 
 It needs `pip install 'sdfsim[learn]'`, and `[bench]` for MuJoCo and the curve.
 """
@@ -70,8 +70,9 @@ def in_mujoco(env: Push, policy: Policy, seed: int, *, late: int = 0, **options:
             seen = {f"position {name}": place[[k]] for k, name in enumerate(names)}
             seen |= {f"velocity {name}": speed[[k]] for k, name in enumerate(names)}
             waiting.append(policy.act(env.look(seen, env.goals[[w]]).astype(np.float32)))
-            for joint, value in zip(("rail_x", "rail_y"), env.command(seen, env.goals[[w]], waiting.pop(0))[0], strict=True):
-                world.data.actuator(joint).ctrl = value
+            targets = env.command(seen, env.goals[[w]], waiting.pop(0))[0]
+            for joint, value in zip(("rail_x", "rail_y"), targets, strict=True):
+                world.data.actuator(f"{joint}_motor").ctrl = value
             world.advance(round(env.period / STEP))
         place = world.state()[0]
         seen = {f"position {name}": place[[k]] for k, name in enumerate(names)}
@@ -94,8 +95,9 @@ def main() -> None:
     if given.mujoco:
         hundred = Push(100, **chosen)
         cases: dict[str, dict[str, Any]] = {
-            "as exported": {}, "friction ten times as stiff": {"impratio": 10.0}, "contacts softer": {"contact": (0.02, 1.0)},
-            "contacts stiffer": {"contact": (2 * STEP, 1.0)}, "actions 0.1 s later": {"late": 1},
+            "as exported": {}, "friction as stiff as contacts": {"impratio": 1.0},
+            "softer contacts": {"contact": (0.02, 1.0)}, "stiffer contacts": {"contact": (2 * STEP, 1.0)},
+            "actions 0.1 s later": {"late": 1},
         }  # fmt: skip
         print(f"sdfsim: {success(hundred, policy, 10**6):.0%}")
         for what, options in cases.items():
@@ -104,7 +106,7 @@ def main() -> None:
     draw_curve(given.out)
     few = Push(3, width=200, height=150, **chosen)
     target = np.array([*few.start, few.floor])
-    few.camera = Camera(target + (0.1, -0.75, 0.65), look_at=target, width=200, height=150)
+    few.camera = Camera(target + np.array([0.1, -0.75, 0.65]), look_at=target, width=200, height=150)
     film(few, [Policy(policy.mean[0].in_features, 2), policy], given.out / "film.webp", 5)
     print(f"wrote {given.out}/curve.png and film.webp: above before training, below after it")
 
