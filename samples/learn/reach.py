@@ -30,7 +30,10 @@ class Reach(Task):
 
     actions, seconds = 3, 3.0
     act = ("target turn", "target lift", "target bend")
-    observe = ("position ball", "position tip", "velocity tip", "force ball", *(f"joint_position {j}" for j in JOINTS))
+    observe = (
+        "position ball", "velocity ball", "force ball", "position tip", "velocity tip",
+        *(f"joint_position {j}" for j in JOINTS),
+    )  # fmt: skip
     task_description = "Touch the ball."
 
     def build(self, scene: Any) -> Scene:
@@ -56,10 +59,11 @@ class Reach(Task):
         return np.concatenate([3.0 * ball, 3.0 * (ball - tip), seen["velocity tip"], np.sin(bent), np.cos(bent)], 1)
 
     def score(self, seen: Any, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The distance to the ball; it is touched if more than the floor acts on it."""
+        """The distance to the ball; it is touched, and the episode over, if more than the floor acts on it."""
         far = np.linalg.norm(seen["position ball"] - seen["position tip"], axis=1)
-        touched = (np.linalg.norm(seen["force ball"][:, :2], axis=1) > 0.05) | (far < 0.085)
-        return -5.0 * far, touched, np.zeros(len(far), bool)
+        touched = np.linalg.norm(seen["force ball"][:, :2], axis=1) > 0.01
+        touched |= np.linalg.norm(seen["velocity ball"], axis=1) > 0.01
+        return -5.0 * far, touched, touched
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ class Task(VectorEnv):
 
     A subclass names what acts, what is observed and what varies, as for `sdfsim.Batch`, and writes the methods below.
     Actions are numbers from -1 to 1. The reward is what the score gains in a step, and `BONUS` more with success; an
-    episode ends when it is lost, or after `seconds`.
+    episode ends when `score` says so, or after `seconds`.
 
     Args:
         num_envs: number of worlds, W.
@@ -64,7 +64,7 @@ class Task(VectorEnv):
         return np.concatenate([*seen.values(), goal], 1)
 
     def score(self, seen: Seen, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """[W] how good a state is; whether it is what is wanted; and whether the episode is lost."""
+        """[W] how good a state is; whether it is what is wanted; and whether the episode is over, as something fell."""
         raise NotImplementedError
 
     def __init__(

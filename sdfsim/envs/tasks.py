@@ -11,7 +11,7 @@ from sdfsim.envs.task import Seen, Task
 from sdfsim.geometry.mesh import lattice
 from sdfsim.physics import pose
 from sdfsim.scene.builder import SceneBuilder, loaded
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Body, Scene
 
 WITHIN = 0.05  # m of the goal: success
 FLAT, SIDE, UP = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -26,25 +26,27 @@ class Push(Task):
     actions, observe, goal = 2, (), ((-0.15, -0.15), (0.15, 0.15))
     task_description = "Push the body to the goal."
     act = ("target rail_x", "target rail_y")
-    stride, area = 0.06, 0.3  # m: how far the tool's target may be ahead of it, and from the middle
+    stride, area = 0.06, 0.25  # m: how far the tool's target may be ahead of it, and from the middle
 
     def build(self, scene: Any, body: str | None = None) -> SceneBuilder:
         made = table() if scene is None else scene
-        self.body, start, low, high = stands(made, body)
-        tall = float(high[2] - low[2])
-        self.half, self.radius, self.floor = float((high - low)[:2].max()) / 2, max(0.02, 0.25 * tall), low[2]
-        place = np.array([start[0] - 0.2, start[1], low[2] + max(0.4 * tall, 1.1 * self.radius)])
+        known, low, high = stands(made, body)
+        self.body, start, tall = known.name, known.position, float(high[2] - low[2])
+        self.half, self.radius = float((high - low)[:2].max()) / 2, float(np.clip(0.25 * tall, 0.02, 0.05))
+        self.floor, away = low[2], self.half + self.radius + 0.12
+        place = np.array([start[0] - away, start[1], low[2] + max(0.3 * tall, 1.1 * self.radius)])
         cart = {"size": [0.05, 0.05, 0.05]}
         made.add("cart", box=cart, position=place + 0.3 * UP, mass=0.5, collides_with=[])
         made.add("tool", sphere={"radius": self.radius}, position=place, mass=0.5, collides_with=[self.body])
-        motor = {"max_force": 30.0, "position": 0.0, "time": 0.05}
+        motor = {"max_force": 30.0 + 20.0 * known.mass, "position": 0.0, "time": 0.05}
         made.join("rail_x", "slider", "cart", axis=(1, 0, 0), motor=motor)
         made.join("rail_y", "slider", "tool", "cart", axis=(0, 1, 0), motor=motor)
         self.start, self.rail = start[:2], place[:2]
         self.observe = [f"{kind} {name}" for name in (self.body, "tool") for kind in ("position", "velocity")]
         self.observe += ["joint_position rail_x", "joint_position rail_y"]
         near = {"position": (start - 0.1 * FLAT, start + 0.1 * FLAT), "yaw": (-np.pi, np.pi)}
-        self.vary = {self.body: near | {"friction": (0.3, 0.7), "mass": (0.2, 0.4)}}
+        material = {"friction": np.array([0.6, 1.2]) * known.friction, "mass": np.array([0.7, 1.3]) * known.mass}
+        self.vary = {self.body: near | material}
         return made
 
     def axes(self, seen: Seen, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +60,8 @@ class Push(Task):
     def command(self, seen: Seen, goal: np.ndarray, actions: np.ndarray) -> np.ndarray:
         moved = np.einsum("wij,wi->wj", self.axes(seen, goal)[1], actions)
         place = seen["position tool"][:, :2] + self.stride * moved - self.start
-        return np.clip(place, -self.area, self.area) + self.start - self.rail
+        area = self.half + self.area
+        return np.clip(place, -area, area) + self.start - self.rail
 
     def look(self, seen: Seen, goal: np.ndarray) -> np.ndarray:
         body, tool = (seen[f"position {name}"] for name in (self.body, "tool"))
@@ -88,8 +91,9 @@ class Grasp(Task):
 
     def build(self, scene: Any, body: str | None = None) -> SceneBuilder:
         made = table() if scene is None else scene
-        self.body, start, low, high = stands(made, body)
-        self.start, self.ground = start, low[2]
+        known, low, high = stands(made, body)
+        self.body, self.start = known.name, known.position
+        start = self.start
         wide = float((high - low)[1]) / 2 + self.opening
         top = start * FLAT + (high[2] + 0.06) * UP
         size = {"size": [0.04, 0.01, 0.08]}
@@ -107,7 +111,8 @@ class Grasp(Task):
         self.rails = ["joint_position rail_x", "joint_position rail_y", "joint_position lift"]
         self.observe = [f"position {self.body}", f"velocity {self.body}", "position hand", *self.rails,
                         "joint_position left", "joint_position right"]  # fmt: skip
-        self.vary = {self.body: {"position": (start - 0.05 * FLAT, start + 0.05 * FLAT), "mass": (0.1, 0.3)}}
+        near = {"position": (start - 0.05 * FLAT, start + 0.05 * FLAT)}
+        self.vary = {self.body: near | {"mass": np.array([0.5, 1.0]) * known.mass}}
         return made
 
     def command(self, seen: Seen, goal: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -133,12 +138,11 @@ class Drop(Task):
 
     def build(self, scene: Any, body: str | None = None, height: float = 0.3) -> SceneBuilder:
         made = table() if scene is None else scene
-        self.body, start, low, _ = stands(made, body)
-        (known,) = (b for b in loaded(made).bodies if b.name == self.body)
-        self.start, self.floor, self.force = start, low[2], 0.5 * 9.81 * known.mass
+        known, low, _ = stands(made, body)
+        self.body, self.start, self.floor, self.force = known.name, known.position, low[2], 0.5 * 9.81 * known.mass
         self.act = [f"force {self.body}"]
         self.observe = [f"{kind} {self.body}" for kind in ("position", "quat_xyzw", "velocity", "angular_velocity")]
-        above = start + height * UP
+        above = self.start + height * UP
         self.vary = {self.body: {"position": (above - 0.1 * FLAT, above + 0.1 * FLAT), "yaw": (-np.pi, np.pi)}}
         return made
 
@@ -160,9 +164,9 @@ def table() -> SceneBuilder:
     return made.add("mug", cylinder={"radius": 0.04, "height": 0.1}, position=(0, 0, 0.45), mass=0.3)
 
 
-def stands(made: SceneBuilder | Scene, body: str | None) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
-    """The name of a body (None: the first that moves), where it stands, and the ends of the box around it, m. Raises
-    SdfsimError if the scene has no such body."""
+def stands(made: SceneBuilder | Scene, body: str | None) -> tuple[Body, np.ndarray, np.ndarray]:
+    """A body (None: the first that moves), and the ends of the box around it, m. Raises SdfsimError if the scene has no
+    such body."""
     scene = loaded(made)
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     found = next((b for b in moving if body in (None, b.name)), None)
@@ -170,4 +174,4 @@ def stands(made: SceneBuilder | Scene, body: str | None) -> tuple[str, np.ndarra
         raise SdfsimError(f"body: {body!r} is none that moves", f"these do: {', '.join(b.name for b in moving)}")
     bounds = scene.shapes[found.shape].sdf.bounds * found.scale
     corners = found.position + pose.rotate(found.quat_xyzw, lattice(*bounds))
-    return found.name, np.array(found.position), corners.min(0), corners.max(0)
+    return found, corners.min(0), corners.max(0)

@@ -87,7 +87,7 @@ def test_any_scene_becomes_an_environment(tmp_path):
     scene.save(tmp_path / "scene.yaml")
     env = sdfsim.envs.Push(16, scene=str(tmp_path / "scene.yaml"), body="box")
     env.reset(seed=0)
-    assert np.abs(env.seen["position tool"] - (1.8, 1.0, 0.78)).max() < 0.01
+    assert np.abs(env.seen["position tool"] - (2 - 0.06 - 0.05 - 0.12, 1.0, 0.76)).max() < 0.01
     assert pushed(env).mean() >= 0.6
 
 
