@@ -18,7 +18,7 @@ from sdfsim.apps.mujoco_world import MujocoWorld
 from sdfsim.envs import Grasp, Push
 from sdfsim.scene.builder import SceneBuilder
 
-STEP, ACTIONS = 0.002, 5  # s, of MuJoCo; in each measurement
+STEP, ACTIONS = 0.002, 3  # s, of MuJoCo; in each measurement
 
 
 def on_table(**body: object) -> SceneBuilder:

@@ -107,8 +107,9 @@ class Task(VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """As any vector environment; worlds whose episode ends begin the next one at once ("final_obs" of the infos has
         the last observation), and "is_success" tells which are as wanted."""
-        if np.shape(actions) != self.action_space.shape:
-            raise SdfsimError(f"actions: must be {list(self.action_space.shape)} (got {list(np.shape(actions))})")
+        if np.shape(actions) != (self.num_envs, self.actions):
+            wanted = [self.num_envs, self.actions]
+            raise SdfsimError(f"actions: must be {wanted} (got {list(np.shape(actions))})")
         command = self.command(self.seen, self.goals, np.clip(np.asarray(actions, float), -1.0, 1.0))
         self.batch.step(command, round(self.period / self.batch.dt))
         self._steps += 1
@@ -119,7 +120,7 @@ class Task(VectorEnv):
         found, over = self._observation(), lost | late
         if self.ends and over.any():
             infos |= {"final_obs": np.array([None] * self.num_envs), "_final_obs": over}
-            for w in np.flatnonzero(over):
+            for w in np.flatnonzero(over).tolist():
                 infos["final_obs"][w] = _of(found, w)
             self._begin(np.flatnonzero(over))
             found = self._observation()
@@ -139,7 +140,7 @@ class Task(VectorEnv):
         self._steps[rows] = 0
         low, high = np.array(self.goal)
         for w in rows.tolist():
-            rng = np.random.default_rng([self.batch.seed, w, self.batch.draws[w], 1])
+            rng = np.random.default_rng([self.batch.seed, w, int(self.batch.draws[w]), 1])
             self.goals[w] = low + (high - low) * rng.random(low.shape)
         self._scores[rows] = self.score(self.seen, self.goals)[0][rows]
 

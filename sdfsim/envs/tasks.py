@@ -173,5 +173,5 @@ def stands(made: SceneBuilder | Scene, body: str | None) -> tuple[Body, np.ndarr
     if found is None:
         raise SdfsimError(f"body: {body!r} is none that moves", f"these do: {', '.join(b.name for b in moving)}")
     bounds = scene.shapes[found.shape].sdf.bounds * found.scale
-    corners = found.position + pose.rotate(found.quat_xyzw, lattice(*bounds))
+    corners = found.position + pose.rotate(found.quat_xyzw, lattice(*bounds.T))
     return found, corners.min(0), corners.max(0)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, typeof, types
 from numba.core import cgutils
 from numba.extending import NativeValue, intrinsic, typeof_impl, unbox
-from numba.typed import List
+from numba.typed.typedlist import List
 
 from sdfsim.base.compiling import cache_of, kept
 from sdfsim.physics.solver.code_cache import sources
@@ -17,7 +17,7 @@ from sdfsim.physics.solver.prepare import TOUCHING
 from sdfsim.physics.solver.references import Reference
 from sdfsim.physics.solver.run import Script, run_steps
 from sdfsim.physics.solver.survey import touching
-from sdfsim.physics.solver.vectors import BARE, ENTRY
+from sdfsim.physics.solver.vectors import BARE, ENTRY, FAST
 from sdfsim.physics.solver.world import COLUMNS, POINTS, Manifolds
 
 
@@ -56,14 +56,16 @@ def _address_of(kind: Reference, stored: Any, c: Any) -> NativeValue:
 
 
 @intrinsic
-def nth(typing: Any, stored: Any, place: types.Type) -> Any:
-    """A reference to one of the NamedTuples that are stored."""
+def _nth(typing: Any, stored: Any, place: types.Type) -> Any:
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         first = builder.bitcast(given[0], context.get_value_type(stored.of).as_pointer())
         return builder.bitcast(builder.gep(first, [given[1]]), cgutils.voidptr_t)
 
     return stored(stored, types.int64), code
+
+
+nth: Any = _nth  # a reference to one of the NamedTuples that are stored
 
 
 class Told(NamedTuple):
@@ -86,7 +88,7 @@ with kept(cache_of([*sources(), Path(__file__)])):
             held.append(_none())
         return held
 
-    @njit(**BARE | {"_nrt": True})
+    @njit(**FAST)
     def _none():
         return Manifolds(np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros((0, POINTS, COLUMNS)))
 

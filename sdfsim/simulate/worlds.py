@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import int64, typeof
@@ -112,7 +112,7 @@ class Batch:
         self._pool = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
         self._pieces, self._rules = model.pieces, compiled_rules(self._options)
         count, n, j = int(worlds), len(one.bodies), 0 if self._start.joints is None else len(self._start.joints)
-        self.scenes, self.drawn = [self.scene] * count, [dict[str, Any]()] * count
+        self.scenes, self.drawn = [self.scene] * count, cast("list[Variant]", [{}]) * count
         self.draws, self.failed, self._fixed = np.zeros(count, np.int64), np.zeros(count, bool), np.zeros(count, bool)
         self._com, self._wrench = np.tile(one.bodies.com, (count, 1, 1)), np.zeros((count, n, 6))
         self._number, self._joint = np.zeros((count, j, col.NUMBERS)), np.zeros((count, j, col.STATE))
@@ -126,7 +126,8 @@ class Batch:
         self._motion = type(first)(*(np.repeat(array[None], count, axis=0) for array in first))
         self._motions = Stored([type(first)(*(array[w] for array in self._motion)) for w in range(count)])
         sizes = (0, n, 3), (0, n, 4), (0, n, 3), (0, n, 3), (0, 3)
-        self._kept = Kept(*map(np.empty, sizes), np.empty((0, 5), np.int64), np.empty(0), np.empty((0, j, 7)))
+        nothing: list[Any] = [*map(np.empty, sizes), np.empty((0, 5), np.int64), np.empty(0), np.empty((0, j, 7))]
+        self._kept = Kept(*nothing)
         self._script, self._ended = NO_SCRIPT, 0
         compile_before([(untouched, (int64,))], "the batch")
         self._held = untouched(count)
@@ -155,7 +156,7 @@ class Batch:
         if variants is not None and len(variants) != len(rows):
             raise SdfsimError(f"variants: must be one for each world ({len(rows)}, got {len(variants)})")
         for k, w in enumerate(rows.tolist()):
-            rng = np.random.default_rng([self.seed, w, self.draws[w]])
+            rng = np.random.default_rng([self.seed, w, int(self.draws[w])])
             self._begin(w, self._draw(self._vary if variants is None else self._checked(variants[k]), rng))
             self.draws[w] += variants is None
         return self.observe()
@@ -266,15 +267,19 @@ class Batch:
             ends = tracks.time[np.isfinite(tracks.time)]
             self._ended = math.ceil(ends.max() / self._options.dt) + 2
             self._script = scripted(tracks, 0.0, self._rules, self._ended + count)[0]
-        ahead = (self._shapes, *self._stored, self._motions, self._rules, self._held, self._pieces, self._script,
-                 limits(self._options.dt), self._kept, self._told)  # fmt: skip
+        ahead: tuple[Any, ...] = (
+            self._shapes, *self._stored, self._motions, self._rules, self._held, self._pieces, self._script,
+            limits(self._options.dt), self._kept, self._told,
+        )  # fmt: skip
         rows = np.array_split(np.arange(len(self)), min(len(self), PIECES * self._threads))
         if not count:
             kinds = (*map(typeof, (*ahead, rows[0])), int64)
-            return compile_before([(run_worlds, kinds)], "the batch")
-        if self._pool is None or len(rows) == 1:
-            return [run_worlds(*ahead, some, int(count)) for some in rows] and None
-        return [*self._pool.map(lambda some: run_worlds(*ahead, some, int(count)), rows)] and None
+            compile_before([(run_worlds, kinds)], "the batch")
+            return
+        run: Any = run_worlds
+        calls = self._pool.map if self._pool is not None and len(rows) > 1 else map
+        for _ in calls(lambda some: run(*ahead, some, int(count)), rows):
+            pass
 
     # --- beginning anew ---
 
