@@ -1,4 +1,4 @@
-"""Learn to push a mug to a place on a table, in about a quarter of an hour on two cores.
+"""Learn to push a mug to a place on a table, in about five minutes of one core.
 
     python samples/learn/push.py                        # trains, or goes on; writes policy, curve and film to push/
     python samples/learn/push.py --scene room/scene.yaml --body mug     # on your own table
@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("push"))
     parser.add_argument("--scene", help="a scene file; default: a mug on a table")
     parser.add_argument("--body", help="what is pushed; default: the first body that moves")
-    parser.add_argument("--steps", type=int, default=800_000, help="actions, in all worlds together")
+    parser.add_argument("--steps", type=int, default=200_000, help="actions, in all worlds together")
     parser.add_argument("--mujoco", action="store_true", help="run the policy in MuJoCo")
     given = parser.parse_args()
     chosen = {"scene": given.scene, "body": given.body}

@@ -69,7 +69,7 @@ class Reach(Task):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, default=Path("reach"))
-    parser.add_argument("--steps", type=int, default=250_000, help="actions, in all worlds together")
+    parser.add_argument("--steps", type=int, default=60_000, help="actions, in all worlds together")
     given = parser.parse_args()
     policy = train(Reach(64), given.out, given.steps)
     print(f"{success(Reach(200), policy, 10**6):.1%} of 200 new episodes end at the ball")
