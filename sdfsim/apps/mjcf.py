@@ -192,10 +192,10 @@ class _Reader:
         couplings = tuple(self._couplings())
         motors = {} if "actuation" in self.off else self._motors(couplings)
         joints = [replace(joint, motor=motors.get(joint.name)) for joint in joints]
-        rotors = sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(model.dof_armature)})
+        free = model.jnt_type[model.dof_jntid] == int(self.mj.mjtJoint.mjJNT_FREE)
+        rotors = sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(free & (model.dof_armature > 0.0))})
         if rotors:
-            self.left.append(named("armature in the motion (the mass matrix and exports have it, but not that of free "
-                                   "joints)", list(map(self._joint_name, rotors))))  # fmt: skip
+            self.left.append(named("armature of free joints", list(map(self._joint_name, rotors))))
         joints += [*self._loops(), *self._ropes()]
         apart = self._apart(geoms)
         meets = self.off.isdisjoint(("contact", "constraint"))

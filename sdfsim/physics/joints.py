@@ -194,9 +194,10 @@ def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple
 
 
 def stored(joints: Joints, state: np.ndarray) -> float:
-    """The energy in springs."""
+    """The energy in springs and rotors."""
     stiffness, away = joints.number[:, STIFFNESS], state[:, COORD] - joints.number[:, REST]
-    return float((0.5 * stiffness * away**2 * (state[:, BROKEN] == 0.0)).sum())
+    springs = stiffness * away**2 * (state[:, BROKEN] == 0.0)
+    return 0.5 * float((springs + joints.number[:, ARMATURE] * state[:, SPEED] ** 2).sum())
 
 
 @dataclass(frozen=True)

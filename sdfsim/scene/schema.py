@@ -658,8 +658,8 @@ class JointTable(Table):
         "torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0, of="hinge slider ball"
     )
     armature: Number = key(
-        "inertia of a motor's rotor, as the joint feels it, in kg m^2 for hinges and balls, in kg for sliders; part of "
-        "the mass matrix and of MJCF, but not of the motion here", 0.0, ge=0, of="hinge slider ball",
+        "inertia of a motor's rotor, as the joint feels it, in kg m^2 for hinges and balls, in kg for sliders",
+        0.0, ge=0, of="hinge slider ball",
     )  # fmt: skip
     spring: SpringTable | None = key("a spring that pulls back", None, of="hinge slider distance")
     motor: MotorTable | None = key("a motor that drives it", None, of="hinge slider")
