@@ -46,7 +46,7 @@ def train(env: Any, folder: Path, steps: int, seed: int = 0) -> Policy:
     policy = Policy(env.single_observation_space.shape[0], env.single_action_space.shape[0])
     optimiser, done, spent = torch.optim.Adam(policy.parameters(), RATE), 0, 0.0
     if file.exists():
-        known = torch.load(file)
+        known = torch.load(file, weights_only=True)
         policy.load_state_dict(known["policy"])
         optimiser.load_state_dict(known["optimiser"])
         done, spent = known["steps"], known["seconds"]
