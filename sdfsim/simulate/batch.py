@@ -11,7 +11,7 @@ from sdfsim.physics.bodies import Bodies, State, Units, from_scene
 from sdfsim.physics.joints import initial
 from sdfsim.physics.options import STEP, SUBSTEPS
 from sdfsim.physics.units import scene_units
-from sdfsim.scene.scene import Joint, Scene
+from sdfsim.scene.scene import Body, Joint, Scene
 from sdfsim.simulate.steppers import stepper_of
 
 
@@ -41,22 +41,33 @@ def placed(
 
 
 class Copies:
-    """`count` copies of the moving bodies of a scene with their joints, each in a world of its own, followed by the
-    static bodies, which are in all worlds. `bodies`, which `solver` moves, are in the scene's `units`."""
+    """`count` copies of the moving bodies of a scene with their joints, each in a world of its own; then `count` copies
+    of each body on a path, of which those of world w are at the path's time `begin[w]` (s) first; then the static
+    bodies, which are in all worlds. `bodies`, which `solver` moves, are in the scene's `units`."""
 
-    def __init__(self, scene: Scene, count: int) -> None:
-        moving, fixed = ([k for k, b in enumerate(scene.bodies) if b.motion == kind] for kind in ("dynamic", "static"))
+    def __init__(self, scene: Scene, count: int, begin: Sequence[float] | None = None) -> None:
+        moving, led, fixed = (
+            [k for k, b in enumerate(scene.bodies) if b.motion == kind] for kind in ("dynamic", "kinematic", "static")
+        )
         self.units, self.total = scene_units(scene), count * len(moving)
+        first = self.total + count * len(led)
+
+        def at_its_time(k: int, w: int) -> Body:
+            body = scene.bodies[k]
+            assert body.path is not None
+            return replace(body, path=replace(body.path, time=body.path.time - (begin[w] if begin is not None else 0)))
 
         def of_world(joint: Joint, w: int) -> Joint:
             rows = {-1: -1} | {k: w * len(moving) + d for d, k in enumerate(moving)}
-            rows |= {k: self.total + d for d, k in enumerate(fixed)}
+            rows |= {k: self.total + d * count + w for d, k in enumerate(led)}
+            rows |= {k: first + d for d, k in enumerate(fixed)}
             return replace(joint, name=f"{joint.name} {w}", bodies=(rows[joint.bodies[0]], rows[joint.bodies[1]]))
 
         held = scene.joints if scene.effects.joints != "off" else ()
         joints = tuple(of_world(joint, w) for w in range(count) for joint in held)
-        bodies = tuple(scene.bodies[k] for k in [*moving * count, *fixed])
-        world = [*np.repeat(np.arange(count), len(moving)).tolist(), *[-1] * len(fixed)]
+        led_bodies = [at_its_time(k, w) for k in led for w in range(count)]
+        bodies = (*(scene.bodies[k] for k in moving * count), *led_bodies, *(scene.bodies[k] for k in fixed))
+        world = [*np.repeat(np.arange(count), len(moving)).tolist(), *[*range(count)] * len(led), *[-1] * len(fixed)]
         couplings = tuple(
             replace(c, joints=(c.joints[0] + w * len(held), c.joints[1] + w * len(held)))
             for w in range(count) for c in scene.couplings if held

@@ -144,6 +144,24 @@ def test_a_sliding_block_shows_its_friction_and_no_restitution(tmp_path, slope, 
     assert told["interval"][0] - 0.01 < 0.3 < told["interval"][1] + 0.01
 
 
+def test_a_block_on_a_tray_that_is_pulled_away_shows_its_friction(tmp_path):
+    """A body on a path: the tray accelerates by more than friction can follow, and the block by its coefficient."""
+    time, friction, pull = np.arange(0.0, 0.6, 0.01), 0.3, 6.0
+    still = np.zeros_like(time)
+    way = 0.5 * friction * 9.81 * time**2
+    place = np.stack([way, still, still + 0.1], 1)[:, None]
+    write_poses(tmp_path / "block.csv", time, ["block"], place, np.tile([0, 0, 0, 1.0], (len(time), 1, 1)))
+    path = [{"time": t, "position": [0.5 * pull * t**2, 0, -0.05]} for t in time.tolist()]
+    bodies = [
+        {"name": "tray", "shape": "tray", "path": path, "motion": "kinematic", "friction": 1.0, "restitution": 1.0},
+        {"name": "block", "shape": "block", "position": [0, 0, 0.1], "friction": 0.5},
+    ]
+    shapes = {"block": {"box": {"size": [0.2] * 3}}, "tray": {"box": {"size": [3.0, 0.6, 0.1]}}}
+    scene = write_scene_file(tmp_path / "scene.yaml", shapes, bodies)
+    told = identify(*load_recordings([tmp_path / "block.csv"], scene)).report()["friction"]["block / tray"]
+    assert told["value"] == pytest.approx(friction, abs=0.015)
+
+
 def test_the_picture_shows_what_the_recordings_tell_and_what_they_do_not(tmp_path, monkeypatch):
     scene = sliding_block(tmp_path, noise=3e-4)
     out, kept = tmp_path / "found.yaml", []

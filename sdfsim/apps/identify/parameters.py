@@ -13,7 +13,7 @@ import numpy as np
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
-from sdfsim.physics.bodies import Bodies, State, largest_extent
+from sdfsim.physics.bodies import Bodies, State, Tracks, largest_extent
 from sdfsim.physics.joint_columns import DAMPING, FRICTION
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Body, Joint, Scene
@@ -83,13 +83,12 @@ class Problem:
     def __init__(self, recordings: Sequence[Recording], scene: Scene) -> None:
         self.scene, self.recordings = scene, list(recordings)
         self.moving, self.fixed = movers(scene), [b for b in scene.bodies if b.motion == "static"]
-        self.bodies, self.units = [*self.moving, *self.fixed], scene_units(scene)
+        self.led = [b for b in scene.bodies if b.motion == "kinematic"]
+        self.bodies, self.units = [*self.moving, *self.led, *self.fixed], scene_units(scene)
         self.sizes = np.array([largest_extent(scene.shapes[b.shape]) * b.scale for b in self.moving])
         self.joints = scene.joints if scene.effects.joints != "off" else ()
         self.parameters: list[Parameter] = []
         self.ground: dict[int, Ground] = {}
-        if any(b.motion == "kinematic" for b in scene.bodies):
-            raise SdfsimError("bodies on paths: identify supports free and static bodies only")
         if any(r.dt == 0.0 for r in recordings):
             raise SdfsimError("a recording has a single frame")
         self.tells = [self._telling(r) for r in recordings]
@@ -220,14 +219,27 @@ class Problem:
                     turn = turn + value * axis
         return pose.from_rotvec(turn), shift
 
+    def rows(self, body: int, count: int) -> Any:
+        """Where one of `bodies` is among those of `Copies`."""
+        many, led = len(self.moving), len(self.led)
+        if body < many:
+            return slice(body, many * count, many)
+        at = body * count
+        return slice(at, at + count) if body < many + led else (many + led) * count + body - many - led
+
+    def number(self, row: int, count: int) -> int:
+        """Which of `bodies` is in this row of `Copies`."""
+        many, led = len(self.moving), len(self.led)
+        if row < many * count:
+            return row % many
+        return row // count if row < (many + led) * count else row - (many + led) * (count - 1)
+
     def applied(self, values: np.ndarray, bodies: Bodies, state: State, count: int) -> tuple[Bodies, State]:
-        """`count` copies of the moving bodies, followed by the static ones, with these parameters."""
-        many = len(self.moving)
-        total = many * count
+        """The bodies of `count` `Copies` with these parameters."""
         names = (*HIGH, "scale", "com", "inertia", "mass", "inverse_mass", "bounds", "size", "radius")
         new = {name: getattr(bodies, name).copy() for name in names}
         position, orientation = state.position.copy(), state.orientation.copy()
-        joints = bodies.joints
+        joints, tracks = bodies.joints, bodies.tracks
         dragged = [(p, v) for p, v in zip(self.parameters, values, strict=True) if p.kind in OF_JOINTS]
         if joints is not None and dragged:
             number, u = joints.number.copy(), self.units
@@ -240,16 +252,34 @@ class Problem:
             bodies = replace(bodies, joints=replace(joints, number=number))
         for p, value in zip(self.parameters, values, strict=True):
             for k in p.bodies:
-                rows: Any = slice(k, total, many) if k < many else total + k - many
+                rows = self.rows(k, count)
                 if p.kind in HIGH:
                     new[p.kind][rows] = value
                 for name, power in KINDS[p.kind].scales.items():
                     new[name][rows] *= math.exp(power * value)
         for body, ground in self.ground.items():
-            row, (turn, shift) = total + body - many, self.lie(values, body)
+            rows, (turn, shift) = self.rows(body, count), self.lie(values, body)
+            if body < len(self.moving) + len(self.led):
+                tracks = _displaced(tracks, self.bodies[body], rows, ground.centre, turn, shift, self.units.length)
+                continue
+            row = rows
             position[row] = ground.centre + pose.rotate(turn, position[row] - ground.centre) + shift
             orientation[row] = pose.multiply(turn, orientation[row])
-        return replace(bodies, **new), replace(state, position=position, orientation=orientation)
+        if tracks is not None:
+            position[tracks.body], orientation[tracks.body] = tracks.at(0.0)
+        return replace(bodies, tracks=tracks, **new), replace(state, position=position, orientation=orientation)
+
+
+def _displaced(tracks, body: Body, rows: slice, centre, turn, shift, length: float) -> Tracks:
+    """The tracks with the body in these rows displaced in its own axes, as a static one at its place in the scene would
+    be: turned about the centre, and shifted."""
+    some = np.flatnonzero((tracks.body >= rows.start) & (tracks.body < rows.stop))
+    back, place = pose.conjugate(body.quat_xyzw), body.position / length
+    way = pose.rotate(back, centre - place + pose.rotate(turn, place - centre) + shift)
+    origin, orientation = tracks.origin.copy(), tracks.orientation.copy()
+    origin[some] += pose.rotate(orientation[some], way)
+    orientation[some] = pose.multiply(orientation[some], pose.multiply(back, pose.multiply(turn, body.quat_xyzw)))
+    return replace(tracks, origin=origin, orientation=orientation)
 
 
 def entry_of(body: Body) -> str:

@@ -245,6 +245,13 @@ def file_values(problem: Problem, values: np.ndarray) -> tuple[dict[str, dict[st
             entry.setdefault("mass", b.mass)  # with a density another size would mean another mass
     for body, ground in problem.ground.items():
         b, (turn, shift) = problem.bodies[body], problem.lie(values, body)
+        if b.path is not None:
+            path = [
+                {"time": t, "position": p, "quat_xyzw": q}
+                for t, p, q in zip(*(a.tolist() for a in vars(b.path).values()), strict=True)
+            ]
+            found.setdefault(b.name, {})["path"] = path
+            continue
         centre = ground.centre * length
         position = centre + pose.rotate(turn, b.position - centre) + shift * length
         found.setdefault(b.name, {}).update(

@@ -106,7 +106,7 @@ class _Part:
         ends = [min(self.length, len(r.known) - 1 - t) for r, (_, t) in zip(some, begin, strict=True)]
         self.length = max(ends)
         many, count = len(problem.moving), len(begin)
-        copies = Copies(problem.scene, count)
+        copies = Copies(problem.scene, count, [r.dt * t for r, (_, t) in zip(some, begin, strict=True)])
         self.bodies, self.solver = copies.bodies, copies.solver
         first = [
             np.concatenate([getattr(r, name)[t] for r, (_, t) in zip(some, begin, strict=True)]) for name in MOTION
@@ -141,7 +141,7 @@ class _Part:
     def touched(self) -> list[tuple[int, int, int, np.ndarray, bool]]:
         """See `Windows.touched`. Inner steps are made one by one, as a rebounding body may have left again at the end
         of a frame."""
-        many, total, inner = self.shape[2], self.shape[1] * self.shape[2], self.options.substeps
+        many, inner = self.shape[2], self.options.substeps
         there = np.asarray(~np.isnan(self.goal[..., 0]).all(-1))
         fine = self.options._replace(dt=self.options.dt / inner, substeps=1)
         state, carry = self.start, self.solver.init(self.bodies, self.start, fine)
@@ -155,8 +155,12 @@ class _Part:
                 touch = cast("Any", state.touch)
                 for (a, b), count, points in zip(touch.pair.tolist(), touch.count.tolist(), touch.point, strict=True):
                     if count and there[t:, a // many].any():
-                        low, high = sorted((a % many, b % many if b < total else many + b - total))
+                        low, high = sorted(self.problem.number(k, len(self.begin)) for k in (a, b))
                         at = pose.rotate(state.orientation[a], points[:count, FIRST : FIRST + 3]) + state.position[a]
+                        if high < many + len(self.problem.led) and high >= many:  # as where it is in the scene
+                            of, where = self.problem.bodies[high], (state.position[b], state.orientation[b])
+                            own = pose.rotate(pose.conjugate(where[1]), at - where[0]) + self.bodies.com[b]
+                            at = pose.rotate(of.quat_xyzw, own) + of.position / self.problem.units.length
                         found.setdefault((a // many, low, high), []).append(at)
                         now.add((a, (a // many, low, high)))
             # A change in the first frame may come from a slightly wrong start.
