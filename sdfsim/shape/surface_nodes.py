@@ -14,7 +14,7 @@ VOXEL = 0.025
 REACHED = 0.005
 PROJECTIONS = 3
 DEFAULT_GRID = 24
-DEFAULT_COUNT = 512  # number with which the bundled model was trained; docs/tradeoff.md shows the effect of fewer
+DEFAULT_COUNT = 512  # number with which the bundled model was trained
 DIRECTIONS = 1000  # directions in which nodes should reach as far as the surface
 CHUNK = 10_000  # points in one product
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
