@@ -7,7 +7,7 @@
     python -m benchmarks scale many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
     python -m benchmarks scale roofline
-        cost of a distance, a contact and a row of impulses, compared with the limits of the machine
+        cost of a distance, a contact and a row of impulses, compared with the limits of the machine: docs/scale.md
 
 Every case of the first command runs in a separate process on one thread; times are processor times. Results in DIR are
 not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
