@@ -24,9 +24,9 @@ suppress_warnings = ["myst.header"]  # the cards of models begin at the second l
 autodoc_default_options = {
     "members": True,
     "member-order": "bysource",
-    "inherited-members": "Exception,VectorEnv,tuple",
+    "inherited-members": "BaseException,Exception,VectorEnv,tuple",
 }
-html_copy_source = False
+html_copy_source = smartquotes = False
 html_static_path = html_css_files = ["site.css"]
 napoleon_use_ivar = True
 
@@ -126,7 +126,7 @@ def add_contents(app, docname: str, source: list[str]) -> None:
 def short(app, what, name, thing, options, signature, returned):
     """Types without their modules."""
     texts = (text and re.sub(r"~[\w.]*\.(?=\w)", "", text) for text in (signature, returned))
-    return tuple(text and text.replace("<factory>", "...") for text in texts)
+    return tuple(text and re.sub(r"<(factory|function [^>]*>?)>", "...", text) for text in texts)
 
 
 def setup(app) -> None:
