@@ -32,11 +32,13 @@ from sdfsim.physics.solver.rows import WIDTH as OF_ROW
 from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held
+from sdfsim.physics.solver.triangles import Triangles
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.validity import NO_LIMITS, fault_of
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactGeometry, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
+from sdfsim.shape.triangle_tree import TriangleTree
 
 FORMS = {
     "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
@@ -53,7 +55,7 @@ NO_PARTS = Parts(
 NOTHING_NEAR = Near(
     np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 3)),
     np.zeros(0), np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros(0, np.bool_), np.zeros((0, 3)),
-    np.zeros(0, np.bool_), np.zeros(0, np.int64),
+    np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0, np.int64),
 )  # fmt: skip
 NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 0, 6)))
 
@@ -409,8 +411,33 @@ def compiled_shapes(shapes: Sequence[ContactGeometry], *, grids: bool = True) ->
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
     arrays = (np.concatenate(parts) for parts in (brick, sample))
-    solids = [shape.solids for shape in shapes]
-    return kinds.Shapes(table, *arrays, *_joined(surfaces), label=np.concatenate(label), solids=_packed(solids))
+    solids, trees = [shape.solids for shape in shapes], [shape.triangles if met else None for shape in shapes]
+    for row, shape, tree in zip(table, shapes, trees, strict=True):
+        if tree is not None and shape.grid is not None:
+            row[kinds.ERROR] = shape.grid.error
+    return kinds.Shapes(
+        table, *arrays, *_joined(surfaces), label=np.concatenate(label), solids=_packed(solids),
+        triangles=_planted(trees),
+    )  # fmt: skip
+
+
+def _planted(trees: Sequence[TriangleTree | None]) -> Triangles:
+    """The triangles of shapes, end to end."""
+    some = [tree for tree in trees if tree is not None]
+
+    def starts(lengths: list[int]) -> np.ndarray:
+        return np.cumsum([0, *lengths], dtype=np.int64)
+
+    def joined(name: str, *shape: int) -> np.ndarray:
+        return np.concatenate([np.zeros((0, *shape)), *(getattr(tree, name) for tree in some)])
+
+    return Triangles(
+        level=np.array([-1 if tree is None else tree.level for tree in trees], dtype=np.int64),
+        first=starts([0 if tree is None else len(tree.corner) for tree in trees]),
+        root=starts([0 if tree is None else len(tree.low) for tree in trees]),
+        size=np.array([0.0 if tree is None else (tree.high[0] - tree.low[0]).max() for tree in trees]),
+        low=joined("low", 3), high=joined("high", 3), corner=joined("corner", 3, 3), normal=joined("normal", 7, 3),
+    )  # fmt: skip
 
 
 def _joined(surfaces: list[ContactSurface]) -> tuple[np.ndarray, ...]:
