@@ -14,7 +14,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import cached_arrays, digest, user_cache
-from sdfsim.geometry.mesh import Mesh, convex_hull, directed_edges, face_normals, halves, is_closed, lattice
+from sdfsim.geometry.mesh import Mesh, convex_hull, directed_edges, face_normals, halves, lattice
 from sdfsim.sdf.baked_grid import BAKE_VERSION, BakedGrid, baked, interpolated, inwards, surface_samples, unseen_wall
 from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf
@@ -98,10 +98,9 @@ class ContactGeometry:
 
     @cached_property
     def triangles(self) -> TriangleTree | None:
-        """The true surface of a shape that has the exact distance of a closed mesh and does not collide as solids."""
-        if not isinstance(self.sdf, MeshSdf) or self.solids:
-            return None
-        return triangle_tree(self.sdf.mesh) if is_closed(self.sdf.mesh) else None
+        """The true surface of a shape that has the exact distance of a mesh and does not collide as solids."""
+        exact = isinstance(self.sdf, MeshSdf) and not self.solids
+        return triangle_tree(self.sdf.mesh) if exact else None
 
     @property
     def thickness(self) -> float:

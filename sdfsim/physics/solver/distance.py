@@ -84,7 +84,8 @@ def true_distance(shapes, s, p):
     d, n = distance(shapes.table, shapes.brick, shapes.sample, s, p)
     if shapes.triangles.level[s] >= 0 and abs(d) <= CLOSE * shapes.table[s, CELL]:
         exact, normal, _ = signed(shapes.triangles, s, p, abs(d) + 1.5 * shapes.table[s, ERROR])
-        if exact < math.inf:
+        # Where faces cross or are missing, the nearest feature may be wrong about the side, and the grid is right.
+        if exact < math.inf and (exact * d > 0.0 or abs(d) <= shapes.table[s, ERROR]):
             return exact, normal
     return d, n
 

@@ -32,9 +32,10 @@ from sdfsim.physics.solver.rows import WIDTH as OF_ROW
 from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held
-from sdfsim.physics.solver.triangles import Triangles
+from sdfsim.physics.solver.triangles import Triangles, signed_distances
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.validity import NO_LIMITS, fault_of
+from sdfsim.sdf.baked_grid import BakedGrid, interpolated, surface_samples
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactGeometry, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
@@ -47,6 +48,7 @@ FORMS = {
 SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
 CROWD = 64  # number of dynamic bodies from which threads may test pairs
 TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
+SIDED, AGREED = 4000, 0.98  # places at which triangles and grid are compared, and the part that must be on one side
 INSTANTS = 4  # of a step, at which networks look for contacts
 NO_PARTS = Parts(
     np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, np.int32),
@@ -412,13 +414,25 @@ def compiled_shapes(shapes: Sequence[ContactGeometry], *, grids: bool = True) ->
             sample.append(grid.fine.reshape(-1))
     arrays = (np.concatenate(parts) for parts in (brick, sample))
     solids, trees = [shape.solids for shape in shapes], [shape.triangles if met else None for shape in shapes]
-    for row, shape, tree in zip(table, shapes, trees, strict=True):
-        if tree is not None and shape.grid is not None:
-            row[kinds.ERROR] = shape.grid.error
+    for k, (row, tree) in enumerate(zip(table, trees, strict=True)):
+        if tree is not None and (grid := shapes[k].grid) is not None:
+            row[kinds.ERROR] = grid.error
+            trees[k] = tree if _bounds_solid(tree, grid) else None
     return kinds.Shapes(
         table, *arrays, *_joined(surfaces), label=np.concatenate(label), solids=_packed(solids),
         triangles=_planted(trees),
     )  # fmt: skip
+
+
+def _bounds_solid(tree: TriangleTree, grid: BakedGrid) -> bool:
+    """Whether triangles tell inside from outside as the grid does, which counts how often the surface goes around."""
+    samples = surface_samples(grid)
+    places = samples[np.random.default_rng(0).integers(len(samples), size=SIDED)] if len(samples) else samples
+    places = places + grid.cell * np.random.default_rng(1).uniform(-1.5, 1.5, places.shape)
+    known = interpolated(grid, places)
+    found, _ = signed_distances(_planted([tree]), 0, places, 4.0 * grid.cell)
+    clear = (np.abs(known) > grid.error) & np.isfinite(found)
+    return bool((found * known >= 0.0)[clear].mean() >= AGREED) if clear.any() else False
 
 
 def _planted(trees: Sequence[TriangleTree | None]) -> Triangles:
