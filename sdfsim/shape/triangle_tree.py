@@ -18,8 +18,7 @@ class TriangleTree:
     heap: leaf l of 2**level holds the triangles T l >> level to T (l + 1) >> level."""
 
     level: int
-    low: np.ndarray  # [2**(level + 1) - 1, 3] m, lower ends of the boxes
-    high: np.ndarray  # likewise the upper ends
+    box: np.ndarray  # [2**(level + 1) - 1, 6] m, lower and upper ends
     corner: np.ndarray  # [T, 3, 3] m
     # [T, 7, 3] pseudonormals of the face, the edges and the corners: sums of the normals that meet there, weighted by
     # angle (Baerentzen and Aanaes 2005)
@@ -45,8 +44,8 @@ def triangle_tree(mesh: Mesh) -> TriangleTree:
     for _ in range(level):
         lows.append(np.minimum(lows[-1][::2], lows[-1][1::2]))
         highs.append(np.maximum(highs[-1][::2], highs[-1][1::2]))
-    low, high = np.concatenate(lows[::-1]), np.concatenate(highs[::-1])
-    return TriangleTree(level, low, high, corner, _pseudonormals(mesh.vertices, faces)[order])
+    box = np.concatenate([np.concatenate(lows[::-1]), np.concatenate(highs[::-1])], axis=1)
+    return TriangleTree(level, box, corner, _pseudonormals(mesh.vertices, faces)[order])
 
 
 def _area(mesh: Mesh) -> np.ndarray:

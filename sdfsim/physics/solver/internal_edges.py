@@ -16,7 +16,7 @@ from sdfsim.physics.solver.manifold import renewed
 from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, pair_kind
 from sdfsim.physics.solver.surface_distance import KEYS
 from sdfsim.physics.solver.triangles import highest
-from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, three, turn, turn_back
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
@@ -126,15 +126,15 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
                 ),
             )  # fmt: skip
             foot = add(get(motion.position, ground), foot)
-            if shapes.triangles.level[t] >= 0:
-                top = _top(shapes, world, work, motion, rules, manifolds, p, k, side, m)
-            else:
-                top = _reach(shapes, world, work, motion, other, key, side, m)
-            if top - dot(m, foot) > LEVEL * rules.slop:
-                continue
+            height = dot(m, foot) + LEVEL * rules.slop
             bottom = _lowest(shapes, world, work, motion, manifolds, p, k, side, m)
             if dot(m, foot) + min(manifolds.point[q, e, GAP], 0.0) - bottom > LEVEL * rules.slop:
                 continue  # for what is below the plane as well, it is a wall
+            if shapes.triangles.level[t] < 0:
+                if _reach(shapes, world, work, motion, other, key, side, m) > height:
+                    continue
+            elif _over(shapes, world, work, motion, rules, manifolds, p, k, side, m, height):
+                continue
             return True, m
     return False, n
 
@@ -159,14 +159,17 @@ def _lowest(shapes, world, work, motion, manifolds, p, k, side, m):
 
 
 @njit(**BARE)
-def _top(shapes, world, work, motion, rules, manifolds, p, k, side, m):
-    """How far the triangles of the other body around a contact extend along m."""
+def _over(shapes, world, work, motion, rules, manifolds, p, k, side, m, height):
+    """Whether triangles of the other body around a contact extend along m beyond a height."""
     other, column = manifolds.pair[p, 1 - side], SECOND if side == 0 else FIRST
-    size, point = world.scale[other], manifolds.point[p, k]
-    place = add((point[column], point[column + 1], point[column + 2]), get(world.com, other))
+    size, place = world.scale[other], three(manifolds.point[p, k], column)
     up = turn_back(work.matrix, other, m)
-    top = highest(shapes.triangles, world.shape[other], scale(place, 1.0 / size), up, AROUND * rules.slop / size)
-    return dot(m, origin(motion.position, work.matrix, world.com, other)) + size * top
+    height -= dot(m, origin(motion.position, work.matrix, world.com, other))
+    place = add(place, get(world.com, other))
+    if dot(up, place) > height:  # the contact itself is on the surface
+        return True
+    around = AROUND * rules.slop / size
+    return size * highest(shapes.triangles, world.shape[other], scale(place, 1.0 / size), up, around) > height
 
 
 @njit(**BARE)

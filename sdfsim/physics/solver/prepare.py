@@ -448,9 +448,9 @@ def _planted(trees: Sequence[TriangleTree | None]) -> Triangles:
     return Triangles(
         level=np.array([-1 if tree is None else tree.level for tree in trees], dtype=np.int64),
         first=starts([0 if tree is None else len(tree.corner) for tree in trees]),
-        root=starts([0 if tree is None else len(tree.low) for tree in trees]),
-        size=np.array([0.0 if tree is None else (tree.high[0] - tree.low[0]).max() for tree in trees]),
-        low=joined("low", 3), high=joined("high", 3), corner=joined("corner", 3, 3), normal=joined("normal", 7, 3),
+        root=starts([0 if tree is None else len(tree.box) for tree in trees]),
+        size=np.array([0.0 if tree is None else (tree.box[0, 3:] - tree.box[0, :3]).max() for tree in trees]),
+        box=joined("box", 6), corner=joined("corner", 3, 3), normal=joined("normal", 7, 3),
     )  # fmt: skip
 
 

@@ -41,7 +41,7 @@ from sdfsim.physics.solver.vectors import (
     turn_back,
     vector,
 )
-from sdfsim.physics.solver.world import COLUMNS, FIRST, GAP, NORMAL, OWNER, SECOND
+from sdfsim.physics.solver.world import COLUMNS, FIRST, GAP, NORMAL, NORMAL_IMPULSE, OWNER, SECOND
 
 KEYS = 1024  # largest number of patches of a shape
 ROUNDS = 12  # rounds of refinement
@@ -52,8 +52,8 @@ WAYS = 8  # directions in which the outermost nodes of a face are searched
 ONTO_IT = 0.05  # cells: a point this near a surface is on it
 STRIDE, FINEST = 0.02, 5e-4  # first and last step of the refinement, relative to a body's size
 LONGER = 4.0  # a step is at most this many times the last one
-SHARPER, SHARPEST = 6, 1e-4  # rounds of refinement on triangles, and their last step, relative to a body's size
-WITHIN = 2.0  # cells: how far the refinement on a grid may end from where triangles are nearest
+SHARPER, SHARPEST = 4, 1e-4  # rounds of refinement on triangles, and their last step, relative to a body's size
+WITHIN = 0.5  # cells: how far the refinement on a grid may end from where triangles are nearest
 AWAY, TRACED = 1e-6, 12  # model lengths: farther points do not touch yet; and steps of a search along their way
 SHORTEST, AHEAD = 2.5, 4.0  # first step when starting again: least multiples of the last, and of the motion since
 
@@ -108,6 +108,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
     chosen = _chosen(scratch, kept, look)
     # A round body may be smaller than the space between two nodes, so the search also starts at the point below its own
     # centre.
+    begun, apart = count, WITHIN * max(own * _cell(shapes, r), k * _cell(shapes, s))
     back, middle = map_between(motion.position, matrix, world.scale, world.com, other, one)
     half = shapes.table[s, SIZE + 1] if shapes.table[s, KIND] == CAPSULE else 0.0
     first = (-1 if half == 0.0 else -3) if is_round(shapes.table, s) else 0
@@ -133,12 +134,15 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
                 there, normal = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, q))
                 if there < d:
                     p, d, n, stride = q, there, normal, short
-        begin = p
+        begin, known = p, at >= 0 and near.placed[at]
         p, d, n = _refined(
             shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
         )
-        if sharp and d <= reach:
-            p, d, n = _sharpened(shapes, r, s, w, c, k, own, begin, p)
+        if sharp:
+            here = sub(scale(p, own), get(world.com, one))
+            if d > reach or (e > 0 and _is_found(scratch.found, begun, count, side, here, apart)):
+                continue
+            p, d, n = _sharpened(shapes, r, s, w, c, k, own, p if known else begin, p)
         if at >= 0:
             near.placed[at] = True
             put(near.place, at, p)
@@ -150,6 +154,17 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
         write(scratch.found, count, side, mine, theirs, turn(matrix, other, n), d, key)
         count += 1
     return count
+
+
+@njit(**BARE)
+def _is_found(found, begun, count, side, place, apart):
+    """Whether a point of this side is known that is nearer than `apart`."""
+    column = FIRST if side == 0 else SECOND
+    for e in range(begun, count):
+        away = sub(three(found[e], column), place)
+        if dot(away, away) < apart * apart:
+            return True
+    return False
 
 
 @njit(**BARE)
@@ -335,7 +350,7 @@ def _sharpened(shapes, s, t, w, c, k, own, begin, p):
     for e in range(2):
         if e == 1 and begin[0] == p[0] and begin[1] == p[1] and begin[2] == p[2]:
             break
-        q = _onto(shapes, s, p if e == 0 else begin, stride)
+        q = _onto(shapes, s, p if e == 0 else begin, 2.0 * shapes.table[s, ERROR])
         there, normal = true_distance(shapes, t, mapped(w, c, q))
         if there < d:
             best, d, n = q, there, normal
@@ -390,6 +405,8 @@ def looked_at(shapes, world, motion, matrix, rules, manifolds, p, count, ahead):
         own = scale(add(three(point, mine), get(world.com, one)), 1.0 / world.scale[one])
         x, gap = mapped(w, c, own), point[GAP]
         if not ahead:
+            if point[NORMAL_IMPULSE] == 0.0:
+                continue  # it is found again if it matters
             d, n = true_distance(shapes, t, x)
             gap = size * d
             if gap > rules.contact_margin:

@@ -27,8 +27,7 @@ class Triangles(NamedTuple):
     first: np.ndarray
     root: np.ndarray
     size: np.ndarray  # [S] largest extent
-    low: np.ndarray  # [B, 3] lower ends of boxes
-    high: np.ndarray  # [B, 3] upper ends
+    box: np.ndarray  # [B, 6] lower and upper ends
     corner: np.ndarray  # [T, 3, 3]
     normal: np.ndarray  # [T, FEATURES, 3] pseudonormals, not of unit length
 
@@ -40,15 +39,19 @@ def closest(triangles, s, p, most):
     Returns:
         The distance, inf if there is none; the point; and the pseudonormal of the feature on which it is.
     """
-    level, first, root = triangles.level[s], triangles.first[s], triangles.root[s]
+    level, first, root = triangles.level[s], triangles.first[s], triangles.root[s] - 1
     count, leaves = triangles.first[s + 1] - first, 1 << level
     least, found, feature, place = most * most, -1, 0, p
-    i = 1
+    # One bit for each level above the present box: whether its sibling must still be looked at.
+    i, waiting, down = 1, 0, _off(triangles, root + 1, p) < least
     while True:
-        if _off(triangles, root + i - 1, p) < least:
-            if i < leaves:
-                i *= 2
-                continue
+        while down and i < leaves:
+            one, other = _off(triangles, root + 2 * i, p), _off(triangles, root + 2 * i + 1, p)
+            nearer = 0 if one <= other else 1
+            down = min(one, other) < least
+            if down:
+                i, waiting = 2 * i + nearer, 2 * waiting + (1 if max(one, other) < least else 0)
+        if down:
             leaf = i - leaves
             for t in range(first + (count * leaf >> level), first + (count * (leaf + 1) >> level)):
                 q, which = _on_triangle(triangles.corner[t], p)
@@ -56,11 +59,13 @@ def closest(triangles, s, p, most):
                 square = dot(away, away)
                 if square < least:
                     least, found, feature, place = square, t, which, q
-        # The next subtree: the right sibling of this one, or of its nearest ancestor that is a left one.
-        i += 1
-        while i & 1 == 0:
-            i >>= 1
-        if i == 1:
+        down = False
+        while i > 1 and not down:
+            if waiting & 1 == 1 and _off(triangles, root + (i ^ 1), p) < least:
+                i, waiting, down = i ^ 1, waiting - 1, True
+            else:
+                i, waiting = i >> 1, waiting >> 1
+        if not down:
             break
     if found < 0:
         return math.inf, place, (0.0, 0.0, 1.0)
@@ -124,7 +129,7 @@ def _off(triangles, b, p):
     """The squared distance of p from a box."""
     total = 0.0
     for x in range(3):
-        out = max(triangles.low[b, x] - p[x], p[x] - triangles.high[b, x], 0.0)
+        out = max(triangles.box[b, x] - p[x], p[x] - triangles.box[b, 3 + x], 0.0)
         total += out * out
     return total
 
