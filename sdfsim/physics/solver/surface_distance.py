@@ -125,24 +125,29 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             i, stride = scratch.pick[e], STRIDE * size
             key, at, p = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
             d, n = scratch.depth[i] / k, get(scratch.normal, i)
+        found = False
         if at >= 0 and near.placed[at]:
             # Start where the last descent ended, with shorter steps, unless the node is deeper by now.
             q, short = get(near.place, at), min(stride, max(SHORTEST * FINEST * size, AHEAD * way / own))
             if q[0] == p[0] and q[1] == p[1] and q[2] == p[2]:
-                stride = short
+                stride, found = short, True
             else:
                 there, normal = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, q))
-                if there < d:
-                    p, d, n, stride = q, there, normal, short
-        begin, known = p, at >= 0 and near.placed[at]
-        p, d, n = _refined(
-            shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
-        )
+                if there < d + shapes.table[s, ERROR]:
+                    p, d, n, stride, found = q, there, normal, short, True
+        # The last descent on triangles ended on the true surface: a grid would lead away from there.
+        if not (sharp and found):
+            p, d, n = _refined(
+                shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
+            )
         if sharp:
             here = sub(scale(p, own), get(world.com, one))
-            if d > reach or (e > 0 and _is_found(scratch.found, begun, count, side, here, apart)):
+            if _is_found(scratch.found, begun, count, side, here, apart):
                 continue
-            p, d, n = _sharpened(shapes, r, s, w, c, k, own, p if known else begin, p)
+            if not found:
+                p = _onto(shapes, r, p, 2.0 * shapes.table[r, ERROR])
+                stride = apart / own
+            p, d, n = _descended(shapes, r, s, w, c, k, own, p, stride, SHARPEST * size)
         if at >= 0:
             near.placed[at] = True
             put(near.place, at, p)
@@ -340,39 +345,29 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
 
 
 @njit(**INLINED)
-def _sharpened(shapes, s, t, w, c, k, own, begin, p):
-    """Descend along the true surface of s to lower distances of the true one of t, from the better of two points near
-    it, by steps along the other's normal and back onto the surface. Returns the point, the distance at the scale of t,
-    and the normal."""
-    ratio, size = k / own, shapes.clump_ball[shapes.clump_start[s], 3]
-    stride = WITHIN * max(_cell(shapes, s), _cell(shapes, t) * ratio)
-    d, n, best = math.inf, (0.0, 0.0, 1.0), p
-    for e in range(2):
-        if e == 1 and begin[0] == p[0] and begin[1] == p[1] and begin[2] == p[2]:
-            break
-        q = _onto(shapes, s, p if e == 0 else begin, 2.0 * shapes.table[s, ERROR])
-        there, normal = true_distance(shapes, t, mapped(w, c, q))
-        if there < d:
-            best, d, n = q, there, normal
-    step = stride
+def _descended(shapes, s, t, w, c, k, own, p, step, least):
+    """Descend along the true surface of s, from a point on it, to lower distances of the true one of t, by steps along
+    the other's normal and back onto the surface. Returns the point, the distance at the scale of t, and the normal."""
+    ratio = k / own
+    d, n = true_distance(shapes, t, mapped(w, c, p))
     for _ in range(SHARPER):
+        if step <= least:
+            break
         g = (
             (w[0][0] * n[0] + w[1][0] * n[1] + w[2][0] * n[2]) * ratio,
             (w[0][1] * n[0] + w[1][1] * n[1] + w[2][1] * n[2]) * ratio,
             (w[0][2] * n[0] + w[1][2] * n[1] + w[2][2] * n[2]) * ratio,
         )
-        q = _onto(shapes, s, along(best, g, -step), 1.01 * step)
-        if norm(sub(q, best)) <= SHARPEST * size:
+        q = _onto(shapes, s, along(p, g, -step), 1.01 * step)
+        if norm(sub(q, p)) <= least:
             break
         there, normal = true_distance(shapes, t, mapped(w, c, q))
         if there < d - 1e-9:
-            best, d, n = q, there, normal
+            p, d, n = q, there, normal
         else:
             # A step by the distance itself leads to where two lines cross.
-            step = d * ratio if SHARPEST * size < d * ratio < 0.5 * step else 0.2 * step
-            if step <= SHARPEST * size:
-                break
-    return best, k * d, n
+            step = d * ratio if least < d * ratio < 0.5 * step else 0.2 * step
+    return p, k * d, n
 
 
 @njit(**BARE)
