@@ -1,9 +1,12 @@
-"""Imports the robots in PyBullet's data, and compares the poses of their links with MuJoCo's.
+"""Imports robots, and compares the poses of their links, and their motion after an export, with MuJoCo's.
 
     python -m benchmarks robots [FILE ...]     # else all of pybullet_data but its random solids
 
 For each file: bodies and joints of the scene; the largest distance (mm) and angle (degrees) between MuJoCo's and the
-scene's links, over the start and 20 random positions of all joints; the largest relative difference of masses.
+scene's links, which `Simulator.set_joints` moves, over the start and 20 random positions of all joints; the largest
+relative difference of masses. For MJCF with actuators, MuJoCo also runs the file and its export for 2 s from the first
+keyframe, without contacts: the largest difference of a hinge (rad) or slide (m) at the end, and how often the forces of
+actuators change their sign in each.
 """
 
 import math
@@ -19,29 +22,33 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from benchmarks.records import Cell, progress, write_record
-from sdfsim import load_scene
+from sdfsim import Simulator, export, load_scene
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.base.errors import SdfsimError
-from sdfsim.physics.bodies import Units, from_scene
-from sdfsim.physics.joint_space import JointSpace
 from sdfsim.scene.scene import Joint, Scene
 
 TRIES = 20
+SECONDS = 2.0  # of motion in MuJoCo
 FREE = 1.0  # rad or m to each side, of joints without limits
 
 
-def poses(scene: Scene, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies of a scene of trees, in the world: roots at their start
+def simulator_of(scene: Scene) -> Simulator:
+    """A simulator of a scene without what closes loops or couples joints."""
+    trees = tuple(joint for joint in scene.joints if not joint.collides)
+    return Simulator(replace(scene, model="solver", joints=trees, couplings=(), keyframes={}))
+
+
+def poses(simulator: Simulator, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] m centres of mass and [N, 3, 3] axes of all bodies, in the world, after `set_joints`: roots at their start
     poses, joints at `q` (rad, m; a rotation vector for a ball), by name."""
-    trees = replace(scene, joints=tuple(joint for joint in scene.joints if not joint.collides), couplings=())
-    bodies, state = from_scene(trees, Units(1.0, 1.0, 1.0))
-    if bodies.joints is not None:
-        space = JointSpace(bodies, state)
-        values = np.zeros(space.size)
-        for joint, place in zip(trees.joints, space.columns, strict=True):
-            values[place] = q.get(joint.name, 0.0)
-        state = space.set(values, np.zeros(space.size))[0]
-    return state.position, Rotation.from_quat(state.orientation).as_matrix()
+    if simulator.scene.joints:
+        values = simulator.joint_positions
+        for name, place in simulator.joint_columns.items():
+            values[place] = q.get(name, 0.0)
+        simulator.set_joints(values)
+    bodies = [simulator[body.name] for body in simulator.scene.bodies]
+    turns = Rotation.from_quat([body.quat_xyzw for body in bodies]).as_matrix()
+    return np.stack([body.centre for body in bodies]), turns
 
 
 @dataclass(frozen=True)
@@ -72,17 +79,18 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     both = [(k, number[name]) for k, name in ids.items() if name in number and model.body_mass[k] > 0]
     both = [(k, i) for k, i in both if scene.bodies[i].motion == "dynamic"]
     by_name = {joint.name: joint for joint in scene.joints}
-    joints = {j: model.joint(j).name or _named(model, j) for j in range(model.njnt)}
+    joints = {j: model.joint(j).name for j in range(model.njnt)}  # those without a name stay at zero
     rng = np.random.default_rng(seed)
     start = _set(mujoco, model, data, joints, by_name, None)
-    places, turns = poses(scene, start)
+    simulator = simulator_of(scene)
+    turns = poses(simulator, start)[1]
     first = [(data.xmat[k].reshape(3, 3).copy(), turns[i]) for k, i in both]
     axes = {k: ours.T @ theirs for (k, _), (theirs, ours) in zip(both, first, strict=True)}
     apart = turned = 0.0
     # MuJoCo fixes the root of a URDF at the origin; in a scene it is free at its own pose.
     for trial in range(tries + 1):
         values = start if trial == 0 else _set(mujoco, model, data, joints, by_name, rng, axes)
-        places, turns = poses(scene, values)
+        places, turns = poses(simulator, values)
         for (k, i), (theirs, ours) in zip(both, first, strict=True):
             apart = max(apart, float(np.linalg.norm(data.xipos[k] - places[i])))
             change = data.xmat[k].reshape(3, 3) @ theirs.T @ (turns[i] @ ours.T).T
@@ -91,18 +99,44 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
     return Judged(len(both), apart, turned, mass)
 
 
+def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
+    """The largest difference (rad, m) of a joint's position after `SECONDS` in MuJoCo between an MJCF file and an
+    export of the `scene` made from it, and how often in each forces of actuators change their sign by more than a
+    thousandth of the largest. None if it has no actuators."""
+    import mujoco
+
+    export(scene, scene.with_suffix(".xml"), collide="sdf")  # nothing touches: no need to cut meshes
+    ends, turns, start = [], [], {}
+    keys = mujoco.MjModel.from_xml_path(str(source))
+    key = (keys.key(0).name or "key 0") if keys.nkey else "start"
+    for file in (scene.with_suffix(".xml"), source):
+        model = mujoco.MjModel.from_xml_path(str(file))
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        data, forces = mujoco.MjData(model), []
+        if not model.nu:
+            return None
+        if number := [k for k in range(model.nkey) if (model.key(k).name or f"key {k}") == key]:
+            mujoco.mj_resetDataKeyframe(model, data, number[0])
+        # Hinges and slides, all from the export's start, which is within limits.
+        single = {model.joint(j).name: model.jnt_qposadr[j] for j in np.flatnonzero(model.jnt_type > 1)}
+        for name, at in single.items():
+            data.qpos[at] = start.setdefault(name, float(data.qpos[at]))
+        while data.time < SECONDS - 1e-9:
+            mujoco.mj_step(model, data)
+            forces.append(data.actuator_force.copy())
+        force = np.array(forces)
+        sign = np.sign(np.where(np.abs(force) > 1e-3 * np.abs(force).max(), force, 0.0))
+        turns.append(int((sign[1:] * sign[:-1] < 0).sum()))
+        ends.append({name: float(data.qpos[at]) for name, at in single.items()})
+    return max(abs(ends[0][name] - end) for name, end in ends[1].items() if name in ends[0]), turns[1], turns[0]
+
+
 def _mass(scene: Scene, k: int) -> float:
     """kg, of a body including the small balls that have a part of its mass."""
     name = scene.bodies[k].name
     balls = [b for b in scene.bodies if b.collides_with == () and b.name.startswith(f"{name}_")]
     chain = [b for b in balls if b.name.removeprefix(f"{name}_") in {joint.name for joint in scene.joints}]
     return scene.bodies[k].mass + sum(b.mass for b in chain)
-
-
-def _named(model, j: int) -> str:
-    body = int(model.jnt_bodyid[j])
-    count = j - int(model.body_jntadr[body])
-    return f"{model.body(body).name or f'body_{body}'}_joint" + (f"_{count}" if count else "")
 
 
 def _set(
@@ -153,22 +187,29 @@ def main(files: Annotated[list[Path] | None, typer.Argument()] = None) -> None:
     rows: list[tuple[Cell, ...]] = []
     files = files or _all()
     for k, file in enumerate(files):
-        progress(k / len(files), file.name)
+        progress(k / len(files), name := f"{file.parent.name}/{file.name}")
         with tempfile.TemporaryDirectory() as folder:
             try:
-                import_robot(file, Path(folder) / "scene.yaml")
-                scene = load_scene(Path(folder) / "scene.yaml")
-            except SdfsimError as error:
-                refused.append((file.name, *[""] * 6, error.message.replace(f"{file.parent}/", "")[:150]))
+                import_robot(file, out := Path(folder) / "scene.yaml")
+                moved = there_and_back(file, out) if file.suffix != ".urdf" else None
+                scene = load_scene(out)
+            except (SdfsimError, ValueError) as error:
+                message = error.message if isinstance(error, SdfsimError) else f"MuJoCo: {str(error).splitlines()[0]}"
+                refused.append((name, *[""] * 8, message.replace(f"{file.parent}/", "")[:150]))
                 continue
-        counts = (file.name, len(scene.bodies), len(scene.joints))
+        counts = (name, len(scene.bodies), len(scene.joints))
         try:
             found = judge(file, scene)
         except ValueError as error:
-            refused.append((*counts, *[""] * 4, f"MuJoCo: {str(error).splitlines()[0][:100]}"))
+            refused.append((*counts, *[""] * 6, f"MuJoCo: {str(error).splitlines()[0][:100]}"))
             continue
-        rows.append((*counts, found.links, 1e3 * found.apart, math.degrees(found.turned), found.mass, ""))
-    columns = ("file", "bodies", "joints", "links compared", "apart, mm", "turned, degrees", "masses, relative")
+        apart = 1e3 * found.apart, math.degrees(found.turned)
+        there = ("", "") if moved is None else (moved[0], f"{moved[1]} / {moved[2]}")
+        rows.append((*counts, found.links, *apart, found.mass, *there, ""))
+    columns = (
+        "file", "bodies", "joints", "links compared", "apart, mm", "turned, degrees", "masses, relative",
+        "after 2 s of the export", "sign changes",
+    )  # fmt: skip
     measured = f"Largest differences from MuJoCo's models, over the start and {TRIES} random joint configurations."
     write_record("robots", "python -m benchmarks robots", measured, (*columns, "refused"), [*refused, *rows])
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: data, bench, test, cluster, export, record3d, rivals)
+# Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: data, bench, test, cluster, export, learn, record3d, rivals)
 # A second run does nothing, unless pyproject.toml has changed or it names a new extra.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -108,7 +108,7 @@ say "installing Python packages (a few minutes the first time)"
 rm -f .venv/.set-up
 .venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" \
     --config-settings editable_mode=compat --editable ".${extras:+[$extras]}"  # a path, so that type checkers find it too
-# Compiles all parts of the contact step, and the search for contacts.
+# Compiles all parts of the contact step, the search for contacts, and batches.
 .venv/bin/python - <<'PYTHON'
 import sdfsim
 
@@ -117,6 +117,7 @@ for k in range(70):
     many.add(f"{k}", sphere={"radius": 0.1}, position=(k, 0, 0))
 for scene, model in (("tower", "solver"), ("knocked_vase", "solver"), ("door", "solver"), (many, "solver"), ("tower", "gnn")):
     sdfsim.Simulator(f"samples/{scene}.yaml" if isinstance(scene, str) else scene, model).step(2)
+sdfsim.Batch("samples/tower.yaml", 2).step()
 PYTHON
 printf '%s\n%s\n' "$made_from" "${extras//,/ }" >.venv/.set-up
 say "done: $(.venv/bin/python --version), $PWD/.venv"

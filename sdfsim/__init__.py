@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from sdfsim.shape.shape import Shape, load_shape
     from sdfsim.simulate.camera import Camera, Style
     from sdfsim.simulate.simulator import Simulator
+    from sdfsim.simulate.worlds import Batch
 
 # Threads of torch wait for one another by spinning. Beside other programs they take the processor from the threads that
 # they wait for, and a step takes ten times as long. So they spin for some microseconds only, which costs little on a
@@ -41,6 +42,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB version")
 
 __all__ = [
+    "Batch",
     "Camera",
     "Rollout",
     "Scene",
@@ -64,6 +66,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "Batch": "sdfsim.simulate.worlds",
     "Camera": "sdfsim.simulate.camera",
     "Rollout": "sdfsim.physics.rollout",
     "Scene": "sdfsim.scene.builder",

@@ -37,7 +37,7 @@ FLOORS = [
     ["physics"],
     ["learned"],
     ["simulate"],
-    ["data"],
+    ["data", "envs"],
     ["training"],
     ["evaluation"],
     ["apps"],

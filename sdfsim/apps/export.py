@@ -37,7 +37,7 @@ from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.load import load_scene
-from sdfsim.scene.scene import Body, Joint, Scene
+from sdfsim.scene.scene import Body, Effects, Joint, Scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 from sdfsim.simulate.looks import body_colors, framed, is_infinite, shown, with_normals
@@ -256,9 +256,18 @@ def _near(scene: Scene) -> tuple[Scene, list[str]]:
     held = [[np.zeros(3) if k < 0 else arms[k] for k in joint.bodies] for joint in scene.joints]
     joints = tuple(replace(joint, anchor=joint.anchor - arm) for joint, arm in zip(scene.joints, held, strict=True))
     frames = tuple(replace(f, position=f.position - (arms[f.body] if f.body >= 0 else 0.0)) for f in scene.frames)
+    arm = {body.name: own for body, own in zip(bodies, arms, strict=True)}
+    keys = {
+        name: replace(key, bodies={
+            of: (place + Rotation.from_quat(quat).apply(arm[of]), quat, *speeds)
+            for of, (place, quat, *speeds) in key.bodies.items()
+        })
+        for name, key in scene.keyframes.items()
+    }  # fmt: skip
     far = [(shape.name, c) for shape, c in zip(scene.shapes, middles, strict=True) if c.any()]
     notes = [f"{name} is far from its origin: poses are those of its middle, at {numbers(c)} m" for name, c in far]
-    return replace(scene, shapes=tuple(shapes), bodies=tuple(bodies), joints=joints, frames=frames), notes
+    scene = replace(scene, shapes=tuple(shapes), bodies=tuple(bodies), joints=joints, frames=frames, keyframes=keys)
+    return scene, notes
 
 
 def plain_names(names: list[str], ascii: bool = False) -> list[str]:
@@ -579,6 +588,9 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 
 
 def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    # The scene's own start has this name.
+    posed = {name: _posed(take.scene, name) for name in take.scene.keyframes if name != "start"}
+    posed = {name: _refined(replace(take, scene=at))[0].scene for name, at in posed.items()}
     take, left_out = _refined(take)
     scene, left_out = take.scene, [*left_out, *_missing(take)]
     sampled = take.collide == "sdf"
@@ -600,7 +612,6 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         group, allowed = np.zeros_like(group), np.ones((1, 1), dtype=bool)
     meshes: set[str] = set()
     geoms: list[list[str]] = [[] for _ in take.names]
-    places, speeds, controls = [], [], []
     tree, joint_names = jointed.trees(scene), _joint_names(take)
     nodes: dict[int, XML] = {-1: world}
 
@@ -615,7 +626,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
 
     every = list(take.each())
     for k in tree.order:
-        (name, body, shape, color), quat, above = every[k], every[k][1].quat_xyzw, tree.above.get(k)
+        (name, body, shape, color), above = every[k], tree.above.get(k)
         place, turned = jointed.mjcf_pose(scene, tree, k)
         node = add(nodes[above.parent if above else -1], "body", name=name, pos=numbers(place))
         node.set("quat", numbers(_wxyz(turned)))
@@ -624,20 +635,12 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             node.set("mocap", "true")
         elif body.motion == "dynamic":
             if above:
-                start, moving = jointed.mjcf_joint(node, scene, above, k, joint_names[above.joint.name])
-                places += [numbers(start)] * (len(start) > 0)
-                speeds += [numbers(moving)] * (len(moving) > 0)
+                jointed.mjcf_joint(node, above, joint_names[above.joint.name])
             else:
                 add(node, "freejoint", name=f"{name}_free")
             com, tensor = body.scale * shape.com, _inertia(body, shape)
             full = numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
             add(node, "inertial", pos=numbers(com), mass=numbers(body.mass), fullinertia=full)
-        if body.motion == "dynamic" and not above:
-            com, turn = body.scale * shape.com, Rotation.from_quat(quat)
-            # Velocity of the body's own origin, in world axes; and angular velocity, in body axes.
-            speed = body.velocity - np.cross(body.angular_velocity, turn.apply(com))
-            places.append(numbers(body.position, _wxyz(quat)))
-            speeds.append(numbers(speed, turn.inv().apply(body.angular_velocity)))
         rgba = _rgba(shape, color)
         if body.shape in seen:
             mesh = mesh_of(seen[body.shape], body.scale)
@@ -683,13 +686,25 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         add(contact, "pair", **pair)
     if scene.joints:
         ends = [nodes[k] for k in range(len(take.names))] + [world]
-        controls, lines = jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names)
-        left_out += lines
-    if places:
-        start = {"qpos": " ".join(places), "qvel": " ".join(speeds)} | ({"ctrl": numbers(controls)} if controls else {})
-        add(add(root, "keyframe"), "key", name="start", **start)
+        left_out += jointed.mjcf_rest(root, ends, scene, tree, take.names, joint_names, STEP)
+    keys = {name: jointed.mjcf_state(scene, at, tree) for name, at in {"start": scene, **posed}.items()}
+    if keys["start"]:
+        element = add(root, "keyframe")
+        for name, key in keys.items():
+            add(element, "key", name=name, **key)
     _write_xml(out, root)
     return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
+
+
+def _posed(scene: Scene, keyframe: str) -> Scene:
+    """The scene with its bodies, joints and targets of motors as in a keyframe."""
+    from sdfsim.simulate.record import at_frame
+    from sdfsim.simulate.simulator import Simulator
+
+    simulator = Simulator(replace(scene, model="solver", effects=Effects()))
+    simulator.reset(keyframe=keyframe)
+    with simulator.record() as run:
+        return at_frame(scene, run.rollout)
 
 
 def _refined(take: Take) -> tuple[Take, list[str]]:
@@ -744,7 +759,7 @@ def _refined_joint(joint: Joint) -> Joint:
         joint, anchor=k * joint.anchor, start=along * joint.start,
         limits=limits and (limits[0] * along, limits[1] * along),
         length=None if joint.length is None else k * joint.length, damping=joint.damping * push / along,
-        friction=joint.friction * push, spring=spring, motor=motor,
+        friction=joint.friction * push, armature=joint.armature * push / along, spring=spring, motor=motor,
         breaks_force=k**4 * joint.breaks_force, breaks_torque=k**5 * joint.breaks_torque,
     )  # fmt: skip
 

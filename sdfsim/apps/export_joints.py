@@ -106,12 +106,15 @@ def speed_of(scene: Scene, one: Held, child: int) -> np.ndarray:
     return turn.inv().apply(spin - turned) if one.joint.kind == "ball" else np.array(kinds.get(one.joint.kind, []))
 
 
-def left_out(joints: Sequence[Joint], *, breaks: bool = True, spring_of: Sequence[str] = ()) -> list[str]:
-    """Properties of joints that only our own format has, one line each."""
+def left_out(scene: Scene, *, breaks: bool = True, mjcf: bool = False, spring_of: Sequence[str] = ()) -> list[str]:
+    """What only our own format has of joints, or also `mjcf`, one line each."""
+    joints = scene.joints
     lines = {
         "the loads at which joints break": breaks
         and any(np.isfinite([j.breaks_force, j.breaks_torque]).any() for j in joints),
         "the restitution of joints' limits": any(j.restitution for j in joints),
+        "armature of joints": not mjcf and any(j.armature for j in joints),
+        "keyframes": not mjcf and bool(scene.keyframes),
     }
     lines |= {f"springs of {kind}s": any(j.kind == kind and j.spring for j in joints) for kind in spring_of}
     return [line for line, there in lines.items() if there]
@@ -148,33 +151,55 @@ def mjcf_pose(scene: Scene, tree: Trees, k: int) -> tuple[np.ndarray, np.ndarray
     return other.inv().apply(here - there), (other.inv() * turn).as_quat()
 
 
-def mjcf_joint(node: Element, scene: Scene, one: Held, child: int, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Write the joint that holds a body, and return its part of qpos and of qvel."""
-    joint, start = one.joint, one.joint.start
-    speed = speed_of(scene, one, child)
+def mjcf_joint(node: Element, one: Held, name: str) -> None:
+    """Write the joint that holds a body."""
+    joint = one.joint
     if joint.kind == "fixed":
-        return np.zeros(0), speed
+        return
     keys = {"type": {"hinge": "hinge", "slider": "slide", "ball": "ball"}[joint.kind], "pos": numbers(one.anchor)}
     if joint.kind != "ball":
-        keys |= {"axis": numbers(one.axis()), "ref": numbers(start)}
-    keys |= {"damping": numbers(joint.damping)} if joint.damping else {}
-    keys |= {"frictionloss": numbers(joint.friction)} if joint.friction else {}
+        keys |= {"axis": numbers(one.axis()), "ref": numbers(joint.start)}
+    drags = {"damping": joint.damping, "frictionloss": joint.friction, "armature": joint.armature}
+    keys |= {key: numbers(value) for key, value in drags.items() if value}
     if joint.limits is not None:
         keys |= {"limited": "true", "range": numbers(joint.limits)}
     if joint.spring is not None:
         keys |= {"stiffness": numbers(joint.spring.stiffness), "springref": numbers(joint.spring.rest)}
     add(node, "joint", name=name, **keys)
-    return (np.array([1.0, 0.0, 0.0, 0.0]) if joint.kind == "ball" else np.array([start])), speed
+
+
+def mjcf_state(scene: Scene, posed: Scene, tree: Trees) -> dict[str, str]:
+    """The attributes qpos, qvel and ctrl of a keyframe for bodies and joints as in `posed`; the model has them as in
+    `scene`."""
+    joints = {joint.name: joint for joint in posed.joints}
+    places, speeds = [], []
+    for k in tree.order:
+        (here, turn), body, one = place(posed.bodies[k]), posed.bodies[k], tree.above.get(k)
+        if body.motion == "dynamic" and one is None:
+            # Velocity of the body's own origin, in world axes; and angular velocity, in body axes.
+            arm = turn.apply(body.scale * scene.shapes[body.shape].com)
+            fast = body.velocity - np.cross(body.angular_velocity, arm)
+            places += [here, np.roll(body.quat_xyzw, 1)]
+            speeds += [fast, turn.inv().apply(body.angular_velocity)]
+        elif one is not None and one.joint.kind != "fixed":
+            before, now = (Rotation.from_quat(mjcf_pose(of, tree, k)[1]) for of in (scene, posed))
+            ball = one.joint.kind == "ball"
+            places.append(np.roll((before.inv() * now).as_quat(), 1) if ball else [joints[one.joint.name].start])
+            speeds.append(speed_of(posed, one, k))
+    motors = [j.motor for j in posed.joints if j.motor and j.name not in {joint.name for joint in tree.loops}]
+    goals = [motor.speed if motor.speed is not None else motor.position or 0.0 for motor in motors]
+    found = {"qpos": places, "qvel": speeds, "ctrl": goals}
+    return {key: numbers(*values) for key, values in found.items() if values}
 
 
 def mjcf_rest(
-    root: Element, sites: Sequence[Element], scene: Scene, tree: Trees, bodies: Sequence[str], names: dict[str, str]
-) -> tuple[list[float], list[str]]:
-    """Write loops, distances, motors and excluded contacts. Returns the controls [U] at the start, and what is left
-    out. `sites` are the elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and
-    joints."""
-    lines, controls = left_out(scene.joints), []
-    lines += ["keyframes"] if scene.keyframes else []
+    root: Element, sites: Sequence[Element], scene: Scene, tree: Trees, bodies: Sequence[str], names: dict[str, str],
+    step: float,
+) -> list[str]:  # fmt: skip
+    """Write loops, distances, motors and excluded contacts. Returns what is left out. `sites` are the
+    elements of the bodies, the world's last; `bodies` and `names` are the names of bodies and joints, `step`
+    [s] is MuJoCo's."""
+    lines = left_out(scene, mjcf=True)
     tags = ("equality", "tendon", "actuator", "contact")
     into = {tag: Element(tag) for tag in tags}
 
@@ -234,22 +259,21 @@ def mjcf_rest(
         keys |= {"forcerange": numbers((-joint.motor.max_force, joint.motor.max_force))}
         if joint.motor.speed is not None:
             add(into["actuator"], "velocity", kv=numbers(kv), **keys)
-            controls.append(joint.motor.speed)
         elif joint.motor.position is not None:
             add(into["actuator"], "position", kp=numbers(kp), kv=numbers(kv), **keys)
-            controls.append(joint.motor.position)
         else:  # no target is set
             add(into["actuator"], "motor", **keys)
-            controls.append(0.0)
     if any(joint.kind == "ball" and joint.limits for joint in scene.joints):
         lines.append("that a cone bounds only the lean of a ball: MuJoCo bounds its whole rotation")
+    for held_so in into["equality"]:  # as stiff as the step allows: here they are rigid
+        held_so.attrib |= {"solref": numbers(2.0 * step, 1.0), "solimp": "0.99 0.999 0.001"}
     for tag in tags:
         before = root.find(tag)
         if len(into[tag]) and before is not None:
             before.extend(into[tag])
         elif len(into[tag]):
             root.append(into[tag])
-    return controls, lines
+    return lines
 
 
 # --- URDF ---
@@ -282,7 +306,7 @@ def urdf_joint(root: Element, one: Held, child: int, names: dict[str, str], link
 
 def urdf_left_out(scene: Scene, tree: Trees) -> list[str]:
     """What a URDF leaves out of joints, one line each."""
-    lines = left_out(scene.joints, spring_of=("hinge", "slider"))
+    lines = left_out(scene, spring_of=("hinge", "slider"))
     lines += [f"joint {joint.name}: URDF supports trees only" for joint in tree.loops if joint.kind in NESTING]
     lines += [
         f"joint {joint.name}: URDF has no {joint.kind} joints" for joint in tree.loops if joint.kind not in NESTING
@@ -311,7 +335,7 @@ def usd_joints(
         "hinge": physics.RevoluteJoint, "slider": physics.PrismaticJoint, "ball": physics.SphericalJoint,
         "fixed": physics.FixedJoint, "distance": physics.DistanceJoint,
     }  # fmt: skip
-    lines = left_out(scene.joints, breaks=False)
+    lines = left_out(scene, breaks=False)
     stage.DefinePrim("/World/joints", "Scope")
     for joint in scene.joints:
         made = made_of[joint.kind].Define(stage, f"/World/joints/{names[joint.name]}")

@@ -2,7 +2,7 @@
 all defaults, frames, inertias and includes, and refuses anything that is not MJCF."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.export import rebound
-from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Pose, Robot, moved, named, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Pose, Robot, named
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.lazy import optional
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
 from sdfsim.scene.joints import joint_axes
+from sdfsim.shape.parts import Part, moved, pose_of
 
 START = "start"  # the keyframe that our own exports have
 SOFTEST = 1.99  # damping ratio from which contacts count as not rebounding
@@ -126,6 +127,7 @@ class _Reader:
         self.mj, self.path, self.model, self.data = mujoco, path, model, mujoco.MjData(model)
         self.left: list[str] = []
         self.notes: list[str] = []
+        self.keyed: dict[str, list[float]] = {}  # targets of motors in the keyframes
         self._switched_off()
         keys = [model.key(k).name or f"key {k}" for k in range(model.nkey)]
         if key is not None and key not in keys:
@@ -187,16 +189,18 @@ class _Reader:
             links += [link for link, _ in made]
             geoms += [own for _, own in made]
         joints = [joint for b in range(1, model.nbody) for joint in self._joints(b)]
-        motors = {} if "actuation" in self.off else self._motors()
+        couplings = tuple(self._couplings())
+        motors = {} if "actuation" in self.off else self._motors(couplings)
         joints = [replace(joint, motor=motors.get(joint.name)) for joint in joints]
-        if rotors := sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(model.dof_armature)}):
-            self.left.append(named("armature of joints", list(map(self._joint_name, rotors))))
+        free = model.jnt_type[model.dof_jntid] == int(self.mj.mjtJoint.mjJNT_FREE)
+        rotors = sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(free & (model.dof_armature > 0.0))})
+        if rotors:
+            self.left.append(named("armature of free joints", list(map(self._joint_name, rotors))))
         joints += [*self._loops(), *self._ropes()]
         apart = self._apart(geoms)
         meets = self.off.isdisjoint(("contact", "constraint"))
         self._left_out([g for own in geoms for g in own] if meets else [])
         links = self._slippery(links, geoms, apart) if meets else links
-        couplings = tuple(self._couplings())
         ends = model.wrap_objid[model.wrap_type == int(self.mj.mjtWrap.mjWRAP_SITE)]  # those of tendons are no frames
         frames = [self._frame(s) for s in range(model.nsite) if s not in ends and model.site(s).name]
         return Robot(
@@ -213,34 +217,40 @@ class _Reader:
         return name, k, pose_of(model.site_pos[s], Rotation.from_quat(np.roll(model.site_quat[s], -1)))
 
     def _keyframes(self) -> dict[str, Pose]:
-        """The keyframes of the file: joints within their limits, at rest."""
+        """The keyframes of the file: joints within their limits."""
         model, mj, found, start = self.model, self.mj, {}, self.data
-        types, moving = mj.mjtJoint, []
-        for number, name in enumerate(self.keys):
+        types = mj.mjtJoint
+        for number, key in enumerate(self.keys):
             data = mj.MjData(model)
             mj.mj_resetDataKeyframe(model, data, number)
-            mj.mj_kinematics(model, data)
+            mj.mj_forward(model, data)
             joints: dict[str, Any] = {}
-            links: dict[int, np.ndarray] = {}
+            speeds: dict[str, Any] = {}
+            links: dict[int, tuple[np.ndarray, ...]] = {}
             for j in range(model.njnt):
                 kind, at, b = types(int(model.jnt_type[j])), model.jnt_qposadr[j], int(model.jnt_bodyid[j])
+                name, moves = self._joint_name(j), data.qvel[model.jnt_dofadr[j] :]
                 turns = Rotation.from_matrix(np.stack([d.xmat[b].reshape(3, 3) for d in (start, data)]))
                 if kind == types.mjJNT_FREE:
-                    links[self.link[b]] = pose_of(data.xpos[b], turns[1])
+                    fast = np.zeros(6)
+                    mj.mj_objectVelocity(model, data, mj.mjtObj.mjOBJ_BODY, b, fast, 0)
+                    links[self.link[b]] = pose_of(data.xpos[b], turns[1]), fast[3:], fast[:3]
                 elif kind == types.mjJNT_BALL:
                     parent = model.body_parentid[b]
                     there = Rotation.from_matrix(np.stack([d.xmat[parent].reshape(3, 3) for d in (start, data)]))
                     turn = there[0] * there[1].inv() * turns[1] * turns[0].inv()
                     axis = turns[0].as_matrix()[:, 0] if model.jnt_limited[j] else None
                     axes = joint_axes(axis)
-                    joints[self._joint_name(j)] = (axes.inv() * turn * axes).as_quat()
+                    joints[name] = (axes.inv() * turn * axes).as_quat()
+                    spin = turns[1].apply(moves[:3])
+                    speeds |= {name: (there[1] * there[0].inv() * axes).inv().apply(spin)} if np.any(spin) else {}
                 else:
                     value, ends = float(data.qpos[at]), model.jnt_range[j]
-                    joints[self._joint_name(j)] = float(np.clip(value, *ends)) if model.jnt_limited[j] else value
-            found[name] = Pose(joints, links)
-            moving += [name] if np.any(model.key_qvel[number]) else []
-        if moving:
-            self.left.append(named("velocities of keyframes", moving))
+                    joints[name] = float(np.clip(value, *ends)) if model.jnt_limited[j] else value
+                    speeds |= {name: float(moves[0])} if moves[0] else {}
+            # A keyframe that says nothing of controls has zeros; motors then aim at its positions.
+            goals = self.keyed.items() if np.any(model.key_ctrl[number]) else ()
+            found[key] = Pose(joints, links, speeds, {name: keyed[number] for name, keyed in goals})
         return found
 
     def _couplings(self) -> Iterator[tuple[str, str, float, float]]:
@@ -478,7 +488,8 @@ class _Reader:
             if kind == types.mjJNT_FREE:
                 return []
             name, limited = self._joint_name(j), bool(model.jnt_limited[j])
-            others = {"damping": float(model.dof_damping[dof]), "friction": float(model.dof_frictionloss[dof])}
+            others = {"damping": float(model.dof_damping[dof]), "friction": float(model.dof_frictionloss[dof]),
+                      "armature": float(model.dof_armature[dof])}  # fmt: skip
             others = {key: value for key, value in others.items() if value}
             held = {"name": name, "child": child, "parent": parent, "anchor": data.xanchor[j].copy(), "others": others}
             if any(np.any(getattr(model, poly)[k]) for poly, k in (("dof_dampingpoly", dof), ("jnt_stiffnesspoly", j))):
@@ -501,33 +512,55 @@ class _Reader:
             found.append(LinkJoint(kind="hinge" if kind == types.mjJNT_HINGE else "slider", **held))
         return found
 
-    def _motors(self) -> dict[str, dict[str, float]]:
-        """Actuators of hinges and slides, by their joints: those that keep a speed or a position, and those that give a
-        torque, which do nothing until it is set."""
+    def _drives(self, k: int, couplings: Sequence[tuple[str, str, float, float]]) -> tuple[int, float, float] | None:
+        """The joint that actuator `k` drives, and its length as number x position + number. None for what
+        is not a hinge or slide, or a fixed tendon of joints that all follow one of them by `couplings`."""
         model, mj = self.model, self.mj
-        found: dict[str, dict[str, float]] = {}
+        of, gear = int(model.actuator_trnid[k, 0]), float(model.actuator_gear[k, 0])
+        kind = int(model.actuator_trntype[k])
+        parts = [(of, 1.0)] if kind in (int(mj.mjtTrn.mjTRN_JOINT), int(mj.mjtTrn.mjTRN_JOINTINPARENT)) else []
+        if kind == int(mj.mjtTrn.mjTRN_TENDON):
+            at = range(int(model.tendon_adr[of]), int(model.tendon_adr[of] + model.tendon_num[of]))
+            if all(model.wrap_type[w] == int(mj.mjtWrap.mjWRAP_JOINT) for w in at):
+                parts = [(int(model.wrap_objid[w]), float(model.wrap_prm[w])) for w in at]
+        numbers = {self._joint_name(j): j for j in range(model.njnt)}
+        follows = {first: (second, ratio, offset) for first, second, ratio, offset in couplings}
+        found, ratio, offset = set(), 0.0, 0.0
+        for j, arm in parts:
+            name = self._joint_name(j)
+            for _ in follows if len(parts) > 1 else ():
+                if name in follows:
+                    name, by, shift = follows[name]
+                    offset, arm = offset + arm * shift, arm * by
+            found.add(numbers[name])
+            ratio += arm
+        moves = (int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE))
+        (joint,) = found if len(found) == 1 else (-1,)
+        return (joint, gear * ratio, gear * offset) if joint >= 0 and model.jnt_type[joint] in moves else None
+
+    def _motors(self, couplings: Sequence[tuple[str, str, float, float]]) -> dict[str, dict[str, Any]]:
+        """Actuators of hinges and slides, by their joints: those that keep a speed or a position, and those that give a
+        torque, which do nothing until it is set. Each with what it has in every keyframe."""
+        model, mj = self.model, self.mj
+        found: dict[str, dict[str, Any]] = {}
         others, freely, idle = [], [], []
         for k in range(model.nu):
-            called = model.actuator(k).name or f"number {k}"
-            joint = int(model.actuator_trnid[k, 0])
-            of_joint = int(model.actuator_trntype[k]) == int(mj.mjtTrn.mjTRN_JOINT)
-            kind = mj.mjtJoint(int(model.jnt_type[joint])) if of_joint else None
-            turns = kind in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE)
-            name = self._joint_name(joint) if of_joint else ""
-            gear, gain, bias = (array[k].copy() for array in (
-                model.actuator_gear[:, 0], model.actuator_gainprm, model.actuator_biasprm
-            ))  # fmt: skip
+            called, driven = model.actuator(k).name or f"number {k}", self._drives(k, couplings)
+            joint, gear, shift = driven or (0, 0.0, 0.0)
+            name = self._joint_name(joint) if driven else ""
+            gain, bias = (array[k].copy() for array in (model.actuator_gainprm, model.actuator_biasprm))
             linear = int(model.actuator_gaintype[k]) == int(mj.mjtGain.mjGAIN_FIXED)
             linear &= int(model.actuator_dyntype[k]) == int(mj.mjtDyn.mjDYN_NONE)
             affine = int(model.actuator_biastype[k]) == int(mj.mjtBias.mjBIAS_AFFINE)
             alone = int(model.actuator_biastype[k]) == int(mj.mjtBias.mjBIAS_NONE)
             bias = np.zeros(3) if alone else bias
-            plain = (affine and bias[0] == 0.0) or alone
-            if not (turns and linear and plain and gear) or name in found or bias[1] > 0 or bias[2] > 0:
+            torque = not (bias[1] or bias[2])
+            plain = (affine and not (torque and bias[0])) or alone
+            if not (linear and plain and gear) or name in found or bias[1] > 0 or bias[2] > 0:
                 others.append(called)
                 continue
-            torque = not (bias[1] or bias[2])
-            # Its force at the joint is gear x (gain x control + bias[1] x gear x place + bias[2] x gear x speed).
+            # Its force at the joint is gear x (gain x control + bias[0] + bias[1] x (gear x place + shift) + bias[2] x
+            # gear x speed).
             bounds = [abs(gear) * np.abs(model.actuator_forcerange[k]).max()] * bool(model.actuator_forcelimited[k])
             bounds += [np.abs(model.jnt_actfrcrange[joint]).max()] * bool(model.jnt_actfrclimited[joint])
             reach = np.abs(model.actuator_ctrlrange[k]).max() * abs(gear * gain[0])
@@ -536,26 +569,27 @@ class _Reader:
             if not most > 0.0:
                 most = UNBOUNDED
                 freely.append(called)
-            wanted = gain[0] * float(self.data.ctrl[k])
+            wanted = gain[0] * np.append(self.data.ctrl[k], model.key_ctrl[:, k]) + bias[0] + bias[1] * shift
             if torque:
                 found[name] = {"max_force": most}
                 idle.append(called)
             elif bias[1] < 0:
-                goal = wanted / (-bias[1] * gear)
+                goal, *keyed = (wanted / (-bias[1] * gear)).tolist()
                 if model.jnt_limited[joint] and goal != (near := float(np.clip(goal, *model.jnt_range[joint]))):
                     self.notes.append(f"actuator {called} aims at {goal:.6g}: {near:.6g} is the nearest of its limits")
                     goal = near
                 stiff = float(-bias[1] * gear**2)
                 found[name] = {"position": goal, "max_force": most, "gain": stiff, "time": float(bias[2] / bias[1])}
+                self.keyed[name] = keyed
             else:
-                speed, gain = wanted / (-bias[2] * gear), float(-bias[2] * gear**2)
-                found[name] = {"speed": speed, "max_force": most, "gain": gain}
+                speed, *self.keyed[name] = (wanted / (-bias[2] * gear)).tolist()
+                found[name] = {"speed": speed, "max_force": most, "gain": float(-bias[2] * gear**2)}
         if idle:
             self.notes.append(named("motors do nothing until an effort or a target of their joint is set", idle))
         if freely:
             self.notes.append(named(f"actuators without a force limit get one of {UNBOUNDED:g}", freely))
         if others:
-            what = "actuators other than motor, position and velocity of a hinge or slide"
+            what = "actuators other than motor, position and velocity of a hinge, slide or a tendon that moves one"
             self.left.append(named(what, others))
         return found
 
@@ -604,6 +638,8 @@ class _Reader:
         }
         coupled = {int(model.eq_obj1id[k]) for k in range(model.neq)
                    if int(model.eq_type[k]) == int(mj.mjtEq.mjEQ_TENDON) and self._couples(k)}  # fmt: skip
+        driven = {int(model.actuator_trnid[k, 0]) for k in range(model.nu)
+                  if int(model.actuator_trntype[k]) == int(mj.mjtTrn.mjTRN_TENDON)}  # fmt: skip
         found, others = [], []
         for k in range(model.ntendon):
             name, first = model.tendon(k).name or f"tendon_{k}", model.tendon_adr[k]
@@ -614,7 +650,7 @@ class _Reader:
             stiff, low = float(model.tendon_stiffness[k]), float(model.tendon_range[k, 0])
             rope = bool(model.tendon_limited[k])
             known = len(sites) == len(wraps) == 2 and moves and both[0] != both[1]
-            if k in coupled and not (rope or stiff):
+            if (k in coupled or k in driven) and not (rope or stiff or (k in driven and model.tendon_damping[k])):
                 continue
             if not known or not (rope or stiff or k in rods) or (rope and low > NEAR):
                 others.append(name)

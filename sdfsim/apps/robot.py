@@ -14,35 +14,17 @@ from scipy.spatial.transform import Rotation
 from sdfsim.apps.export import plain_names
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
-from sdfsim.geometry.mesh import Mesh, convex_hull, is_closed, joined, signed_volume
-from sdfsim.geometry.skins import Painted, one_skin
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import WORLD
-from sdfsim.shape.make import analytic_shape, fit_pieces, mesh_shape
+from sdfsim.shape.parts import GREY, Part, color_of, mesh_of, moved, pose_of, primitive_of, skin_of, solid_of, textured
 from sdfsim.shape.shape import Shape
 
 FLOOR = "floor"
 SMALL_PART = 0.02  # relative to a link's mass: mass of a ball between two of its joints
 EVEN = 1e-5  # relative: largest deviation from evenly spread mass at which it is written as such
-CONVEX = 1e-3  # relative: how much less volume than its hull a convex mesh may have
 OVERLAP = 2e-3  # relative to the smaller size: links that overlap deeper at the start do not touch each other
 MOST_NAMED = 6  # names in a line of the report
-GREY = (180, 180, 185)
 UNBOUNDED = 1e6  # N m or N, for a motor without a limit in the file
-
-PartKind = Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh"]
-
-
-@dataclass(frozen=True)
-class Part:
-    """A geometry of a link."""
-
-    kind: PartKind
-    pose: np.ndarray  # [4, 4] in the link
-    sizes: dict[str, Any] = field(default_factory=dict)  # m, as scene.yaml has them: size, radius, height
-    mesh: Mesh | None = None  # m, of the kind "mesh"
-    where: str = ""  # file, line and element, for messages
-    color: tuple[int, int, int] | None = None  # sRGB
 
 
 @dataclass(frozen=True)
@@ -90,10 +72,13 @@ class LinkJoint:
 @dataclass(frozen=True)
 class Pose:
     """A keyframe: positions of joints (rad, m; a quaternion [4] xyzw for a ball) by their names, and poses [4, 4] in
-    the world of links that no joint holds, by their numbers."""
+    the world of links that no joint holds with their velocities [3] m/s, of the centre of mass, and angular velocities
+    [3] rad/s, by their numbers; speeds of joints, and targets of their motors."""
 
     joints: dict[str, Any]
-    links: dict[int, np.ndarray]
+    links: dict[int, tuple[np.ndarray, ...]]
+    speeds: dict[str, Any]
+    targets: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -116,20 +101,6 @@ def named(what: str, names: Sequence[str]) -> str:
     """`what (3: a, b, c)`, for a line of the report."""
     more = ", ..." if len(names) > MOST_NAMED else ""
     return f"{what} ({len(names)}: {', '.join(names[:MOST_NAMED])}{more})"
-
-
-def pose_of(place: Any = (0.0, 0.0, 0.0), turn: Rotation | None = None) -> np.ndarray:
-    """[4, 4] of a place [3] and a rotation."""
-    made = np.eye(4)
-    made[:3, 3] = place
-    if turn is not None:
-        made[:3, :3] = turn.as_matrix()
-    return made
-
-
-def moved(mesh: Mesh, pose: np.ndarray) -> Mesh:
-    """A mesh, transformed by `pose`."""
-    return replace(mesh, vertices=mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
 
 
 # --- to a scene ---
@@ -221,7 +192,15 @@ def _add_poses(scene: SceneBuilder, robot: Robot, names: list[str], poses: list[
             elif joint in kinds:
                 keys["positions" if kinds[joint] == "slider" else "quats_xyzw"][joint] = _round(value)
         shapes = {k: np.linalg.inv(robot.links[k].pose) @ poses[k] for k in key.links}
-        keys["bodies"] = {names[k]: placed(pose_of(lift) @ pose @ shapes[k]) for k, pose in key.links.items()}
+        for joint, speed in key.speeds.items():
+            if joint in kinds:
+                keys.setdefault("spins" if kinds[joint] == "ball" else "speeds", {})[joint] = _round(speed)
+        keys["targets"] = {joint: _round(value) for joint, value in key.targets.items() if joint in kinds}
+        keys["bodies"] = {
+            names[k]: placed(pose_of(lift) @ pose @ shapes[k])
+            | {what: _round(v) for what, v in zip(("velocity", "angular_velocity"), fast, strict=True) if np.any(v)}
+            for k, (pose, *fast) in key.links.items()
+        }
         scene.keyframe(name, **{what: found for what, found in keys.items() if found})
     for first, second, ratio, given in robot.couplings:
         offset = float(np.round(given, 12))
@@ -295,7 +274,7 @@ def _merged(robot: Robot, taken: set[str]) -> Robot:
         notes=tuple(notes),
         frames=tuple((name, k, np.linalg.inv(whole[k].pose) @ pose if k >= 0 else pose) for name, k, pose in there),
         keyframes={
-            name: Pose(key.joints, {number[k]: pose for k, pose in key.links.items() if k in number})
+            name: replace(key, links={number[k]: pose for k, pose in key.links.items() if k in number})
             for name, key in robot.keyframes.items()
         },
     )
@@ -382,18 +361,9 @@ def _spread(link: Link) -> np.ndarray:
     """[3, 3] kg m^2, the approximate inertia of a link; if unknown, that of a ball of its size."""
     if link.inertia is not None:
         return link.inertia
-    parts = [_mesh(part).vertices for part in (link.solid or link.shown) if part.kind != "plane"]
+    parts = [mesh_of(part).vertices for part in (link.solid or link.shown) if part.kind != "plane"]
     size = max((float(np.ptp(points, axis=0).max()) for points in parts), default=0.1)
     return 0.1 * link.mass * size**2 * np.eye(3)
-
-
-def _mesh(part: Part) -> Mesh:
-    return moved(_primitive(part, "").mesh if part.mesh is None else part.mesh, part.pose)
-
-
-def _primitive(part: Part, name: str) -> Shape:
-    kind: Any = part.kind
-    return analytic_shape(kind, name=name, **part.sizes)
 
 
 def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], np.ndarray, dict[str, Any]]:
@@ -416,10 +386,11 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
         parts = [Part("sphere", pose_of(link.com), {"radius": radius})]
     density = 1000.0
     if len(parts) == 1 and parts[0].mesh is None:
-        frame, shape = parts[0].pose, _primitive(parts[0], link.name)
+        frame, shape = parts[0].pose, primitive_of(parts[0], link.name)
         keys: dict[str, Any] = {parts[0].kind: {key: _round(value) for key, value in parts[0].sizes.items()}}
     else:
-        frame, keys, shape = np.eye(4), {"asset": link.name}, _solid(link, parts, notes)
+        frame, keys, shape = np.eye(4), {"asset": link.name}, solid_of(parts, link.name)
+        notes += [f"link {link.name}: {note}" for note in shape.source.pop("notes", [])]
     shape, look = _dressed(link, shape, frame)
     mass: dict[str, Any] = {}
     if not link.still:
@@ -461,77 +432,16 @@ def _possible(link: Link, tensor: np.ndarray, even: np.ndarray, notes: list[str]
     return tensor
 
 
-def _solid(link: Link, parts: list[Part], notes: list[str]) -> Shape:
-    """The shape of several parts, or of a mesh, in the link's frame. If all parts are convex, they are the pieces that
-    collide."""
-    meshes, convex = [], []
-    for part in parts:
-        mesh = _mesh(part)
-        if part.mesh is None:
-            meshes.append(mesh)
-            convex.append(mesh)
-            continue
-        try:
-            hull = convex_hull(mesh.vertices)
-        except SdfsimError as error:
-            raise SdfsimError(
-                f"{part.where}: the mesh is flat, so it cannot be a body", "give it a thickness"
-            ) from error
-        closed = is_closed(mesh)
-        if closed and abs(signed_volume(mesh)) >= (1.0 - CONVEX) * signed_volume(hull):
-            convex.append(hull)
-        meshes.append(mesh)
-    if len(convex) == len(parts) > 1:
-        return fit_pieces(convex, name=link.name, kind="grid")
-    try:
-        shape = mesh_shape(joined(meshes), name=link.name, kind="mesh")
-    except SdfsimError as error:
-        notes.append(f"link {link.name}: its convex hull replaces it ({error.message})")
-        hulls = [convex_hull(mesh.vertices) for mesh in meshes]
-        shape = fit_pieces(hulls, name=link.name, kind="grid")
-    source = {key: value for key, value in shape.source.items() if key != "notes"}
-    return replace(shape, source=source)
-
-
 def _dressed(link: Link, shape: Shape, frame: np.ndarray) -> tuple[Shape, dict[str, Any]]:
     """A shape with the shown mesh of its link, with its colours and textures. If that is the solid itself, in one
     colour, the body's key for its colour instead."""
     parts = [part for part in (link.shown or link.solid) if part.kind != "plane"]
-    if not link.solid or [_same(part) for part in parts] == [_same(part) for part in link.solid]:
-        colors = {_color(part) for part in parts}
-        if len(colors) <= 1 and not any(map(_textured, parts)):
+    if not link.solid or [mesh_of(part).digest() for part in parts] == [mesh_of(part).digest() for part in link.solid]:
+        colors = {color_of(part) for part in parts}
+        if len(colors) <= 1 and not any(map(textured, parts)):
             (color,) = colors or {None}
             return shape, {"color": [*color]} if color else {}
-    skin = one_skin([_painted(part, np.linalg.inv(frame)) for part in parts])
-    return (shape if skin is None else replace(shape, skin=skin)), {}
-
-
-def _color(part: Part) -> tuple[int, ...] | None:
-    """The colour of a part, or the mean of its mesh's."""
-    if part.color or part.mesh is None or part.mesh.colors is None:
-        return part.color
-    return tuple(int(c) for c in part.mesh.colors.mean(0))
-
-
-def _textured(part: Part) -> bool:
-    own = part.mesh
-    return part.color is None and own is not None and own.uv is not None and own.texture is not None
-
-
-def _painted(part: Part, back: np.ndarray) -> Painted:
-    """A part with its colour, or with the texture of its mesh."""
-    mesh, own = moved(_mesh(part), back), part.mesh
-    if own is not None and own.texture is not None and own.uv is not None and _textured(part):
-        return Painted(mesh.vertices, mesh.faces, own.uv, own.texture)
-    color = np.array([[_color(part) or GREY]], np.uint8)
-    return Painted(mesh.vertices, mesh.faces, np.full((len(mesh.vertices), 2), 0.5), color)
-
-
-def _same(part: Part) -> tuple:
-    """A key that is equal for equal parts."""
-    mesh = None if part.mesh is None else part.mesh.digest()
-    sizes = [(key, np.round(value, 9).tolist()) for key, value in sorted(part.sizes.items())]
-    return part.kind, tuple(np.round(part.pose, 9).ravel() + 0.0), str(sizes), mesh
+    return replace(shape, skin=skin_of(parts, frame)), {}
 
 
 # --- which links touch ---

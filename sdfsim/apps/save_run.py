@@ -5,7 +5,7 @@ from pathlib import Path
 from sdfsim.apps.play import saved
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.rollout import Rollout
-from sdfsim.simulate.record import Recording
+from sdfsim.simulate.record import Recording, at_frame
 from sdfsim.simulate.simulator import Simulator
 
 
@@ -20,4 +20,4 @@ def save_run(simulator: Simulator, run: Recording | Rollout, folder: Path | str)
         )
     if not len(rollout):
         raise SdfsimError("run: has no step", "make steps inside the block: with simulator.record() as run: ...")
-    return saved.save_run(saved.at_frame(simulator.scene, rollout), rollout, Path(folder))
+    return saved.save_run(at_frame(simulator.scene, rollout), rollout, Path(folder))

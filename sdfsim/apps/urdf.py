@@ -17,11 +17,12 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Part, Robot, moved, pose_of
+from sdfsim.apps.robot import UNBOUNDED, Link, LinkJoint, Robot
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, Loaded, load_textured
 from sdfsim.scene.scene import WORLD
+from sdfsim.shape.parts import Part, moved, pose_of
 
 MOST_BYTES = 64 * 2**20  # largest size of a file
 OPTIONAL = re.compile(r"\$\((?:opt)?env +(\w+)([^()]*)\)")  # of ROS: an environment variable, or else the rest
@@ -373,7 +374,7 @@ class _Reader:
                 raise self.wrong(element, f"no such file: {name} (looked for {tried})", "give its folder: --packages")
             if place not in self.meshes:
                 try:
-                    self.meshes[place] = load_textured(place)
+                    self.meshes[place] = load_textured(place, upright=False)
                 except SdfsimError as error:
                     hint = error.hint or "use " + " ".join(MESH_SUFFIXES)
                     raise self.wrong(element, error.message, hint) from error

@@ -9,12 +9,14 @@ import numpy as np
 from sdfsim.geometry.mesh_formats import FileMesh
 
 WHITE = (255, 255, 255)
+# The axes of a file that become x, y and z, by its `up_axis`: right, in, with the sign turned, and up.
+UPRIGHT = {"X_UP": ((1, 2, 0), (-1, -1, 1)), "Y_UP": ((0, 2, 1), (1, -1, 1)), "Z_UP": ((0, 1, 2), (1, 1, 1))}
 
 
-def collada_surface(path: Path) -> FileMesh:
-    """The triangles of all instances in the file's scene, in metres. Its axes are taken as they are, whatever `up_axis`
-    says: robot files rely on that, as RViz and Gazebo do it. Raises ValueError if there are none, and the errors of the
-    reader if it is damaged."""
+def collada_surface(path: Path, *, upright: bool) -> FileMesh:
+    """The triangles of all instances in the file's scene, in metres, with z up. Unless `upright`, its axes are taken as
+    they are, whatever `up_axis` says: robot files rely on that, as RViz, MoveIt and Gazebo do it. Raises ValueError if
+    there are none, and the errors of the reader if it is damaged."""
     collada: Any = importlib.import_module("collada")  # few need it
     file = collada.Collada(str(path), ignore=[collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError])
     vertices, faces, colors, first, textured = [], [], [], 0, False
@@ -37,10 +39,12 @@ def collada_surface(path: Path) -> FileMesh:
     if not faces:
         raise ValueError("it has no triangles in its scene")
     notes = ["its textures are left out"] if textured else []
-    if file.assetInfo.upaxis != "Z_UP":
-        notes.append(f"its up axis, {file.assetInfo.upaxis}, is taken as z, as in RViz")
+    up = file.assetInfo.upaxis or "Y_UP"
+    if up != "Z_UP":
+        notes.append(f"its up axis, {up[0].lower()}, is {'turned to z' if upright else 'taken as z, as in RViz'}")
     unit = float(file.assetInfo.unitmeter or 1.0)
-    whole = unit * np.concatenate(vertices).astype(np.float64)
+    order, signs = UPRIGHT[up if upright else "Z_UP"]
+    whole = unit * np.concatenate(vertices).astype(np.float64)[:, order] * signs
     return FileMesh(whole, np.concatenate(faces), np.concatenate(colors), notes=tuple(notes))
 
 

@@ -41,14 +41,14 @@ class Loaded(NamedTuple):
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh (obj, ply, glb, gltf, stl, off, dae), cleaned by `clean`; glTF has y up and is turned to z
+    """Read a triangle mesh (obj, ply, glb, gltf, stl, off, dae), cleaned by `clean`; glTF and COLLADA are turned to z
     up. Raises SdfsimError if the file is missing, cut short or not a mesh, if it needs an unsupported extension, or if
     it has no faces, vertices that are not finite or indices out of range."""
     return load_textured(path).mesh
 
 
-def load_textured(path: str | Path) -> Loaded:
-    """As `load_mesh`, with the texture."""
+def load_textured(path: str | Path, *, upright: bool = True) -> Loaded:
+    """As `load_mesh`, with the texture. Unless `upright`, a COLLADA file keeps its axes (see `collada_surface`)."""
     path = Path(path)
     suffix = path.suffix.lower()
     if not path.is_file():
@@ -61,7 +61,7 @@ def load_textured(path: str | Path) -> Loaded:
         how = "export glb from Blender; " if kind else ""
         raise SdfsimError(f"{path}: {fault}", f"{how}use " + " ".join(MESH_SUFFIXES))
     try:
-        found = _read(path, suffix)
+        found = _read(path, suffix) if suffix != ".dae" else collada_surface(path, upright=upright)
         notes = list(dict.fromkeys(found.notes))
         colors, painted = _shown(found, notes)
         mesh = clean(Mesh(found.vertices, found.faces, colors), name=str(path))
@@ -80,8 +80,6 @@ def _read(path: Path, suffix: str) -> FileMesh:
     """The triangles of a file."""
     if suffix in GLTF:
         return read_gltf(path)
-    if suffix == ".dae":
-        return collada_surface(path)
     content = path.read_bytes()
     if suffix == ".obj":
         return obj_surface(path, content)

@@ -3,11 +3,12 @@
 KINDS = ("hinge", "slider", "ball", "fixed", "distance")
 HINGE, SLIDER, BALL, FIXED, DISTANCE = range(5)
 # Columns of `Joints.number`: limits, restitution there, friction and damping, spring, motor (see the modes), its
-# largest force or torque, time and gain (0: as much as its strength allows), length of the rod (below 0: none), and
-# breaking loads.
+# largest force or torque, time and gain (0: as much as its strength allows), length of the rod (below 0: none),
+# breaking loads, and armature.
 (
-    LOW, HIGH, BOUNCE, DAMPING, FRICTION, STIFFNESS, REST, MOTOR, MAX_FORCE, TIME, GAIN, LENGTH, FORCE, TORQUE, NUMBERS,
-) = range(15)  # fmt: skip
+    LOW, HIGH, BOUNCE, DAMPING, FRICTION, STIFFNESS, REST, MOTOR, MAX_FORCE, TIME, GAIN, LENGTH, FORCE, TORQUE,
+    ARMATURE, NUMBERS,
+) = range(16)  # fmt: skip
 # Columns of `State.joints`: the joint's angle, position or length, its speed, the target of its motor, whether it is
 # broken; force and torque on the first body (at its anchor, world axes); the impulses at its limit, and of motor and
 # friction, of the last inner step (a ball has three of the latter; after the impulse of a motor with friction comes

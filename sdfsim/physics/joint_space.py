@@ -16,6 +16,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
 from sdfsim.physics.joint_columns import (
+    ARMATURE,
     BALL,
     BROKEN,
     COORD,
@@ -133,12 +134,17 @@ class JointSpace:
         return fast, spin
 
     def mass_matrix(self, base: int | None = None) -> np.ndarray:
-        """[n, n] so that half of v M v is the kinetic energy of all bodies, for velocities v of the coordinates."""
+        """[n, n] so that half of v M v is the kinetic energy of all bodies and rotors (the armature of joints), for
+        velocities v of the coordinates."""
         fast, spin = (part[:-1][self.bodies.moves] for part in self.jacobian(base))
         turn = self.turn[:-1][self.bodies.moves]
         inertia = turn @ self.bodies.inertia[self.bodies.moves] @ turn.swapaxes(1, 2)
         slow = np.einsum("n,nxi,nxj->ij", self.bodies.mass[self.bodies.moves], fast, fast)
-        return slow + np.einsum("nxi,nxy,nyj->ij", spin, inertia, spin)
+        made = slow + np.einsum("nxi,nxy,nyj->ij", spin, inertia, spin)
+        rotors = np.zeros(len(made))
+        for j, _ in self.tree:
+            rotors[len(made) - self.size :][self.columns[j]] = self.joints.number[j, ARMATURE]
+        return made + np.diag(rotors)
 
     def set(
         self, positions: np.ndarray, velocities: np.ndarray, which: Collection[int] | None = None

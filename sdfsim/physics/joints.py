@@ -8,6 +8,7 @@ import numpy as np
 
 from sdfsim.physics import pose
 from sdfsim.physics.joint_columns import (
+    ARMATURE,
     BOUNCE,
     BROKEN,
     COORD,
@@ -89,6 +90,7 @@ def joints_of(
         row[BOUNCE] = joint.restitution
         row[DAMPING] = joint.damping / (effort / unit * time)
         row[FRICTION] = joint.friction / effort
+        row[ARMATURE] = joint.armature * unit / (effort * time**2)
         if joint.spring is not None:
             row[STIFFNESS], row[REST] = joint.spring.stiffness * unit / effort, joint.spring.rest / unit
         if (motor := joint.motor) is not None:
@@ -192,9 +194,10 @@ def driven(joints: Joints, state: np.ndarray, drive: np.ndarray | None) -> tuple
 
 
 def stored(joints: Joints, state: np.ndarray) -> float:
-    """The energy in springs."""
+    """The energy in springs and rotors."""
     stiffness, away = joints.number[:, STIFFNESS], state[:, COORD] - joints.number[:, REST]
-    return float((0.5 * stiffness * away**2 * (state[:, BROKEN] == 0.0)).sum())
+    springs = stiffness * away**2 * (state[:, BROKEN] == 0.0)
+    return 0.5 * float((springs + joints.number[:, ARMATURE] * state[:, SPEED] ** 2).sum())
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Scenes written in Python: the keys of scene.yaml as keyword arguments, and the same checks."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -67,8 +67,7 @@ class SceneBuilder:
         scene, home = cls(), path.parent
         vars(scene).update({key: document[key] for key in _ENTRIES if document.get(key)})
         scene.settings = {key: value for key, value in document.items() if key not in _LISTED}
-        for entry in scene.shapes.values():
-            entry |= {key: str(home / entry[key]) for key in _PATHS if key in entry}
+        scene.shapes = {name: _moved(entry, lambda path: str(home / path)) for name, entry in scene.shapes.items()}
         if str(scene.settings.get("model", "")).endswith(".safetensors"):
             scene.settings["model"] = str(home / scene.settings["model"])
         return scene
@@ -158,12 +157,15 @@ class SceneBuilder:
         document = {"version": VERSION, **self.settings}
         if str(document.get("model", "")).endswith(".safetensors"):
             document["model"] = moved(document["model"])
-        shapes = {
-            name: {key: moved(value) if key in _PATHS else value for key, value in entry.items()}
-            for name, entry in self.shapes.items()
-        }
+        shapes = {name: _moved(entry, moved) for name, entry in self.shapes.items()}
         listed = {name: getattr(self, name) for name in _ENTRIES} | {"shapes": shapes}
         return document | {key: value for key, value in listed.items() if value}
+
+
+def _moved(entry: dict[str, Any], move: Callable[[str], str]) -> dict[str, Any]:
+    """A shape or a part of one, with other paths."""
+    made = {key: move(value) if key in _PATHS else value for key, value in entry.items()}
+    return made | ({"parts": [_moved(part, move) for part in entry["parts"]]} if "parts" in entry else {})
 
 
 def _text(document: dict[str, Any]) -> str:

@@ -119,6 +119,7 @@ def _joint(
         restitution=table.restitution,
         damping=table.damping,
         friction=table.friction,
+        armature=table.armature,
         spring=spring and Spring(spring.stiffness, math.radians(spring.rest_deg) if hinge else spring.rest),
         motor=motor and Motor(motor.max_force, motor.speed, place_of, motor.time, motor.gain),
         breaks_force=math.inf if breaks is None or breaks.force is None else breaks.force,

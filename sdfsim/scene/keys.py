@@ -26,6 +26,7 @@ class BodyKeys(TypedDict, total=False):
     box: Group | None
     cylinder: Group | None
     plane: Group | None
+    parts: Sequence[Group] | None
     units: Literal["m", "cm", "mm", "in"] | None
     cap: Switch | None
     thicken: float | None
@@ -75,6 +76,7 @@ class JointKeys(TypedDict, total=False):
     restitution: float | None
     damping: float | None
     friction: float | None
+    armature: float | None
     spring: Group | None
     motor: Group | None
     breaks_at: Group | None

@@ -1,7 +1,7 @@
 """`load_scene`: reads and checks a scene file, makes its shapes, and returns a `Scene`."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,24 @@ from pydantic import ValidationError
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.base.warned import warn_once
+from sdfsim.geometry.mesh_io import load_textured
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.document import Document, Faults
 from sdfsim.scene.joints import joints_of
 from sdfsim.scene.scene import WORLD, Body, Coupling, Effects, Frame, Keyframe, Motion, Scene, Waypoints
-from sdfsim.scene.schema import FITTED, UNITS, BodyTable, CouplingTable, KeyframeTable, SceneTable, ShapeTable
+from sdfsim.scene.schema import (
+    FITTED,
+    OF_PART,
+    UNITS,
+    BodyTable,
+    CouplingTable,
+    KeyframeTable,
+    PartTable,
+    SceneTable,
+    ShapeTable,
+)
 from sdfsim.shape.make import analytic_shape, far_origin, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.parts import Part, color_of, moved, pose_of, skin_of, solid_of
 from sdfsim.shape.shape import Shape, centred, load_shape, with_nodes, with_sdf, with_wall
 
 
@@ -78,7 +90,7 @@ def scene_of(table: SceneTable, faults: Faults, on_progress: Progress) -> Scene:
     faults.check()
     loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
     fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
-    notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", []))
+    notes = tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh or of.parts for note in s.source.get("notes", []))
     away = [(s.name, far_origin(s.mesh)) for of, s in loaded if of.mesh or of.asset]
     notes += tuple(f"{name}: {line}; centre: on moves it to the centre of mass" for name, line in away if line)
     if on_progress is silent:
@@ -110,8 +122,11 @@ def _poses_of(table: SceneTable, bodies: list[Body]) -> dict[str, Any]:
     def pose(key: KeyframeTable) -> Keyframe:
         angles = {name: math.radians(angle) for name, angle in key.angles_deg.items()}
         turns = {name: np.array(quat) for name, quat in key.quats_xyzw.items()}
-        there = {name: (np.array(at.position), at.rotation()) for name, at in key.bodies.items()}
-        return Keyframe(angles | key.positions | turns, there)
+        there = {
+            name: (np.array(at.position), at.rotation(), np.array(at.velocity), np.array(at.angular_velocity))
+            for name, at in key.bodies.items()
+        }
+        return Keyframe(angles | key.positions | turns, there, key.speeds | key.spins, key.targets)
 
     def coupling(of: CouplingTable) -> Coupling:
         first, second = (joint[name] for name in of.joints)
@@ -167,11 +182,33 @@ def _load_shape(name: str, entry: ShapeTable, scales: list[float], on_progress: 
         shape = shape_from_mesh(entry.mesh, **made)
     elif entry.primitive:
         shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)
+    elif entry.parts:
+        shape = _of_parts(name, entry.parts)
     else:
         shape = analytic_shape(kind, name=name, **dict(getattr(entry, kind)))
     shape = with_wall(shape, entry.wall) if entry.wall else shape
     shape = with_nodes(shape, entry.nodes) if entry.nodes else shape
     return centred(shape) if entry.centre == "on" else shape
+
+
+def _of_parts(name: str, entries: Sequence[PartTable]) -> Shape:
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    def part(k: int, *, seen: bool) -> Part:
+        one, mesh, sizes = entries[k], None, {}
+        kind: Any = next(kind for kind in OF_PART if getattr(one, kind) is not None)
+        if one.mesh is not None:
+            loaded = load_textured(one.mesh)
+            mesh = moved((loaded.skin if seen else None) or loaded.mesh, one.scale * np.eye(4))
+        else:
+            sizes = dict(getattr(one, kind))
+        color: Any = one.color and tuple(map(round, one.color))
+        return Part(kind, pose_of(one.position, Rotation.from_quat(one.rotation())), sizes, mesh, f"parts[{k}]", color)
+
+    shape = solid_of([part(k, seen=False) for k, one in enumerate(entries) if one.use != "shown"], name)
+    seen = [part(k, seen=True) for k, one in enumerate(entries) if one.use != "touch"]
+    plain = all(one.use == "both" for one in entries) and not any(map(color_of, seen))
+    return shape if plain or not seen else replace(shape, skin=skin_of(seen, np.eye(4)))
 
 
 def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:

@@ -136,6 +136,7 @@ class Joint:
         restitution: coefficient with which limits rebound.
         damping: N m s/rad for hinges and balls, else N s/m.
         friction: N m for hinges and balls, N for sliders.
+        armature: kg m^2 for hinges and balls, kg for sliders: inertia against changes of the joint's speed.
         spring, motor: None if it has none.
         breaks_force, breaks_torque: N and N m; beyond either the joint breaks.
         collides: whether its bodies may touch each other.
@@ -152,6 +153,7 @@ class Joint:
     restitution: float = 0.0
     damping: float = 0.0
     friction: float = 0.0
+    armature: float = 0.0
     spring: Spring | None = None
     motor: Motor | None = None
     breaks_force: float = math.inf
@@ -183,11 +185,18 @@ class Keyframe:
     Attributes:
         joints: the angle of hinges (rad), the position of sliders (m) and the quaternion [4] xyzw of balls, see
             `JointHandle.quat_xyzw`, by names of joints; others stay as at the start.
-        bodies: position [3] m and quaternion [4] xyzw of bodies that no joint holds, by their names.
+        bodies: position [3] m, quaternion [4] xyzw, velocity [3] m/s of the centre of mass and angular velocity [3]
+            rad/s of bodies that no joint holds, by their names.
+        speeds: rad/s and m/s of hinges and sliders, and [3] rad/s of balls, as `Simulator.joint_velocities` has them;
+            others are at rest.
+        targets: of motors, by names of joints: rad or m, or rad/s or m/s if the motor keeps a speed. Other motors that
+            go to a position aim at that of their joint.
     """
 
     joints: Mapping[str, Any]
-    bodies: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    bodies: Mapping[str, tuple[np.ndarray, ...]]
+    speeds: Mapping[str, Any] = field(default_factory=dict)
+    targets: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -278,9 +287,10 @@ def _held(joints: Sequence[Joint]) -> list:
     springs = _six_digits([(j.spring.stiffness, j.spring.rest) if j.spring else (0.0, 0.0) for j in joints])
     known = [_six_digits([getattr(j, name) for j in joints]) for name in ("anchor", "quat_xyzw", "restitution")]
     drags = _six_digits([(j.damping, j.friction, j.length or 0.0) for j in joints])
+    rotors = [_six_digits([j.armature for j in joints])] if any(j.armature for j in joints) else []
     turns = [round(j.start / (2.0 * math.pi)) for j in joints if j.kind == "hinge"]
     bears = _six_digits([[min(most, 1e30) for most in (j.breaks_force, j.breaks_torque)] for j in joints])
-    return [kinds, limits, springs, *known, drags, bears, turns]
+    return [kinds, limits, springs, *known, drags, bears, turns, *rotors]
 
 
 def _described(shape: Shape) -> list:

@@ -277,6 +277,12 @@ class Upright(Table):
     height: Number = key("along z; for a capsule with its caps, so above twice the radius", unit="m", gt=0)
 
 
+class Capsule(Upright):
+    def check_values(self) -> Iterator[Fault]:
+        if self.height <= 2 * self.radius:
+            yield ("height",), f"must be above twice the radius, its caps included (got {self.height:g} m)"
+
+
 class Box(Table):
     """An exact box about the origin."""
 
@@ -287,13 +293,65 @@ class PlaneShape(Table):
     """z = 0, infinite. It takes no keys: tilt it by the body's pose, or give the body its own `plane`."""
 
 
-_KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane")
+_KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane", "parts")
+OF_PART = ("mesh", "sphere", "capsule", "cylinder", "box")
 FITTED = ("mesh", "primitive")  # made on first use, which may take a minute
 _WITH_SDF = ("asset", *FITTED)  # the other kinds have an exact SDF
 
 
+_ROTATIONS = ("quat_xyzw", "quat_wxyz", "euler_xyz_deg")
+
+
+class Turned(Table):
+    """An entry with an orientation, given by at most one of three keys."""
+
+    quat_xyzw: Quaternion | None = key("orientation as a quaternion, scalar last; of any length", None)
+    quat_wxyz: Quaternion | None = key("the same, scalar first", None)
+    euler_xyz_deg: Vector | None = key("orientation as turns about the fixed axes x, then y, then z", None, "degrees")
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        yield from _one_of(data, _ROTATIONS)
+
+    def rotation(self) -> np.ndarray:
+        """[4] unit quaternion xyzw."""
+        if self.quat_wxyz is not None:
+            return np.roll(self.quat_wxyz, -1)
+        if self.euler_xyz_deg is not None:
+            from scipy.spatial.transform import Rotation  # slow to import
+
+            return Rotation.from_euler("xyz", self.euler_xyz_deg, degrees=True).as_quat()
+        return np.array([0.0, 0.0, 0.0, 1.0] if self.quat_xyzw is None else self.quat_xyzw)
+
+
+class PartTable(Turned):
+    """One part of a shape: exactly one of `mesh` to `box`, and its pose in the shape. Where parts overlap, they count
+    once in the mass."""
+
+    mesh: Annotated[Text, AfterValidator(_there)] | None = key("mesh file, relative to the scene's folder", None)
+    sphere: Sphere | None = key("a sphere", None)
+    capsule: Capsule | None = key("a capsule", None)
+    cylinder: Upright | None = key("a cylinder", None)
+    box: Box | None = key("a box", None)
+    scale: Number = key("factor on the size of a mesh", 1.0, gt=0)
+    position: Vector = key("its middle, or the origin of its mesh, from the shape's origin", (0.0, 0.0, 0.0), "m")
+    color: Annotated[list[Annotated[Number, Field(ge=0, le=255)]], _THREE] | None = key(
+        "red, green and blue (sRGB, 0 to 255); by default those of the mesh, or grey", None
+    )
+    use: Literal["both", "touch", "shown"] = key(
+        "whether it touches others and has mass (`touch`), is only shown, or both; meshes that touch are solids", "both"
+    )
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        yield from _one_of(data, OF_PART, required=True)
+        yield from super().check_keys(data)
+        if "scale" in data and "mesh" not in data:
+            yield ("scale",), "is for a mesh only: give other parts their size"
+
+
 class ShapeTable(Table):
-    """One shape: exactly one of `asset` to `plane`, and how its distances and surface nodes are made."""
+    """One shape: exactly one of `asset` to `parts`, and how its distances and surface nodes are made."""
 
     asset: Annotated[Text, AfterValidator(_there)] | None = key(
         "folder that `reconstruct` or `fit` has written, relative to the scene's folder", None
@@ -303,10 +361,11 @@ class ShapeTable(Table):
     )
     primitive: Primitive | None = key("a procedural shape, fitted on first use", None)
     sphere: Sphere | None = key("an exact sphere", None)
-    capsule: Upright | None = key("an exact capsule", None)
+    capsule: Capsule | None = key("an exact capsule", None)
     cylinder: Upright | None = key("an exact cylinder", None)
     box: Box | None = key("an exact box", None)
     plane: PlaneShape | None = key("an infinite plane", None)
+    parts: Annotated[list[PartTable], Field(min_length=1)] | None = key("several of these as one body", None)
     units: Literal["m", "cm", "mm", "in"] = key("unit of the numbers in a mesh file", "m")
     cap: Literal["on", "off"] = key("close the openings of a mesh", "off")
     thicken: Number | None = key("thickness that an open sheet of a mesh gets", None, "m", gt=0)
@@ -333,50 +392,23 @@ class ShapeTable(Table):
         for key in ("units", "cap", "thicken"):
             if key in data and kind not in ("mesh", None):
                 yield (key,), f"is for mesh only (this is a {kind})"
-        if "centre" in data and kind not in (*_WITH_SDF, None):
+        if "centre" in data and kind not in (*_WITH_SDF, "parts", None):
             yield ("centre",), f"is for {', '.join(_WITH_SDF)} only (a {kind} is about its centre)"
         if "sdf" in data and kind not in (*_WITH_SDF, None):
             yield ("sdf",), f"is for {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
+        parts = data["parts"] if isinstance(data.get("parts"), list) else []
+        if parts and all(isinstance(part, dict) and part.get("use") == "shown" for part in parts):
+            yield ("parts",), "one part must not be use: shown; a body that touches nothing has collides_with: []"
         if "resolution" in data and data.get("sdf") in (None, "mlp", "mesh"):
             yield ("resolution",), "is for sdf: grid only"
         for key in ("nodes", "wall"):
             if key in data and kind == "plane":
                 yield (key,), "is not for a plane, which has no nodes and no mass"
 
-    def check_values(self) -> Iterator[Fault]:
-        if self.capsule and self.capsule.height <= 2 * self.capsule.radius:
-            got = f"(got {self.capsule.height:g} m)"
-            yield ("capsule", "height"), f"must be above twice the radius, its caps included {got}"
-
     @property
     def kind(self) -> str:
         """Which of `_KINDS` is given."""
         return next(kind for kind in _KINDS if getattr(self, kind) is not None)
-
-
-_ROTATIONS = ("quat_xyzw", "quat_wxyz", "euler_xyz_deg")
-
-
-class Turned(Table):
-    """An entry with an orientation, given by at most one of three keys."""
-
-    quat_xyzw: Quaternion | None = key("orientation as a quaternion, scalar last; of any length", None)
-    quat_wxyz: Quaternion | None = key("the same, scalar first", None)
-    euler_xyz_deg: Vector | None = key("orientation as turns about the fixed axes x, then y, then z", None, "degrees")
-
-    @classmethod
-    def check_keys(cls, data: dict) -> Iterator[Fault]:
-        yield from _one_of(data, _ROTATIONS)
-
-    def rotation(self) -> np.ndarray:
-        """[4] unit quaternion xyzw."""
-        if self.quat_wxyz is not None:
-            return np.roll(self.quat_wxyz, -1)
-        if self.euler_xyz_deg is not None:
-            from scipy.spatial.transform import Rotation  # slow to import
-
-            return Rotation.from_euler("xyz", self.euler_xyz_deg, degrees=True).as_quat()
-        return np.array([0.0, 0.0, 0.0, 1.0] if self.quat_xyzw is None else self.quat_xyzw)
 
 
 class Waypoint(Turned):
@@ -625,6 +657,10 @@ class JointTable(Table):
     friction: Number = key(
         "torque in N m for hinges and balls, force in N for sliders", 0.0, ge=0, of="hinge slider ball"
     )
+    armature: Number = key(
+        "inertia of a motor's rotor, as the joint feels it, in kg m^2 for hinges and balls, in kg for sliders",
+        0.0, ge=0, of="hinge slider ball",
+    )  # fmt: skip
     spring: SpringTable | None = key("a spring that pulls back", None, of="hinge slider distance")
     motor: MotorTable | None = key("a motor that drives it", None, of="hinge slider")
     breaks_at: BreaksTable | None = key("load at which it breaks", None)
@@ -689,15 +725,25 @@ class Pose(Turned):
     """Where a keyframe has a body."""
 
     position: Vector = key("position of the shape's own origin", unit="m")
+    velocity: Vector = key("velocity of the centre of mass", _ORIGIN, "m/s")
+    angular_velocity: Vector = key("angular velocity in world axes", _ORIGIN, "rad/s")
 
 
 class KeyframeTable(Table):
-    """A pose of all joints by its name, for `simulator.reset(keyframe=NAME)`: everything is at rest in it, and motors
-    that go to a position aim at it. Joints and bodies that it leaves out stay as at the start."""
+    """A pose of all joints by its name, for `simulator.reset(keyframe=NAME)`. What it gives no speed is at rest, and
+    motors that go to a position aim at it. Joints and bodies that it leaves out stay as at the start."""
 
     angles_deg: dict[str, Number] = key("angles of hinges, by their names", {}, "degrees")
     positions: dict[str, Number] = key("positions of sliders", {}, "m")
     quats_xyzw: dict[str, Quaternion] = key("rotations of balls, scalar last, from their start", {})
+    speeds: dict[str, Number] = key("speeds of hinges in rad/s, of sliders in m/s", {})
+    spins: dict[str, Vector] = key(
+        "angular velocities of balls: of the first body relative to the second, in its axes, which are those of the "
+        "world at the start; with a cone, x is its axis", {}, "rad/s",
+    )  # fmt: skip
+    targets: dict[str, Number] = key(
+        "targets of motors, in place of the position: rad or m, or rad/s or m/s for those that keep a speed", {}
+    )
     bodies: dict[str, Pose] = key("poses of bodies that no joint holds", {})
 
 
@@ -810,10 +856,15 @@ class SceneTable(Table):
             elif kinds[name] not in allowed:
                 yield loc, f"must be a {' or '.join(allowed)} (got {name!r}, a {kinds[name]})"
 
+        moving, driven = ("hinge", "slider"), {joint.name for joint in self.joints if joint.motor}
+        of = {"angles_deg": moving[:1], "positions": moving[1:], "quats_xyzw": ("ball",), "speeds": moving,
+              "spins": ("ball",)}  # fmt: skip
         for key, frame in self.keyframes.items():
-            for what, kind in (("angles_deg", "hinge"), ("positions", "slider"), ("quats_xyzw", "ball")):
+            for what, allowed in {**of, "targets": moving}.items():
                 for name in getattr(frame, what):
-                    yield from fits(("keyframes", key, what, name), name, kind)
+                    yield from fits(("keyframes", key, what, name), name, *allowed)
+            for name in frame.targets.keys() & kinds.keys() - driven:
+                yield ("keyframes", key, "targets", name), f"joint {name!r} has no motor"
             for name in frame.bodies.keys() - bodies:
                 yield ("keyframes", key, "bodies", name), _no_body(name, bodies)
         for i, coupling in enumerate(self.couplings):
@@ -858,6 +909,7 @@ _SECTIONS: dict[str, type[Table]] = {
     "The file": SceneTable,
     "effects": EffectsTable,
     "shapes: NAME": ShapeTable,
+    "shapes: NAME: parts[]": PartTable,
     "shapes: NAME: primitive": Primitive,
     "shapes: NAME: sphere": Sphere,
     "shapes: NAME: capsule, cylinder": Upright,

@@ -380,21 +380,24 @@ class Jointed(LiveScene):
         self._follow(*space.set(q, v, {*positions, *velocities}))
 
     def _pose_as(self, key: Keyframe) -> None:
-        """Move all bodies and joints to a keyframe, at rest."""
-        if self.bodies.joints is not None:
-            places, q = self.joint_columns, self.joint_positions
-        for name, (position, quat) in key.bodies.items():
+        """Move all bodies and joints to a keyframe, with its speeds."""
+        q = self.joint_positions if self.bodies.joints is not None else np.zeros(0)
+        for name, (position, quat, velocity, spin) in key.bodies.items():
             body = BodyHandle(self, name)
-            body.quat_xyzw, body.position = quat, position
-            body.velocity = body.angular_velocity = np.zeros(3)
+            body.quat_xyzw, body.position, body.velocity, body.angular_velocity = quat, position, velocity, spin
         if self.bodies.joints is None:
             return
+        v, places = np.zeros(len(q)), self.joint_columns
         for name, value in key.joints.items():
             q[places[name]] = pose.to_rotvec(value) if np.ndim(value) else value
             handle = self.joint(name)
-            if handle.aims:
+            if handle.aims and name not in key.targets:
                 handle.target = float(value)
-        self.set_joints(q, np.zeros(len(q)))
+        for name, target in key.targets.items():
+            self.joint(name).target = target
+        for name, speed in key.speeds.items():
+            v[places[name]] = speed
+        self.set_joints(q, v)
 
     def frame(self, name: str) -> FrameHandle:
         """A frame of the scene by its name, such as a robot's `hand_tcp`. Raises SdfsimError if there is none."""

@@ -1,9 +1,14 @@
 """Recordings of steps that somebody makes one by one, see `Simulator.record`."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
+from sdfsim.physics import pose
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout, join
+from sdfsim.scene.scene import Scene
 
 TOGETHER = 256  # so many parts are joined: each has some thirty arrays
 
@@ -60,3 +65,32 @@ class Recording:
 
         while len(self._parts) > 1 and sum(map(size, self._parts)) > most:
             del self._parts[0]
+
+
+def at_frame(scene: Scene, frame: Rollout) -> Scene:
+    """The scene with its bodies, joints and targets of motors as in the first frame of a recorded rollout. Paths of
+    kinematic bodies go on from there."""
+    bodies, joints = [], []
+    for k, body in enumerate(scene.bodies):
+        turn = frame.orientation[0, k]
+        place = frame.position[0, k] - pose.rotate(turn, scene.shapes[body.shape].com * body.scale)
+        path = body.path
+        if path is not None:
+            ahead = path.time > frame.time[0]
+            path = replace(
+                path, time=np.r_[0.0, path.time[ahead] - frame.time[0]],
+                position=np.r_[place[None], path.position[ahead]],
+                quat_xyzw=np.r_[turn[None], path.quat_xyzw[ahead]],
+            )  # fmt: skip
+        speeds = {"velocity": frame.velocity[0, k], "angular_velocity": frame.angular_velocity[0, k]}
+        bodies.append(replace(body, position=place, quat_xyzw=turn, path=path, **speeds))
+    for k, joint in enumerate(scene.joints):
+        if frame.joint_names and joint.kind in ("hinge", "slider"):
+            low, high = joint.limits or (-math.inf, math.inf)  # a limit gives a little
+            joint = replace(joint, start=float(np.clip(frame.joint_position[0, k], low, high)))
+        aim = float(frame.counters.get(f"target_{joint.name}", [math.nan])[0])
+        if joint.motor is not None and math.isfinite(aim):
+            which = "position" if joint.motor.speed is None else "speed"
+            joint = replace(joint, motor=replace(joint.motor, **{which: aim}))
+        joints.append(joint)
+    return replace(scene, bodies=tuple(bodies), joints=tuple(joints))

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 GLANCE = 0.1  # s between two progress reports
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
-VARIED = ("position", "quat_xyzw", "velocity", "angular_velocity", "mass", "friction", "restitution")
+VARIED = ("position", "quat_xyzw", "velocity", "angular_velocity", "mass", "friction", "restitution", "scale")
 CHUNKS = 16  # largest number of pieces that variants are cut into, so that all cores finish together
 
 
@@ -346,8 +346,10 @@ class Simulator(Jointed):
         joints = [replace(j, bodies=(number[j.bodies[0]], number[j.bodies[1]])) for j in joints]
         names = {joint.name for joint in joints}
         keys = {
-            key: Keyframe({joint: at for joint, at in known.joints.items() if joint in names},
-                          {body: at for body, at in known.bodies.items() if body != name})
+            key: Keyframe(**{
+                field: {of: value for of, value in values.items() if of in names or (field == "bodies" and of != name)}
+                for field, values in vars(known).items()
+            })
             for key, known in scene.keyframes.items()
         }  # fmt: skip
         self.become(replace(
@@ -450,8 +452,9 @@ class Simulator(Jointed):
         of this one.
 
         Variants map names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity, mass, friction,
-        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. `on_progress` is called as variants finish.
-        Raises SdfsimError for an unknown body or field, or an invalid value, and SimulationError for an invalid state.
+        restitution, scale (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. `on_progress` is called as variants
+        finish. Raises SdfsimError for an unknown body or field, or an invalid value, and SimulationError for an invalid
+        state.
         """
         scenes = [varied(self.scene, variant) for variant in variants]
         same = {"device": self.device, "seed": self.seed, **self._asked}
@@ -706,7 +709,8 @@ def differing_motion(state: State, other: State) -> np.ndarray:
 
 def varied(scene: Scene, variant: Variant) -> Scene:
     """The scene with some of the fields `VARIED` changed, in SI units, with the limits of a scene file. A body's own
-    inertia scales with its mass. Raises SdfsimError for an unknown body or field, or an invalid value."""
+    inertia follows its mass and scale; its mass does not follow its scale. Raises SdfsimError for an unknown body or
+    field, or an invalid value."""
     known = {body.name for body in scene.bodies}
     for name in variant:
         if name not in known:
@@ -726,8 +730,9 @@ def _changed(body: Body, fields: Mapping[str, Any], what: str) -> Body:
     (table,) = validated(what, (BodyTable, plain({"name": body.name, "shape": "its own", **fields})))
     values = {name: getattr(table, name) for name in fields}
     new: dict[str, Any] = {name: np.array(v) if isinstance(v, list) else v for name, v in values.items()}
-    if "mass" in new and body.inertia is not None:
-        new["inertia"] = body.inertia * (new["mass"] / body.mass)
+    if body.inertia is not None:
+        heavier, larger = (new.get(key, getattr(body, key)) / getattr(body, key) for key in ("mass", "scale"))
+        new["inertia"] = body.inertia * (heavier * larger**2)
     return replace(body, **new)
 
 

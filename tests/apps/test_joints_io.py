@@ -10,17 +10,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.robots import poses
+from benchmarks.robots import poses, simulator_of
 from sdfsim import Simulator, load_scene
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
+from sdfsim.apps.play.saved import save_scene
 from sdfsim.apps.recording import ends, marks
-from sdfsim.apps.robot import GREY
 from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.mesh_io import load_mesh
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.parts import GREY
 from sdfsim.simulate.looks import body_colors
+from sdfsim.simulate.record import at_frame
 from tests.helpers.command import run
 
 LINK = """
@@ -71,7 +74,7 @@ def imported(file: Path, **options) -> tuple[Scene, dict]:
 
 def centres(scene: Scene, q: dict[str, float]) -> dict[str, np.ndarray]:
     """By body: its centre of mass [3] with joints at `q`, roots as they are at the start."""
-    return dict(zip((body.name for body in scene.bodies), poses(scene, q)[0], strict=True))
+    return dict(zip((body.name for body in scene.bodies), poses(simulator_of(scene), q)[0], strict=True))
 
 
 def inertia(scene: Scene, name: str) -> np.ndarray:
@@ -466,7 +469,8 @@ def test_mjcf_has_the_poses_and_masses_that_mujoco_has(tmp_path: Path) -> None:
     assert scene.gravity == pytest.approx([0, 0, -3.7])
     assert bodies["mast"].friction == pytest.approx(0.9)  # two of them: 0.81
     assert bodies["ground"].motion == "static"
-    assert "sensors (1)" in report["left_out"] and any("armature" in line for line in report["left_out"])
+    assert "sensors (1)" in report["left_out"] and not any("armature" in line for line in report["left_out"])
+    assert [j.armature for j in scene.joints if j.armature] == [0.1]
     # Inertias are those of the whole links.
     data = mujoco.MjData(model)
     data.joint("pitch").qpos[0] = math.radians(10)
@@ -787,7 +791,84 @@ def test_keyframes_sites_and_couplings_of_an_mjcf_are_those_of_mujoco(tmp_path: 
     ]
 
 
-def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
+def moving_alike(simulator: Simulator, model: mujoco.MjModel, key: int) -> None:
+    """Whether bodies a, b and c are and move as in MuJoCo's keyframe."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, key)
+    mujoco.mj_forward(model, data)
+    for name in "abc":
+        speed = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(name).id, speed, 0)
+        np.testing.assert_allclose(simulator[name].centre, data.body(name).xipos, atol=1e-8)
+        np.testing.assert_allclose(simulator[name].velocity, speed[3:], atol=1e-7)
+        np.testing.assert_allclose(simulator[name].angular_velocity, speed[:3], atol=1e-7)
+    assert simulator.joint("ja").target == pytest.approx(data.ctrl[0])
+
+
+def test_keyframes_keep_velocities_targets_and_balls_here_in_exports_and_in_saved_scenes(tmp_path: Path) -> None:
+    keys = 'qvel="1 -2 3 0.1 0.2 0.3 0.7 -0.4 3 2 1" ctrl="0.25"/>'
+    text = re.sub(r"<equality>.*</equality>", "", COUPLED).replace('0.6 0 0"/>', '0.6 0 0" ' + keys)
+    scene, report = imported(write(tmp_path, "robot.xml", text))
+    assert not any("keyframe" in line for line in report["left_out"])
+    simulator, theirs = Simulator(scene), mujoco.MjModel.from_xml_string(text)
+    simulator.reset(keyframe="home")
+    moving_alike(simulator, theirs, 0)
+    export(tmp_path / "scene.yaml", tmp_path / "out.xml")
+    out = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    moving_alike(simulator, out, out.key("home").id)
+    turned = Simulator(scene)  # balls count from where bodies are when the scene is saved
+    turned.joint("jc").quat_xyzw, turned.joint("ja").angle = (0.1, 0.7, -0.3, 0.5), 0.8
+    with turned.record() as run:
+        turned.step(1)
+    file = save_scene(at_frame(scene, run.rollout), tmp_path / "saved")
+    again = Simulator(load_scene(file))
+    again.reset(keyframe="home")
+    moving_alike(again, theirs, 0)
+
+
+def test_armature_is_that_of_mujoco_in_the_mass_matrix_and_after_an_export(tmp_path: Path) -> None:
+    text = COUPLED.replace('axis="0 1 0" ref', 'axis="0 1 0" armature="0.3" ref').replace(
+        'type="ball"', 'type="ball" armature="0.02"'
+    )
+    text = text.replace('type="slide"', 'type="slide" armature="2"').replace("<freejoint/>", "")
+    scene, _ = imported(write(tmp_path, "robot.xml", re.sub("<keyframe>.*</keyframe>", "", text)))
+    export(tmp_path / "scene.yaml", tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert model.dof_armature == pytest.approx([0.3, 2, 0.02, 0.02, 0.02])
+    data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, full, data.qM) if mujoco.__version__ < "3.4" else mujoco.mj_fullM(model, data, full)
+    np.testing.assert_allclose(Simulator(scene).mass_matrix()[:2, :2], full[:2, :2], atol=1e-9)
+    assert np.trace(Simulator(scene).mass_matrix()) == pytest.approx(np.trace(full))
+
+
+def test_a_tendon_of_coupled_joints_is_a_motor_of_the_one_they_follow(tmp_path: Path) -> None:
+    """Fingers of a gripper under load, which MuJoCo holds by an equality and drives by a tendon."""
+    text = """<mujoco><option timestep="0.0005"/><default><joint type="slide" axis="0 0 1" damping="2"/></default>
+      <worldbody><body pos="0 0 1"><geom size=".01"/>
+      <body pos="0 .1 0"><joint name="left"/><geom size=".02" mass=".2"/></body>
+      <body pos="0 -.1 0"><joint name="right"/><geom size=".02" mass=".1"/></body></body></worldbody>
+      <tendon><fixed name="both"><joint joint="left" coef=".5"/><joint joint="right" coef=".5"/></fixed></tendon>
+      <equality><joint joint1="left" joint2="right" polycoef=".01 1 0 0 0" solref=".002 1"/></equality>
+      <actuator><general tendon="both" gainprm="2" biastype="affine" biasprm=".3 -400 -4" forcerange="-50 50"/>
+      </actuator><keyframe><key name="start" qpos=".01 0" ctrl="10"/></keyframe></mujoco>"""
+    scene, report = imported(write(tmp_path, "gripper.xml", text))
+    assert not any("actuator" in line or "tendon" in line for line in report["left_out"] if "soft" not in line)
+    model, simulator = mujoco.MjModel.from_xml_string(text), Simulator(replace(scene, step=0.001))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    for time in (0.05, 0.05, 0.9):
+        for _ in range(round(time / 0.0005)):
+            mujoco.mj_step(model, data)
+        simulator.step(simulator.steps_in(time))
+        found = simulator.joint_positions
+        assert found[0] - found[1] == pytest.approx(0.01, abs=1e-4)
+        assert found == pytest.approx(data.qpos, abs=3e-4)
+
+
+@pytest.mark.parametrize("up", ["X_UP", "Y_UP", "Z_UP"])
+def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path, up: str) -> None:
+    """In a robot their axes are what they are, as in trimesh, MoveIt and RViz; else their up axis becomes z."""
     collada = pytest.importorskip("collada")
     file = collada.Collada()
     effect = collada.material.Effect("e", [], "lambert", diffuse=(1.0, 0.5, 0.0, 1.0))
@@ -806,7 +887,7 @@ def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
     used = collada.scene.GeometryNode(shape, [collada.scene.MaterialNode("paint", paint, inputs=[])])
     moved = collada.scene.Node("n", children=[used], transforms=[collada.scene.TranslateTransform(0, 0, 50)])
     file.scenes.append(scene := collada.scene.Scene("s", [moved]))
-    file.scene, file.assetInfo.unitname, file.assetInfo.unitmeter = scene, "mm", 0.001
+    file.assetInfo.upaxis, file.scene, file.assetInfo.unitname, file.assetInfo.unitmeter = up, scene, "mm", 0.001
     file.write(str(tmp_path / "box.dae"))
     mesh = '<geometry><mesh filename="box.dae"/></geometry>'
     text = f"""<robot name="r"><link name="one"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0"
@@ -814,6 +895,15 @@ def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path) -> None:
     scene = imported(write(tmp_path, "r.urdf", text))[0]
     shape = scene.shapes[0]
     np.testing.assert_allclose(shape.mesh.vertices.max(0), (0.1, 0.1, 0.15), atol=1e-9)
+    theirs = pytest.importorskip("trimesh").load(tmp_path / "box.dae", force="mesh")
+    np.testing.assert_allclose(
+        shape.mesh.vertices.max(0), theirs.vertices.max(0) * (0.001 if theirs.extents.max() > 1 else 1)
+    )
+    # Of the file's box, its z goes from 50 to 150 mm, the others from 0 to 100.
+    alone = load_mesh(tmp_path / "box.dae").vertices
+    ends = {"X_UP": ((-0.1, -0.15, 0), (0, -0.05, 0.1)), "Y_UP": ((0, -0.15, 0), (0.1, -0.05, 0.1)),
+            "Z_UP": ((0, 0, 0.05), (0.1, 0.1, 0.15))}  # fmt: skip
+    np.testing.assert_allclose((alone.min(0), alone.max(0)), ends[up], atol=1e-9)
     assert shape.volume == pytest.approx(1e-3) and shape.skin is None
     assert (np.abs(np.subtract(scene.bodies[0].color, (255, 128, 0))) < 6).all()
 

@@ -92,3 +92,30 @@ def test_a_scan_in_centimetres_has_the_size_of_a_stone():
 def test_the_vase_is_knocked_off_the_table():
     vase = track("knocked_vase", "vase")
     assert vase[0, 2] > 0.6 and vase[-1, 2] < 0.3
+
+
+def test_the_car_drives_over_the_ramp_and_the_log():
+    way = track("cart", "body")
+    rolled = 14.0 * 0.07  # m/s, from the speed of its wheels
+    assert way[:, 2].max() > 0.2 and way[-1, 0] > 3.0 and abs(way[-1, 1]) < 0.1
+    speed = np.diff(way[-20:, 0]).mean() / np.diff(run("cart")[0].time[-20:]).mean()
+    assert speed == pytest.approx(rolled, rel=0.02)
+
+
+def test_the_fingers_stay_together_and_hold_the_can_in_the_middle():
+    left, right, can, hand = (track("gripper", name) for name in ("left", "right", "can", "hand"))
+    assert np.abs(left[:, 0] + right[:, 0] - 2 * hand[:, 0]).max() < 1e-4
+    assert can[-1, 2] > 0.25 and abs(can[-1, 0]) < 1e-3
+    held = can[:, 2] - hand[:, 2]
+    assert np.ptp(held[len(held) // 2 :]) < 2e-3  # it does not slip
+
+
+def test_the_rollers_carry_both_parcels_through_the_gate_and_down_the_chute():
+    _, end = run("conveyor")
+    parcels = [body for body in end if "parcel" in body["name"]]
+    assert all(body["rests"] and body["centre_m"][0] > 0.8 and body["centre_m"][2] < 0.1 for body in parcels)
+    assert abs(next(body for body in end if body["name"] == "gate")["centre_m"][2] - 0.45) < 0.01
+
+
+def test_the_mobile_arm_pushes_the_box_off_the_shelf():
+    assert track("mobile_arm", "box")[-1, 2] < 0.3 and track("mobile_arm", "base")[-1, 0] > 1.2

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.export import plain_names
 from sdfsim.apps.run import summary
@@ -15,6 +16,7 @@ from sdfsim.base.files import CONFIG, check_own, check_writable, write_json, wri
 from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.builder import SceneBuilder, plain
+from sdfsim.scene.joints import joint_axes
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import WORLD, Body, Coupling, Frame, Joint, Keyframe, Scene, fingerprints
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
@@ -22,35 +24,6 @@ from sdfsim.shape.shape import Shape
 from sdfsim.simulate.looks import is_infinite
 
 SCENE = "scene.yaml"
-
-
-def at_frame(scene: Scene, frame: Rollout) -> Scene:
-    """The scene with its bodies, joints and targets of motors as in the first frame of a recorded rollout. Paths of
-    kinematic bodies go on from there."""
-    bodies, joints = [], []
-    for k, body in enumerate(scene.bodies):
-        turn = frame.orientation[0, k]
-        place = frame.position[0, k] - pose.rotate(turn, scene.shapes[body.shape].com * body.scale)
-        path = body.path
-        if path is not None:
-            ahead = path.time > frame.time[0]
-            path = replace(
-                path, time=np.r_[0.0, path.time[ahead] - frame.time[0]],
-                position=np.r_[place[None], path.position[ahead]],
-                quat_xyzw=np.r_[turn[None], path.quat_xyzw[ahead]],
-            )  # fmt: skip
-        speeds = {"velocity": frame.velocity[0, k], "angular_velocity": frame.angular_velocity[0, k]}
-        bodies.append(replace(body, position=place, quat_xyzw=turn, path=path, **speeds))
-    for k, joint in enumerate(scene.joints):
-        if frame.joint_names and joint.kind in ("hinge", "slider"):
-            low, high = joint.limits or (-math.inf, math.inf)  # a limit gives a little
-            joint = replace(joint, start=float(np.clip(frame.joint_position[0, k], low, high)))
-        aim = float(frame.counters.get(f"target_{joint.name}", [math.nan])[0])
-        if joint.motor is not None and math.isfinite(aim):
-            which = "position" if joint.motor.speed is None else "speed"
-            joint = replace(joint, motor=replace(joint.motor, **{which: aim}))
-        joints.append(joint)
-    return replace(scene, bodies=tuple(bodies), joints=tuple(joints))
 
 
 def save_scene(scene: Scene, folder: Path) -> Path:
@@ -137,14 +110,24 @@ def _coupling(scene: Scene, coupling: Coupling) -> dict[str, Any]:
 
 
 def _keyframe(scene: Scene, keyframe: Keyframe) -> dict[str, Any]:
-    """A keyframe without its balls, whose rotations count from the saved pose."""
-    kinds = {joint.name: joint.kind for joint in scene.joints}
-    of = {kind: {n: v for n, v in keyframe.joints.items() if kinds[n] == kind} for kind in ("hinge", "slider")}
-    return {
-        "angles_deg": {name: np.degrees(angle) for name, angle in of["hinge"].items()},
-        "positions": of["slider"],
-        "bodies": {name: {"position": at, "quat_xyzw": turn} for name, (at, turn) in keyframe.bodies.items()},
-    }
+    """A keyframe; the rotations of its balls count from the saved pose."""
+    keys: dict[str, dict[str, Any]] = {key: {} for key in ("angles_deg", "positions", "quats_xyzw", "speeds", "spins")}
+    for joint in scene.joints:
+        value, speed = keyframe.joints.get(joint.name), keyframe.speeds.get(joint.name)
+        if joint.kind == "ball":
+            old = [Rotation.from_quat(quat) for quat in joint.quat_xyzw]
+            bodies = [Rotation.from_quat([0, 0, 0, 1] if k < 0 else scene.bodies[k].quat_xyzw) for k in joint.bodies]
+            axis = (bodies[0] * old[0]).as_matrix()[:, 0] if joint.limits is not None else None
+            one, other = (was.inv() * body.inv() * joint_axes(axis) for was, body in zip(old, bodies, strict=True))
+            value = None if value is None else (other.inv() * Rotation.from_quat(value) * one).as_quat()
+            speed = None if speed is None else other.inv().apply(speed)
+        hinge = joint.kind == "hinge"
+        what = {"hinge": "angles_deg", "slider": "positions"}.get(joint.kind, "quats_xyzw")
+        keys[what] |= {} if value is None else {joint.name: np.degrees(value) if hinge else value}
+        keys["spins" if joint.kind == "ball" else "speeds"] |= {} if speed is None else {joint.name: speed}
+    names = ("position", "quat_xyzw", "velocity", "angular_velocity")
+    bodies = {name: dict(zip(names, at, strict=True)) for name, at in keyframe.bodies.items()}
+    return {**keys, "bodies": bodies, "targets": keyframe.targets}
 
 
 def _joint(scene: Scene, joint: Joint) -> dict[str, Any]:
@@ -171,7 +154,8 @@ def _joint(scene: Scene, joint: Joint) -> dict[str, Any]:
         entry["to"] = pose.rotate(pose.conjugate(body.quat_xyzw), end - body.position)
         entry |= {} if joint.length is None else {"rod": joint.length}
         entry |= {} if limits is None or joint.length is not None else {"rope": limits[1]}
-    numbers = {"restitution": joint.restitution, "damping": joint.damping, "friction": joint.friction}
+    numbers = {"restitution": joint.restitution, "damping": joint.damping, "friction": joint.friction,
+               "armature": joint.armature}  # fmt: skip
     entry |= {name: value for name, value in numbers.items() if value}
     if joint.spring is not None:
         entry["spring"] = {"stiffness": joint.spring.stiffness} | angles("rest", joint.spring.rest)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.apps.play.hand import Hand
-from sdfsim.apps.play.saved import at_frame, save_run, save_scene
+from sdfsim.apps.play.saved import save_run, save_scene
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation.instruments import judged
 from sdfsim.geometry.bvh import Caster
@@ -32,6 +32,7 @@ from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.looks import framed, is_infinite
+from sdfsim.simulate.record import at_frame
 from sdfsim.simulate.simulator import SimulationError, Simulator, Snapshot
 
 MINUTE = 60.0  # s that one can go back

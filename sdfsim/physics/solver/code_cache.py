@@ -7,12 +7,17 @@ from pathlib import Path
 from sdfsim.base.compiling import cache_of, kept
 
 
+def sources() -> list[Path]:
+    """The files of the compiled step."""
+    here = Path(__file__).parent
+    files = [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]
+    return [file for file in files if file.name != "prepare.py"]
+
+
 @cache
 def code_folder() -> Path:
     """The folder of the compiled step, named after a hash of its source."""
-    here = Path(__file__).parent
-    files = [*sorted(here.glob("*.py")), here.parent / "joint_columns.py"]
-    return cache_of(file for file in files if file.name != "prepare.py")
+    return cache_of(sources())
 
 
 def kept_here() -> AbstractContextManager[None]:

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.joint_columns import (
+    ARMATURE,
     BALL,
     BOUNCE,
     BROKEN,
@@ -268,7 +269,7 @@ def _write_held(each, held, position, matrix, j):
 def _write_springs(work, rules, each, held, j, phase):
     """Springs and damping of a joint as soft rows beside those that hold."""
     number, kind = each.number[j], each.kind[j]
-    if number[STIFFNESS] <= 0.0 and number[DAMPING] <= 0.0:
+    if number[STIFFNESS] <= 0.0 and number[DAMPING] <= 0.0 and number[ARMATURE] <= 0.0:
         return
     a, b = each.body[j, 0], each.body[j, 1]
     for k in range(3 if kind == BALL else 1):
@@ -287,6 +288,11 @@ def _write_springs(work, rules, each, held, j, phase):
         held.wanted[j, e], held.soft[j, e] = softness(
             number[STIFFNESS], number[DAMPING], 0.0, away, before, row[MASS], rules.substep_dt, phase
         )
+        if number[ARMATURE] > 0.0:  # the impulse of a rotor is -armature x the change of the row's velocity
+            rate = 1.0 / held.soft[j, e]
+            whole = rate + number[ARMATURE]
+            held.wanted[j, e] = (rate * held.wanted[j, e] + number[ARMATURE] * before) / whole
+            held.soft[j, e] = 1.0 / whole
 
 
 @njit(**BARE)
@@ -673,9 +679,10 @@ def given(each):
 
 @njit(**BARE)
 def stored(each):
-    """The energy in springs."""
+    """The energy in springs and rotors."""
     total = 0.0
     for j in range(len(each.body)):
+        total += 0.5 * each.number[j, ARMATURE] * each.state[j, SPEED] ** 2
         if each.number[j, STIFFNESS] > 0.0 and not each.state[j, BROKEN] > 0.0:
             total += 0.5 * each.number[j, STIFFNESS] * (each.state[j, COORD] - each.number[j, REST]) ** 2
     return total

@@ -120,7 +120,7 @@ class Compiled:
         self.surfaces = self.threads or bool(meet_as_surfaces(self.bodies.contact))
         self.seen: compiled.Motion | None = None  # motion in which `points_near` searches
         self.searches: Pieces | None = None  # its pieces, once they are compiled
-        self._pieces: Pieces | None = None  # those of the step, once they are compiled
+        self.pieces: Pieces | None = None  # those of the step, once they are compiled
         self._load: np.ndarray | None = None
         self._options: Options | None = None  # the options from which `_rules` were made
         self._latest: State | None = None  # the state whose arrays are `_motion` and `_manifolds`
@@ -147,10 +147,10 @@ class Compiled:
         arguments = (self.shapes, self.world, self.work, motion, rules, manifolds, self.joints)
         # An integer of another type would cause another compilation.
         others = script, most, kept, TOUCHING, int(steps)
-        if self._pieces is None:
+        if self.pieces is None:
             used = chosen(surfaces=self.surfaces, threads=self.threads, joints=joints > 0)
-            self._pieces = _compiled("the contact step", run_steps, arguments, others, used)
-        return *run_steps(*arguments, self._pieces, *others), kept
+            self.pieces = _compiled("the contact step", run_steps, arguments, others, used)
+        return *run_steps(*arguments, self.pieces, *others), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make `steps` steps of the contact solve from `state`, or fewer if one leads to a state beyond the limits
@@ -171,7 +171,7 @@ class Compiled:
         if options is not self._options:
             self._options, self._rules = options, compiled_rules(options)
         rules, motion = self._rules, self._motion
-        script, time = _script(self.bodies.tracks, state.time, rules, steps)
+        script, time = scripted(self.bodies.tracks, state.time, rules, steps)
         self._latest = None  # in case the rest raises an error
         manifolds, counts, done, body, wrong, before, given, pair, point, kept = self.run(
             motion, self._manifolds, rules, steps, script, most, keep=keep
@@ -237,7 +237,7 @@ def _compiled(what: str, function: Any, arguments: tuple, others: tuple, used: d
     return nowhere._replace(**{of: piece.address(types[of]) for of, piece in used.items()})
 
 
-def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
+def scripted(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
     """Poses and velocities of paths for `steps` steps, and the time after them. Velocities change in each inner step:
     if they jumped once a step, bodies on an accelerating tray would slip. The last is that at the end of the step."""
     inner, count = rules.substep_dt, rules.options.substeps
@@ -253,7 +253,9 @@ def _script(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: in
     for k, (one, other) in enumerate([*((k, k + 1) for k in range(count)), (count + 1, count + 2)]):
         speeds[:, k, :, :3] = place[:, other] - place[:, one]
         speeds[:, k, :, 3:] = pose.to_rotvec(pose.multiply(turn[:, other], pose.conjugate(turn[:, one])))
-    return Script(tracks.body, np.concatenate([place, turn], -1)[:, count], speeds / inner), times[-1]
+    # An array of another layout would cause another compilation.
+    ends = np.ascontiguousarray(np.concatenate([place, turn], -1)[:, count])
+    return Script(tracks.body, ends, speeds / inner), times[-1]
 
 
 def _at(tracks: Tracks, instants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -288,7 +290,7 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, moved: np.ndarr
     are those that slept with them or on them. Pose or velocities of the bodies `moved` [N] have changed, not only what
     acts on them."""
     touch = state.touch
-    if bodies.joints is not None and state.joints is not None and changed.any():
+    if bodies.joints is not None and state.joints is not None and moved.any():
         place = jointed.coordinates(
             bodies.joints, state.joints[:, joint_columns.COORD], state.position, state.orientation
         )

@@ -56,8 +56,8 @@ def _field(context: Any, builder: Any, reference: Reference, place: Any, name: s
 
 @intrinsic
 def _reference(typing: Any, value: types.Type) -> Any:
-    if isinstance(value, types.NoneType):
-        return value(value), lambda context, builder, signature, arguments: context.get_dummy_value()
+    if isinstance(value, types.NoneType | Reference):
+        return value(value), lambda context, builder, signature, arguments: arguments[0]
     if not isinstance(value, types.NamedTuple):
         return None
 
@@ -87,7 +87,7 @@ def _call(typing: Any, address: types.Type, arguments: Any) -> Any:
 # Call a function at an address with a tuple of references and whole numbers; it returns a whole number. Nothing checks
 # the types of the arguments.
 call: Any = (lambda function, arguments: function(*arguments)) if vars(config)["DISABLE_JIT"] else _call
-# A reference to a NamedTuple, for compiled code; None for None. Numba frees arrays after the last use of the variable
-# that holds them, so take references of arguments only, or of variables that are used again after the last use of the
-# reference.
+# A reference to a NamedTuple, for compiled code; None and references as they are. Numba frees arrays after the last use
+# of the variable that holds them, so take references of arguments only, or of variables that are used again after the
+# last use of the reference.
 reference: Any = (lambda value: value) if vars(config)["DISABLE_JIT"] else _reference
