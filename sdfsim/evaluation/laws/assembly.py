@@ -1,6 +1,7 @@
 """Laws of assembly: meshes whose edges, holes and teeth must be as sharp as their files say."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from math import cos, pi, radians, sqrt, tan
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from sdfsim.evaluation.laws.check import Check
 from sdfsim.evaluation.laws.scenes import UNIT, G, Put, Setting, about, fixed, floor, run, run_built, solid
-from sdfsim.geometry.mesh import Mesh, joined
+from sdfsim.geometry.mesh import Mesh, clean, joined
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box, revolve, sleeve, tube
 from sdfsim.scene.builder import SceneBuilder
@@ -100,9 +101,8 @@ def spur_gear(teeth: int, module: float, height: float = 0.02) -> Mesh:
         radius, off = np.append(root, radius), np.append(half, off)
     radius, off = np.append(radius, radius[::-1]), np.append(-off, off[::-1])
     turn = (2 * pi / teeth * np.arange(teeth)[:, None] + off).reshape(-1)
-    outer = np.tile(radius, teeth)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    around = turn[0] + 2 * pi * np.arange(len(turn)) / len(turn)
-    return sleeve(outer, 2 * module * np.stack([np.cos(around), np.sin(around)], axis=1), height)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return sleeve(np.tile(radius, teeth)[:, None] * circle, 2 * module * circle, height)
 
 
 def gears(at: Setting) -> Iterator[Check]:
@@ -122,4 +122,53 @@ def gears(at: Setting) -> Iterator[Check]:
     yield ran.near("ratio", turns[0] / turns[1], -2.0, 1e-3)
 
 
-ASSEMBLY = (pegs, edges, rollers, gears)
+def threaded(flanks: np.ndarray, pitch: float, turns: int, other: float, around: int = 96) -> Mesh:
+    """A solid between a thread about z and the radius `other`: a bolt if that is 0, else a nut. `flanks` [K, 2] are
+    corners of the thread's profile: their place along the pitch, from 0 to 1, and their radius. Lengths in m."""
+    corners, knot = len(flanks), np.arange(turns * len(flanks) + 1)
+    along = pitch * (flanks[knot % corners, 0] + knot // corners)
+    turn = 2 * pi * np.arange(around)[:, None] / around
+
+    def sheet(radius: float | np.ndarray, height: np.ndarray) -> np.ndarray:
+        flat = np.broadcast_arrays(radius * np.cos(turn), radius * np.sin(turn), height)
+        return np.stack(flat, axis=-1).reshape(-1, 3)
+
+    helix = along + pitch * turn / (2 * pi)
+    ends = np.where(knot < len(knot) / 2, helix[0, 0], helix[0, -1]) + 0.5 * pitch  # points on the axis
+    this = np.arange(around * len(knot)).reshape(around, -1)
+    # After a turn the thread meets itself one pitch higher.
+    following = np.concatenate([this[1:], np.append(this[0, corners:], np.full(corners, -1))[None]])
+    quads = np.stack([this[:, :-1], following[:, :-1], following[:, 1:], this[:, 1:]], axis=-1).reshape(-1, 4)
+    quads = quads[(quads >= 0).all(1)]
+    edges = np.concatenate([quads[:, [k, (k + 1) % 4]] for k in range(4)])
+    inner = set(map(tuple, edges.tolist()))
+    rims = np.array([(b, a) for a, b in inner if (b, a) not in inner])
+    walls = np.concatenate([rims, rims[:, ::-1] + this.size], axis=1)
+    faces = np.concatenate([quads, quads[:, ::-1] + this.size, walls])
+    vertices = [sheet(flanks[knot % corners, 1], helix), sheet(other, helix if other else ends)]
+    return clean(Mesh(np.concatenate(vertices), np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])))
+
+
+def nuts(at: Setting) -> Iterator[Check]:
+    """An M16 nut with a tenth of a millimetre of play on its bolt, both of 96 facets: friction locks it, and without
+    friction it turns down by the lead, somewhat slower than on a true screw, as each facet is an impact."""
+    pitch, radius = 2e-3, 8e-3
+    root = radius - 5 / 8 * pitch * sqrt(0.75)
+    flanks = np.array([(0.0, radius), (1 / 8, radius), (7 / 16, root), (11 / 16, root)])
+    bolt = mesh_shape(threaded(flanks, pitch, 14, 0.0), name="bolt", kind="mesh")
+    nut = mesh_shape(threaded(flanks + np.array([0.0, 1e-4]), pitch, 5, 12e-3), name="nut", kind="mesh")
+    lead, spin = pitch / (2 * pi), nut.inertia[2, 2] / nut.volume
+    for mu in (0.2, 0.0):
+        scale = 1 / at.size
+        bodies = [Put("nut", nut, [0, 0, 8 * pitch * scale], mu=mu, scale=scale), fixed("bolt", bolt, [0, 0, 0])]
+        ran = run(at, f"mu = {mu:g}", [bodies[0], replace(bodies[1], scale=scale)], 1.0 / at.time)
+        turned = -ran.w("nut")[-1, 2] / at.time
+        if mu:
+            yield ran.most("turns", abs(turned), 1e-3, "rad/s")
+        else:
+            yield ran.near("down a turn", ran.v("nut")[-1, 2] * at.time / turned, -lead, 0.05, "m/rad")
+            full = G * lead / (lead**2 + spin) * ran.time[-1]
+            yield ran.between("speed of a true screw", turned / full, 0.75, 1.01, "")
+
+
+ASSEMBLY = (pegs, edges, rollers, gears, nuts)
