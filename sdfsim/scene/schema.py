@@ -359,9 +359,9 @@ class ShapeTable(Table):
         "folder that `reconstruct` or `fit` has written, relative to the scene's folder", None
     )
     mesh: Annotated[Text, AfterValidator(_there)] | None = key(
-        "mesh file, relative to the scene's folder; fitted on first use, then taken from a cache", None
+        "mesh file, relative to the scene's folder", None
     )
-    primitive: Primitive | None = key("a procedural shape, fitted on first use", None)
+    primitive: Primitive | None = key("a procedural shape", None)
     sphere: Sphere | None = key("an exact sphere", None)
     capsule: Capsule | None = key("an exact capsule", None)
     cylinder: Upright | None = key("an exact cylinder", None)
@@ -372,8 +372,8 @@ class ShapeTable(Table):
     cap: Literal["on", "off"] = key("close the openings of a mesh", "off")
     thicken: Number | None = key("thickness that an open sheet of a mesh gets", None, "m", gt=0)
     sdf: SdfKind | None = key(
-        "where distances come from: a fitted network, samples on a grid, or the mesh itself; by default "
-        "an asset keeps its own and others are fitted",
+        "where distances come from: a fitted network, samples on a grid, or the mesh itself; by default an asset keeps "
+        "its own, and others are the mesh itself, or fitted if the scene's `model` is a network",
         None,
     )
     resolution: Whole = key(

@@ -17,13 +17,15 @@ from sdfsim.base.files import cached_arrays, digest, user_cache
 from sdfsim.geometry.mesh import Mesh, convex_hull, directed_edges, face_normals, halves, lattice
 from sdfsim.sdf.baked_grid import BAKE_VERSION, BakedGrid, baked, interpolated, inwards, surface_samples, unseen_wall
 from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
+from sdfsim.shape.triangle_tree import TriangleTree, triangle_tree
 
-VERSION = 9  # version of the cache files, in addition to that of the baked grid
+VERSION = 10  # version of the cache files, in addition to that of the baked grid
 DENSEST = 4000  # largest number of nodes of a closed form, roughly
 LATTICE = 40  # cells, along the largest extent, of the lattice that says which patch is nearest
 MOST_PATCHES = 1024  # patches of a shape: the contact solve cannot distinguish more
@@ -94,6 +96,12 @@ class ContactGeometry:
         whole = convex_vertices(self.mesh)
         return (hull(whole),) if len(whole) else ()
 
+    @cached_property
+    def triangles(self) -> TriangleTree | None:
+        """The true surface of a shape that has the exact distance of a mesh and does not collide as solids."""
+        exact = isinstance(self.sdf, MeshSdf) and not self.solids
+        return triangle_tree(self.sdf.mesh) if exact else None
+
     @property
     def thickness(self) -> float:
         """m, of the thinnest walls, or of the thinnest solid; infinite for a plane."""
@@ -124,7 +132,8 @@ class ContactGeometry:
             if grid is not None:
                 samples = surface_samples(grid)
                 if not self.pieces:
-                    edges = on_edges(self.mesh, grid) if isinstance(sdf, MlpSdf) else nodes[:0]
+                    sharp = isinstance(sdf, MlpSdf) or self.triangles is not None
+                    edges = on_edges(self.mesh, grid) if sharp else nodes[:0]
                     nodes = np.concatenate([nodes, edges])
                     nodes = np.concatenate([nodes, between(nodes, samples, APART * grid.cell)])
             patches = patches_of(sdf, nodes, self.pieces)
