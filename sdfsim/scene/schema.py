@@ -358,9 +358,7 @@ class ShapeTable(Table):
     asset: Annotated[Text, AfterValidator(_there)] | None = key(
         "folder that `reconstruct` or `fit` has written, relative to the scene's folder", None
     )
-    mesh: Annotated[Text, AfterValidator(_there)] | None = key(
-        "mesh file, relative to the scene's folder", None
-    )
+    mesh: Annotated[Text, AfterValidator(_there)] | None = key("mesh file, relative to the scene's folder", None)
     primitive: Primitive | None = key("a procedural shape", None)
     sphere: Sphere | None = key("an exact sphere", None)
     capsule: Capsule | None = key("an exact capsule", None)
