@@ -1,10 +1,7 @@
 """The compiled tree of triangles against trimesh and closed forms."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import trimesh
 
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
@@ -30,6 +27,8 @@ def test_a_box_has_its_closed_form_also_at_edges_and_corners() -> None:
 
 @pytest.mark.parametrize("name", ["torus", "gear", "bowl", "torus_knot", "cone"])
 def test_the_nearest_point_is_that_of_another_library_and_so_is_the_side(name: str) -> None:
+    import trimesh
+
     mesh = primitives.PRIMITIVES[name]()
     other = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     rng = np.random.default_rng(1)
@@ -58,7 +57,7 @@ def test_what_is_farther_than_asked_is_not_found() -> None:
     assert np.isinf(limited[~near]).all()
 
 
-def test_a_repeated_seam_of_vertices_is_one_edge(tmp_path: Path) -> None:
+def test_a_repeated_seam_of_vertices_is_one_edge() -> None:
     """Files for rendering repeat vertices where textures are cut: signs at such edges stay right."""
     box = primitives.box()
     apart = Mesh(box.vertices[box.faces].reshape(-1, 3), np.arange(3 * len(box.faces)).reshape(-1, 3))
