@@ -7,7 +7,7 @@ from pathlib import Path
 
 import typer
 
-ALONE = ("camera", "contact_step", "effects")  # measured on one thread
+ALONE = ("camera", "effects")  # measured on one thread
 SHARED = ("baselines", "records")  # modules that the benchmarks share
 
 if __name__ == "__main__":

@@ -356,19 +356,4 @@ def turns(data: Path, *, out: Out, rounds: int = 7) -> None:
     write_record("rivals_in_turn", "python -m benchmarks rivals turns DATA -o DIR", measured, ("case", *columns), rows)
 
 
-def large(*, out: Out) -> None:
-    """Large scenes: a row for each case and engine, with time, memory and depth."""
-    rows: list[tuple[Cell, ...]] = []
-    for (case, name), result in compared(LARGE, None, out).items():
-        usual = result.get("inner", {}).get(str(USUAL))
-        if usual:
-            gone = f"{usual['lost']} lost" if usual["lost"] else ""
-            rows.append((case, name, usual["ms"], result["mib"], 100 * usual["deep"], gone))
-        else:
-            rows.append((case, name, None, None, None, why_not(result)))
-    measured = f"The first {HEAP_STEPS} steps of large scenes, inner steps of 4 ms, in processor time of one thread."
-    columns = ("case", "engine", "ms per s", "MiB", "depth, %", "not finished, or lost")
-    write_record("rivals_large", "python -m benchmarks rivals large -o DIR", measured, columns, rows)
-
-
-COMMANDS = (shapes, turns, large)
+COMMANDS = (shapes, turns)
