@@ -17,17 +17,14 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
-from numba import njit
 
 from benchmarks.engines import bullet, mujoco
-from benchmarks.records import ROOT, Out, progress, write_record
+from benchmarks.records import Out, progress, write_record
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
@@ -39,17 +36,9 @@ from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.laws.hard_cases import body, box, on_floor
 from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout
-from sdfsim.physics.solver.contacts import contact_rows
-from sdfsim.physics.solver.distance import distances
-from sdfsim.physics.solver.prepare import compiled_rules, compiled_shapes
-from sdfsim.physics.solver.references import reference
-from sdfsim.physics.solver.rows import IMPULSE, MASS, WANTED, WIDTH, Rows, sweep
-from sdfsim.physics.solver.world import BETWEEN
-from sdfsim.physics.solver.world import COLUMNS as OF_POINT
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import load_shape
 from sdfsim.simulate.simulator import SimulationError, Simulator, join
 from sdfsim.simulate.steppers import stepper_of
 
