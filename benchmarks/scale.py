@@ -1,14 +1,14 @@
 """Time and memory of large scenes, and of many scenes at once: RESULTS.md.
 
-    python -m benchmarks scale growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
-        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, with networks and two engines
+    python -m benchmarks scale growth -o DIR
+        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, with two engines
     python -m benchmarks scale large -o DIR
         heaps, shoes and knots to the end on all cores
     python -m benchmarks scale many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
 
 Every case of the first command runs in a separate process on one thread; times are processor times. Results in DIR are
-not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
+not measured again.
 """
 
 import os
@@ -29,18 +29,16 @@ from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene
+from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory, why_failed
 from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.laws.hard_cases import body, box, on_floor
-from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.simulate.simulator import SimulationError, Simulator, join
-from sdfsim.simulate.steppers import stepper_of
+from sdfsim.simulate.simulator import Simulator
 
 BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
@@ -63,29 +61,13 @@ def with_nodes_cut(scene: Scene, keep: float) -> Scene:
 
 
 @one_thread()
-def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
-    """Time and memory of a scene (its file, or a number of boxes `apart`) with a model, and the depth of overlaps."""
+def ours(source: Path | int, steps: int, keep: float = 1.0) -> dict:
+    """Time and memory of a scene (its file, or a number of boxes `apart`), and the depth of overlaps."""
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
-    frames, broken = [], None
     with peak_memory() as memory:
-        published = stepper_of(load_model(model, weights=False)).on_surfaces
-        simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
-        frames.extend(simulator.frames(1))  # not timed: it loads compiled code
-        began = time.process_time()
-        try:
-            frames.extend(simulator.frames(steps - 1))
-        except SimulationError as error:
-            broken = error.message
-            frames.append(error.rollout)
-        spent = time.process_time() - began
-    rollout = join(frames)
-    return {
-        "bodies": int(simulator.bodies.moves.sum()),
-        "ms": 1e3 * spent / max(1, len(rollout)),
-        "contacts": float(rollout.counters["contacts"].mean()),
-        "broken": broken,
-        "peak_mib": memory["mib"],
-    } | _where(Ran(scene, rollout))
+        rollout, timing = timed_rollout(Simulator(scene, "solver"), steps)
+    contacts = float(rollout.counters["contacts"].mean())
+    return {"ms": timing.cpu_ms, "contacts": contacts, "peak_mib": memory["mib"]} | _where(Ran(scene, rollout))
 
 
 def engine(run: Engine, file: Path, steps: int) -> dict:
@@ -95,8 +77,8 @@ def engine(run: Engine, file: Path, steps: int) -> dict:
     start = start_of_scene(scene, file.parent / "engine", units)
     with peak_memory() as memory:
         motion, timing = run(start, steps)
-    known = {"bodies": int((~motion.static).sum()), "ms": timing.cpu_ms, "peak_mib": memory["mib"]}
-    return known | _where(Ran(scene, scene_rollout(scene, motion, units)))
+    run_of = Ran(scene, scene_rollout(scene, motion, units))
+    return {"ms": timing.cpu_ms, "peak_mib": memory["mib"]} | _where(run_of)
 
 
 def _where(run: Ran) -> dict[str, float]:
@@ -108,7 +90,7 @@ def _where(run: Ran) -> dict[str, float]:
     }
 
 
-def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
+def jobs_of(folder: Path) -> list[Job]:
     """All jobs; scene files are written on first use."""
 
     def scene(name: str, count: int, nodes: int = 0) -> Path:
@@ -116,27 +98,25 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
         return home / "scene.yaml" if (home / "scene.yaml").exists() else write_scene(name, home, count, nodes)
 
     jobs = []
-    for count in (n for n in BOWLS if n <= largest):
+    for count in BOWLS:
         case = f"{count} spheres in a bowl"
-        for nodes, model in ((64, "solver"), (512, "solver"), (64, "gnn"), *(((64, sdf_sim),) if sdf_sim else ())):
-            steps, method = 200 if model != sdf_sim else 10, f"{Path(model).stem}, {nodes} nodes"
-            jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
+        for nodes in (64, 512):
+            jobs.append(Job(case, f"solver, {nodes} nodes", [200], ours, (scene("bowl", count, nodes), 200)))
         for name, run in (("PyBullet", bullet), ("MuJoCo", mujoco)):
             jobs.append(Job(case, name, [200], engine, (run, scene("bowl", count, 64), 200)))
-    for model in ("solver", "gnn"):
-        jobs += [Job(f"{n} boxes far apart", model, [30], ours, (n, 30, model)) for n in APART if n <= 4 * largest]
-        for parts in PARTS:
-            knots = (scene("knots", 64, 2844), 100, model, 1 / parts)
-            jobs.append(Job(f"64 knots of {2844 // parts} nodes", model, [100], ours, knots))
+    jobs += [Job(f"{n} boxes far apart", "solver", [30], ours, (n, 30)) for n in APART]
+    for parts in PARTS:
+        knots = (scene("knots", 64, 2844), 100, 1 / parts)
+        jobs.append(Job(f"64 knots of {2844 // parts} nodes", "solver", [100], ours, knots))
     return jobs
 
 
-def growth(*, out: Out, sdf_sim: str | None = None, largest: int = 512) -> None:
-    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=progress)
+def growth(*, out: Out) -> None:
+    results = measure(jobs_of(out), out / "results", where="fresh", on_progress=progress)
     rows = [(*key, *map(found.get, COLUMNS), why_failed(found)) for key, found in results.items()]
     measured = (
-        "200 steps of spheres in a bowl (10 of *sdf-sim*), 30 of boxes, 100 of knots; each row is a process on one "
-        "thread, in processor time."
+        "200 steps of spheres in a bowl, 30 of boxes, 100 of knots; each row is a process on one thread, in processor "
+        "time."
     )
     columns = ("case", "with", *COLUMNS.values(), "not finished")
     write_record("growth", "python -m benchmarks scale growth -o DIR", measured, columns, rows)
