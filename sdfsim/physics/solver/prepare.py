@@ -35,7 +35,7 @@ from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held
 from sdfsim.physics.solver.triangles import Triangles, signed_distances
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.validity import NO_LIMITS, fault_of
-from sdfsim.sdf.baked_grid import BakedGrid, interpolated, surface_samples
+from sdfsim.sdf.baked_grid import BakedGrid, interpolated
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactGeometry, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
@@ -428,8 +428,7 @@ def compiled_shapes(shapes: Sequence[ContactGeometry], *, grids: bool = True) ->
 
 def _bounds_solid(tree: TriangleTree, grid: BakedGrid) -> bool:
     """Whether triangles tell inside from outside as the grid does, which counts how often the surface goes around."""
-    samples = surface_samples(grid)
-    places = samples[np.random.default_rng(0).integers(len(samples), size=SIDED)] if len(samples) else samples
+    places = tree.corner.mean(1)[np.random.default_rng(0).integers(len(tree.corner), size=SIDED)]
     places = places + grid.cell * np.random.default_rng(1).uniform(-1.5, 1.5, places.shape)
     known = interpolated(grid, places)
     found, _ = signed_distances(_planted([tree]), 0, places, 4.0 * grid.cell)
