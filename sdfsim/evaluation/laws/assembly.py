@@ -162,13 +162,14 @@ def nuts(at: Setting) -> Iterator[Check]:
         scale = 1 / at.size
         bodies = [Put("nut", nut, [0, 0, 8 * pitch * scale], mu=mu, scale=scale), fixed("bolt", bolt, [0, 0, 0])]
         ran = run(at, f"mu = {mu:g}", [bodies[0], replace(bodies[1], scale=scale)], 1.0 / at.time)
-        turned = -ran.w("nut")[-1, 2] / at.time
+        spins, half = ran.rollout.angular_velocity[:, 0, 2], len(ran.time) // 2
         if mu:
-            yield ran.most("turns", abs(turned), 1e-3, "rad/s")
+            yield ran.most("turns", abs(spins[-1]), 1e-3, "rad/s")
         else:
-            yield ran.near("down a turn", ran.v("nut")[-1, 2] * at.time / turned, -lead, 0.05, "m/rad")
+            way, turned = np.ptp(ran.rollout.position[half:, 0, 2]), np.trapezoid(spins[half:], ran.time[half:])
+            yield ran.near("down a turn", 2 * pi * way / -turned, pitch, 0.02, "m")
             full = G * lead / (lead**2 + spin) * ran.time[-1]
-            yield ran.between("speed of a true screw", turned / full, 0.75, 1.01, "")
+            yield ran.between("speed of a true screw", -spins[-1] / full, 0.75, 1.01, "")
 
 
 ASSEMBLY = (pegs, edges, rollers, gears, nuts)
