@@ -77,7 +77,9 @@ def test_a_mesh_has_a_shape_without_any_fit(kind, member: type) -> None:
         mesh_shape(Mesh(crate.vertices, crate.faces[:0]), name="none", kind=kind)
 
 
-def test_grids_are_cached_by_resolution_and_so_are_exact_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grids_are_cached_by_resolution_and_so_are_exact_meshes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from sdfsim.shape import make
 
     monkeypatch.setattr(make, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
