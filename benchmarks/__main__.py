@@ -1,19 +1,15 @@
 """`python -m benchmarks NAME ...` runs the benchmark of that name, in the folder that holds them all."""
 
-import os
 import sys
 from importlib import import_module
 from pathlib import Path
 
 import typer
 
-ALONE = ("camera", "contact_step", "effects")  # measured on one thread
 SHARED = ("baselines", "records")  # modules that the benchmarks share
 
 if __name__ == "__main__":
     name = sys.argv[1] if len(sys.argv) > 1 else ""
-    if name in ALONE:
-        os.environ["NUMBA_NUM_THREADS"] = "1"  # before the first import of numba
     from sdfsim.base.errors import run_main
 
     here = sorted(file.stem for file in Path(__file__).parent.glob("[a-z]*.py") if file.stem not in SHARED)

@@ -2,7 +2,7 @@
 
     python -m benchmarks networks [--model gnn --model sdf-sim] [--seconds 900]
 
-Writes the record of docs/simulator.md. If a motion fails, none of its checks hold. A law that takes a network longer
+Writes the record of docs/stability.md. If a motion fails, none of its checks hold. A law that takes a network longer
 than so many seconds of the processor is cut off, and its remaining checks are not counted.
 """
 

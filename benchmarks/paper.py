@@ -6,8 +6,6 @@
         the same with 2 to 512 spheres in a bowl, and where memory ends
     python -m benchmarks paper accuracy DATA -o DIR [--minutes 5 --minutes 15 ...]
         trains all of them on one core for equal times, SDF-Sim also on unsigned distances, then rolls them out
-    python -m benchmarks paper train DATA -o DIR [--minutes 60] [--device auto]
-        continues the training of SDF-Sim as published for so many minutes, then keeps its curve so far in DIR
 
 DATA is a MOVi-B dataset with train, validation and test. Graphs have the published number of surface nodes, about 440
 per body, and networks the published size. The trained networks have `NODES` nodes per body and the sizes `TRAINED`, so
@@ -25,9 +23,8 @@ import numpy as np
 import torch
 
 from benchmarks import baselines  # noqa: F401, adds its networks
-from benchmarks.records import Cell, Out, progress, table, write_record
+from benchmarks.records import Cell, Out, progress, write_record
 from samples.large import write_scene
-from sdfsim.base.files import read_json, write_json
 from sdfsim.data.dataset import read_info
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.evaluation.harness import Job, Panel, draw, line, measure, one_thread, peak_memory, why_failed
@@ -268,28 +265,4 @@ def _power_law(minutes: list[float], found: list[dict[str, Any]]) -> float | Non
     return float(np.exp(start + slope * np.log(600.0)))
 
 
-PUBLISHED = 0.160  # m, SDF-Sim's error on MOVi-B at `FRAME`, after a million steps
-
-
-def train(data: Path, out: Out, minutes: float = 60.0, device: str = "auto") -> None:
-    """Continue the published training of SDF-Sim for `minutes` of processor time; print and keep its curve."""
-    file, run = out / "curve.json", out / "run"
-    curve = read_json(file) if file.exists() else []
-    budget = 60.0 * minutes + (curve[-1]["seconds"] if curve else 0.0)
-    resume = (run / "checkpoint.npz").exists()
-    report = run_training(
-        data, run, preset="sdf-sim", resume=resume, budget=budget, device=device, on_progress=progress
-    )
-    curve.append(report | judged(run / "model.safetensors", data, "validation", "exact"))
-    write_json(file, curve)
-    columns = ("steps", "seconds", "held_out_loss", "translation_rmse", "rotation_error")
-    print(table(columns, [[look[name] for name in columns] for look in curve]), flush=True)
-    if len(curve) > 2 and curve[-1]["translation_rmse"] < curve[-3]["translation_rmse"]:
-        steps, metres = (np.log([look[name] for look in curve[-3:]]) for name in ("steps", "translation_rmse"))
-        slope, start = np.polyfit(metres, steps, 1)
-        needed = np.exp(start + slope * np.log(PUBLISHED))
-        hours = needed * curve[-1]["seconds"] / curve[-1]["steps"] / 3600
-        print(f"By the power law of the last three, {PUBLISHED} m need {needed:.2g} steps, {hours:.2g} hours.")
-
-
-COMMANDS = (graphs, growth, accuracy, train)
+COMMANDS = (graphs, growth, accuracy)

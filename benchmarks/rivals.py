@@ -4,8 +4,6 @@
     python -m benchmarks rivals turns DATA -o DIR
         ours and the engines on convex pieces in turn, each with the longest inner step at which `shapes` found bodies
         at most 1 % deep in each other: medians and ranges of 7 rounds
-    python -m benchmarks rivals large -o DIR
-        the first 20 steps of large scenes with inner steps of 4 ms: as they fall, and at rest
 
 DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 10, 4, 2 and 1 ms (for bodies of a
 metre; for smaller ones in proportion to the square root of their size), in processor time of one thread. No engine is
@@ -29,7 +27,7 @@ from benchmarks.records import Cell, Out, in_turn, progress, spread, write_recor
 from samples.large import sample_shape, write_scene
 from sdfsim.apps.export import convex_pieces
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import read_arrays, write_arrays, write_text
+from sdfsim.base.files import write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
@@ -62,8 +60,6 @@ INNER = (2, 5, 10, 20)  # inner steps in a step of 20 ms; the last is an engine'
 USUAL = 5
 STEPS = 100
 COMPARED = 25  # steps over which an engine is compared with itself: later, chaos dominates
-HEAP_STEPS = 20  # of the large scenes: enough to time a step
-SETTLED = 400  # steps in which our solver lets bodies come to rest
 MOVI_B = 5  # trajectories
 DEEP = 0.01  # of the smallest body's size: "equal penetration"
 FRICTION = 0.7  # of all bodies: 0.49 for a contact
@@ -147,28 +143,8 @@ def scan(folder: Path) -> Scene:
     return on_floor(shapes, [*bodies, body("ground", 5, (0.0, 0.0, 1.0), motion="static", mass=0.0)])
 
 
-def written(folder: Path, name: str, count: int | None = None) -> Scene:
-    return load_scene(write_scene(name, folder / f"{name}{count or ''}", count))
-
-
-def settled(folder: Path, name: str, count: int | None = None) -> Scene:
-    """The same scene after our solver has let it come to rest; poses are kept in the folder."""
-    scene, file = written(folder, name, count), folder / f"{name}{count or ''}-settled.npz"
-    if not file.exists():
-        simulator = Simulator(scene, "solver")
-        simulator.step(SETTLED)
-        handles = [simulator[body.name] for body in scene.bodies]
-        poses = {
-            "position": np.array([h.position for h in handles]),
-            "quat_xyzw": np.array([h.quat_xyzw for h in handles]),
-        }
-        write_arrays(file, poses)
-    found, rest = read_arrays(file, "settled bodies"), np.zeros(3)
-    bodies = tuple(
-        replace(b, position=place, quat_xyzw=turn, velocity=rest, angular_velocity=rest) if b.motion == "dynamic" else b
-        for b, place, turn in zip(scene.bodies, found["position"], found["quat_xyzw"], strict=True)
-    )
-    return replace(scene, bodies=bodies)
+def written(folder: Path, name: str, count: int) -> Scene:
+    return load_scene(write_scene(name, folder / f"{name}{count}", count))
 
 
 CASES: dict[str, Callable[[Path], Scene]] = {
@@ -177,13 +153,8 @@ CASES: dict[str, Callable[[Path], Scene]] = {
     "mugs on pegs": mugs,
     "scan of 200,000 triangles": scan,
     "16 spheres in a bowl": partial(written, name="bowl", count=16),
-    "512 spheres in a bowl": partial(written, name="bowl", count=512),
-    "512 spheres at rest in a bowl": partial(settled, name="bowl", count=512),
-    "heaps, 1.1 M nodes": partial(written, name="heaps"),
-    "heaps at rest": partial(settled, name="heaps"),
 }
-LARGE = ["512 spheres in a bowl", "512 spheres at rest in a bowl", "heaps, 1.1 M nodes", "heaps at rest"]
-SHAPES = ["MOVi-B", *(case for case in CASES if case not in LARGE)]
+SHAPES = ["MOVi-B", *CASES]
 
 
 def in_pieces(scene: Scene, folder: Path) -> Scene:
@@ -225,10 +196,10 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
     return Ran(scene, rollout), timing.cpu_ms / (0.02 * units.time), prepared
 
 
-def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
+def scenes_of(case: str, data: Path, folder: Path) -> list[Scene]:
     """The scenes of a case, of equal friction and without restitution and sleep."""
     folder.mkdir(parents=True, exist_ok=True)
-    if data is not None and case == "MOVi-B":
+    if case == "MOVi-B":
         recorded, shapes = load_recorded(data, "test", most=MOVI_B)
         scenes = [scene_of([t], [0], shapes, conditions_of(data).floor)[0] for t in recorded]
     else:
@@ -240,7 +211,7 @@ def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
 
 
 @one_thread()
-def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str, Any]:
+def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
     """The cost of every inner step for an engine in a case.
 
     Returns:
@@ -249,15 +220,14 @@ def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str,
         prepare_s and mib once.
     """
     scenes = scenes_of(case, data, folder)
-    steps, inners = (HEAP_STEPS, (USUAL,)) if case in LARGE else (STEPS, INNER)
     size = [min(largest_extent(s.shapes[b.shape]) * b.scale for b in s.bodies if b.motion == "dynamic") for s in scenes]
     found: dict[int, dict[str, float]] = {}
     motions: dict[int, list[Ran]] = {}
     prepare, broken = 0.0, {}
     with peak_memory() as memory:
-        for inner in inners:
+        for inner in INNER:
             try:
-                runs = [moved(name, scene, steps, inner, folder) for scene in scenes]
+                runs = [moved(name, scene, STEPS, inner, folder) for scene in scenes]
             except SdfsimError as error:
                 broken[inner] = error.message
                 break  # finer steps take longer still
@@ -287,13 +257,11 @@ def lost(case: str, run: Ran, size: float) -> int:
     return int((gone | (height < 1.2)).sum() if case == "mugs on pegs" else gone.sum())
 
 
-def compared(cases: list[str], data: Path | None, out: Out) -> Results:
-    for case in set(cases) & set(LARGE):
-        CASES[case](out / "scenes")  # settles it here, so that the measured process does not contain that memory
-    content = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION]
+def compared(data: Path, out: Out) -> Results:
+    content = [INNER, STEPS, COMPARED, MOVI_B, FRICTION]
     jobs = [
-        Job(case, name, content, measured, (name, case, data and data.resolve(), out / "scenes"))
-        for case in cases
+        Job(case, name, content, measured, (name, case, data.resolve(), out / "scenes"))
+        for case in SHAPES
         for name in ENGINES
     ]
     return measure(jobs, out / "results", where="fresh", on_progress=progress)
@@ -310,7 +278,7 @@ def shapes(data: Path, *, out: Out) -> None:
         f"ms per s where depth is at most {100 * DEEP:g} %", "prepared in, s", "MiB",
     )  # fmt: skip
     rows: list[tuple[Cell, ...]] = []
-    for (case, name), result in compared(SHAPES, data, out).items():
+    for (case, name), result in compared(data, out).items():
         usual = result.get("inner", {}).get(str(USUAL))
         if usual is None:
             rows.append((case, name, why_not(result), *[""] * 6))
@@ -336,7 +304,7 @@ def turns(data: Path, *, out: Out, rounds: int = 7) -> None:
     """The fast engines at equal depth in alternating runs, so that other work on the machine slows all of them
     alike."""
     rows: list[tuple[Cell, ...]] = []
-    found = compared(SHAPES, data, out)
+    found = compared(data, out)
     for k, case in enumerate(SHAPES):
         scenes, inner = scenes_of(case, data, out / "scenes"), {name: enough(found[case, name]) for name in FAST}
 
@@ -356,19 +324,4 @@ def turns(data: Path, *, out: Out, rounds: int = 7) -> None:
     write_record("rivals_in_turn", "python -m benchmarks rivals turns DATA -o DIR", measured, ("case", *columns), rows)
 
 
-def large(*, out: Out) -> None:
-    """Large scenes: a row for each case and engine, with time, memory and depth."""
-    rows: list[tuple[Cell, ...]] = []
-    for (case, name), result in compared(LARGE, None, out).items():
-        usual = result.get("inner", {}).get(str(USUAL))
-        if usual:
-            gone = f"{usual['lost']} lost" if usual["lost"] else ""
-            rows.append((case, name, usual["ms"], result["mib"], 100 * usual["deep"], gone))
-        else:
-            rows.append((case, name, None, None, None, why_not(result)))
-    measured = f"The first {HEAP_STEPS} steps of large scenes, inner steps of 4 ms, in processor time of one thread."
-    columns = ("case", "engine", "ms per s", "MiB", "depth, %", "not finished, or lost")
-    write_record("rivals_large", "python -m benchmarks rivals large -o DIR", measured, columns, rows)
-
-
-COMMANDS = (shapes, turns, large)
+COMMANDS = (shapes, turns)

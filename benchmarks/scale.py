@@ -1,16 +1,14 @@
 """Time and memory of large scenes, and of many scenes at once: RESULTS.md.
 
-    python -m benchmarks scale growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
-        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, with networks and two engines
+    python -m benchmarks scale growth -o DIR
+        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, with two engines
     python -m benchmarks scale large -o DIR
         heaps, shoes and knots to the end on all cores
     python -m benchmarks scale many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
-    python -m benchmarks scale roofline
-        cost of a distance, a contact and a row of impulses, compared with the limits of the machine: docs/scale.md
 
 Every case of the first command runs in a separate process on one thread; times are processor times. Results in DIR are
-not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
+not measured again.
 """
 
 import os
@@ -19,41 +17,28 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
-from numba import njit
 
 from benchmarks.engines import bullet, mujoco
-from benchmarks.records import ROOT, Out, progress, write_record
+from benchmarks.records import Out, progress, write_record
 from samples.large import HEAPS, write_scene
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene
+from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory, why_failed
 from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.laws.hard_cases import body, box, on_floor
-from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout
-from sdfsim.physics.solver.contacts import contact_rows
-from sdfsim.physics.solver.distance import distances
-from sdfsim.physics.solver.prepare import compiled_rules, compiled_shapes
-from sdfsim.physics.solver.references import reference
-from sdfsim.physics.solver.rows import IMPULSE, MASS, WANTED, WIDTH, Rows, sweep
-from sdfsim.physics.solver.world import BETWEEN
-from sdfsim.physics.solver.world import COLUMNS as OF_POINT
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import load_shape
-from sdfsim.simulate.simulator import SimulationError, Simulator, join
-from sdfsim.simulate.steppers import stepper_of
+from sdfsim.simulate.simulator import Simulator
 
 BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
@@ -76,29 +61,13 @@ def with_nodes_cut(scene: Scene, keep: float) -> Scene:
 
 
 @one_thread()
-def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
-    """Time and memory of a scene (its file, or a number of boxes `apart`) with a model, and the depth of overlaps."""
+def ours(source: Path | int, steps: int, keep: float = 1.0) -> dict:
+    """Time and memory of a scene (its file, or a number of boxes `apart`), and the depth of overlaps."""
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
-    frames, broken = [], None
     with peak_memory() as memory:
-        published = stepper_of(load_model(model, weights=False)).on_surfaces
-        simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
-        frames.extend(simulator.frames(1))  # not timed: it loads compiled code
-        began = time.process_time()
-        try:
-            frames.extend(simulator.frames(steps - 1))
-        except SimulationError as error:
-            broken = error.message
-            frames.append(error.rollout)
-        spent = time.process_time() - began
-    rollout = join(frames)
-    return {
-        "bodies": int(simulator.bodies.moves.sum()),
-        "ms": 1e3 * spent / max(1, len(rollout)),
-        "contacts": float(rollout.counters["contacts"].mean()),
-        "broken": broken,
-        "peak_mib": memory["mib"],
-    } | _where(Ran(scene, rollout))
+        rollout, timing = timed_rollout(Simulator(scene, "solver"), steps)
+    contacts = float(rollout.counters["contacts"].mean())
+    return {"ms": timing.cpu_ms, "contacts": contacts, "peak_mib": memory["mib"]} | _where(Ran(scene, rollout))
 
 
 def engine(run: Engine, file: Path, steps: int) -> dict:
@@ -108,8 +77,8 @@ def engine(run: Engine, file: Path, steps: int) -> dict:
     start = start_of_scene(scene, file.parent / "engine", units)
     with peak_memory() as memory:
         motion, timing = run(start, steps)
-    known = {"bodies": int((~motion.static).sum()), "ms": timing.cpu_ms, "peak_mib": memory["mib"]}
-    return known | _where(Ran(scene, scene_rollout(scene, motion, units)))
+    run_of = Ran(scene, scene_rollout(scene, motion, units))
+    return {"ms": timing.cpu_ms, "peak_mib": memory["mib"]} | _where(run_of)
 
 
 def _where(run: Ran) -> dict[str, float]:
@@ -121,7 +90,7 @@ def _where(run: Ran) -> dict[str, float]:
     }
 
 
-def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
+def jobs_of(folder: Path) -> list[Job]:
     """All jobs; scene files are written on first use."""
 
     def scene(name: str, count: int, nodes: int = 0) -> Path:
@@ -129,27 +98,25 @@ def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
         return home / "scene.yaml" if (home / "scene.yaml").exists() else write_scene(name, home, count, nodes)
 
     jobs = []
-    for count in (n for n in BOWLS if n <= largest):
+    for count in BOWLS:
         case = f"{count} spheres in a bowl"
-        for nodes, model in ((64, "solver"), (512, "solver"), (64, "gnn"), *(((64, sdf_sim),) if sdf_sim else ())):
-            steps, method = 200 if model != sdf_sim else 10, f"{Path(model).stem}, {nodes} nodes"
-            jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
+        for nodes in (64, 512):
+            jobs.append(Job(case, f"solver, {nodes} nodes", [200], ours, (scene("bowl", count, nodes), 200)))
         for name, run in (("PyBullet", bullet), ("MuJoCo", mujoco)):
             jobs.append(Job(case, name, [200], engine, (run, scene("bowl", count, 64), 200)))
-    for model in ("solver", "gnn"):
-        jobs += [Job(f"{n} boxes far apart", model, [30], ours, (n, 30, model)) for n in APART if n <= 4 * largest]
-        for parts in PARTS:
-            knots = (scene("knots", 64, 2844), 100, model, 1 / parts)
-            jobs.append(Job(f"64 knots of {2844 // parts} nodes", model, [100], ours, knots))
+    jobs += [Job(f"{n} boxes far apart", "solver", [30], ours, (n, 30)) for n in APART]
+    for parts in PARTS:
+        knots = (scene("knots", 64, 2844), 100, 1 / parts)
+        jobs.append(Job(f"64 knots of {2844 // parts} nodes", "solver", [100], ours, knots))
     return jobs
 
 
-def growth(*, out: Out, sdf_sim: str | None = None, largest: int = 512) -> None:
-    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=progress)
+def growth(*, out: Out) -> None:
+    results = measure(jobs_of(out), out / "results", where="fresh", on_progress=progress)
     rows = [(*key, *map(found.get, COLUMNS), why_failed(found)) for key, found in results.items()]
     measured = (
-        "200 steps of spheres in a bowl (10 of *sdf-sim*), 30 of boxes, 100 of knots; each row is a process on one "
-        "thread, in processor time."
+        "200 steps of spheres in a bowl, 30 of boxes, 100 of knots; each row is a process on one thread, in processor "
+        "time."
     )
     columns = ("case", "with", *COLUMNS.values(), "not finished")
     write_record("growth", "python -m benchmarks scale growth -o DIR", measured, columns, rows)
@@ -218,142 +185,4 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     write_record("many_scenes", command, measured, ("workers", "scenes a second", "times one worker"), rows)
 
 
-# Operations (a product, a sum, a comparison or a root each) and bytes of one distance, one contact and one row, counted
-# in `physics/solver/distance.py` (`_grid`), `contacts.py` (`contact_rows`) and `rows.py` (`_relax`): eight samples and
-# the number of a brick, and the columns of the table of shapes; a point, poses, inertias and velocities of two bodies,
-# and three rows, written twice as they are made of zeros; a row, and the changes of two bodies' velocities, read and
-# written.
-DISTANCE, ROW = (95, 8 * 4 + 8 + 15 * 8), (52, 17 * 8 + 2 * 2 * 6 * 8 + 4 * 8)
-CONTACT = (583, OF_POINT * 8 + 2 * (18 + 15) * 8 + 2 * 3 * WIDTH * 8 + 11 * 8)
-PLACES, ROWS, ISLAND, SWEEPS, BOXES, AGAIN = 200_000, 4096, 64, 50, 60, 50
-
-
-def roofline() -> None:
-    """The machine's bandwidth and arithmetic on one thread, and ours."""
-    flops, bandwidth, latency = arithmetic(), memory(), chain()
-    columns = ("one thread", "operations", "bytes", "ns", "Gop/s", "GB/s", "share of arithmetic", "share of bandwidth")
-    rows = []
-    for name, (operations, moved), seconds in (
-        ("machine: matrix products", (1, 0), 1 / flops),
-        ("machine: dependent sums", (1, 0), latency),
-        ("machine: copies of 256 MiB", (0, 1), 1 / bandwidth),
-        ("grid distance, neighbouring points in order", DISTANCE, distance_time(scattered=False)),
-        ("grid distance, points in random order", DISTANCE, distance_time(scattered=True)),
-        ("contact: its three rows", CONTACT, contact_time()),
-        ("row of impulses, one update", ROW, row_time()),
-    ):
-        rate, speed = operations / seconds, moved / seconds
-        told = ((operations, rate / 1e9, rate / flops), (moved, speed / 1e9, speed / bandwidth))
-        first, second = (some if some[0] else [None] * 3 for some in told)
-        rows.append((name, first[0], second[0], 1e9 * seconds, first[1], second[1], first[2], second[2]))
-    measured = "Processor times on one thread, the least of seven."
-    write_record("roofline", "python -m benchmarks scale roofline", measured, columns, rows)
-
-
-def best(call: Callable[[], object], rounds: int = 7) -> float:
-    """Least processor seconds of several calls, which reduces the effect of other programs."""
-    call()
-    took = []
-    for _ in range(rounds):
-        started = time.process_time()
-        call()
-        took.append(time.process_time() - started)
-    return min(took)
-
-
-def arithmetic() -> float:
-    """Operations per second in double precision, with all units of a core busy."""
-    size = 768
-    a, b = torch.rand((2, size, size), dtype=torch.float64)
-    with one_thread():
-        return 2 * size**3 / best(lambda: a @ b)
-
-
-def memory() -> float:
-    """Bytes per second, read and written, of copies that do not fit into a cache."""
-    a = np.full(2**25, 2.0)  # written, because unwritten pages of zeros are all one page
-    b = np.ones_like(a)
-    return 2 * a.nbytes / best(lambda: np.copyto(b, a))
-
-
-@njit(error_model="numpy")
-def _summed(count: int, value: float) -> float:
-    total = value
-    for _ in range(count):
-        total = total * value + value  # the next one depends on it
-    return total
-
-
-def chain() -> float:
-    """s per operation in a chain of dependent operations: two per turn."""
-    count = 10_000_000
-    return best(lambda: _summed(count, 0.999)) / (2 * count)
-
-
-def distance_time(*, scattered: bool) -> float:
-    """s of a distance with its gradient near the surface of the sample vase."""
-    shape = load_shape(ROOT / "samples" / "shapes" / "vase")
-    table = compiled_shapes([shape.contact])
-    generator = np.random.default_rng(0)
-    places = shape.nodes[np.arange(PLACES) % len(shape.nodes)]
-    places = places + generator.uniform(-0.01, 0.01, places.shape)
-    places = places[generator.permutation(PLACES) if scattered else np.lexsort(np.round(places, 2).T)]
-    return best(lambda: distances(table.table, table.brick, table.sample, 0, places)) / PLACES
-
-
-@njit(error_model="numpy")
-def _written(world, work, motion, rules, manifolds, rows, times: int) -> int:
-    count = 0
-    for _ in range(times):
-        some = reference(world), reference(work), reference(motion), reference(rules), reference(manifolds)
-        count += contact_rows(*some, reference(rows), BETWEEN)
-    return count
-
-
-def _room(row: np.ndarray, where: np.ndarray, start: np.ndarray, order: np.ndarray) -> Rows:
-    blocks, nothing = len(row), np.zeros(0, np.int64)
-    zero = [np.zeros(blocks) for _ in range(3)]
-    kind = np.zeros(blocks, np.int64)
-    return Rows(kind, where, row, zero[0], np.zeros((blocks, 4)), *zero[1:], start, order, nothing, nothing)
-
-
-def contact_time() -> float:
-    """s to write the rows of a contact, for boxes that rest on a floor."""
-    simulator = Simulator(apart(BOXES), "solver")
-    simulator.step(30)
-    scene: Any = simulator.carry.scene
-    rules = compiled_rules(simulator.options)
-    most, nothing = int(scene._manifolds.count.sum()), np.zeros(0, np.int64)
-    rows = _room(np.zeros((most, 3, WIDTH)), np.zeros((most, 4), np.int64), nothing, nothing)
-    known = scene.world, scene.work, scene._motion, rules, scene._manifolds, rows
-    return best(lambda: _written(*known, AGAIN)) / _written(*known, AGAIN)
-
-
-class Velocities(NamedTuple):
-    """What a sweep needs of `Work`."""
-
-    inverse_mass: np.ndarray
-    change: np.ndarray
-
-
-@njit(error_model="numpy")
-def _swept(velocities: Velocities, rows: Rows) -> None:
-    some, work = reference(rows), reference(velocities)
-    for i in range(len(rows.start) - 1):
-        for _ in range(SWEEPS):
-            sweep(some, work, None, rows.start[i], rows.start[i + 1])
-
-
-def row_time() -> float:
-    """s per row of impulses in a sweep, in islands of `ISLAND` contacts of bodies in a chain that does not converge."""
-    generator, bodies = np.random.default_rng(0), ROWS + 1
-    row = generator.uniform(-1.0, 1.0, (ROWS, 3, WIDTH))
-    row[:, :, MASS], row[:, :, WANTED], row[:, :, IMPULSE] = 0.01, 1.0, 0.0
-    first = np.arange(ROWS)
-    where = np.stack([first, np.zeros_like(first), first, first + 1], axis=1)
-    rows = _room(row, where, np.arange(0, ROWS + 1, ISLAND), first)
-    velocities = Velocities(np.ones(bodies), np.zeros((bodies, 6)))
-    return best(lambda: _swept(velocities, rows)) / (ROWS * SWEEPS)
-
-
-COMMANDS = (growth, large, many, roofline)
+COMMANDS = (growth, large, many)

@@ -87,16 +87,12 @@ class Thing:
 
     def tosses(self, folder: Path) -> tuple[float, list[Links]]:
         """Frame spacing s, and the poses [T, D, *] of every toss, in axes that are upright on the table. Raises
-        SdfsimError if the file is absent or holds no such recordings."""
-        file, hinged = folder / f"{self.name}.npz", self.name == "elbow"
+        SdfsimError if the file is absent."""
+        file, tosses = folder / f"{self.name}.npz", []
         found = read_arrays(file, "recorded tosses", f"give the folder that holds {file.name}")
-        wanted = {"start", "dt", "position", "quat_xyzw", *(("hinge", "number") if hinged else ())}
-        if missing := wanted - set(found):
-            raise SdfsimError(f"{file}: there is no array {min(missing)!r}", f"it has {', '.join(sorted(found))}")
-        tosses = []
         for k, (a, b) in enumerate(zip(found["start"][:-1], found["start"][1:], strict=True)):
             place, quat = (found[name][a:b].astype(np.float64) for name in ("position", "quat_xyzw"))
-            if hinged:
+            if "hinge" in found:
                 both = links_of(place, Rotation.from_quat(quat), found["hinge"][a:b].astype(np.float64))
                 tosses.append(upright(both, int(found["number"][k])))
             else:

@@ -1,4 +1,4 @@
-"""The results of `sdfsim tradeoff` on MOVi-B, with its picture: docs/notes/error-against-time.md.
+"""The results of `sdfsim tradeoff` on MOVi-B, with its picture: RESULTS.md.
 
     python -m benchmarks tradeoff DATA -o DIR
 

@@ -1,4 +1,4 @@
-"""Simulates samples and the large scenes, and takes their pictures for docs/samples.md and docs/scale.md.
+"""Simulates samples and the large scenes, and takes their pictures for docs/tutorial.md and RESULTS.md.
 
 python scripts/gallery.py [NAME ...]     # samples, or heaps, knots and shoes, which take minutes
 """

@@ -222,7 +222,7 @@ def export(
     ] = "pieces",
     allow_outside: Outside = False,
 ) -> None:
-    """Shape, scene or run -> a file of other programs (docs/export.md)."""
+    """Shape, scene or run -> a file of other programs (docs/import-and-export.md)."""
     from sdfsim.apps import export as room
 
     report = room.export(**session.given("scene"), scene_file=scene, on_progress=session.stage_progress)
@@ -254,7 +254,7 @@ def import_(
         typer.Option(metavar="NAME", help="The keyframe to start from (MJCF; default: the one called start)."),
     ] = None,
 ) -> None:
-    """URDF or MJCF -> scene.yaml with joints (docs/import.md)."""
+    """URDF or MJCF -> scene.yaml with joints (docs/import-and-export.md)."""
     from sdfsim.apps import import_robot as room
 
     given = session.given("packages")

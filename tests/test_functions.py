@@ -3,6 +3,7 @@
 import inspect
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -88,14 +89,18 @@ def test_a_handle_knows_its_inertia():
     np.testing.assert_allclose(axes @ handle.inertia @ axes.T @ turned, np.cross(arm, impulse), atol=1e-9)
 
 
-def test_the_tour_runs_and_leaves_pictures(tmp_path):
-    command = [sys.executable, str(ROOT / "samples" / "tour.py")]
-    done = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+def test_the_notebook_runs_from_top_to_bottom(tmp_path):
+    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    shutil.copytree(ROOT / "samples" / "shapes", tmp_path / "shapes")
+    book = nbformat.read(ROOT / "samples" / "tour.ipynb", as_version=4)
+    assert not [cell for cell in book.cells if cell.get("outputs")]  # it is kept without what it printed
+    nbclient.NotebookClient(book, timeout=300, resources={"metadata": {"path": tmp_path}}).execute(
+        env=os.environ | {"PYTHONPATH": str(ROOT)}
     )
-    assert done.returncode == 0, done.stderr
-    slid = [float(line.split()[-2]) for line in done.stdout.splitlines() if line.startswith("friction")]
+    printed = "".join(o.get("text", "") for cell in book.cells for o in cell.get("outputs", ()))
+    slid = [float(line.split()[-2]) for line in printed.splitlines() if line.startswith("friction")]
     assert len(slid) == 5 and slid == sorted(slid, reverse=True)  # the rougher, the shorter
+    assert "no law of mechanics is broken" in printed
     assert {file.name for file in (tmp_path / "tour").iterdir()} == {
         *("tour-0.png", "tour-0.25.png", "tour-1.5.png", "tour.glb", "tour.npz", "tour.yaml")
     }

@@ -1,7 +1,7 @@
 """`export`: a shape, a scene or a run becomes a file that other programs open.
 
 In every format poses are those of the shapes' own origins. The report's `left_out` says what the format cannot hold;
-docs/export.md lists it for each format.
+docs/import-and-export.md lists it for each format.
 """
 
 import csv

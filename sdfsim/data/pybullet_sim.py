@@ -1,7 +1,20 @@
 """The teacher: PyBullet with Kubric's settings (an optional extra, `pip install sdfsim[data]`).
 
-docs/teacher.md compares the settings one by one. Before the first inner step the engine makes an extra one, with the
-bodies far apart, because it uses the inertias of a mass of 1 kg in its first step.
+Line numbers are those of Kubric: `sim` is kubric/simulator/pybullet.py, `ab` and `c` are
+challenges/movi/movi_*_worker.py. As there: maximal coordinates (sim:84, 100, 125, floor too; btRigidBody in place of
+btMultiBody, so no damping), contacts at a distance <= 0 (sim:85, 101, 133), restitution from any speed on (sim:38:
+threshold 0), impulses from 0 in each inner step (sim:38), split impulse below -40 mm, otherwise 8 % of a depth become
+speed in each step (sim:39), no contact slop (sim:39), two bounds of friction, along the slip and across (sim:39; the
+cone is read for btMultiBody only), deterministic pairs (sim:40), 50 iterations or a residual below 1e-7, no sleeping,
+no rolling friction, products of the two bodies' friction and restitution, gravity of (0, 0, -10) (core/scene.py:67),
+the inertia of the hulls' bounding box, and a margin of 1 mm around hulls. Recorded velocities are those that the next
+inner step starts from.
+
+Otherwise: inner steps of 1/250 s (1/240 s there, core/scene.py:66) and 50 or 60 frames a second (12 there, ab:72),
+which they divide; the floor is a box with its top at z = 0 (there a dome, ab:87, c:95, whose margin lies on top of
+it; rebounds are as high); spheres of our own recipes are exact. Before the first inner step the engine makes an extra
+one, with the bodies far apart, because it uses the inertias of a mass of 1 kg in its first step; bodies that start in
+the air move the same.
 """
 
 from dataclasses import dataclass

@@ -53,15 +53,15 @@ def tube(outer: float, inner: float, height: float, segments: int = 64) -> Mesh:
     """A tube about z of radii `outer` and `inner` m."""
     turn = 2 * np.pi * np.arange(segments) / segments
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return _sleeve(outer * circle, inner * circle, height)
+    return sleeve(outer * circle, inner * circle, height)
 
 
 def gear() -> Mesh:
     """A spur gear about z: 12 teeth of 0.1 m, 0.2 m thick, with a bore of radius 0.12 m."""
-    return _sleeve(*_gear_outline(), 0.2)
+    return sleeve(*_gear_outline(), 0.2)
 
 
-def _sleeve(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
+def sleeve(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
     """The solid between two outlines [K, 2] m, counter-clockwise, from -height / 2 to height / 2 m."""
     count = len(outer)
     layers = [np.column_stack([line, np.full(count, z)]) for z in (-height / 2, height / 2) for line in (outer, inner)]

@@ -31,7 +31,7 @@ from sdfsim.scene.schema import (
 )
 from sdfsim.shape.make import analytic_shape, far_origin, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.parts import Part, color_of, moved, pose_of, skin_of, solid_of
-from sdfsim.shape.shape import Shape, centred, load_shape, with_nodes, with_sdf, with_wall
+from sdfsim.shape.shape import SdfKind, Shape, centred, load_shape, with_nodes, with_sdf, with_wall
 
 
 def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
@@ -152,6 +152,8 @@ def _load_shapes(
     scales: dict[str | None, list[float]] = {}
     for body in table.bodies:
         scales.setdefault(same[body.shape], []).append(body.scale)
+    # A network that predicts motions was trained on fitted shapes.
+    own: SdfKind = "mesh" if table.model in (None, "solver") else "mlp"
     slow = {key: s.kind in FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
     for now in (False, True):
         todo = [key for key in first.values() if slow[key] is now]
@@ -162,7 +164,7 @@ def _load_shapes(
 
             try:
                 told = silent if on_progress is silent else report
-                shapes[key] = _load_shape(key, table.shapes[key], scales[key], told)
+                shapes[key] = _load_shape(key, table.shapes[key], scales[key], own, told)
             except SdfsimError as error:
                 hint = f" ({error.hint})" if error.hint else ""
                 faults.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
@@ -170,9 +172,9 @@ def _load_shapes(
     return same, shapes
 
 
-def _load_shape(name: str, entry: ShapeTable, scales: list[float], on_progress: Progress) -> Shape:
+def _load_shape(name: str, entry: ShapeTable, scales: list[float], own: SdfKind, on_progress: Progress) -> Shape:
     kind: Any = entry.kind
-    made: Any = {"sdf": entry.sdf or "mlp", "resolution": entry.resolution, "on_progress": on_progress, "name": name}
+    made: Any = {"sdf": entry.sdf or own, "resolution": entry.resolution, "on_progress": on_progress, "name": name}
     if entry.asset:
         shape = load_shape(entry.asset)
         shape = with_sdf(shape, entry.sdf, resolution=entry.resolution) if entry.sdf else shape

@@ -271,13 +271,15 @@ class Sphere(Table):
 
 
 class Upright(Table):
-    """An exact capsule or cylinder along z, about the origin."""
+    """An exact cylinder along z, about the origin."""
 
     radius: Number = key("radius", unit="m", gt=0)
-    height: Number = key("along z; for a capsule with its caps, so above twice the radius", unit="m", gt=0)
+    height: Number = key("along z; for a capsule above twice the radius, because it includes the caps", unit="m", gt=0)
 
 
 class Capsule(Upright):
+    """An exact capsule along z, about the origin."""
+
     def check_values(self) -> Iterator[Fault]:
         if self.height <= 2 * self.radius:
             yield ("height",), f"must be above twice the radius, its caps included (got {self.height:g} m)"
@@ -356,10 +358,8 @@ class ShapeTable(Table):
     asset: Annotated[Text, AfterValidator(_there)] | None = key(
         "folder that `reconstruct` or `fit` has written, relative to the scene's folder", None
     )
-    mesh: Annotated[Text, AfterValidator(_there)] | None = key(
-        "mesh file, relative to the scene's folder; fitted on first use, then taken from a cache", None
-    )
-    primitive: Primitive | None = key("a procedural shape, fitted on first use", None)
+    mesh: Annotated[Text, AfterValidator(_there)] | None = key("mesh file, relative to the scene's folder", None)
+    primitive: Primitive | None = key("a procedural shape", None)
     sphere: Sphere | None = key("an exact sphere", None)
     capsule: Capsule | None = key("an exact capsule", None)
     cylinder: Upright | None = key("an exact cylinder", None)
@@ -370,8 +370,8 @@ class ShapeTable(Table):
     cap: Literal["on", "off"] = key("close the openings of a mesh", "off")
     thicken: Number | None = key("thickness that an open sheet of a mesh gets", None, "m", gt=0)
     sdf: SdfKind | None = key(
-        "where distances come from: a fitted network, samples on a grid, or the mesh itself; by default "
-        "an asset keeps its own and others are fitted",
+        "where distances come from: a fitted network, samples on a grid, or the mesh itself; by default an asset keeps "
+        "its own, and others are the mesh itself, or fitted if the scene's `model` is a network",
         None,
     )
     resolution: Whole = key(
@@ -905,29 +905,20 @@ class SceneTable(Table):
         return body.motion or ("static" if self.flat(body) else "dynamic")
 
 
-_SECTIONS: dict[str, type[Table]] = {
-    "The file": SceneTable,
-    "effects": EffectsTable,
-    "shapes: NAME": ShapeTable,
-    "shapes: NAME: parts[]": PartTable,
-    "shapes: NAME: primitive": Primitive,
-    "shapes: NAME: sphere": Sphere,
-    "shapes: NAME: capsule, cylinder": Upright,
-    "shapes: NAME: box": Box,
-    "shapes: NAME: plane": PlaneShape,
-    "bodies[]": BodyTable,
-    "bodies[]: plane": Plane,
-    "bodies[]: arrange": Arrange,
-    "bodies[]: path[]": Waypoint,
-    "joints[]": JointTable,
-    "joints[]: spring": SpringTable,
-    "joints[]: motor": MotorTable,
-    "joints[]: breaks_at": BreaksTable,
-    "frames[]": FrameTable,
-    "keyframes: NAME": KeyframeTable,
-    "keyframes: NAME: bodies: NAME": Pose,
-    "couplings[]": CouplingTable,
-}
+# A section's tables: its own keys, and those of small tables in it, after the key that holds them.
+_SECTIONS: dict[str, dict[str, type[Table]]] = {
+    "The file": {"": SceneTable, "effects": EffectsTable},
+    "shapes: NAME": {
+        "": ShapeTable, "primitive": Primitive, "sphere": Sphere, "capsule": Capsule, "cylinder": Upright, "box": Box,
+        "plane": PlaneShape, "parts[]": PartTable,
+    },
+    "bodies[]": {"": BodyTable, "plane": Plane, "arrange": Arrange, "path[]": Waypoint},
+    "joints[]": {"": JointTable, "spring": SpringTable, "motor": MotorTable, "breaks_at": BreaksTable},
+    "frames[], keyframes and couplings[]": {
+        "frames[]": FrameTable, "keyframes.NAME": KeyframeTable, "keyframes.NAME.bodies.NAME": Pose,
+        "couplings[]": CouplingTable,
+    },
+}  # fmt: skip
 
 
 def reference() -> str:
@@ -935,20 +926,30 @@ def reference() -> str:
     lines = [
         "# Every key of scene.yaml",
         "",
-        "Lengths are in metres, z is up. Unknown keys, keys that appear twice, NaN and infinity are refused.",
-        "`python -m sdfsim.scene.schema > docs/scene.md` writes this page.",
+        "Lengths are in metres, z is up. Unknown keys, keys that appear twice, NaN and infinity are refused. Paths are "
+        "relative to the folder",
+        "of the file and must stay inside it, unless you give `--allow-outside`. `python -m sdfsim.scene.schema > "
+        "docs/scene.md` writes this page.",
     ]
-    for title, table in _SECTIONS.items():
-        lines += ["", f"## {title}", "", table.__doc__ or ""]
-        head = ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"]
-        lines += head if table.model_fields else []
-        for key, field in table.model_fields.items():
-            known = _schema(table, key)
-            default = "required" if field.is_required() else known.get("default")
-            default = "" if default is None or isinstance(default, dict) else str(default)
-            cells = (f"`{key}`", known["description"], known["unit"], _allowed(known), default)
-            lines.append("| " + " | ".join(cells) + " |")
+    for title, tables in _SECTIONS.items():
+        lines += ["", f"## {title}", ""]
+        said = {name: " ".join((table.__doc__ or "").split()) for name, table in tables.items()}
+        lines.append(" ".join(f"`{name}`: {text}" if name else text for name, text in said.items()))
+        lines += ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"]
+        lines += [row for name, table in tables.items() for row in _rows(f"{name}." if name else "", table)]
     return "\n".join(lines) + "\n"
+
+
+def _rows(prefix: str, table: type[Table]) -> Iterator[str]:
+    for key, field in table.model_fields.items():
+        known = _schema(table, key)
+        default = "required" if field.is_required() else known.get("default")
+        default = "" if default is None or isinstance(default, dict) else str(default)
+        cells = (f"`{prefix}{key}`", known["description"], known["unit"], _allowed(known), default)
+        if table is BodyTable or key not in Turned.model_fields:
+            yield "| " + " | ".join(cells) + " |"
+        elif key == "quat_xyzw":
+            yield f"| `{prefix}quat_xyzw`, `quat_wxyz`, `euler_xyz_deg` | orientation, as of a body |  |  |  |"
 
 
 def _allowed(schema: dict) -> str:

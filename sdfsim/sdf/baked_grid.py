@@ -38,16 +38,19 @@ class BakedGrid:
     error: float  # m, the largest difference from the SDF, at random places in the bricks of the surface
 
 
-def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None) -> BakedGrid:
+def baked(
+    sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None, finest: int = FINEST
+) -> BakedGrid:
     """The grid of an SDF, or of the union of convex pieces (vertices [V, 3] m each) that it was fitted to. It is baked
-    on first use and then taken from the cache. The thickness of walls is measured at `nodes` [K, 3] m."""
+    on first use and then taken from the cache. The thickness of walls is measured at `nodes` [K, 3] m; thin ones get up
+    to `finest` cells along the largest extent."""
     cache_dir = cache_dir or user_cache("baked")
     # The walls at the nodes decide how fine the grid is. Nodes come from bodies of any scale, so only nine digits
     # count.
     extent = float(np.ptp(sdf.bounds, axis=0).max())
-    known = digest(sdf, np.round(np.asarray(nodes) / extent, 9) + 0.0, [*pieces], CELLS, FINEST)
+    known = digest(sdf, np.round(np.asarray(nodes) / extent, 9) + 0.0, [*pieces], CELLS, finest)
     path = cache_dir / f"{known}-{BAKE_VERSION}.npz"
-    kept = cached_arrays(path, "a baked grid", lambda: vars(bake(sdf, nodes, pieces)))
+    kept = cached_arrays(path, "a baked grid", lambda: vars(bake(sdf, nodes, pieces, finest)))
     cell, thickness, error = (float(kept[name]) for name in ("cell", "thickness", "error"))
     return BakedGrid(kept["low"], cell, kept["coarse"], kept["brick"], kept["fine"], thickness, error)
 
@@ -61,8 +64,8 @@ def grid_certificate(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] =
     return {"baked_cell": grid.cell / extent, "baked_error": grid.error / extent}
 
 
-def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> BakedGrid:
-    """Sample an SDF with `CELLS` cells along the largest extent, or more if walls are thin, up to `FINEST`."""
+def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), finest: int = FINEST) -> BakedGrid:
+    """Sample an SDF with `CELLS` cells along the largest extent, or more if walls are thin, up to `finest`."""
     union = PiecesDistance([convex_hull(piece) for piece in pieces]) if len(pieces) else None
 
     def ask(points: np.ndarray) -> np.ndarray:
@@ -73,7 +76,7 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     thickness = wall_thickness(sdf, nodes)
     cells = CELLS
-    while cells < FINEST and WALL * extent / cells > thickness:
+    while cells < finest and WALL * extent / cells > thickness:
         cells *= 2
     cell = extent / cells
     low, high = sdf.bounds[0] - PADDING * cell, sdf.bounds[1] + PADDING * cell

@@ -55,6 +55,11 @@ class MeshSdf:
         # Built on first use: a scene that only contains such a shape does not need open3d.
         return MeshDistance(self.mesh)
 
+    @property
+    def simple(self) -> bool:
+        """Whether a single clean surface bounds the solid."""
+        return self._oracle.solid.simple
+
     def to(self, device: torch.device | str) -> MeshSdf:
         """Itself."""
         return self

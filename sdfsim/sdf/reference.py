@@ -14,6 +14,9 @@ from sdfsim.geometry.solidify import Solid, exposed
 TRUSTED_COSINE = float(np.cos(np.radians(75.0)))
 # Least difference of a winding number from one half for a reliable sign, if the surface is not quite closed.
 CLEAR = 0.2
+# Cosine between the offset and a face's normal, above which the nearest point is within the face; and the distance,
+# relative to the mesh's size, below which float32 gives the offset no direction.
+STRAIGHT, TOUCHING = 1.0 - 1e-4, 1e-4
 CHUNK = 200_000
 # Number of points tested together against the convex pieces.
 BLOCK = 512
@@ -76,14 +79,19 @@ class MeshDistance:
             direction = np.where(on[:, None], normal, offset / np.where(on, 1.0, unsigned)[:, None])
             return Reference(unsigned - half, closest + half * direction, np.ones(len(points), dtype=bool))
         clear = np.ones(len(points), dtype=bool)
+        side = np.einsum("pi,pi->p", offset, normal)
+        height = np.abs(side)
         if self.solid.simple:
-            inside = self._nearest.odd(points)
+            inside = side < 0.0
+            # Straight above or below a face the sign is that of its normal; beside an edge rays are counted.
+            size = float((self.bounds[1] - self.bounds[0]).max())
+            aside = (height < STRAIGHT * unsigned) | (unsigned < TOUCHING * size)
+            inside[aside] = self._nearest.odd(points[aside])
         else:
             winding = self._winding(points)
             inside = winding > 0.5
             if not self.closed:
                 clear = np.abs(winding - 0.5) > CLEAR
-        height = np.abs(np.einsum("pi,pi->p", offset, normal))
         trusted = clear & (height >= TRUSTED_COSINE * unsigned)
         return Reference(np.where(inside, -unsigned, unsigned), closest, trusted)
 

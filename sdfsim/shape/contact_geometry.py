@@ -14,20 +14,40 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import cached_arrays, digest, user_cache
-from sdfsim.geometry.mesh import Mesh, convex_hull, directed_edges, face_normals, halves, lattice
-from sdfsim.sdf.baked_grid import BAKE_VERSION, BakedGrid, baked, interpolated, inwards, surface_samples, unseen_wall
+from sdfsim.geometry.mesh import (
+    Mesh,
+    convex_hull,
+    directed_edges,
+    face_normals,
+    halves,
+    lattice,
+    sample_surface,
+)
+from sdfsim.sdf.baked_grid import (
+    BAKE_VERSION,
+    CELLS,
+    BakedGrid,
+    baked,
+    interpolated,
+    inwards,
+    surface_samples,
+    unseen_wall,
+)
 from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
 from sdfsim.shape.surface_nodes import SHARP, one_per_voxel
+from sdfsim.shape.triangle_tree import TriangleTree, triangle_tree
 
-VERSION = 9  # version of the cache files, in addition to that of the baked grid
+VERSION = 11  # version of the cache files, in addition to that of the baked grid
 DENSEST = 4000  # largest number of nodes of a closed form, roughly
 LATTICE = 40  # cells, along the largest extent, of the lattice that says which patch is nearest
 MOST_PATCHES = 1024  # patches of a shape: the contact solve cannot distinguish more
 OUTSIDE = 1e-3  # relative to the extent: vertices deeper in the union are not on its surface
+MANY = 2  # samples of a mesh in a square of one cell
 APART, DENSEST_ON_GRID = 2.0, 3000  # least distance of nodes on a grid, cells, and their largest number
 LEAF, CLUMP = 16, 256  # largest number of nodes in a leaf, and in a clump of leaves
 ROUNDED = 0.1  # cells: an edge of the mesh counts as rounded off if the grid is off by this much there
@@ -76,6 +96,8 @@ class ContactGeometry:
         it."""
         if isinstance(self.sdf, ClosedForm):
             return None
+        if self.triangles is not None and self.sdf.simple:
+            return baked(self.sdf, self.nodes, finest=CELLS)  # it only says where triangles have to be asked
         grid = baked(self.sdf, self.nodes, self.pieces)
         if not self.solids and (wall := unseen_wall(self.sdf, grid)) is not None:
             extent = np.ptp(self.sdf.bounds, axis=0).max()
@@ -93,6 +115,12 @@ class ContactGeometry:
             return () if found is None else (found,)
         whole = convex_vertices(self.mesh)
         return (hull(whole),) if len(whole) else ()
+
+    @cached_property
+    def triangles(self) -> TriangleTree | None:
+        """The true surface of a shape that has the exact distance of a mesh and does not collide as solids."""
+        exact = isinstance(self.sdf, MeshSdf) and not self.solids
+        return triangle_tree(self.sdf.mesh) if exact else None
 
     @property
     def thickness(self) -> float:
@@ -122,9 +150,10 @@ class ContactGeometry:
         else:
             nodes, samples = self.nodes, self.nodes[:0]
             if grid is not None:
-                samples = surface_samples(grid)
+                exact = self.triangles is not None
+                samples = _all_over(self.mesh, grid.cell) if exact else surface_samples(grid)
                 if not self.pieces:
-                    edges = on_edges(self.mesh, grid) if isinstance(sdf, MlpSdf) else nodes[:0]
+                    edges = on_edges(self.mesh, grid) if exact or isinstance(sdf, MlpSdf) else nodes[:0]
                     nodes = np.concatenate([nodes, edges])
                     nodes = np.concatenate([nodes, between(nodes, samples, APART * grid.cell)])
             patches = patches_of(sdf, nodes, self.pieces)
@@ -137,6 +166,12 @@ class ContactGeometry:
                 cover += grid.cell
         node, patch = patches.pop("node"), patches.pop("patch")
         return {**in_leaves(node, patch, cover, inwards(sdf, node)), **patches}
+
+
+def _all_over(mesh: Mesh, spacing: float) -> np.ndarray:
+    """Points [P, 3] m all over a mesh, closer than `spacing` m to each other."""
+    count = int(MANY * face_normals(mesh)[1].sum() / spacing**2) + 1
+    return sample_surface(mesh, count, np.random.default_rng(0))[0]
 
 
 def between(nodes: np.ndarray, samples: np.ndarray, spacing: float) -> np.ndarray:

@@ -157,9 +157,9 @@ def shape_from_mesh(
     user's cache folder), whose key is the content of the mesh.
 
     `units` are metres per unit of the file (None: unknown, taken as metres), `thicken` m is a thickness for an open
-    sheet. With `sdf` "mlp" the network is fitted; "grid" and "mesh" need no fit (see `mesh_shape`). `source["notes"]`
-    lists what was done to the mesh, and `remarks` on its size, by which `scales` its bodies have. Raises SdfsimError if
-    the mesh cannot be used.
+    sheet. With `sdf` "mlp" the network is fitted, which takes up to a minute; "grid" and "mesh" need no fit (see
+    `mesh_shape`). `source["notes"]` lists what was done to the mesh, and `remarks` on its size, by which `scales` its
+    bodies have. Raises SdfsimError if the mesh cannot be used.
     """
     path = Path(path)
     loaded = load_textured(path)
@@ -240,23 +240,21 @@ def _wall(mesh: Mesh) -> float:
 def _cached(
     mesh: Mesh, key: str, name: str, kind: SdfKind, resolution: int, cache_dir: str | Path | None, **how: Any
 ) -> Shape:
-    if kind == "mesh":  # making it is as fast as reading it
-        return mesh_shape(mesh, name=name, kind=kind, **how)
     variant = "-cap" if how.get("cap") else ""
     variant += "" if how.get("thicken") is None else f"-thick{how['thicken']:g}"
-    variant += f"-grid{resolution}" if kind == "grid" else ""
+    variant += f"-grid{resolution}" if kind == "grid" else "-mesh" if kind == "mesh" else ""
     folder = Path(cache_dir or user_cache("shapes")) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
     if folder.is_dir():
         try:
             return load_shape(folder)
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
-    if how["on_progress"] is silent:  # no progress is shown, so log what takes long
+    if how["on_progress"] is silent and kind != "mesh":  # no progress is shown, so log what takes long
         _log.warning("making the shape %s, once for this mesh: about half a minute", name)
-    if kind == "grid":
-        shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
-    else:
+    if kind == "mlp":
         shape = fit_mesh(mesh, name=name, **how)
+    else:
+        shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
     # Write to a temporary folder first, so that processes and threads that fit the same mesh never see half-written
     # files.
     partial = folder.with_name(f"{folder.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")

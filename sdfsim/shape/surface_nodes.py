@@ -14,7 +14,7 @@ VOXEL = 0.025
 REACHED = 0.005
 PROJECTIONS = 3
 DEFAULT_GRID = 24
-DEFAULT_COUNT = 512  # number with which the bundled model was trained; docs/tradeoff.md shows the effect of fewer
+DEFAULT_COUNT = 512  # number with which the bundled model was trained
 DIRECTIONS = 1000  # directions in which nodes should reach as far as the surface
 CHUNK = 10_000  # points in one product
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
@@ -55,11 +55,14 @@ def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
 
 def one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
     """The point nearest the middle of each occupied voxel; an average would leave the surface where it bends."""
+    if len(points) == 0:
+        return points
     # Voxels centred on the origin: the faces of a normalised box at 0.5 then run through their middles.
     cell = np.round(points / voxel).astype(np.int64)
     off_centre = np.square(points - cell * voxel).sum(1)
     order = np.argsort(off_centre, kind="stable")
-    return points[order[np.unique(cell[order], axis=0, return_index=True)[1]]]
+    number = np.ravel_multi_index((cell - cell.min(0)).T, np.ptp(cell, axis=0) + 1)
+    return points[order[np.unique(number[order], return_index=True)[1]]]
 
 
 def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> np.ndarray:

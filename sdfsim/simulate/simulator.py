@@ -80,28 +80,34 @@ class Simulator(Jointed):
         for state in simulator.steps(100):               # or `step(n)`: n steps at once
             print(state.time, ball.position, simulator.contact_points())
 
-    Methods, in the order in which you may need them:
+    What you may need, in this order:
 
-        run              all of the motion
-        simulator[name]  a body: read it, set it, push it, pull it
-        step, steps      make n steps: the state after all of them, or after each contact_points   contact points, with
-        forces and normals joint            a joint by its name: its angle, its motor (`JointHandle`) reset back to the
-        start state, restore   keep a state, and go back to it rollouts         many variants of the scene, on all cores
-        frames           a run in pieces, to show it while it runs record           keep what your own steps do
-        add, remove      bodies, while it runs
+        run                           all of the motion
+        simulator[name]               a body: read it, set it, push it, pull it (`BodyHandle`)
+        step, steps                   make n steps: the state after all of them, or after each
+        contact_points                where bodies touch, with forces and normals
+        joint, frame                  a joint with its motor (`JointHandle`), a named pose
+        set_joints, jacobian, mass_matrix
+        reset                         back to the start, or to a keyframe
+        state, restore                keep a state, and go back to it
+        snapshot, rewind              the same with the scene and the options
+        record                        keep what your own steps do
+        rollouts                      many variants of the scene, on all cores
+        frames                        a run in pieces, to show it while it runs
+        add, remove                   bodies, while it runs
 
     Args:
         scene: bodies, shapes, gravity. A scene written in Python, the path of a file or the name of a sample is loaded
             first.
         model: bundled name, path or `Model`; None: the scene's model, else the default.
         device: "cpu", "cuda" or "auto".
-        seed: seed of torch's generator (recorded; no step uses random numbers today).
+        seed: seed of torch's generator (recorded; no step uses random numbers).
         dt: s, the step; None: the scene's, else by the size of the bodies (a model has a fixed step in its units).
         free_flight: "exact", or "learned": networks on surface nodes then predict it, as in the papers.
         units: those of another simulator, for states that the two share; None: by the bodies.
 
     Attributes:
-        state: poses, velocities, contacts and more, model units; see `LiveScene`.
+        state: poses, velocities, contacts and more, model units: `State`.
         options: gravity, the step and which effects are on, model units; assign to it to change them.
         stepper: the object that makes the steps.
         dt: s, the step in the scene's units.

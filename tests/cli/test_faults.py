@@ -1,47 +1,13 @@
 """Commands that break or are broken off: exit codes, what is told, and what is kept."""
 
-import json
 import signal
 from functools import partial
 
 import pytest
 
-from sdfsim import Rollout, SdfsimError
+from sdfsim import SdfsimError
 from sdfsim.base.errors import run_main
-from sdfsim.simulate.simulator import SimulationError, Simulator
 from tests.helpers.command import run
-
-
-def stop_after(steps: int, how):
-    """A `Simulator.frames` that breaks after some steps, as `how(frame)` says."""
-    real = Simulator.frames
-
-    def broken(self, count, at_once=None):
-        for frame in real(self, steps):
-            yield frame
-        raise how(frame)
-
-    return broken
-
-
-def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    broken = stop_after(3, lambda f: SimulationError("step 4: not finite", f.frames(0, 0)))
-    monkeypatch.setattr(Simulator, "frames", broken)
-    out = tmp_path / "run"
-    done = run("simulate", scene, "-o", out, "--model", model, "--json")
-    assert done.exit_code == 3 and "error: step 4: not finite" in done.stderr
-    assert json.loads(done.stdout)["exit_code"] == 3
-    assert len(Rollout.load(out / "rollout.npz")) == 3 and (out / "rollout.rrd").exists()
-    assert json.loads((out / "report.json").read_text())["status"] == "failed"
-
-
-def test_an_interrupt_is_code_130_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: KeyboardInterrupt()))
-    out = tmp_path / "run"
-    done = run("simulate", scene, "-o", out, "--model", model)
-    assert done.exit_code == 130 and "interrupted" in done.stderr
-    assert len(Rollout.load(out / "rollout.npz")) == 3
-    assert json.loads((out / "report.json").read_text())["status"] == "interrupted"
 
 
 def test_an_interrupt_that_a_library_turns_into_another_error_is_code_130_too(scene, monkeypatch):

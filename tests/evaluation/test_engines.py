@@ -9,13 +9,10 @@ pytest.importorskip("pybullet")
 
 from benchmarks.engines import bullet, drake, mujoco, newton, rapier
 from sdfsim.base.errors import SdfsimError
-from sdfsim.data.pybullet_sim import Teacher, TeacherBody
-from sdfsim.evaluation.engines import by_engine, shape_urdf, start_of_scene
+from sdfsim.evaluation.engines import by_engine, start_of_scene
 from sdfsim.evaluation.laws import hard_cases
-from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
-from sdfsim.shape.make import analytic_shape, shape_from_primitive
 from sdfsim.simulate.steppers import stepper_of
 from tests.helpers.scene_files import SCENE
 
@@ -72,16 +69,3 @@ def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_has_it(
     bullet(replace(start, motion=doubled), 2)
     with pytest.raises(SdfsimError, match="inertia"):
         bullet(replace(start, motion=doubled, own_inertia=False), 2)
-
-
-def test_engine_files_are_of_the_size_of_the_shape(tmp_path):
-    shape = shape_from_primitive("torus", 2.0, sdf="mesh")
-    urdf = shape_urdf(shape, tmp_path)
-    vertices = np.concatenate([piece.vertices for piece in load_pieces(urdf.with_suffix(".obj"))])
-    np.testing.assert_allclose(np.ptp(vertices, axis=0), np.ptp(shape.mesh.vertices, axis=0), rtol=0.01)
-    box = shape_urdf(analytic_shape("box", size=(1.0, 2.0, 3.0)), tmp_path)
-    with Teacher(np.zeros(3), None) as teacher:
-        teacher.add(TeacherBody(box, 2.0, 1.0, 0.5, 0.5), (0, 0, 0))
-        teacher._call("performCollisionDetection")
-        low, high = teacher._call("getAABB", teacher.bodies[0])
-    np.testing.assert_allclose(np.array(high) - low, [2.0, 4.0, 6.0], atol=0.1)

@@ -10,7 +10,7 @@ from tests.helpers.everyday import COUNTS, MISSED
 
 SLOW = {
     "slender", "heaps", "seams", "rolling", "facets", "round_on_meshes", "flat_drops", "slabs", "spins", "bullets",
-    "chains",
+    "chains", "rollers", "nuts",
 }  # fmt: skip
 FAST_GROUPS = ("overlap", "thin", "mass", "bounce", "slope")  # of hard cases
 # Three sizes and orientations, and what solids are made of.

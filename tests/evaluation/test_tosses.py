@@ -19,15 +19,12 @@ from benchmarks.tosses import (
     SIDE,
     TEST,
     Motion,
-    cost,
     drawn,
     errors,
     ours,
     recorded,
-    searched,
 )  # fmt: skip
 from sdfsim.apps.observed import Recording
-from sdfsim.base.errors import SdfsimError
 from sdfsim.data.public_tosses import CUBE, Links
 from sdfsim.scene.load import load_scene
 
@@ -129,31 +126,6 @@ def test_tosses_side_by_side_meet_the_table_alone(name, tmp_path):
     assert np.abs(together.position[1] - alone.position[0]).max() < 1e-6
     lies = 0.5 * SIDE * np.abs(Rotation.from_quat(alone.quat_xyzw[0, -1, 0]).as_matrix()[2]).sum()
     assert alone.position[0, -1, 0, 2] == pytest.approx(lies, abs=3e-3)  # it has come down
-
-
-def test_the_search_finds_a_minimum_within_bounds():
-    bounds = {"friction": (0.0, 1.0), "side": (0.9, 1.1)}
-    found = searched(lambda v: (v["friction"] - 0.3) ** 2 + 100.0 * (v["side"] - 1.02) ** 2, bounds)
-    assert found == pytest.approx({"friction": 0.3, "side": 1.02}, abs=0.02)
-    found = searched(lambda v: v["friction"] - 5.0 * v["side"], bounds)
-    assert found == pytest.approx({"friction": 0.0, "side": 1.1}, abs=0.05)
-    assert all(low <= found[name] <= high for name, (low, high) in bounds.items())
-
-
-def test_a_toss_that_ends_on_another_face_counts_as_far():
-    truth = Motion(np.zeros((2, FRAMES, 1, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, FRAMES, 1, 1)))
-    for degrees, wanted in ((90, 15.0), (20, 10.0)):
-        turned = truth.quat_xyzw.copy()
-        turned[1] = Rotation.from_euler("x", degrees, degrees=True).as_quat()
-        assert cost(errors(Motion(truth.position, turned), truth, SIDE)) == pytest.approx(wanted)
-
-
-def test_no_recordings_are_told(tmp_path):
-    with pytest.raises(SdfsimError, match=r"cube\.npz: no such file"):
-        A_CUBE.tosses(tmp_path)
-    np.savez(tmp_path / "cube.npz", start=[0, 3], dt=DT, position=np.zeros((3, 3)))
-    with pytest.raises(SdfsimError, match=r"cube\.npz: there is no array 'quat_xyzw'"):
-        A_CUBE.tosses(tmp_path)
 
 
 def test_recorded_tosses_fly_as_their_authors_say_and_are_split_apart(folder, tmp_path):

@@ -123,16 +123,6 @@ def test_forces_are_refused_and_no_impulses_are_reported(name):
         sim.contact_points()
 
 
-@pytest.mark.parametrize("effect", ["friction", "restitution", "rotation"])
-def test_an_effect_that_is_off_stays_off(effect):
-    sim = Simulator(pile(1, **{effect: "off"}), MODEL)
-    start = sim.si_state()
-    rollout = sim.run(steps=12)
-    if effect == "rotation":
-        np.testing.assert_array_equal(rollout.orientation[-1], start.orientation)
-    assert np.isfinite(rollout.velocity).all() and sim.carry.counts["edges"] > 0
-
-
 def test_whatever_it_adds_keeps_momentum(free_pair):
     sim = Simulator(free_pair, random_model("impulse", push=5.0, width=16, rounds=2))
     mass, start = sim.bodies.mass[:, None], sim.state.velocity.copy()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.reconstruct import BALL, PHOTOS, VASE, drawn, dropped_ball, seen_depth
+from benchmarks.reconstruct import BALL, PHOTOS, drawn, dropped_ball
 from sdfsim.shape.make import analytic_shape
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "samples" / "photos"))
@@ -66,35 +66,6 @@ def test_a_ball_falls_as_far_into_the_vase_as_that_is_hollow(tmp_path, kind):
     found = dropped_ball(tmp_path, "object1")
     assert found["below_rim_cm"] == pytest.approx(100 * (depth - BALL), abs=0.4)
     assert found["aside_cm"] < 4
-
-
-@pytest.mark.parametrize(("high", "photos"), [(0.6, 3), (1.1, 3), (1.1, 2)])
-def test_how_deep_photos_see_into_a_tube(high, photos):
-    """A tube of radius r, open at the top, and cameras D beside its axis and H above its rim: a line to the axis d
-    below the rim passes that where d (D - r) < H r. Places beside the axis are seen as deep on the whole."""
-    import open3d as o3d
-
-    radius, rim, away = 0.15, 0.8, 1.2
-    turn = np.arange(64) * 2 * np.pi / 64
-    circle = VASE + radius * np.stack([np.cos(turn), np.sin(turn)], 1)
-    vertices = np.concatenate([np.column_stack([circle, np.full(64, z)]) for z in (0.0, rim)])
-    k, following = np.arange(64), (np.arange(64) + 1) % 64
-    faces = np.concatenate([np.stack([k, following, k + 64], 1), np.stack([following, following + 64, k + 64], 1)])
-    tube = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
-    frames = []
-    for number in range(photos):
-        angle = 0.1 + number * 2 * np.pi / photos
-        center = np.array([*(VASE + away * np.array([np.cos(angle), np.sin(angle)])), rim + high])
-        backward = center - np.array([*VASE, rim])
-        backward /= np.linalg.norm(backward)
-        right = np.cross([0, 0, 1], backward)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.column_stack([right, np.cross(backward, right), backward, center])
-        frames.append({"transform_matrix": pose.tolist()})
-    about = {"fl_x": 500.0, "fl_y": 500.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480, "frames": frames}
-    wanted = high * radius / (away - radius) if photos > 2 else 0.0
-    assert seen_depth(tube, about, rim) == pytest.approx(100 * wanted, abs=1.5)
 
 
 def test_floors_of_what_is_turned_have_rings_not_rays_alone():

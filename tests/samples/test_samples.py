@@ -28,7 +28,7 @@ def track(name: str, body: str) -> np.ndarray:
 
 
 def test_every_sample_can_be_read_and_is_in_the_gallery():
-    page = (SAMPLES.parent / "docs" / "samples.md").read_text(encoding="utf-8")
+    page = (SAMPLES.parent / "docs" / "tutorial.md").read_text(encoding="utf-8")
     for file in SAMPLES.glob("*.yaml"):
         read_scene(file)
         assert f"images/sample-{file.stem}.jpg" in page and f"samples/{file.name}" in page

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.mesh import Mesh, convex_hull
+from sdfsim.geometry.mesh import Mesh, convex_hull, joined
 from sdfsim.geometry.primitives import spiral
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.solver.distance import GRID, distances
@@ -63,9 +63,19 @@ def two_halves() -> list[np.ndarray]:
 
 @pytest.mark.parametrize(("wall", "told"), [(0.002, True), (0.03, False)])
 def test_walls_that_no_grid_sees_are_reported(wall, told, caplog):
-    rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
-    assert ContactGeometry(rod.sdf, rod.nodes, (), NOTHING).grid is not None
+    rod, aside = analytic_shape("box", size=(1.0, 0.03, wall)), np.array([0.0, 0.2, 0.0])
+    two = joined([rod.mesh, Mesh(rod.mesh.vertices + aside, rod.mesh.faces)])
+    nodes = np.concatenate([rod.nodes, rod.nodes + aside])
+    assert ContactGeometry(MeshSdf(two), nodes, (), NOTHING).grid is not None
     assert ("bodies may pass through" in caplog.text) is told and "--thicken" not in caplog.text
+
+
+def test_the_grid_of_a_single_surface_need_not_hold_its_walls(caplog):
+    """Where it is near, the triangles are asked."""
+    rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, 0.002)), "mesh")
+    grid = ContactGeometry(rod.sdf, rod.nodes, (), NOTHING).grid
+    assert grid is not None and grid.cell == pytest.approx(1.0 / module.CELLS)
+    assert not caplog.text
 
 
 CONVEX = {

@@ -77,7 +77,9 @@ def test_a_mesh_has_a_shape_without_any_fit(kind, member: type) -> None:
         mesh_shape(Mesh(crate.vertices, crate.faces[:0]), name="none", kind=kind)
 
 
-def test_grids_are_cached_by_resolution_and_exact_meshes_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grids_are_cached_by_resolution_and_so_are_exact_meshes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from sdfsim.shape import make
 
     monkeypatch.setattr(make, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
@@ -90,7 +92,11 @@ def test_grids_are_cached_by_resolution_and_exact_meshes_not(tmp_path: Path, mon
     assert len(list(tmp_path.iterdir())) == 2
     path = tmp_path / "cup.ply"
     path.write_bytes(write_ply(primitives.cone(segments=12)))
-    assert isinstance(shape_from_mesh(path, tmp_path / "none", units=0.01, sdf="mesh").sdf, MeshSdf)
-    assert not (tmp_path / "none").exists()
+    first = shape_from_mesh(path, tmp_path, units=0.01, sdf="mesh")
     monkeypatch.setattr("sdfsim.shape.make.mesh_shape", lambda *args, **kwargs: pytest.fail("sampled again"))
     assert shape_from_primitive("torus", 0.6, tmp_path, sdf="grid", resolution=8).volume > 0
+    again = shape_from_mesh(path, tmp_path, units=0.01, sdf="mesh")
+    assert isinstance(again.sdf, MeshSdf)
+    assert again.volume == first.volume
+    assert np.array_equal(again.sdf.mesh.vertices, first.sdf.mesh.vertices)
+    assert np.array_equal(again.nodes, first.nodes)

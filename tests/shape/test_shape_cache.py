@@ -75,7 +75,7 @@ def test_what_the_cache_knows_a_mesh_by_is_all_that_it_describes(tmp_path: Path,
 def test_a_fit_that_nobody_sees_is_reported_once(tmp_path: Path, quick: None, caplog: pytest.LogCaptureFixture) -> None:
     told = "making the shape cup, once for this mesh"
     (tmp_path / "cup.ply").write_bytes(write_ply(primitives.cone(segments=12)))
-    text = "version: 1\nshapes: {cup: {mesh: cup.ply}}\nbodies: [{name: a, shape: cup, mass: 1}]\n"
+    text = "version: 1\nshapes: {cup: {mesh: cup.ply, sdf: mlp}}\nbodies: [{name: a, shape: cup, mass: 1}]\n"
     (tmp_path / "scene.yaml").write_text(text)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path / "one"))

@@ -52,15 +52,27 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("name", ["position", "velocity", "time"])
-def test_a_state_of_the_caller_that_is_no_number_is_refused_in_every_way(free_pair, way, name):
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("time", np.nan, "time is not finite"),
+        ("velocity", np.nan, "body 'right': velocity is not finite"),
+        ("position", np.inf, "body 'right': position is not finite"),
+        ("position", 1e12, "body 'right': .* too far to be placed exactly"),
+        ("velocity", 1e9, "body 'right': .* too fast"),
+        ("angular_velocity", 1e9, "body 'right': .* too fast"),
+        ("orientation", np.nan, "body 'right': orientation is not finite"),
+        ("orientation", 2.0, "body 'right': orientation is not a unit quaternion"),
+        ("orientation", 0.0, "body 'right': orientation is not a unit quaternion"),
+    ],
+)
+def test_a_state_of_the_caller_that_cannot_be_is_refused_in_every_way(free_pair, way, name, value, told):
     simulator = Simulator(free_pair, model=random_model("impulse"))
     good = simulator.state
-    if name == "time":
-        broken, told = float("nan"), "time is not finite"
-    else:
-        broken, told = getattr(good, name).copy(), f"body 'right': {name} is not finite"
-        broken[1, 2] = np.nan
+    broken = value
+    if name != "time":
+        broken = getattr(good, name).copy()
+        broken[1] = value
     simulator.state = replace(good, **{name: broken})
     with pytest.raises(SimulationError, match=f"step 1: {told}"):
         WAYS[way](simulator)

@@ -4,8 +4,8 @@
 
 prints a line for each check: the measured value, the wanted one, and whether the check holds. `--size` is the unit of
 length (the size of the smallest bodies), `--yaw` turns the whole scene about the vertical, and `--kind` says how solids
-are given: in closed form, as the exact distance of a mesh, or as samples of it on a grid. Hard cases and joints have
-scenes of their own, which these do not change.
+are given: in closed form, as the exact distance of a mesh, or as samples of it on a grid. Hard cases, joints and
+assembly have scenes of their own, which these do not change.
 """
 
 import argparse
@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
 from typing import NamedTuple
 
+from sdfsim.evaluation.laws.assembly import ASSEMBLY
 from sdfsim.evaluation.laws.check import Check
 from sdfsim.evaluation.laws.everyday import EVERYDAY
 from sdfsim.evaluation.laws.hard_cases import hard_cases
@@ -42,11 +43,12 @@ GROUPS = {
     "everyday": Group("everyday scenes: checks that do not hold"),
     "textbook": Group("laws of a textbook: checks that do not hold"),
     "joints": Group("laws of joints: checks that do not hold"),
+    "assembly": Group("meshes that fit into each other: checks that do not hold"),
 }
 
 ROWS = {
     row.__name__: Law(row.__name__, group, row.__name__.replace("_", " "), row, engines=False, counted=True)
-    for group, rows in (("everyday", EVERYDAY), ("textbook", TEXTBOOK), ("joints", JOINTS))
+    for group, rows in (("everyday", EVERYDAY), ("textbook", TEXTBOOK), ("joints", JOINTS), ("assembly", ASSEMBLY))
     for row in rows
 }
 
@@ -58,7 +60,7 @@ def laws(*, quick: bool = False, shapes: Mapping[str, Shape] | None = None) -> l
 
 def settings(law: Law, *, quick: bool = False) -> list[Setting]:
     """How a counted law is run in reports."""
-    if quick or law.group == "joints":
+    if quick or law.group in ("joints", "assembly"):
         return [Setting()]
     return [*(Setting(size) for size in SIZES), Setting(yaw=37.0), *(Setting(kind=kind) for kind in KINDS[1:])]
 

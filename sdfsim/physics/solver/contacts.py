@@ -19,11 +19,10 @@ from sdfsim.physics.solver.rows import (
     respond,
     soften,
     softness,
-    three,
     within,
     write_point,
 )
-from sdfsim.physics.solver.vectors import BARE, add, along, cross, dot, get, scale, sub, turn, vector
+from sdfsim.physics.solver.vectors import BARE, add, along, cross, dot, get, scale, sub, three, turn, vector
 from sdfsim.physics.solver.world import (
     END,
     FIRST,

@@ -12,10 +12,12 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.convex import Convex
+from sdfsim.physics.solver.triangles import Triangles, signed
 from sdfsim.physics.solver.vectors import BARE, ENTRY, INLINED, along, dot, get, norm, put, scale
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
 TINY = 1e-12
+CLOSE = 2.0  # cells: a grid is exact enough farther from the surface
 EVEN = 1e-9  # relative to the size: on an edge of a closed form the first face gives the normal, not rounding
 
 
@@ -25,7 +27,9 @@ EVEN = 1e-9  # relative to the size: on an edge of a closed form the first face 
 KIND, SIZE, THICKNESS, LOW, CELL, BRICKS, COARSE, BRICK = 0, 1, 4, 5, 8, 9, 12, 13
 # And for a shape of several patches: the first labelled point, the distance between two, their number along each side,
 # and where the labels begin; -1 if there is one patch only.
-PATCH_LOW, PATCH_CELL, PATCHES, PATCH, FIELDS = 14, 17, 18, 21, 22
+PATCH_LOW, PATCH_CELL, PATCHES, PATCH = 14, 17, 18, 21
+# And for a shape with triangles how far its grid is off near the surface, else 0.
+ERROR, FIELDS = 22, 23
 
 
 class Shapes(NamedTuple):
@@ -44,6 +48,7 @@ class Shapes(NamedTuple):
     leaf_patch: np.ndarray  # [L] int64, the patch of the surface to which a leaf's nodes belong
     label: np.ndarray  # int16, the nearest patch at points all over the shape
     solids: Convex  # the convex pieces of the shapes
+    triangles: Triangles  # the true surfaces of shapes that a grid would round off
 
 
 @njit(**BARE)
@@ -71,6 +76,18 @@ def distance_alone(table, brick, sample, s, p):
         return _grid_alone(table, brick, sample, s, p)
     d, _ = distance(table, brick, sample, s, p)
     return d
+
+
+@njit(**BARE)
+def true_distance(shapes, s, p):
+    """Signed distance and unit gradient of the true surface of shape s, where p is near it."""
+    d, n = distance(shapes.table, shapes.brick, shapes.sample, s, p)
+    if shapes.triangles.level[s] >= 0 and abs(d) <= CLOSE * shapes.table[s, CELL]:
+        exact, normal, _ = signed(shapes.triangles, s, p, abs(d) + 1.5 * shapes.table[s, ERROR])
+        # Where faces cross or are missing, the nearest feature may be wrong about the side, and the grid is right.
+        if exact < math.inf and (exact * d > 0.0 or abs(d) <= shapes.table[s, ERROR]):
+            return exact, normal
+    return d, n
 
 
 @njit(**ENTRY)

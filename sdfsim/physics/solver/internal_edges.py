@@ -15,12 +15,14 @@ from sdfsim.physics.solver.distance import KIND, PLANE
 from sdfsim.physics.solver.manifold import renewed
 from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, pair_kind
 from sdfsim.physics.solver.surface_distance import KEYS
-from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, turn
+from sdfsim.physics.solver.triangles import highest
+from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, three, turn, turn_back
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
 STEEPEST = -0.1  # cosine below which they face each other
 LEVEL = 4.0  # slops: a body that is higher than the support by no more than this is not a wall
+AROUND = 12.0  # slops: distance from a contact within which triangles may be its wall
 
 
 @njit(**BARE, inline="always")
@@ -40,8 +42,10 @@ def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
                 if not world.moves[body]:
                     continue  # a body that does not move needs no support
                 several = several or latest[body] >= 0
+                other = world.shape[manifolds.pair[p, 1 - side]]
+                sharp = shapes.triangles.level[other] >= 0
                 for k in range(1, manifolds.count[p]):
-                    several = several or manifolds.point[p, k, KEY] != manifolds.point[p, 0, KEY]
+                    several = several or sharp or manifolds.point[p, k, KEY] != manifolds.point[p, 0, KEY]
                 latest[body] = 2 * p + side
     if not several:
         return
@@ -95,7 +99,9 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
     point k is above that plane, and everything that it meets there is below it; and this normal, towards the body."""
     body, other = manifolds.pair[p, side], manifolds.pair[p, 1 - side]
     n = _normal(manifolds, p, k, side)
-    if shapes.solids.start[world.shape[other] + 1] == shapes.solids.start[world.shape[other]]:
+    s, t = world.shape[body], world.shape[other]
+    solids = pair_kind(shapes, s, t) == SOLIDS
+    if shapes.solids.start[t + 1] == shapes.solids.start[t] and shapes.triangles.level[t] < 0:
         return False, n  # its extent is not known
     key = manifolds.point[p, k, KEY]
     link = work.latest[body]
@@ -103,7 +109,7 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
         q, own = link // 2, link % 2
         link = near.following[link]
         for e in range(manifolds.count[q]):
-            if q == p and manifolds.point[q, e, KEY] == key:
+            if q == p and solids and manifolds.point[q, e, KEY] == key:
                 continue
             m = _normal(manifolds, q, e, own)
             facing = dot(n, m)
@@ -120,11 +126,15 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
                 ),
             )  # fmt: skip
             foot = add(get(motion.position, ground), foot)
-            if _reach(shapes, world, work, motion, other, key, side, m) - dot(m, foot) > LEVEL * rules.slop:
-                continue
+            height = dot(m, foot) + LEVEL * rules.slop
             bottom = _lowest(shapes, world, work, motion, manifolds, p, k, side, m)
             if dot(m, foot) + min(manifolds.point[q, e, GAP], 0.0) - bottom > LEVEL * rules.slop:
                 continue  # for what is below the plane as well, it is a wall
+            if shapes.triangles.level[t] < 0:
+                if _reach(shapes, world, work, motion, other, key, side, m) > height:
+                    continue
+            elif _over(shapes, world, work, motion, rules, manifolds, p, k, side, m, height):
+                continue
             return True, m
     return False, n
 
@@ -146,6 +156,20 @@ def _lowest(shapes, world, work, motion, manifolds, p, k, side, m):
     column = FIRST if side == 0 else SECOND
     place = turn(work.matrix, body, (point[column], point[column + 1], point[column + 2]))
     return dot(m, add(get(motion.position, body), place))
+
+
+@njit(**BARE)
+def _over(shapes, world, work, motion, rules, manifolds, p, k, side, m, height):
+    """Whether triangles of the other body around a contact extend along m beyond a height."""
+    other, column = manifolds.pair[p, 1 - side], SECOND if side == 0 else FIRST
+    size, place = world.scale[other], three(manifolds.point[p, k], column)
+    up = turn_back(work.matrix, other, m)
+    height -= dot(m, origin(motion.position, work.matrix, world.com, other))
+    place = add(place, get(world.com, other))
+    if dot(up, place) > height:  # the contact itself is on the surface
+        return True
+    around = AROUND * rules.slop / size
+    return size * highest(shapes.triangles, world.shape[other], scale(place, 1.0 / size), up, around) > height
 
 
 @njit(**BARE)

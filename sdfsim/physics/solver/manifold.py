@@ -19,6 +19,7 @@ from sdfsim.physics.solver.world import (
     KEY,
     NORMAL,
     NORMAL_IMPULSE,
+    OWNER,
     POINTS,
     SECOND,
     TANGENTIAL,
@@ -121,6 +122,7 @@ def write(found, count, side, mine, theirs, normal, gap, key):
     found[count, KEY] = key
     found[count, TORSION] = 1.0
     found[count, VOID] = 0.0
+    found[count, OWNER] = side
 
 
 @njit(**BARE)

@@ -42,6 +42,7 @@ from sdfsim.physics.solver.surface_distance import (
     at_least,
     beyond,
     is_round,
+    looked_at,
     map_between,
     mapped,
     nodes_near,
@@ -105,6 +106,7 @@ class Near(NamedTuple):
     placed: np.ndarray  # [L] bool, whether it is known
     place: np.ndarray  # [L, 3] on the body's own surface, in its frame
     held: np.ndarray  # [L] bool, whether a pair of pieces has the normal of a support, see `internal_edges`
+    acts: np.ndarray  # [L] bool, whether it touched at the start of the inner step in which its way was last followed
     following: np.ndarray  # [2 P] int64 for finding the contacts of a body
 
 
@@ -202,7 +204,7 @@ def _gathered(shapes, found):
     return Near(
         start, found.count, leaf, away, np.zeros((total, 3)), np.full(count, -math.inf), np.full(count, -math.inf),
         np.full(total, -1, np.int32), np.empty(total * wide), np.zeros(total, np.bool_), np.empty((total, 3)),
-        np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
+        np.zeros(total, np.bool_), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
 
 
@@ -365,6 +367,10 @@ def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, wen
     """The manifold of a pair of which at least one is neither convex nor made of convex pieces."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     known = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
+    s, t = world.shape[a], world.shape[b]
+    sharp = shapes.triangles.level[s] >= 0 or shapes.triangles.level[t] >= 0
+    if sharp:
+        known = looked_at(shapes, world, motion, matrix, rules, manifolds, p, known, False)
     manifolds.count[p] = known
     # Numbers of one type, or everything would be compiled again.
     none, one = np.int64(0), np.int64(1)
@@ -377,6 +383,8 @@ def _collide_surfaces(shapes, world, motion, matrix, rules, manifolds, near, wen
     for side in range(2):
         count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, since, scratch, count)
     manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, none > one)
+    if sharp:
+        manifolds.count[p] = looked_at(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p], True)
     _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, first)
 
 
@@ -557,8 +565,9 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
 @njit(**BARE)
 def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh, room, surfaces):
     """The least distance of pair p, over the parts that were near, with its two bodies at `place` and `frame`; `least`
-    if all are farther, and possibly any distance below `enough`. `went` is how much nearer two points may have come
-    since `near` was made. `refresh`: whether these are the present poses, so that distances may be stored in `near`."""
+    if all are farther, and possibly any distance below `enough`. Parts that touch at the start of an inner step are
+    left out: their contacts act. `went` is how much nearer two points may have come since `near` was made. `refresh`:
+    whether these are the poses at that start, so that distances may be stored in `near`."""
     table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, shapes.solids
     s, t = shape[pairs[p, 0]], shape[pairs[p, 1]]
     way = pair_kind(shapes, s, t)
@@ -566,7 +575,9 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
         offset = sub(origin(place, frame, coms, 0), origin(place, frame, coms, 1))
         plane, pieces = table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])
         for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
-            if near.away[at] - went >= least or near.held[at]:
+            if refresh:
+                near.acts[at] = False
+            if near.away[at] - went >= least or near.held[at] or near.acts[at]:
                 continue
             i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
             # Numbers of one type, or everything would be compiled again.
@@ -580,7 +591,9 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
                 gap, n, _, _ = closest(convex, frame, pair, n, known, least, room)
                 put(near.axis, at, n)
             if refresh:
-                near.away[at] = gap + went
+                near.away[at], near.acts[at] = gap + went, gap <= 0.0
+                if near.acts[at]:
+                    continue
             least = min(least, gap)
             if least < enough:
                 return least
@@ -593,6 +606,8 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
             for e in range(-2, 3):
                 d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
+            if refresh and least <= 0.0:
+                return math.inf
         elif surfaces is not None:
             if way == SURFACES and near.count[p, side] > 0 and not is_round(table, s):
                 least = _nearest_node(
@@ -614,21 +629,26 @@ def _nearest_node(shapes, s, t, place, frame, scales, coms, side, near, p, went,
     if refresh:
         for i in range(first, last):
             if near.away[i] - went < least:
+                near.acts[i] = False
                 near.away[i] = went + beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
                 front = i if near.away[i] < near.away[front] else front
     # The nearest leaf first: the others are then seldom near enough to be searched.
     for n in range(first - 1, last):
         i = front if n < first else n
-        if n == front or near.away[i] - went >= least:
+        if n == front or near.away[i] - went >= least or near.acts[i]:
             continue
         e = near.leaf[i]
         if refresh or beyond(shapes, t, w, c, k, scales[side], e) < least:
-            there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
+            there, d, nearest_here = get(shapes.node, shapes.leaf_node[e]), -math.inf, least
             for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
                 p_u = get(shapes.node, u)
-                if d - scales[side] * norm(sub(p_u, there)) < least:  # else it is too near to a far node
+                if d - scales[side] * norm(sub(p_u, there)) < nearest_here:  # else it is too near to a far node
                     d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
-                    least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
+                    nearest_here, there, d = min(nearest_here, k * d), p_u, k * at_least(table, t, d)
+            if refresh and nearest_here <= 0.0:
+                near.acts[i] = True
+                continue
+            least = nearest_here
             if least < enough:
                 return least
     return least

@@ -32,11 +32,14 @@ from sdfsim.physics.solver.rows import WIDTH as OF_ROW
 from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held
+from sdfsim.physics.solver.triangles import Triangles, signed_distances
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.validity import NO_LIMITS, fault_of
+from sdfsim.sdf.baked_grid import BakedGrid, interpolated
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactGeometry, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
+from sdfsim.shape.triangle_tree import TriangleTree
 
 FORMS = {
     "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
@@ -45,6 +48,7 @@ FORMS = {
 SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
 CROWD = 64  # number of dynamic bodies from which threads may test pairs
 TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
+SIDED, AGREED = 4000, 0.98  # places at which triangles and grid are compared, and the part that must be on one side
 INSTANTS = 4  # of a step, at which networks look for contacts
 NO_PARTS = Parts(
     np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, np.int32),
@@ -53,7 +57,7 @@ NO_PARTS = Parts(
 NOTHING_NEAR = Near(
     np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 3)),
     np.zeros(0), np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros(0, np.bool_), np.zeros((0, 3)),
-    np.zeros(0, np.bool_), np.zeros(0, np.int64),
+    np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0, np.int64),
 )  # fmt: skip
 NO_SCRIPT = Script(np.zeros(0, np.int64), np.zeros((0, 0, 7)), np.zeros((0, 0, 0, 6)))
 
@@ -411,8 +415,44 @@ def compiled_shapes(shapes: Sequence[ContactGeometry], *, grids: bool = True) ->
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
     arrays = (np.concatenate(parts) for parts in (brick, sample))
-    solids = [shape.solids for shape in shapes]
-    return kinds.Shapes(table, *arrays, *_joined(surfaces), label=np.concatenate(label), solids=_packed(solids))
+    solids, trees = [shape.solids for shape in shapes], [shape.triangles if met else None for shape in shapes]
+    for k, (row, tree) in enumerate(zip(table, trees, strict=True)):
+        if tree is not None and (grid := shapes[k].grid) is not None:
+            row[kinds.ERROR] = grid.error
+            trees[k] = tree if _bounds_solid(tree, grid) else None
+    return kinds.Shapes(
+        table, *arrays, *_joined(surfaces), label=np.concatenate(label), solids=_packed(solids),
+        triangles=_planted(trees),
+    )  # fmt: skip
+
+
+def _bounds_solid(tree: TriangleTree, grid: BakedGrid) -> bool:
+    """Whether triangles tell inside from outside as the grid does, which counts how often the surface goes around."""
+    places = tree.corner.mean(1)[np.random.default_rng(0).integers(len(tree.corner), size=SIDED)]
+    places = places + grid.cell * np.random.default_rng(1).uniform(-1.5, 1.5, places.shape)
+    known = interpolated(grid, places)
+    found, _ = signed_distances(_planted([tree]), 0, places, 4.0 * grid.cell)
+    clear = (np.abs(known) > grid.error) & np.isfinite(found)
+    return bool((found * known >= 0.0)[clear].mean() >= AGREED) if clear.any() else False
+
+
+def _planted(trees: Sequence[TriangleTree | None]) -> Triangles:
+    """The triangles of shapes, end to end."""
+    some = [tree for tree in trees if tree is not None]
+
+    def starts(lengths: list[int]) -> np.ndarray:
+        return np.cumsum([0, *lengths], dtype=np.int64)
+
+    def joined(name: str, *shape: int) -> np.ndarray:
+        return np.concatenate([np.zeros((0, *shape)), *(getattr(tree, name) for tree in some)])
+
+    return Triangles(
+        level=np.array([-1 if tree is None else tree.level for tree in trees], dtype=np.int64),
+        first=starts([0 if tree is None else len(tree.corner) for tree in trees]),
+        root=starts([0 if tree is None else len(tree.box) for tree in trees]),
+        size=np.array([0.0 if tree is None else (tree.box[0, 3:] - tree.box[0, :3]).max() for tree in trees]),
+        box=joined("box", 6), corner=joined("corner", 3, 3), normal=joined("normal", 7, 3),
+    )  # fmt: skip
 
 
 def _joined(surfaces: list[ContactSurface]) -> tuple[np.ndarray, ...]:

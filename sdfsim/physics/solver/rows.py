@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, scale, sub, turn
+from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, scale, sub, three, turn
 from sdfsim.physics.solver.world import END, START, kick_of
 
 # Columns of a row. Jacobian: the direction at the first body (its opposite at the second), and about both centres of
@@ -83,11 +83,6 @@ def write_turn(row, axis):
     """Write the Jacobian about an axis."""
     for x in range(3):
         row[LINEAR + x], row[ANGULAR + x], row[OTHER + x] = 0.0, axis[x], -axis[x]
-
-
-@njit(**BARE)
-def three(row, column):
-    return row[column], row[column + 1], row[column + 2]
 
 
 @njit(**BARE)

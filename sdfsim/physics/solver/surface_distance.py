@@ -11,6 +11,7 @@ from sdfsim.physics.solver.clipping import across
 from sdfsim.physics.solver.distance import (
     CAPSULE,
     CELL,
+    ERROR,
     GRID,
     KIND,
     PLANE,
@@ -19,9 +20,28 @@ from sdfsim.physics.solver.distance import (
     distance,
     distance_alone,
     patch_of,
+    true_distance,
 )
 from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
-from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, dot, get, norm, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.triangles import closest
+from sdfsim.physics.solver.vectors import (
+    BARE,
+    INLINED,
+    add,
+    along,
+    cross,
+    dot,
+    get,
+    norm,
+    put,
+    scale,
+    sub,
+    three,
+    turn,
+    turn_back,
+    vector,
+)
+from sdfsim.physics.solver.world import COLUMNS, FIRST, GAP, NORMAL, NORMAL_IMPULSE, OWNER, SECOND
 
 KEYS = 1024  # largest number of patches of a shape
 ROUNDS = 12  # rounds of refinement
@@ -32,6 +52,9 @@ WAYS = 8  # directions in which the outermost nodes of a face are searched
 ONTO_IT = 0.05  # cells: a point this near a surface is on it
 STRIDE, FINEST = 0.02, 5e-4  # first and last step of the refinement, relative to a body's size
 LONGER = 4.0  # a step is at most this many times the last one
+SHARPER, SHARPEST = 4, 1e-4  # rounds of refinement on triangles, and their last step, relative to a body's size
+WITHIN = 0.5  # cells: how far the refinement on a grid may end from where triangles are nearest
+AWAY, TRACED = 1e-6, 12  # model lengths: farther points do not touch yet; and steps of a search along their way
 SHORTEST, AHEAD = 2.5, 4.0  # first step when starting again: least multiples of the last, and of the motion since
 
 
@@ -79,10 +102,13 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
     size = shapes.clump_ball[shapes.clump_start[r], 3]
-    kept = _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch)
+    sharp = shapes.triangles.level[r] >= 0 or shapes.triangles.level[s] >= 0
+    reach = look + k * shapes.table[s, ERROR]
+    kept = _candidates(shapes, r, s, w, c, k, own, reach, side, near, pair, went, scratch)
     chosen = _chosen(scratch, kept, look)
     # A round body may be smaller than the space between two nodes, so the search also starts at the point below its own
     # centre.
+    begun, apart = count, WITHIN * max(own * _cell(shapes, r), k * _cell(shapes, s))
     back, middle = map_between(motion.position, matrix, world.scale, world.com, other, one)
     half = shapes.table[s, SIZE + 1] if shapes.table[s, KIND] == CAPSULE else 0.0
     first = (-1 if half == 0.0 else -3) if is_round(shapes.table, s) else 0
@@ -99,18 +125,29 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             i, stride = scratch.pick[e], STRIDE * size
             key, at, p = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
             d, n = scratch.depth[i] / k, get(scratch.normal, i)
+        found = False
         if at >= 0 and near.placed[at]:
             # Start where the last descent ended, with shorter steps, unless the node is deeper by now.
             q, short = get(near.place, at), min(stride, max(SHORTEST * FINEST * size, AHEAD * way / own))
             if q[0] == p[0] and q[1] == p[1] and q[2] == p[2]:
-                stride = short
+                stride, found = short, True
             else:
                 there, normal = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, q))
-                if there < d:
-                    p, d, n, stride = q, there, normal, short
-        p, d, n = _refined(
-            shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
-        )
+                if there < d + shapes.table[s, ERROR]:
+                    p, d, n, stride, found = q, there, normal, short, True
+        # The last descent on triangles ended on the true surface: a grid would lead away from there.
+        if not (sharp and found):
+            p, d, n = _refined(
+                shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
+            )
+        if sharp:
+            here = sub(scale(p, own), get(world.com, one))
+            if _is_found(scratch.found, begun, count, side, here, apart):
+                continue
+            if not found:
+                p = _onto(shapes, r, p, 2.0 * shapes.table[r, ERROR])
+                stride = apart / own
+            p, d, n = _descended(shapes, r, s, w, c, k, own, p, stride, SHARPEST * size)
         if at >= 0:
             near.placed[at] = True
             put(near.place, at, p)
@@ -122,6 +159,17 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
         write(scratch.found, count, side, mine, theirs, turn(matrix, other, n), d, key)
         count += 1
     return count
+
+
+@njit(**BARE)
+def _is_found(found, begun, count, side, place, apart):
+    """Whether a point of this side is known that is nearer than `apart`."""
+    column = FIRST if side == 0 else SECOND
+    for e in range(begun, count):
+        away = sub(three(found[e], column), place)
+        if dot(away, away) < apart * apart:
+            return True
+    return False
 
 
 @njit(**BARE)
@@ -296,6 +344,107 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
     return p, k * d, n
 
 
+@njit(**INLINED)
+def _descended(shapes, s, t, w, c, k, own, p, step, least):
+    """Descend along the true surface of s, from a point on it, to lower distances of the true one of t, by steps along
+    the other's normal and back onto the surface. Returns the point, the distance at the scale of t, and the normal."""
+    ratio = k / own
+    d, n = true_distance(shapes, t, mapped(w, c, p))
+    for _ in range(SHARPER):
+        if step <= least:
+            break
+        g = (
+            (w[0][0] * n[0] + w[1][0] * n[1] + w[2][0] * n[2]) * ratio,
+            (w[0][1] * n[0] + w[1][1] * n[1] + w[2][1] * n[2]) * ratio,
+            (w[0][2] * n[0] + w[1][2] * n[1] + w[2][2] * n[2]) * ratio,
+        )
+        q = _onto(shapes, s, along(p, g, -step), 1.01 * step)
+        if norm(sub(q, p)) <= least:
+            break
+        there, normal = true_distance(shapes, t, mapped(w, c, q))
+        if there < d - 1e-9:
+            p, d, n = q, there, normal
+        else:
+            # A step by the distance itself leads to where two lines cross.
+            step = d * ratio if least < d * ratio < 0.5 * step else 0.2 * step
+    return p, k * d, n
+
+
+@njit(**BARE)
+def _cell(shapes, s):
+    return shapes.table[s, CELL] if shapes.table[s, KIND] == GRID else 0.0
+
+
+@njit(**BARE)
+def _onto(shapes, s, p, most):
+    """A point on the surface of s near p: with triangles the closest, if it is nearer than `most`."""
+    if shapes.triangles.level[s] >= 0:
+        _, q, _ = closest(shapes.triangles, s, p, most)
+        return q
+    return _foot(shapes, s, p)
+
+
+@njit(**BARE)
+def looked_at(shapes, world, motion, matrix, rules, manifolds, p, count, ahead):
+    """Find the normals and distances of the points of a pair again, on true surfaces; or, looking `ahead`, where points
+    that are apart will touch in this inner step: what only passes an edge is no contact. Returns the number of points
+    that are left."""
+    kept = 0
+    for k in range(count):
+        point = manifolds.point[p, k]
+        side = int(point[OWNER])
+        one, other = manifolds.pair[p, side], manifolds.pair[p, 1 - side]
+        mine, theirs = (FIRST, SECOND) if side == 0 else (SECOND, FIRST)
+        t, size = world.shape[other], world.scale[other]
+        w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
+        own = scale(add(three(point, mine), get(world.com, one)), 1.0 / world.scale[one])
+        x, gap = mapped(w, c, own), point[GAP]
+        if not ahead:
+            if point[NORMAL_IMPULSE] == 0.0:
+                continue  # it is found again if it matters
+            d, n = true_distance(shapes, t, x)
+            gap = size * d
+            if gap > rules.contact_margin:
+                continue
+        elif gap > AWAY:
+            r = _travel(world, motion, matrix, rules, point, one, other, mine, theirs)
+            way, gone, d, n = norm(r) / size, 0.0, gap / size, (0.0, 0.0, 0.0)
+            r = scale(turn_back(matrix, other, r), 1.0 / size)
+            if way > d:
+                for _ in range(TRACED):
+                    gone += d / way
+                    if gone >= 1.0 or d * size <= AWAY:
+                        break
+                    d, n = true_distance(shapes, t, along(x, r, gone))
+                gap = -gone * dot(r, n) * size
+                if gone >= 1.0 or gap <= 0.0:
+                    continue
+        if not ahead or gap != point[GAP]:
+            foot = sub(scale(along(x, n, -d), size), get(world.com, other))
+            normal = turn(matrix, other, n)
+            for e in range(3):
+                point[NORMAL + e] = normal[e] if side == 0 else -normal[e]
+                if not ahead:
+                    point[theirs + e] = foot[e]
+            point[GAP] = gap
+        for e in range(COLUMNS):
+            manifolds.point[p, kept, e] = point[e]
+        kept += 1
+    return kept
+
+
+@njit(**BARE)
+def _travel(world, motion, matrix, rules, point, one, other, mine, theirs):
+    """How far a point of the first body moves relative to the second in an inner step."""
+    arm, lever = turn(matrix, one, three(point, mine)), turn(matrix, other, three(point, theirs))
+    v = add(get(motion.velocity, one), cross(get(motion.angular, one), arm))
+    if world.moves[other] or world.scripted[other]:
+        v = sub(v, add(get(motion.velocity, other), cross(get(motion.angular, other), lever)))
+    fall = (1.0 if world.moves[one] else 0.0) - (1.0 if world.moves[other] else 0.0)
+    v = along(v, vector(rules.options.gravity), fall * rules.substep_dt)
+    return scale(v, rules.substep_dt)
+
+
 @njit(**BARE)
 def round_points(shapes, world, motion, matrix, reach, a, b, side, found):
     """A sphere or capsule against anything: the distance at its core, less its radius."""
@@ -335,7 +484,7 @@ def at_least(table, t, d):
     """A lower bound of a point's distance to shape t, from the distance that was read: between the corners of a grid's
     bricks that may be too large."""
     if table[t, KIND] != GRID or d <= NEAR * table[t, CELL]:
-        return d
+        return d - table[t, ERROR]
     return max(NEAR, d / table[t, CELL] - FARTHER) * table[t, CELL]
 
 

@@ -84,10 +84,9 @@ def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p,
         rest = max((1.0 - t) * way - deep, -0.5 * deep)  # bodies farther apart do not meet before the end
         gap = nearest(
             shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, rest,
-            0.0 if t == 0.0 else -0.5 * deep, t == 0.0, scratch.simplex, surfaces,
+            -0.5 * deep, t == 0.0, scratch.simplex, surfaces,
         )  # fmt: skip
-        # Or they are in contact already, and the contact acts.
-        if gap >= rest or (t == 0.0 and gap <= 0.0):
+        if gap >= rest:
             return 1.0
         if gap <= -0.5 * deep:
             return t

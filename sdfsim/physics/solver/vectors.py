@@ -36,6 +36,12 @@ def vector(array):
 
 
 @njit(**BARE)
+def three(row, column):
+    """Three numbers of an array, from a column on, as a vector."""
+    return row[column], row[column + 1], row[column + 2]
+
+
+@njit(**BARE)
 def put(array, i, v):
     """Write a vector to row i of [N, 3]."""
     array[i, 0] = v[0]

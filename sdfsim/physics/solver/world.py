@@ -14,19 +14,10 @@ POINTS = 24  # largest number of points of a manifold
 # Columns of a contact point: its position on each body (about its centre of mass, in its axes); the unit normal from
 # the second body to the first (world); the distance; the impulses of a whole inner step, along the normal and
 # tangential (world); the two patches that meet there; the factor by which friction acts nearer to the middle of the
-# patch than the point is; and whether it is void, see `internal_edges`.
-FIRST, SECOND, NORMAL, GAP, NORMAL_IMPULSE, TANGENTIAL, KEY, TORSION, VOID, COLUMNS = (
-    0,
-    3,
-    6,
-    9,
-    10,
-    11,
-    14,
-    15,
-    16,
-    17,
-)
+# patch than the point is; whether it is void, see `internal_edges`; and whose surface it was found on (0 or 1).
+FIRST, SECOND, NORMAL, GAP, NORMAL_IMPULSE, TANGENTIAL, KEY, TORSION, VOID, OWNER, COLUMNS = (
+    0, 3, 6, 9, 10, 11, 14, 15, 16, 17, 18,
+)  # fmt: skip
 
 
 # Phases of a step. Its kicks (changes of velocity) and moves alternate: half a kick at the start, a move, whole kicks

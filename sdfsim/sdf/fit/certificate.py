@@ -24,8 +24,8 @@ EXACT = {
     "walls_lost": 1.0e-3,
 }
 # With larger errors bodies rest at a height that is wrong by 5 % of their size, creep, or rebound from a straight hit
-# more than 6 degrees aside (docs/sdf.md). Distances farther away only decide where to search for contacts, and only 0.8
-# of such a distance is trusted.
+# more than 6 degrees aside (docs/objects.md). Distances farther away only decide where to search for contacts, and only
+# 0.8 of such a distance is trusted.
 USABLE = {
     "error_within_0.01": 3.2e-3,
     "error_in_box": 2.0e-2,

@@ -1,0 +1,175 @@
+"""Laws of assembly: meshes whose edges, holes and teeth must be as sharp as their files say."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from math import cos, pi, radians, sqrt, tan
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from sdfsim.evaluation.laws.check import Check
+from sdfsim.evaluation.laws.scenes import UNIT, G, Put, Setting, about, fixed, floor, run, run_built, solid
+from sdfsim.geometry.mesh import Mesh, clean, joined
+from sdfsim.geometry.mesh_io import write_ply
+from sdfsim.geometry.primitives import box, revolve, sleeve, tube
+from sdfsim.scene.builder import SceneBuilder
+from sdfsim.shape.make import mesh_shape
+from sdfsim.shape.shape import Shape
+
+
+@cache
+def plate(hole: float) -> Shape:
+    """A plate 6 wide and 1 thick with a square hole."""
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    return mesh_shape(sleeve(3.0 * square, 0.5 * hole * square, 1.0), name="plate", kind="mesh")
+
+
+def pegs(at: Setting) -> Iterator[Check]:
+    """A peg falls through a hole that is wider by a thousandth, and stands on one that is narrower."""
+    long, through = solid("analytic", "box", 1, 1, 1.5), [0, 0, 0]
+    for gap in (1e-2, 5e-3, 1e-3):
+        for part in (0.0, 0.3, -0.45):
+            bodies = [Put("peg", long, [part * gap, 0, 1.3], mu=0.2), fixed("plate", plate(1 + gap), through)]
+            ran = run(at, f"square, {gap:g} wider, {part:g} of it aside", bodies, 0.3)
+            yield ran.near("falls", -ran.moved("peg")[-1, 2], 0.5 * G * ran.seconds[-1] ** 2 / UNIT, 0.05, "sizes")
+    hole = mesh_shape(tube(3.0, 0.505 / cos(pi / 64), 1.0), name="hole", kind="mesh")
+    peg = Put("peg", solid("mesh", "cylinder", 0.5, 1.5, 64), [0.002, 0, 1.3], mu=0.2)
+    ran = run(at, "round, a hundredth wider", [peg, fixed("plate", hole, through)], 0.3)
+    yield ran.near("falls", -ran.moved("peg")[-1, 2], 0.5 * G * ran.seconds[-1] ** 2 / UNIT, 0.05, "sizes")
+    peg = Put("peg", long, [0, 0, 1.25], mu=0.2)
+    ran = run(at, "square, a hundredth narrower", [peg, fixed("plate", plate(0.99), through)], 1.0)
+    yield ran.most("sinks", np.abs(ran.moved("peg")).max(), 1e-3, "sizes")
+
+
+def edges(at: Setting) -> Iterator[Check]:
+    """A box crosses a gap in a floor that is one mesh; a ball rests on the edge of a hole, and stops at a rim."""
+    half = box((10, 10, 1))
+    halves = [Mesh(half.vertices + np.array([5.1 * side, 0, -0.5]), half.faces) for side in (-1, 1)]
+    ground = mesh_shape(joined(halves), name="ground", kind="mesh")
+    for size in (2.0, 1.0):
+        for yaw in (0, 30, 45):
+            slab = solid("analytic", "box", size, size, 1)
+            moves = Put("box", slab, [-3, 0, 0.5], about("z", yaw), v=[0.5, 0, 0], mu=0.0)
+            ran = run(at, f"box of {size:g} at {yaw} degrees", [moves, fixed("ground", ground, [0, 0, 0])], 1.2)
+            yield ran.near("speed", ran.v("box")[-1, 0], 0.5, 1e-3, "m/s")
+            yield ran.most("hops", ran.moved("box")[:, 2].max(), 1e-3, "sizes")
+    for radius in (0.5, 0.75):
+        hole = mesh_shape(tube(3.0, radius, 1.0, 128), name="hole", kind="mesh")
+        ball = Put("ball", solid("analytic", "ball", 1.0), [0.01, 0, 1.5])
+        ran = run(at, f"ball on a hole of {radius:g}", [ball, fixed("hole", hole, [0, 0, 0])], 2.0)
+        inner = radius * cos(pi / 128)
+        yield ran.near("height", ran.place("ball")[-1, 2], 0.5 + sqrt(1 - inner**2), 0.0, "sizes", 1e-3)
+    turn = np.linspace(-pi / 2, 0.0, 24)
+    shell = [np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1) for radius in (1.0, 0.9)]
+    bowl = np.concatenate([shell[0], shell[1][::-1]])
+    bowl[[0, -1], 0] = 0.0
+    rim = mesh_shape(revolve(bowl, 96), name="bowl", kind="mesh")
+    for gap in (8e-3, 2e-3):
+        place = np.array([1.0, 0, 0]) + (0.2 + gap) * np.array([1.0, 0, 1.0]) / sqrt(2)
+        ball = Put("ball", solid("analytic", "ball", 0.2), place, v=[-0.02, 0, -0.02])
+        ran = run(at, f"ball, {gap:g} from a rim", [ball, fixed("bowl", rim, [0, 0, 0])], 1.0, gravity=0.0)
+        end = ran.place("ball")[-1]
+        yield ran.near("stops at", np.hypot(end[0] - 1.0, end[2]), 0.2, 0.0, "sizes", 5e-4)
+
+
+def rollers(at: Setting) -> Iterator[Check]:
+    """Fine meshes of round things roll: a ring and a wheel of 128 sides keep most of their speed."""
+    torus = solid("mesh", "torus", 1.0, 0.3)
+    put = Put("ring", torus, [0, 0, 1.3], about("x", 90), v=[1.2, 0, 0], w=[0, 1.2 / 0.13, 0])
+    ran = run(at, "torus", [put, floor()], 1.5)
+    yield Check("torus: keeps", ran.v("ring")[-1, 0] / 1.2, 0.85, 1.001, "of its speed")
+    wheel = mesh_shape(tube(1.0, 0.5, 0.4, 128), name="wheel", kind="mesh")
+    for speed, kept in ((0.1, 0.9), (0.4, 0.9), (1.0, 0.89)):
+        put = Put("wheel", wheel, [0, 0, 1.0], about("x", 90), v=[speed, 0, 0], w=[0, speed / 0.1, 0])
+        ran = run(at, f"wheel at {speed:g} m/s", [put, floor()], 1.2)
+        yield Check(f"{ran.label}: keeps", ran.v("wheel")[-1, 0] / speed, kept, 1.001, "of its speed")
+
+
+def spur_gear(teeth: int, module: float, height: float = 0.02) -> Mesh:
+    """A gear about z with involute flanks at 20 degrees and a hundredth of its module of backlash, its first tooth at
+    +x. Lengths in m."""
+    pitch, press = 0.5 * module * teeth, radians(20.0)
+    root, base = pitch - 1.25 * module, pitch * cos(press)
+    half = pi / (2 * teeth) + tan(press) - press - 0.01 * module / pitch  # of a tooth at the base circle
+    radius = np.linspace(max(base, root), pitch + module, 8)
+    angle = np.arccos(base / radius)
+    off = half - (np.tan(angle) - angle)
+    if root < base:
+        radius, off = np.append(root, radius), np.append(half, off)
+    radius, off = np.append(radius, radius[::-1]), np.append(-off, off[::-1])
+    turn = (2 * pi / teeth * np.arange(teeth)[:, None] + off).reshape(-1)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return sleeve(np.tile(radius, teeth)[:, None] * circle, 2 * module * circle, height)
+
+
+def gears(at: Setting) -> Iterator[Check]:
+    """Two spur gears of 20 and 40 teeth of 5 mm: ten turns, without a tooth that is skipped."""
+    built = SceneBuilder(gravity=(0, 0, 0))
+    with TemporaryDirectory() as folder:
+        for name, teeth, place, turn in (("small", 20, 0.0, 0.0), ("large", 40, 0.15, 180 + 180 / 40)):
+            path = Path(folder) / f"{name}.ply"
+            path.write_bytes(write_ply(spur_gear(teeth, 5e-3)))
+            built.add(name, mesh=str(path), position=(place, 0, 0), mass=0.1, euler_xyz_deg=(0, 0, turn))
+        driven: dict[str, Any] = {"axis": (0, 0, 1), "anchor": (0, 0, 0), "motor": {"speed": 2 * pi, "max_force": 10}}
+        built.join("driven", "hinge", "small", **driven)
+        built.join("follows", "hinge", "large", axis=(0, 0, 1), anchor=(0.15, 0, 0), damping=0.01)
+        ran = run_built(at, "spur gears", built, 10.0)
+    turns = ran.rollout.joint_position[-1] / (2 * pi)
+    yield ran.near("turns", turns[0], 10.0, 1e-2)
+    yield ran.near("ratio", turns[0] / turns[1], -2.0, 1e-3)
+
+
+def threaded(flanks: np.ndarray, pitch: float, turns: int, other: float, around: int = 96) -> Mesh:
+    """A solid between a thread about z and the radius `other`: a bolt if that is 0, else a nut. `flanks` [K, 2] are
+    corners of the thread's profile: their place along the pitch, from 0 to 1, and their radius. Lengths in m."""
+    corners, knot = len(flanks), np.arange(turns * len(flanks) + 1)
+    along = pitch * (flanks[knot % corners, 0] + knot // corners)
+    turn = 2 * pi * np.arange(around)[:, None] / around
+
+    def sheet(radius: float | np.ndarray, height: np.ndarray) -> np.ndarray:
+        flat = np.broadcast_arrays(radius * np.cos(turn), radius * np.sin(turn), height)
+        return np.stack(flat, axis=-1).reshape(-1, 3)
+
+    helix = along + pitch * turn / (2 * pi)
+    ends = np.where(knot < len(knot) / 2, helix[0, 0], helix[0, -1]) + 0.5 * pitch  # points on the axis
+    this = np.arange(around * len(knot)).reshape(around, -1)
+    # After a turn the thread meets itself one pitch higher.
+    following = np.concatenate([this[1:], np.append(this[0, corners:], np.full(corners, -1))[None]])
+    quads = np.stack([this[:, :-1], following[:, :-1], following[:, 1:], this[:, 1:]], axis=-1).reshape(-1, 4)
+    quads = quads[(quads >= 0).all(1)]
+    edges = np.concatenate([quads[:, [k, (k + 1) % 4]] for k in range(4)])
+    inner = set(map(tuple, edges.tolist()))
+    rims = np.array([(b, a) for a, b in inner if (b, a) not in inner])
+    walls = np.concatenate([rims, rims[:, ::-1] + this.size], axis=1)
+    faces = np.concatenate([quads, quads[:, ::-1] + this.size, walls])
+    vertices = [sheet(flanks[knot % corners, 1], helix), sheet(other, helix if other else ends)]
+    return clean(Mesh(np.concatenate(vertices), np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])))
+
+
+def nuts(at: Setting) -> Iterator[Check]:
+    """An M16 nut with a tenth of a millimetre of play on its bolt, both of 96 facets: friction locks it, and without
+    friction it turns down by the lead, somewhat slower than on a true screw, as each facet is an impact."""
+    pitch, radius = 2e-3, 8e-3
+    root = radius - 5 / 8 * pitch * sqrt(0.75)
+    flanks = np.array([(0.0, radius), (1 / 8, radius), (7 / 16, root), (11 / 16, root)])
+    bolt = mesh_shape(threaded(flanks, pitch, 14, 0.0), name="bolt", kind="mesh")
+    nut = mesh_shape(threaded(flanks + np.array([0.0, 1e-4]), pitch, 5, 12e-3), name="nut", kind="mesh")
+    lead, spin = pitch / (2 * pi), nut.inertia[2, 2] / nut.volume
+    for mu in (0.2, 0.0):
+        scale = 1 / at.size
+        bodies = [Put("nut", nut, [0, 0, 8 * pitch * scale], mu=mu, scale=scale), fixed("bolt", bolt, [0, 0, 0])]
+        ran = run(at, f"mu = {mu:g}", [bodies[0], replace(bodies[1], scale=scale)], 1.0 / at.time)
+        spins, half = ran.rollout.angular_velocity[:, 0, 2], len(ran.time) // 2
+        if mu:
+            yield ran.most("turns", abs(spins[-1]), 1e-3, "rad/s")
+        else:
+            way, turned = np.ptp(ran.rollout.position[half:, 0, 2]), np.trapezoid(spins[half:], ran.time[half:])
+            yield ran.near("down a turn", 2 * pi * way / -turned, pitch, 0.02, "m")
+            full = G * lead / (lead**2 + spin) * ran.time[-1]
+            yield ran.between("speed of a true screw", -spins[-1] / full, 0.75, 1.01, "")
+
+
+ASSEMBLY = (pegs, edges, rollers, gears, nuts)
