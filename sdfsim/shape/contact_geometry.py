@@ -96,7 +96,7 @@ class ContactGeometry:
         it."""
         if isinstance(self.sdf, ClosedForm):
             return None
-        if self.triangles is not None and self.sdf.simple:
+        if self._exact is not None and self._exact.simple:
             return baked(self.sdf, self.nodes, finest=CELLS)  # it only says where triangles have to be asked
         grid = baked(self.sdf, self.nodes, self.pieces)
         if not self.solids and (wall := unseen_wall(self.sdf, grid)) is not None:
@@ -116,11 +116,14 @@ class ContactGeometry:
         whole = convex_vertices(self.mesh)
         return (hull(whole),) if len(whole) else ()
 
+    @property
+    def _exact(self) -> MeshSdf | None:
+        return self.sdf if isinstance(self.sdf, MeshSdf) and not self.solids else None
+
     @cached_property
     def triangles(self) -> TriangleTree | None:
         """The true surface of a shape that has the exact distance of a mesh and does not collide as solids."""
-        exact = isinstance(self.sdf, MeshSdf) and not self.solids
-        return triangle_tree(self.sdf.mesh) if exact else None
+        return None if self._exact is None else triangle_tree(self._exact.mesh)
 
     @property
     def thickness(self) -> float:
@@ -150,7 +153,7 @@ class ContactGeometry:
         else:
             nodes, samples = self.nodes, self.nodes[:0]
             if grid is not None:
-                exact = self.triangles is not None
+                exact = self._exact is not None
                 samples = _all_over(self.mesh, grid.cell) if exact else surface_samples(grid)
                 if not self.pieces:
                     edges = on_edges(self.mesh, grid) if exact or isinstance(sdf, MlpSdf) else nodes[:0]

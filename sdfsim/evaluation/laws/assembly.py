@@ -44,7 +44,7 @@ def pegs(at: Setting) -> Iterator[Check]:
     yield ran.most("sinks", np.abs(ran.moved("peg")).max(), 1e-3, "sizes")
 
 
-def edges(at: Setting) -> Iterator[Check]:
+def rims(at: Setting) -> Iterator[Check]:
     """A box crosses a gap in a floor that is one mesh; a ball rests on the edge of a hole, and stops at a rim."""
     half = box((10, 10, 1))
     halves = [Mesh(half.vertices + np.array([5.1 * side, 0, -0.5]), half.faces) for side in (-1, 1)]
@@ -172,4 +172,4 @@ def nuts(at: Setting) -> Iterator[Check]:
             yield ran.between("speed of a true screw", -spins[-1] / full, 0.75, 1.01, "")
 
 
-ASSEMBLY = (pegs, edges, rollers, gears, nuts)
+ASSEMBLY = (pegs, rims, rollers, gears, nuts)

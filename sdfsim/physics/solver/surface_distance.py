@@ -399,6 +399,7 @@ def looked_at(shapes, world, motion, matrix, rules, manifolds, p, count, ahead):
         w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         own = scale(add(three(point, mine), get(world.com, one)), 1.0 / world.scale[one])
         x, gap = mapped(w, c, own), point[GAP]
+        d, n = gap / size, (0.0, 0.0, 0.0)
         if not ahead:
             if point[NORMAL_IMPULSE] == 0.0:
                 continue  # it is found again if it matters
@@ -408,7 +409,7 @@ def looked_at(shapes, world, motion, matrix, rules, manifolds, p, count, ahead):
                 continue
         elif gap > AWAY:
             r = _travel(world, motion, matrix, rules, point, one, other, mine, theirs)
-            way, gone, d, n = norm(r) / size, 0.0, gap / size, (0.0, 0.0, 0.0)
+            way, gone = norm(r) / size, 0.0
             r = scale(turn_back(matrix, other, r), 1.0 / size)
             if way > d:
                 for _ in range(TRACED):
