@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
+from sdfsim.evaluation.laws.assembly import ASSEMBLY
 from sdfsim.evaluation.laws.check import Check, most, near
+from sdfsim.evaluation.laws.everyday import EVERYDAY
+from sdfsim.evaluation.laws.joints import JOINTS
 from sdfsim.evaluation.laws.scenes import Setting
 from sdfsim.evaluation.laws.table import ROWS, checks, laws
+from sdfsim.evaluation.laws.textbook import TEXTBOOK
 from tests.helpers.everyday import COUNTS, MISSED
 
 SLOW = {
@@ -63,3 +67,4 @@ def test_checks_hold_between_their_limits():
 def test_every_law_has_a_name_of_its_own_and_the_short_form_is_shorter():
     names = [[law.name for law in laws(quick=quick)] for quick in (False, True)]
     assert len(set(names[0])) == len(names[0]) and set(names[1]) < set(names[0])
+    assert len(ROWS) == sum(map(len, (EVERYDAY, TEXTBOOK, JOINTS, ASSEMBLY)))
