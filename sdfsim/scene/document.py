@@ -112,7 +112,7 @@ def _text_of(path: Path) -> str:
         if path.exists() and not path.is_dir() and not path.is_file():
             raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may never end
         if path.is_file() and path.suffix.lower() in MESH_SUFFIXES:
-            scene = f"shapes: {{thing: {{mesh: {path.name}, sdf: grid}}}}"
+            scene = f"shapes: {{thing: {{mesh: {path.name}}}}}"
             raise SceneError(
                 [f"{path}: a mesh is not a scene"], f"name it in one: {scene} (docs/vfx.md has one to copy)"
             )
