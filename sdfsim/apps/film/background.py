@@ -75,7 +75,7 @@ def checked(clip: Clip, back: Background) -> None:
         return  # a plain wall cannot tell
     grey = [cv2.cvtColor(clip.pixels[k], cv2.COLOR_RGB2GRAY) for k in (0, len(clip.time) // 2, -1)]
     for later in grey[1:]:
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(grey[0], later, corners, None, winSize=(15, 15))
+        moved, found, _ = cv2.calcOpticalFlowPyrLK(grey[0], later, corners, corners.copy(), winSize=(15, 15))
         way = (moved - corners)[found[:, 0] == 1][:, 0]
         drift = np.abs(np.median(way, axis=0)).max() if len(way) >= 12 else 0.0
         if drift > DRIFT:

@@ -46,7 +46,7 @@ def read_clip(
     """Read the frames from `start` to `end` s of the film; `slow`: how many times slower it plays than things moved.
     Raises SdfsimError if it cannot be read, or if too few or too many frames remain."""
     import av
-    from av import FFmpegError
+    from av.error import FFmpegError
 
     times, pictures, small = [], [], 1.0
     try:
