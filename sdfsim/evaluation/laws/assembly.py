@@ -76,8 +76,8 @@ def rims(at: Setting) -> Iterator[Check]:
 
 
 def rollers(at: Setting) -> Iterator[Check]:
-    """Fine meshes of round things keep most of their speed: a ring, a wheel of 128 sides, a disc of 1,024. The limits are
-    what is reached, not what dead impacts of the polygons would leave (0.99, 0.97, 0.92; 0.994)."""
+    """Fine meshes of round things keep most of their speed: a ring, a wheel of 128 sides, a disc of 1,024. Limits
+    are what is reached, not what dead impacts of the polygons would leave (0.99, 0.97, 0.92; 0.994)."""
     torus = solid("mesh", "torus", 1.0, 0.3)
     put = Put("ring", torus, [0, 0, 1.3], about("x", 90), v=[1.2, 0, 0], w=[0, 1.2 / 0.13, 0])
     ran = run(at, "torus", [put, floor()], 1.5)
