@@ -49,7 +49,7 @@ def options(*names: str, kept: bool = False) -> Callable[[Callable[..., None]], 
 
 
 @command
-@options("preset", "size", "distance", "up", "crop", "body", "drop", "material", "sdf")
+@options("preset", "size", "distance", "up", "crop", "body", "drop", "material", "mass", "sdf")
 def reconstruct(
     session: Session,
     photos: Photos,

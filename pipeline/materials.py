@@ -1,7 +1,9 @@
 """Named materials: how heavy, how rough and how bouncy a body is, and where each number comes from."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from sdfsim.base.errors import SdfsimError, nearest
 
@@ -67,11 +69,13 @@ class Choice:
     name: str = "assumed"  # in `MATERIALS`, or `assumed`
     material: Material = ASSUMED  # its numbers
     wall: float | None = None  # m, thickness of the wall of a hollow body; None for a solid one
+    mass: float | None = None  # kg, in place of the density's; None if it is unknown
 
 
-def materials_of(given: dict[str, str]) -> dict[str, Choice]:
+def materials_of(given: dict[str, str], masses: dict[str, float] | None = None) -> dict[str, Choice]:
     """Looks up the materials of bodies: for each body's name, a name in `MATERIALS`, optionally with the thickness of a
-    hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError for an invalid entry."""
+    hollow body's wall (mm, cm or m), such as `ceramic:4mm`; and adds known `masses`, kg, by body. Raises SdfsimError
+    for an invalid entry."""
     found = {}
     for body, text in given.items():
         name, colon, thickness = text.partition(":")
@@ -86,4 +90,10 @@ def materials_of(given: dict[str, str]) -> dict[str, Choice]:
             message = f"material: {body}: {thickness!r} is not the thickness of a wall"
             raise SdfsimError(message, "give one such as 4mm or 0.4cm")
         found[body] = Choice(name, MATERIALS[name], wall)
+    for body, mass in (masses or {}).items():
+        if body in UNMOVED:
+            raise SdfsimError(f"mass: {body}: does not move, so its mass does not matter")
+        if not 0 < mass < np.inf:
+            raise SdfsimError(f"mass: {body}: must be more than 0 kg (got {mass:g})")
+        found[body] = replace(found.get(body, Choice()), mass=mass)
     return found

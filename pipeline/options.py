@@ -82,6 +82,11 @@ class Options(BaseModel):
         "Material of a body: object1=wood, or object1=ceramic:4mm for a hollow one. Can be repeated.",
         kind=list[str] | None, metavar="BODY=MATERIAL",
     )  # fmt: skip
+    # kg, by body
+    mass: dict[str, float] = option(
+        dict, ["scene"], "Mass of a body, kg, if you weighed it: object1=0.35. Can be repeated.",
+        kind=list[str] | None, metavar="BODY=KG",
+    )  # fmt: skip
 
     @field_validator("crop", mode="before")
     @classmethod
@@ -98,19 +103,22 @@ class Options(BaseModel):
             raise SdfsimError(message, exit_code=EXIT_USAGE)
         return corners[0] + corners[1]
 
-    @field_validator("material", "body", mode="before")
+    @field_validator("material", "mass", "body", mode="before")
     @classmethod
     def _read_by_body(cls, given: Any, info: ValidationInfo) -> Any:
         """Values by body from a list of `BODY=VALUE` as on the command line; a body may have several places."""
         if not isinstance(given, list):
             return given
-        once = info.field_name == "material"
+        once = info.field_name != "body"
         found: dict[str, list[str]] = {}
         for text in given:
             body, _, value = text.partition("=")
             if not body or not value or (once and body in found):
-                form = "BODY=MATERIAL once for a body, such as object1=wood"
-                form = form if once else "NAME=PHOTO:X,Y, such as cup=041.jpg:300,200"
+                form = {
+                    "material": "BODY=MATERIAL once for a body, such as object1=wood",
+                    "mass": "BODY=KG once for a body, such as object1=0.35",
+                    "body": "NAME=PHOTO:X,Y, such as cup=041.jpg:300,200",
+                }[info.field_name or "body"]
                 raise SdfsimError(f"--{info.field_name} takes {form} (got {text})", exit_code=EXIT_USAGE)
             found.setdefault(body, []).append(value)
         return {body: values[0] for body, values in found.items()} if once else found
@@ -138,7 +146,7 @@ class Options(BaseModel):
                 raise SdfsimError(f"body: no body can be called {name!r}", NAMING)
             if not spots:
                 raise SdfsimError(f"body: {name} has no place", "write PHOTO:X,Y")
-        materials_of(self.material)
+        materials_of(self.material, self.mass)
         return self
 
     def changed(self, changes: dict[str, Any]) -> "Options":
@@ -186,6 +194,7 @@ class OptionKeys(TypedDict, total=False):
     body: Mapping[str, Sequence[str]]
     drop: Literal["box", "ball", "none"]
     material: Mapping[str, str]
+    mass: Mapping[str, float]
 
 
 def form_of(name: str) -> dict[str, Any]:

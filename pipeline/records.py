@@ -68,6 +68,8 @@ class MeshReport:
     masks_without_surface: list[str] = field(default_factory=list)  # names
     places_without_surface: list[str] = field(default_factory=list)  # names of clicked bodies
     unrefined: dict[str, str] = field(default_factory=dict)  # by body, why photos did not refine its surface
+    # by body, the symmetry that completed what photos do not show, and the share of the surface that it guessed
+    symmetries: dict[str, tuple[str, float]] = field(default_factory=dict)
     hollows: dict[str, Hollow] = field(default_factory=dict)  # by body
     left_out_m: list[float] = field(default_factory=list)  # longest sides of pieces
     completed_m2: list[float] = field(default_factory=list)  # areas of level surfaces
@@ -88,7 +90,7 @@ class FitReport:
 
 @dataclass(frozen=True)
 class BodyReport:
-    """Of a body of the scene; the last four only if it moves."""
+    """Of a body of the scene; density to mass only if it moves."""
 
     material: str
     friction: float
@@ -97,6 +99,7 @@ class BodyReport:
     wall: float | None = None  # m; None: solid
     volume: float | None = None  # m^3 with mass
     mass: float | None = None  # kg
+    weighed: bool = False  # whether the user gave the mass
 
 
 @dataclass(frozen=True)

@@ -110,6 +110,10 @@ def notes(stages: dict[str, dict]) -> list[str]:
     lines += mesh_notes(read(MeshReport, stages["mesh"])) if "mesh" in stages else []
     lines += [f"usable, not exact: {caveat}" for caveat in read(FitReport, stages.get("fit")).caveats]
     lines += [f"{name}: {material_line(body)}" for name, body in scene.bodies.items()]
+    moving = {name: body for name, body in scene.bodies.items() if body.mass is not None}
+    if guessed := [name for name, body in moving.items() if body.material == "assumed" and not body.weighed]:
+        lines.append(f"{', '.join(guessed)}: the mass is assumed. A wrong mass changes how bodies push each other and "
+                     "the forces, not how one falls or slides on the scenery (give --material or --mass)")  # fmt: skip
     return [f"joint: {scene.joint}"] * bool(scene.joint) + lines + scene.notes
 
 
@@ -133,6 +137,8 @@ def mesh_notes(mesh: MeshReport) -> list[str]:
     lines += [f"no body was found for {name}, which masks name" for name in mesh.masks_without_surface]
     lines += [f"no body was found for {name}, which places name" for name in mesh.places_without_surface]
     lines += [f"{name}: its surface was not fully refined by photos: {why}" for name, why in mesh.unrefined.items()]
+    lines += [f"{name}: the {share:.0%} that photos do not show well were completed as {kind}, with which all that "
+              "they show agrees: a guess" for name, (kind, share) in mesh.symmetries.items()]  # fmt: skip
     lines += [hollow_line(name, found) for name, found in mesh.hollows.items()]
     if mesh.smallest_object_m:
         lines.append(f"pieces lower than {mesh.smallest_object_m:.2g} m stay part of their support")
@@ -156,7 +162,8 @@ def material_line(body: BodyReport) -> str:
     if body.mass is None:
         return line
     thick = f" in a wall of {1000 * body.wall:g} mm" if body.wall else ""
-    return f"{line}, {body.mass:.3g} kg ({body.volume:.3g} m^3{thick}, {body.density:g} kg/m^3)"
+    known = ", weighed" if body.weighed else ""
+    return f"{line}, {body.mass:.3g} kg{known} ({body.volume:.3g} m^3{thick}, {body.density:g} kg/m^3)"
 
 
 def page(report: dict, folder: Path) -> str:

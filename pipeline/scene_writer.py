@@ -187,7 +187,7 @@ def write_scene(
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:
-            message = f"material: no body is called {name!r}{nearest(name, names)}"
+            message = f"material or mass: no body is called {name!r}{nearest(name, names)}"
             raise SdfsimError(message, "the bodies are " + ", ".join(names))
     made = hashlib.sha256(text.encode()).hexdigest()
     if scene_file.exists() and hashlib.sha256(scene_file.read_bytes()).hexdigest() not in (written, made):
@@ -246,7 +246,7 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, BodyRepor
     found = {}
     for body in scene.bodies:
         choice = materials.get(body.name, Choice())
-        entry = BodyReport(choice.name, body.friction, body.restitution)
+        entry = BodyReport(choice.name, body.friction, body.restitution, weighed=choice.mass is not None)
         if body.motion == "dynamic":
             volume = scene.shapes[body.shape].volume
             entry = replace(entry, density=body.mass / volume, wall=choice.wall, volume=volume, mass=body.mass)
@@ -270,14 +270,18 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
 
     def add(name: str, keys: str, shape: dict | None = None) -> None:
         choice = made.get(name, Choice())
-        density = f"density: {choice.material.density:g}, " if shape and name != SCENERY else ""
+        density = ""
+        if shape and name != SCENERY:
+            weight = f"density: {choice.material.density:g}" if choice.mass is None else f"mass: {choice.mass:g}"
+            density = f"{weight}, "
         surface = f"friction: {choice.material.friction:g}, restitution: {choice.material.restitution:g}"
         if shape:
             wall = {} if choice.wall is None else {"wall": float(rounded(choice.wall))}
             shapes.append(f"  {name}: {_flow(shape | wall)}")
             keys = f"shape: {name}, {keys}"
         thick = f", a wall of {1000 * choice.wall:g} mm" if choice.wall else ""
-        known = f"{choice.name}{thick}. From: {choice.material.source}"
+        weighed = "" if choice.mass is None else "weighed; the rest is "
+        known = f"{weighed}{choice.name}{thick}. From: {choice.material.source}"
         bodies.append(f"  # {known if name in made else 'assumed: photos do not show the material (give --material)'}")
         bodies.append(f"  - {{name: {name}, {keys}, {density}{surface}}}")
 

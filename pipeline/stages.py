@@ -149,7 +149,7 @@ def do_scene(project: Project, work: Path) -> SceneReport:
     known = read(SceneReport, before.report if before else None).scene_sha256
     return write_scene(
         project.place("mesh"), project.folder / "scene.yaml", drop=project.options.drop, written=known,
-        materials=materials_of(project.options.material), seed=project.options.seed,
+        materials=materials_of(project.options.material, project.options.mass), seed=project.options.seed,
     )  # fmt: skip
 
 
@@ -167,9 +167,9 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
     "poses": Stage(do_poses, "poses", version=8),
     "distill": Stage(do_distill, "distill", version=13),
-    "mesh": Stage(do_mesh, "mesh", version=17),
+    "mesh": Stage(do_mesh, "mesh", version=18),
     "fit": Stage(do_fit, "assets", version=3),
-    "scene": Stage(do_scene, "scene", version=7),
+    "scene": Stage(do_scene, "scene", version=8),
 }
 
 

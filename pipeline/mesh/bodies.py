@@ -43,6 +43,9 @@ from pipeline.mesh.seams import (
     parts_by_votes,
     solid_of,
 )
+from pipeline.mesh.symmetry import Known
+from pipeline.mesh.symmetry import complete as completed
+from pipeline.mesh.trust import evidence_of
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
@@ -348,6 +351,8 @@ class Parts:
     missing: list[str] = field(default_factory=list)  # names of masks or clicks without a body
     noise: list[float] = field(default_factory=list)  # longest sides of pieces that are noise
     unrefined: dict[str, str] = field(default_factory=dict)  # by body, why its surface was not refined by photos
+    # by body, the symmetry that completes what photos do not show, and the share of the surface that it guessed
+    symmetries: dict[str, tuple[str, float]] = field(default_factory=dict)
 
 
 def split(surface: FieldSurface, distance: Distance, finest: float, poses: PosedPhotos, photos_folder: Path,
@@ -406,13 +411,18 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
     noise = _noise(sampled, poses.sparse.xyz, finest)
     called = _names([body for body in sampled if body not in noise])
-    meshes, unrefined, pictures = {}, {}, load_grey_photos(poses.views, photos_folder)
+    meshes, unrefined, symmetries, pictures = {}, {}, {}, load_grey_photos(poses.views, photos_folder)
     for body, name in called.items():
         # Lifted off the occluding surface, which is sampled more coarsely.
         mesh, why = refine(sampled[body], pictures, blocking, lift, finest, body.level.above, body.layer)
         if why:
             unrefined[name] = why
-        seen = look(Visibility(mesh, lift, blocking), poses.views, photos_folder)
+        sight = Visibility(mesh, lift, blocking)
+        whole_of = completed(Known(mesh, evidence_of(sight, poses.views), poses.views, blocking, finest), up)
+        if whole_of is not None:
+            mesh, symmetries[name] = whole_of.mesh, (whole_of.symmetry.name, whole_of.guessed)
+            sight = Visibility(mesh, lift, blocking)
+        seen = look(sight, poses.views, photos_folder)
         known, color = seen.weight > 0, seen.color
         if known.any() and not known.all():
             color[~known] = spread_colors(mesh.vertices[~known], mesh.vertices[known], color[known])
@@ -421,7 +431,15 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
     pairs = [(called[a], called[b], by) for a, b, by in touching if a in called and b in called]
     missing = [name for name in names if name not in meshes]
     return Parts(
-        solid, shown, meshes, smallest, pairs, missing, [body.size for body in pieces if body not in called], unrefined
+        solid,
+        shown,
+        meshes,
+        smallest,
+        pairs,
+        missing,
+        [body.size for body in pieces if body not in called],
+        unrefined,
+        symmetries,
     )
 
 

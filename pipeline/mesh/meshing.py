@@ -107,6 +107,7 @@ def make_meshes(
         objects=list(parts.bodies), smallest_object_m=float(rounded(parts.smallest * metres)),
         touching=parts.touching, masks_without_surface=[] if clicked else parts.missing,
         places_without_surface=parts.missing if clicked else [], unrefined=parts.unrefined,
+        symmetries=parts.symmetries,
         hollows={name: found for name, found in deep.items() if found is not None},
         left_out_m=[float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
         completed_m2=[float(rounded(one.area * metres**2)) for one in completed],

@@ -67,15 +67,26 @@ def test_what_is_no_material_is_refused_before_any_work(body, text, message):
     assert caught.value.message == f"material: {message}" and caught.value.exit_code == 1
 
 
+@pytest.mark.parametrize(
+    ("mass", "message"),
+    [({"scenery": 2.0}, "mass: scenery: does not move"), ({"cup": 0.0}, "mass: cup: must be more than 0 kg")],
+)
+def test_what_is_no_mass_is_refused(mass, message):
+    with pytest.raises(SdfsimError, match=message):
+        options_of(mass=mass)
+
+
 def test_the_command_takes_a_material_for_every_body(photos, tmp_path, calls, monkeypatch):
     monkeypatch.setattr("pipeline.report.write_recording", lambda folder, done: None)
 
-    def reconstruct(*materials: str) -> int:
-        options = [part for text in materials for part in ("--material", text)]
+    def reconstruct(*materials: str, mass: str = "object1=0.35") -> int:
+        options = ["--mass", mass, *(part for text in materials for part in ("--material", text))]
         return command("reconstruct", photos, "-o", tmp_path / "out", *options).exit_code
 
     assert reconstruct("object1=cermic") == 1
     assert reconstruct("object1") == reconstruct("=wood") == reconstruct("a=wood", "a=glass") == 2
+    assert reconstruct("object1=wood", mass="object1=heavy") == 1
     assert calls == [] and not (tmp_path / "out").exists()
     assert reconstruct("object1=ceramic:4mm", "scenery=wood") == 0
+    assert read_config(tmp_path / "out").mass == {"object1": 0.35}
     assert read_config(tmp_path / "out").material == {"object1": "ceramic:4mm", "scenery": "wood"}

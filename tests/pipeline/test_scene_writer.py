@@ -241,6 +241,14 @@ def test_bodies_weigh_what_their_materials_do(fitted):
         assert bodies["scenery"].friction == MATERIALS["rubber"].friction and report.bodies["scenery"].mass is None
 
 
+def test_a_weighed_body_has_its_mass_whatever_its_material(fitted):
+    scene = fitted / "scene.yaml"
+    for material in ({}, {"object1": "glass:2cm"}):
+        report = write_scene(fitted, scene, drop="none", materials=materials_of(material, {"object1": 0.35}))
+        body = next(body for body in load_scene(scene).bodies if body.name == "object1")
+        assert body.mass == 0.35 and report.bodies["object1"].weighed and "weighed; the rest is" in scene.read_text()
+
+
 def test_the_scene_file_names_the_source_of_every_number_and_what_is_assumed(fitted):
     materials = materials_of({"object1": "ceramic:4mm", "floor": "wood"})
     write_scene(fitted, fitted / "scene.yaml", materials=materials)
