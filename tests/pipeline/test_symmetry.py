@@ -85,7 +85,8 @@ def test_the_belly_of_a_vase_that_no_photo_sees_is_as_thick_as_its_neck():
     points = np.random.default_rng(0).uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 0.4], (20_000, 3))
     air = points[hollow(points) < -0.01]
     assert inside(filled, air).mean() > 0.15 and inside(found.mesh, air).mean() < 0.1
-    assert signed_volume(found.mesh) == pytest.approx(signed_volume(true), rel=0.1)
+    right = signed_volume(true)
+    assert signed_volume(filled) > 1.15 * right and signed_volume(found.mesh) == pytest.approx(right, rel=0.12)
 
 
 def test_a_box_takes_its_back_from_its_front():
