@@ -55,16 +55,9 @@ def fuse(
     """Fuses depth maps in the space of the unit sphere, `side` samples along each side and twice as many near the
     surface, with the colours of their photos; None if they show no surface."""
     given, surface = _prepared(maps), _surface(maps)
-    line = np.linspace(-1, 1, side, dtype=np.float32)
-    cell = float(line[1] - line[0])
-    places = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)[:, ::-1]
-    value, weight = (part.reshape((side,) * 3) for part in _carved(given, surface, places, cell, on_progress))
-    known = weight > SEEN
-    if not (known & (value < 0)).any() or not (known & (value > 0)).any():
+    coarse, cell = _coarse(given, surface, side, on_progress), 2.0 / (side - 1)
+    if coarse is None:
         return None
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    solid = without_cavities((value < 0)[tuple(np.asarray(nearest))])
-    coarse = _distance(solid, np.where(known, value, np.nan), cell)
     bricks = near_bricks(coarse, 2 * side - 1)
     place = places_of(bricks)
     start = ndimage.map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
@@ -74,6 +67,25 @@ def fuse(
     fine = np.clip(share * (value - start), -cell, cell)
     color = _painted(maps, given, place, coarse, start + fine, cell, photos_folder)
     return Fused(coarse, 2 * side - 1, bricks, fine.astype(np.float32), color)
+
+
+def coarse_distance(maps: Sequence[DepthMap], side: int, on_progress: Progress = silent) -> np.ndarray | None:
+    """The signed distance [side, side, side] (z, y, x) on [-1, 1]^3 alone; None if the maps show no surface there."""
+    return _coarse(_prepared(maps), _surface(maps), side, on_progress)
+
+
+def _coarse(given: tuple[np.ndarray, ...], surface: tuple[KDTree, np.ndarray], side: int, on_progress: Progress
+            ) -> np.ndarray | None:  # fmt: skip
+    line = np.linspace(-1, 1, side, dtype=np.float32)
+    cell = float(line[1] - line[0])
+    places = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)[:, ::-1]
+    value, weight = (part.reshape((side,) * 3) for part in _carved(given, surface, places, cell, on_progress))
+    known = weight > SEEN
+    if not (known & (value < 0)).any() or not (known & (value > 0)).any():
+        return None
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    solid = without_cavities((value < 0)[tuple(np.asarray(nearest))])
+    return _distance(solid, np.where(known, value, np.nan), cell)
 
 
 def without_cavities(solid: np.ndarray) -> np.ndarray:
