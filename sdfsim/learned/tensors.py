@@ -21,7 +21,6 @@ class BodyTensors:
     size: Tensor  # [N] float64
     node: Tensor  # [M, 3] float64
     node_start: Tensor  # [N + 1] int64
-    face: Tensor  # [F, 3] int64
     group: Tensor  # [N] int64
     allowed: Tensor  # [G, G] bool
     world: Tensor  # [N] int64

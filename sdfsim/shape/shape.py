@@ -58,7 +58,6 @@ class Shape:
         source: where it came from, and a hash of its content.
         pieces: the vertices [V, 3] float64 m of each of its convex pieces, if it was made of pieces.
         skin: a mesh with a texture that is shown in place of `mesh`, or None.
-        faces: [F, 3] int64 triangles between the nodes, if these are the vertices of a mesh; never stored.
     """
 
     name: str
@@ -72,7 +71,6 @@ class Shape:
     source: dict = field(default_factory=dict)
     pieces: tuple[np.ndarray, ...] = ()
     skin: Mesh | None = None
-    faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
 
     @property
     def shown(self) -> Mesh:
