@@ -43,9 +43,9 @@ class Options(BaseModel):
     budget: float | None = option(None, ["distill", "fit"], gt=0, allow_inf_nan=False)
     seed: int = option(0, ["poses", "distill", "fit", "scene"])  # of all random numbers
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    recipe: Literal["quick", "default", "paper"] | None = option(
+    recipe: Literal["quick", "default"] | None = option(
         None, ["fit"],
-        "How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says).",
+        "How long networks are fitted (a reconstruction: as its preset says).",
     )  # fmt: skip
     # None: a grid for the preset quick, where no recipe is given
     sdf: Literal["grid", "mlp"] | None = option(
@@ -177,7 +177,7 @@ class OptionKeys(TypedDict, total=False):
     budget: float | None
     seed: int
     device: Literal["auto", "cpu", "cuda"]
-    recipe: Literal["quick", "default", "paper"] | None
+    recipe: Literal["quick", "default"] | None
     sdf: Literal["grid", "mlp"] | None
     distance: tuple[str, str, float] | None
     crop: Sequence[float] | None

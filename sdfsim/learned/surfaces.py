@@ -21,7 +21,7 @@ TARGET = Features(3, (0,))  # accelerations
 # Weight of staying at `start`, relative to the nodes' spread. It is far below the weight of any extent beyond rounding,
 # so it decides only about rotations that the nodes do not define.
 STAY = 1e-12
-_NOT_PER_BODY = ("node", "node_start", "allowed")
+_NOT_PER_BODY = ("node", "node_start")
 
 
 def node_owner(bodies: BodyTensors) -> Tensor:
