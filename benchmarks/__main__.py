@@ -6,13 +6,11 @@ from pathlib import Path
 
 import typer
 
-SHARED = ("baselines", "records")  # modules that the benchmarks share
-
 if __name__ == "__main__":
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     from sdfsim.base.errors import run_main
 
-    here = sorted(file.stem for file in Path(__file__).parent.glob("[a-z]*.py") if file.stem not in SHARED)
+    here = sorted(file.stem for file in Path(__file__).parent.glob("[a-z]*.py") if file.stem != "records")
     if name not in here:
         sys.exit(f"usage: python -m benchmarks NAME ...   (NAME: {', '.join(here)})")
     module = import_module(f"benchmarks.{name}")

@@ -1,9 +1,9 @@
-"""The records and pictures of docs/stability.md, and the ratchet for later models.
+"""The records of the hard cases, and the ratchet for later models.
 
     python -m benchmarks hard_cases -o DIR [--quick]
 
 Runs the hard cases in DIR (their short form in DIR/quick) that have no results there yet; then writes the records and
-the pictures of docs/stability.md, and benchmarks/hard_cases_ratchet.json from the short form, which the slow test runs.
+benchmarks/hard_cases_ratchet.json from the short form, which the slow test runs.
 With --quick the table is that of the short form too.
 """
 
@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.engines import drake, mujoco
-from benchmarks.records import ROOT, Out, progress, write_record
+from benchmarks.records import Out, progress, write_record
 from sdfsim.apps.stress import (
     LEGEND,
     TEACHER,
     USUAL,
     Study,
-    draw_group,
     figures,
     losses,
     rows,
@@ -32,7 +31,6 @@ ENGINES = USUAL | {"MuJoCo": mujoco, "Drake": drake}
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
 SPREADS = 3.0  # standard deviations that count as noise
 SHARE = 0.05  # of a figure: possible change by another machine's rounding if repetitions agree
-PICTURES = {"bounce": "stability_bounces.png", "slope": "stability_slopes.png"}
 
 
 def accepted(study: Study) -> dict[str, Any]:
@@ -81,7 +79,3 @@ def main(*, out: Out, quick: bool = False) -> None:
         head, *lines = rows(replace(study, laws=[law]), {"missed": "**", "behind": "*"})
         found += [(GROUPS[law.group].title, law.title, *line[1:]) for line in lines]
     write_record("hard_cases", command, f"{measured}.", ("group", *head), found, [f"- {line}" for line in LEGEND])
-    # Engines without restitution would set the scale of the plots.
-    others = replace(study, engines=list(USUAL))
-    for group, name in PICTURES.items():
-        draw_group(others, group, ROOT / "docs" / "images" / name)

@@ -16,7 +16,7 @@ COMMAND = "reconstruct"
 METRES = (1e-4, 1e5)  # smallest and largest length that can be given
 
 
-Preset = Literal["quick", "standard", "fine", "volsdf"]  # what each is: PRESETS in pipeline/field/training.py
+Preset = Literal["quick", "standard"]  # what each is: PRESETS in pipeline/field/training.py
 
 
 def option(default: Any, stages: Sequence[str], about: str = "", kind: Any = None, metavar: str | None = None,
@@ -36,16 +36,16 @@ class Options(BaseModel):
     photos: str = ""  # what the user gave, an absolute path
     preset: Preset = option(
         "standard", ["distill", "mesh"],
-        "How much time to spend; volsdf is the network of the VolSDF paper, for a GPU.",
+        "How much time to spend.",
     )  # fmt: skip
     size: float | None = option(None, ["mesh"], "Widest side of the scene, metres.")  # None: assumed to be 1 m
     # s for all stages; None: no limit beyond the preset
     budget: float | None = option(None, ["distill", "fit"], gt=0, allow_inf_nan=False)
     seed: int = option(0, ["poses", "distill", "fit", "scene"])  # of all random numbers
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    recipe: Literal["quick", "default", "paper"] | None = option(
+    recipe: Literal["quick", "default"] | None = option(
         None, ["fit"],
-        "How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says).",
+        "How long networks are fitted (a reconstruction: as its preset says).",
     )  # fmt: skip
     # None: a grid for the preset quick, where no recipe is given
     sdf: Literal["grid", "mlp"] | None = option(
@@ -165,8 +165,7 @@ class Options(BaseModel):
         """Advice on options that train for longer than these."""
         if self.budget is not None:
             return "train for longer (a larger --budget)"
-        better = {"quick": "standard", "standard": "fine"}.get(self.preset)
-        return f"train for longer (--preset {better})" if better else "take more and sharper photos"
+        return "train for longer (--preset standard)" if self.preset == "quick" else "take more and sharper photos"
 
     def fit_recipe(self) -> str:
         """The recipe of the fit, see `fit_mesh`. If none is given: quick for the preset quick, else the default."""
@@ -186,7 +185,7 @@ class OptionKeys(TypedDict, total=False):
     budget: float | None
     seed: int
     device: Literal["auto", "cpu", "cuda"]
-    recipe: Literal["quick", "default", "paper"] | None
+    recipe: Literal["quick", "default"] | None
     sdf: Literal["grid", "mlp"] | None
     distance: tuple[str, str, float] | None
     crop: Sequence[float] | None

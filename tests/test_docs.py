@@ -163,7 +163,7 @@ def test_presets_and_recipes_in_documents_exist():
             for found in re.finditer(r"(reconstruct|train|fit)\b[^`|]*?--(?:preset|recipe) ([\w-]+)", line):
                 assert found[2] in known[found[1]], f"{file.name}: {line}"
                 named.add((found[1], found[2]))
-    assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick")} <= named
+    assert {("train", "sdf-sim"), ("reconstruct", "quick")} <= named
 
 
 def test_no_temporary_file_is_among_the_sources() -> None:

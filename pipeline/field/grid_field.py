@@ -6,7 +6,6 @@ background outside of it uses contracted coordinates (Barron et al., 2022, eq. 1
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +56,7 @@ BACKGROUND_SAMPLES = 12
 GEOMETRY = 13  # features from the SDF network to the colour network
 
 
-def laplace_density(sdf: Tensor, beta: float | Tensor) -> Tensor:
+def laplace_density(sdf: Tensor, beta: float) -> Tensor:
     """Density 1/beta * Psi_beta(-sdf) with Psi the Laplace distribution function (VolSDF eq. 2, 3; alpha = 1/beta)."""
     decay = 0.5 * torch.exp(-sdf.abs() / beta)
     return torch.where(sdf > 0, decay, 1 - decay) / beta
@@ -112,38 +111,6 @@ class Background(nn.Module):
         return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
 
 
-class Field(nn.Module, ABC):
-    """SDF and colour in the unit sphere, and a background outside; the base of both encodings."""
-
-    background: Background
-    size: Any  # of the encoding, a dataclass
-    start_radius: float  # radius of the sphere that the SDF starts from
-    active: int = 0  # how many levels of detail are in use
-    view_dependence: float = 1.0  # dependence of colour on direction, 0 to 1
-
-    @property
-    def device(self) -> torch.device:
-        """Of its parameters."""
-        return next(self.parameters()).device
-
-    @property
-    def finest(self) -> float:
-        """Size of the smallest detail, normalised units."""
-        return self.size.finest
-
-    @abstractmethod
-    def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """SDF [P] and two kinds of features [P, F] for `color_of` at points [P, 3] of normalised space."""
-
-    @abstractmethod
-    def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
-        """RGB [P, 3] in 0..1 seen along unit directions [P, 3]."""
-
-    def sdf(self, points: Tensor) -> Tensor:
-        """Signed distance [P] in normalised units at points [P, 3]."""
-        return self.geometry_at(points)[0]
-
-
 class Bricks(nn.Module):
     """A level of a field that exists only near the surface."""
 
@@ -188,11 +155,16 @@ class Bricks(nn.Module):
         return interpolate_bricks(self.start, self.numbers, self.side, points)
 
 
-class GridField(Field):
+class GridField(nn.Module):
     """SDF and colour in the unit sphere, and a background outside. The SDF starts as a sphere of `start_radius`, or
     from depth maps."""
 
     start: Tensor  # [n, n, n, 1] SDF at the start, empty if it is a sphere
+    size: FieldSize
+    start_radius: float  # of the sphere, normalised units
+    background: Background
+    active: int  # how many levels of detail are in use
+    view_dependence: float = 1.0  # dependence of colour on direction, 0 to 1
 
     def __init__(self, size: FieldSize, seed: int = 0, start_radius: float = 0.5, fused: Fused | None = None) -> None:
         super().__init__()
@@ -240,6 +212,16 @@ class GridField(Field):
                 else:
                     level.add(torch.from_numpy(near_bricks(fused.coarse, side)))  # type: ignore[operator]
 
+    @property
+    def finest(self) -> float:
+        """Size of the smallest detail, normalised units."""
+        return self.size.finest
+
+    @property
+    def device(self) -> torch.device:
+        """Of its parameters."""
+        return next(self.parameters()).device
+
     def refine(self, cache: Tensor) -> list[Tensor]:
         """Adds bricks where a cached SDF [n, n, n, 1] has its surface and none exist. Returns the features that they
         replace, level by level."""
@@ -257,6 +239,10 @@ class GridField(Field):
             level.started = bool(state_dict[f"bricks.{number}.start"].any())
         self.start = torch.zeros_like(state_dict["start"], device=self.start.device)
         return super().load_state_dict(state_dict, *more, **options)
+
+    def sdf(self, points: Tensor) -> Tensor:
+        """Signed distance [P] in normalised units at points [P, 3]."""
+        return self.geometry_at(points)[0]
 
     def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """SDF [P], geometry features [P, 13] and grid features [P, F] at points [P, 3] of normalised space."""
@@ -285,6 +271,7 @@ class GridField(Field):
         return found, color
 
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
+        """RGB [P, 3] in 0..1 seen along unit directions [P, 3], from the features of `geometry_at`."""
         features, start = features[:, :-3], features[:, -3:]
         seen_along = self.view_dependence * direction_features(directions)
         # The photos' mean colour there, plus the network's correction.

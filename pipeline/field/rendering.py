@@ -1,29 +1,25 @@
 """Volume rendering: samples of the field along rays, and the resulting colour.
 
-The grids choose samples from a cached SDF; the MLP bounds the error of the opacity as VolSDF does (sections 3.3, 3.4).
+Samples are chosen from a cached SDF.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.field.grid_field import BACKGROUND_SAMPLES, Field, laplace_density, render_weights
+from pipeline.field.grid_field import BACKGROUND_SAMPLES, GridField, laplace_density, render_weights
 from pipeline.grids.interpolation import interpolate
 
-EPSILON = 0.1  # of opacity
-START = 128  # first samples of every ray, and samples added to rays that need more
 COARSE = 4  # cells of the cached SDF between points where the field is always evaluated
 SLACK = 1.4  # factor by which a field may be steeper than a distance
 BINS = 0.75  # reads of the cached SDF along a ray, per cell of a side
-ROUNDS, BISECTIONS = 5, 10
 
 
 @torch.no_grad()
-def sdf_cache(field: Field, cell: float) -> Tensor:
+def sdf_cache(field: GridField, cell: float) -> Tensor:
     """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), used to choose samples along rays.
 
     Its cells are no wider than `cell`. Every `COARSE`-th value is the field's, the others only in blocks in reach of
@@ -94,19 +90,14 @@ def choose_samples(
     importance = draw(edges, weights + 9e-5, uniforms[:, :count])
     even = (torch.arange(plain, device=cache.device) + uniforms[:, count:]) / plain
     position, order = torch.cat([importance, even], 1).sort(1)
-    return samples_at(enter[:, None] + length * position, enter, leave, origins, directions, order < count)
-
-
-def samples_at(distance: Tensor, enter: Tensor, leave: Tensor, origins: Tensor, directions: Tensor,
-               near_surface: Tensor) -> Samples:  # fmt: skip
-    """Samples at distances [R, S], in order, along rays that enter and leave the sphere at distances [R]."""
+    distance = enter[:, None] + length * position
     edge = torch.cat([enter[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, leave[:, None]], 1)
     points = origins[:, None] + distance[..., None] * directions[:, None]
-    return Samples(distance, edge[:, 1:] - edge[:, :-1], points, directions, near_surface)
+    return Samples(distance, edge[:, 1:] - edge[:, :-1], points, directions, order < count)
 
 
 def composite(
-    field: Field, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float | Tensor, behind: Tensor
+    field: GridField, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float, behind: Tensor
 ) -> dict[str, Tensor]:
     """Renders rays from the output of `field.geometry_at` at their samples, in front of a colour `behind` [R, 3] or
     [3]: `rgb` [R, 3] and `opacity` [R] inside the sphere."""
@@ -125,7 +116,7 @@ def composite(
 
 @torch.no_grad()
 def render(
-    field: Field, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
+    field: GridField, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
     samples: int = 32, backdrop: Tensor | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Renders rays [R, 3] like `composite`, without gradients and deterministically; a `backdrop` [3] is a constant
@@ -136,48 +127,6 @@ def render(
     if behind is None:
         behind = field.background.along(origins, directions, middle[:, :BACKGROUND_SAMPLES])
     return composite(field, chosen, field.geometry_at(chosen.points.view(-1, 3)), beta, behind)
-
-
-def distance_bound(sdf: Tensor, delta: Tensor) -> Tensor:
-    """A lower bound [R, S - 1] of the distance to the surface within each interval of a ray (eq. 13, figure 5), from
-    the SDF [R, S] at the samples and the intervals' lengths [R, S - 1].
-
-    The balls around both ends contain no surface. The surface may come as near to the rest of the interval as the
-    corner where the balls meet; if they do not meet, the bound is zero.
-    """
-    a, b = sdf[:, :-1].abs(), sdf[:, 1:].abs()
-    half = (a + b + delta) / 2
-    area = (half * (half - a) * (half - b) * (half - delta)).clamp_min(0)
-    height = 2 * area.sqrt() / delta.clamp_min(1e-12)
-    obtuse = (a**2 - b**2).abs() >= delta**2
-    bound = torch.where(obtuse, torch.minimum(a, b), height)
-    apart = (a + b <= delta) | (sdf[:, :-1].sign() * sdf[:, 1:].sign() <= 0)
-    return torch.where(apart, torch.zeros_like(bound), bound)
-
-
-def opacity_bound(distance: Tensor, sdf: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
-    """Bound of the error of the opacity by the rectangle rule, for each interval [R, S - 1] (theorem 1, eq. 12, 14),
-    and the optical depth in front of each; from distances and SDF [R, S] of the samples and beta [R, 1]."""
-    delta = distance[:, 1:] - distance[:, :-1]
-    density = laplace_density(sdf[:, :-1], beta)
-    before = torch.cumsum(density * delta, 1) - density * delta
-    error = torch.cumsum(delta**2 * torch.exp(-distance_bound(sdf, delta) / beta), 1) / (4 * beta**2)
-    return torch.exp(-before) * torch.expm1(error.clamp_max(30.0)), before
-
-
-def worst(distance: Tensor, sdf: Tensor, beta: Tensor) -> Tensor:
-    """The largest bound [R, 1] along each ray."""
-    return opacity_bound(distance, sdf, beta)[0].amax(1, keepdim=True)
-
-
-def _smallest_beta(distance: Tensor, sdf: Tensor, beta: Tensor, safe: Tensor) -> Tensor:
-    """The smallest beta+ [R, 1] between `beta` and `safe` whose bound is below `EPSILON`, by bisection."""
-    low, high = beta.expand_as(safe).clone(), safe.clone()
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        good = worst(distance, sdf, middle) <= EPSILON
-        high, low = torch.where(good, middle, high), torch.where(good, low, middle)
-    return high
 
 
 def draw(distance: Tensor, weights: Tensor, uniforms: Tensor) -> Tensor:
@@ -192,47 +141,3 @@ def draw(distance: Tensor, weights: Tensor, uniforms: Tensor) -> Tensor:
     inside = ((wanted - before) / (cumulative.gather(1, index) - before).clamp_min(1e-9)).clamp(0, 1)
     left, right = distance.gather(1, index), distance.gather(1, index + 1)
     return (left + inside * (right - left)).sort(1).values
-
-
-@torch.no_grad()
-def bounded_samples(
-    sdf_at: Callable[[Tensor, Tensor], Tensor], enter: Tensor, leave: Tensor, beta: Tensor, uniforms: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Samples along rays by algorithm 1: distances [R, M] in order, drawn by opacity with uniforms [R, M], and whether
-    each ray's error is below `EPSILON` [R].
-
-    Rays enter and leave the trained space at distances [R]; `sdf_at` gives the SDF [A, S] at distances [A, S] along the
-    rays with indices [A].
-    """
-    count = len(enter)
-    steps = torch.linspace(0, 1, START, device=enter.device, dtype=enter.dtype)
-    distance = enter[:, None] + (leave - enter)[:, None] * steps
-    chosen = torch.empty_like(uniforms)
-    converged = torch.zeros(count, dtype=torch.bool, device=enter.device)
-    active = torch.arange(count, device=enter.device)
-    sdf = sdf_at(active, distance)
-    beta = beta.detach().reshape(1, 1).to(enter.dtype)
-    # Lemma 2: with this beta+ the first samples are enough.
-    length = (leave - enter)[:, None]
-    safe = (length**2 / (4 * (START - 1) * torch.log(torch.tensor(1 + EPSILON)))).sqrt().clamp_min(float(beta))
-    for number in range(ROUNDS + 1):
-        good = worst(distance, sdf, beta)[:, 0] <= EPSILON
-        last = number == ROUNDS
-        use = torch.where(good[:, None], beta, _smallest_beta(distance, sdf, beta, safe))
-        done = good | last
-        if done.any():
-            before = opacity_bound(distance[done], sdf[done], use[done])[1]
-            delta = distance[done, 1:] - distance[done, :-1]
-            weights = torch.exp(-before) * -torch.expm1(-laplace_density(sdf[done, :-1], use[done]) * delta)
-            chosen[active[done]] = draw(distance[done], weights, uniforms[active[done]])
-            converged[active[done]] = good[done]
-        if done.all():
-            break
-        active, distance, sdf, safe = active[~done], distance[~done], sdf[~done], use[~done]
-        # More samples where the bound is large.
-        bound, _ = opacity_bound(distance, sdf, safe)
-        middle = torch.full((len(active), START), 0.5, device=enter.device, dtype=enter.dtype)
-        added = draw(distance, bound, middle)
-        distance, order = torch.cat([distance, added], 1).sort(1)
-        sdf = torch.cat([sdf, sdf_at(active, added)], 1).gather(1, order)
-    return chosen, converged

@@ -17,19 +17,8 @@ from torch import Tensor
 
 from pipeline.cameras import PosedPhotos, Similarity, View
 from pipeline.field.exposure import Exposure, color_error, matched
-from pipeline.field.grid_field import Field, FieldSize, GridField, differences, stencil
-from pipeline.field.mlp_field import MlpField, MlpSize
-from pipeline.field.rendering import (
-    BACKGROUND_SAMPLES,
-    Samples,
-    bounded_samples,
-    choose_samples,
-    composite,
-    render,
-    samples_at,
-    sdf_cache,
-    sphere_interval,
-)
+from pipeline.field.grid_field import FieldSize, GridField, differences, stencil
+from pipeline.field.rendering import BACKGROUND_SAMPLES, Samples, choose_samples, composite, render, sdf_cache
 from pipeline.field.supervision import (
     FreeSpace,
     Supervision,
@@ -75,14 +64,13 @@ EMPTY = 0.9  # grey of pixels whose ray misses the trained sphere
 class Settings:
     """Settings of the training of a field. Lengths are in normalised units (the scene is the unit sphere)."""
 
-    # resolutions of the grids, or of the MLP of the VolSDF paper
-    size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
+    size: FieldSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25  # of the ball at the start; small, because shadowed parts are hardly removed
     iterations: int = 900  # steps of Adam
     rays: int = 512  # per step
     samples: int = 32  # along a ray inside the sphere
     long_side: int = 480  # of the photos used, px
-    stereo: int = 640  # px of the longer side for depth from stereo; 0: none, training starts from a ball
+    stereo: int = 640  # px of the longer side for depth from stereo
     beta: tuple[float, float] = (0.1, 0.004)  # density scale at the start and at the end
     rate: float = 0.02  # Adam's rate for the grids at the start (the networks use a quarter of it)
     eikonal: float = 0.1  # weight of (|grad| - 1)^2
@@ -91,24 +79,14 @@ class Settings:
     depth: float = 0.3  # weight of |sdf| at the points of a depth sensor, at the start
     free: float = 1.0  # weight of solid matter between a camera and a point that it sees
     mask: float = 0.3  # weight of the opacity loss if photos have masks
-    exposure: float = 0.02  # weight of the penalty on differences of exposure; 0: one exposure for all
+    exposure: float = 0.02  # weight of the penalty on differences of exposure
     surface_points: int = 512  # points of the eikonal loss
 
 
 PRESETS = {
     "quick": Settings(),
     "standard": Settings(iterations=7500, rays=768, samples=40, long_side=800, stereo=800, beta=(0.1, 0.0025)),
-    "fine": Settings(
-        size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96), stereo=1280,
-        iterations=20000, rays=1024, samples=48, long_side=1280, beta=(0.1, 0.0015),
-    ),
-    # The paper's settings (section 4, appendix B): L1 colour, eikonal 0.1, Adam 5e-4, 1024 rays of 64 samples. Beta is
-    # learned; sparse points, which the paper does not use, have a small weight.
-    "volsdf": Settings(
-        size=MlpSize(), iterations=100_000, rays=1024, samples=64, long_side=1600, rate=5e-4, eikonal=0.1,
-        curvature=0.0, sparse=0.1, free=0.0, exposure=0.0, surface_points=2048, stereo=0,
-    ),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -207,36 +185,29 @@ class Trainer:
             for values in (supervision.points, supervision.weights)
         )
         self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
-        sight = supervision.sight if settings.free else supervision.sight[:0]
-        self.free = FreeSpace(sight, settings.size.finest, device)
+        self.free = FreeSpace(supervision.sight, settings.size.finest, device)
         self.begin()
         self.cache: Tensor | None = None
 
     def begin(self) -> None:
         """Sets everything to the state before the first step."""
-        self.field = self.fresh()
-        self.exposure = Exposure(len(self.rays.center)).to(self.device) if self.settings.exposure else None
-        self.optimizer = self.optimizer_of(self.field)
+        settings = self.settings
+        self.field = GridField(settings.size, self.seed, settings.start_radius, self.fused).to(self.device)
+        self.exposure = Exposure(len(self.rays.center)).to(self.device)
+        self.optimizer = self.new_optimizer()
         self.iteration, self.iterations, self.seconds, self.refined = 0, self.settings.iterations, 0.0, False
 
-    def fresh(self) -> Field:
-        """An untrained field."""
-        settings = self.settings
-        assert isinstance(settings.size, FieldSize)
-        return GridField(settings.size, self.seed, settings.start_radius, self.fused).to(self.device)
-
-    def optimizer_of(self, field: Field) -> torch.optim.Adam:
-        """The optimiser of a field, in its initial state."""
-        assert isinstance(field, GridField)
+    def new_optimizer(self) -> torch.optim.Adam:
+        """The optimiser of the field, in its initial state."""
+        field = self.field
         networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "bricks", "background"))]
         features = [*field.grids, *(level.values for level in field.bricks)]
-        groups = _groups((features, self.settings.rate), (networks, self.settings.rate / 4),
-                         (list(field.background.parameters()), BACKGROUND_RATE), self.exposures())  # fmt: skip
-        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
-
-    def exposures(self) -> tuple[list, float]:
-        """The photos' gains and offsets, if they are learned, and their rate."""
-        return [] if self.exposure is None else [*self.exposure.parameters()], EXPOSURE_RATE
+        groups = (
+            (features, self.settings.rate), (networks, self.settings.rate / 4),
+            ([*field.background.parameters()], BACKGROUND_RATE), ([*self.exposure.parameters()], EXPOSURE_RATE),
+        )  # fmt: skip
+        parameters = [{"params": some, "lr": rate, "base": rate} for some, rate in groups]  # "base" is the full rate
+        return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
     @property
     def fraction(self) -> float:
@@ -244,9 +215,8 @@ class Trainer:
         return self.iteration / self.iterations
 
     @property
-    def beta(self) -> float | Tensor:
-        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays. It
-        has a gradient if it is learned."""
+    def beta(self) -> float:
+        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays."""
         start, end = self.settings.beta
         if self.fused is not None:
             start = max(end, min(start, FUSED_BETA * self.settings.size.sampling))
@@ -264,7 +234,6 @@ class Trainer:
 
     def refresh(self) -> None:
         """Updates the cached SDF and the active levels."""
-        assert isinstance(self.settings.size, FieldSize)
         # Two levels at first, then the others one by one.
         levels = len(self.settings.size.steps)
         used = 1.0 if self.fused is not None else self.fraction / ALL_LEVELS
@@ -278,7 +247,7 @@ class Trainer:
 
     def refine(self) -> None:
         """Adds bricks where the surface is now; the optimiser keeps its state for existing features."""
-        assert isinstance(self.field, GridField) and self.cache is not None
+        assert self.cache is not None
         self.refined = True
         for before, level in zip(self.field.refine(self.cache), self.field.bricks, strict=True):
             now = level.values
@@ -305,25 +274,16 @@ class Trainer:
         if self.cache is None or self.iteration % self.period == 0:
             self.refresh()
         assert self.cache is not None
-        return choose_samples(self.cache, origins, directions, float(self.beta), uniforms)
+        return choose_samples(self.cache, origins, directions, self.beta, uniforms)
 
-    def slope_queries(self, points: Tensor) -> Tensor:
-        """Points [Q, 3] at which the field is needed for its slopes at points [P, 3]."""
-        return stencil(points, self._cell()).view(-1, 3)
-
-    def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
-        """Losses of gradient and curvature from the field's values at `slope_queries`."""
-        width = self._cell()
+    def slope_losses(self, sdf: Tensor, width: float) -> dict[str, Tensor]:
+        """Losses of gradient and curvature from the field's values on stencils of a width."""
         gradient, laplacian = differences(sdf.view(-1, 7), width)
         fade = self.settings.curvature * max(0.03, 1 - self.fraction / 0.7)
         return {
             "eikonal": ((gradient.norm(dim=1) - 1) ** 2).mean() * self.settings.eikonal,
             "curvature": (laplacian.abs() * width).clamp_max(10).mean() * fade,
         }
-
-    def _cell(self) -> float:
-        assert isinstance(self.settings.size, FieldSize)
-        return self.settings.size.steps[self.field.active - 1]
 
     def step(self) -> dict[str, float]:
         """One step of Adam; returns the losses."""
@@ -337,7 +297,8 @@ class Trainer:
         behind = torch.full((3,), BACKDROP, device=self.device)
         if self.rays.mask is None:
             behind = field.background.along(origins, directions, uniforms[:, settings.samples :])
-        slopes = self.slope_queries(self.regularised(samples, rng))
+        cell = settings.size.steps[field.active - 1]
+        slopes = stencil(self.regularised(samples, rng), cell).view(-1, 3)
         pick = torch.randint(max(1, len(self.points)), (min(256, len(self.points)),), generator=rng).to(self.device)
         empty, clearance = self.free.pick(512, rng)
         measured = torch.randint(max(1, len(self.depth)), (min(512, len(self.depth)),), generator=rng).to(self.device)
@@ -347,18 +308,14 @@ class Trainer:
             values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
         )
         out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.beta, behind)
-        rgb = out["rgb"]
-        if self.exposure is not None:
-            opacity = None if self.rays.mask is None else out["opacity"]
-            rgb = self.exposure(rgb, opacity, BACKDROP, self.rays.view[index].long())
-        losses = {"color": color_error(rgb, truth)}
-        if self.exposure is not None:
-            losses["exposure"] = self.exposure.penalty() * settings.exposure
+        opacity = None if self.rays.mask is None else out["opacity"]
+        rgb = self.exposure(out["rgb"], opacity, BACKDROP, self.rays.view[index].long())
+        losses = {"color": color_error(rgb, truth), "exposure": self.exposure.penalty() * settings.exposure}
         if self.rays.mask is not None:
             wanted = self.rays.mask[index].float() / 255
             opacity = out["opacity"].clamp(1e-4, 1 - 1e-4)
             losses["mask"] = torch.nn.functional.binary_cross_entropy(opacity, wanted) * settings.mask
-        losses |= self.slope_losses(sdf[1], more[1])
+        losses |= self.slope_losses(sdf[1], cell)
         if len(pick):
             # Robust, so that a wrong point does not create a surface.
             pull = self.point_weights[pick] * sdf[2].abs().clamp_max(0.1)
@@ -395,8 +352,7 @@ class Trainer:
                 tensors[f"adam.{number}.{key}"] = torch.as_tensor(value).detach().contiguous()
         if self.cache is not None:
             tensors["cache"] = self.cache
-        if self.exposure is not None:
-            tensors["exposure"] = self.exposure.change.detach().contiguous()
+        tensors["exposure"] = self.exposure.change.detach().contiguous()
         about = {
             "iteration": self.iteration, "iterations": self.iterations, "seconds": self.seconds,
             "active": self.field.active, "view_dependence": self.field.view_dependence, "refined": self.refined,
@@ -417,9 +373,8 @@ class Trainer:
                     raise ValueError("it is of another field")
                 tensors = {key: file.get_tensor(key).to(self.device) for key in file.keys()}
             self.field.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("field.")})
-            if self.exposure is not None:
-                self.exposure.load_state_dict({"change": tensors["exposure"]})
-            self.optimizer = self.optimizer_of(self.field)
+            self.exposure.load_state_dict({"change": tensors["exposure"]})
+            self.optimizer = self.new_optimizer()
             for number, parameter in enumerate(self._parameters()):
                 names = [k for k in tensors if k.startswith(f"adam.{number}.")]
                 if names:
@@ -439,64 +394,12 @@ class Trainer:
         return [p for group in self.optimizer.param_groups for p in group["params"]]
 
 
-class MlpTrainer(Trainer):
-    """One training run of the VolSDF paper's field: error-bounded samples, learned beta; the arguments are those of
-    `Trainer`."""
-
-    field: MlpField
-    converged = 0.0  # share of the last step's rays whose opacity is bounded
-
-    def fresh(self) -> Field:
-        assert isinstance(self.settings.size, MlpSize)
-        return MlpField(self.settings.size, self.seed, self.settings.start_radius).to(self.device)
-
-    def optimizer_of(self, field: Field) -> torch.optim.Adam:
-        networks = [p for name, p in field.named_parameters() if not name.startswith("background")]
-        groups = _groups((networks, self.settings.rate), (list(field.background.parameters()), BACKGROUND_RATE),
-                         self.exposures())  # fmt: skip
-        return torch.optim.Adam(groups)
-
-    @property
-    def beta(self) -> Tensor:
-        return self.field.beta
-
-    def rate_factor(self) -> float:
-        return 0.1**self.fraction
-
-    def refresh(self) -> None:
-        self.cache = sdf_cache(self.field, self.settings.size.sampling)  # only for pictures
-
-    def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
-        """Samples [R, S] that bound the error of the opacity, one for each of the uniforms [R, S]."""
-        enter, leave = sphere_interval(origins, directions)
-
-        def sdf_at(rays: Tensor, distance: Tensor) -> Tensor:
-            points = origins[rays, None] + distance[..., None] * directions[rays, None]
-            return torch.cat([self.field.sdf(part) for part in points.view(-1, 3).split(1 << 18)]).view(distance.shape)
-
-        distance, converged = bounded_samples(sdf_at, enter, leave, self.field.beta, uniforms)
-        self.converged = float(converged.float().mean())
-        near = torch.ones_like(distance, dtype=torch.bool)
-        return samples_at(distance, enter, leave, origins, directions, near)
-
-    def slope_queries(self, points: Tensor) -> Tensor:
-        return points  # The network returns its own gradient.
-
-    def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
-        return {"eikonal": ((more[:, 3:].norm(dim=1) - 1) ** 2).mean() * self.settings.eikonal}
-
-
-def _groups(*groups: tuple[list, float]) -> list[dict]:
-    """Adam's groups of parameters, each with its full rate."""
-    return [{"params": parameters, "lr": rate, "base": rate} for parameters, rate in groups]
-
-
 @dataclass
 class Trained:
     """A trained field, its density scale, the transform from the world of the poses to its unit sphere, and its
     report."""
 
-    field: Field
+    field: GridField
     beta: float
     to_unit: Similarity
     report: dict
@@ -522,28 +425,24 @@ def train(
     training = [view for number, view in enumerate(local.views) if number not in test]
     rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
     depth, agreed, noise = None, {}, 0.0
-    fused: Fused | None = None
     start: Callable[[Tensor], Tensor] | None = None
-    paired: dict[str, Any] = {}
     if any(photo.depth for photo in photos):
         agreed = depth_scale(poses, depth_points(poses.views, photos, photos_folder))
         depth, noise = depth_points(poses.views, photos, photos_folder, scale=agreed["scale"]), agreed["spread"]
-    if settings.stereo and isinstance(settings.size, FieldSize):
-        begun = time.monotonic()
-        seen = only(local, [number for number in range(len(local.views)) if number not in test])
-        maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
-        carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
-        fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
-        spent = time.monotonic() - begun
-        paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
-        budget = None if budget is None else budget - spent
-        if fused is not None and depth is None:
-            depth, noise = stereo_points(maps, local), paired["spread"]
-            untrained = GridField(settings.size, seed, settings.start_radius, fused)
-            start = lambda points: untrained.start_of(points)[0]  # noqa: E731
+    begun = time.monotonic()
+    seen = only(local, [number for number in range(len(local.views)) if number not in test])
+    maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
+    carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
+    fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
+    spent = time.monotonic() - begun
+    paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
+    budget = None if budget is None else budget - spent
+    if fused is not None and depth is None:
+        depth, noise = stereo_points(maps, local), paired["spread"]
+        untrained = GridField(settings.size, seed, settings.start_radius, fused)
+        start = lambda points: untrained.start_of(points)[0]  # noqa: E731
     supervision = supervision_of(local, settings.size.finest, depth, noise, start)
-    make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
-    trainer = make(settings, rays, supervision, seed, device, fused)
+    trainer = Trainer(settings, rays, supervision, seed, device, fused)
     checkpoint = out / "checkpoint.safetensors"
     resumed, notes = False, []
     try:
@@ -551,11 +450,10 @@ def train(
     except SdfsimError as error:  # The rest of the killed run is of no use.
         notes = [f"what a killed run had trained is lost: {error.message}; training began again"]
         on_progress(0.0, notes[0])
-    per_step = calibrate(make(settings, trainer.rays, supervision, seed, device, fused), threads)
+    per_step = calibrate(Trainer(settings, trainer.rays, supervision, seed, device, fused), threads)
     if budget is not None and not resumed:
         trainer.iterations = min(settings.iterations, max(FEWEST_STEPS, int(budget / per_step)))
     left = None if budget is None else budget - trainer.seconds
-    first_share = STEREO if paired else 0.0
     saved = started = time.monotonic()
     first, before = trainer.iteration, trainer.seconds
     smooth: dict[str, float] = {}
@@ -572,7 +470,7 @@ def train(
             trainer.save(checkpoint)
             saved = now
         if trainer.iteration % 10 == 0:
-            done = first_share + (0.92 - first_share) * trainer.fraction
+            done = STEREO + (0.92 - STEREO) * trainer.fraction
             on_progress(done, f"step {trainer.iteration} of {trainer.iterations}, "
                         f"colour error {smooth['color']:.4f}")  # fmt: skip
     trainer.save(checkpoint)
@@ -583,12 +481,12 @@ def train(
         scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=report)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
-        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),
+        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": trainer.beta,
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
         "depth": agreed, "stereo": paired, "notes": notes,
-        "exposure_spread": round(trainer.exposure.spread(), 4) if trainer.exposure is not None else 0.0,
+        "exposure_spread": round(trainer.exposure.spread(), 4),
     }  # fmt: skip
-    trained = Trained(trainer.field.cpu(), float(trainer.beta), to_unit, report)
+    trained = Trained(trainer.field.cpu(), trainer.beta, to_unit, report)
     save_field(trained, out)
     checkpoint.unlink(missing_ok=True)
     return trained
@@ -629,11 +527,11 @@ def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) 
     for part in index.split(4096):
         origins, directions = rays.at(part)
         parts.append(
-            render(trainer.field, trainer.cache, origins, directions, float(trainer.beta),
+            render(trainer.field, trainer.cache, origins, directions, trainer.beta,
                    samples=trainer.settings.samples, backdrop=backdrop)["rgb"]
         )  # fmt: skip
     rgb, truth = torch.cat(parts), rays.rgb[index].float() / 255
-    if backdrop is None and trainer.exposure is not None and trainer.exposure.spread() > VARIED:
+    if backdrop is None and trainer.exposure.spread() > VARIED:
         rgb = matched(rgb, truth)
     error = float(((rgb - truth) ** 2).mean())
     width, height = (-(-(int(side) - every // 2) // every) for side in rays.sizes[number])
@@ -677,11 +575,8 @@ def load_field(folder: Path) -> Trained:
     try:
         about = json.loads((folder / "field.json").read_text(encoding="utf-8"))
         size, radius = about["size"], float(about["start_radius"])
-        if "levels" in size:
-            lists = {key: tuple(size[key]) for key in ("levels", "channels")}
-            field: Field = GridField(FieldSize(**{**size, **lists}), start_radius=radius)
-        else:
-            field = MlpField(MlpSize(**size), start_radius=radius)
+        lists = {key: tuple(size[key]) for key in ("levels", "channels")}
+        field = GridField(FieldSize(**{**size, **lists}), start_radius=radius)
         with safe_open(str(folder / "field.safetensors"), "pt") as file:
             field.load_state_dict({key: file.get_tensor(key) for key in file.keys()})
         return Trained(field, float(about["beta"]), Similarity.from_dict(about["to_unit"]), about["report"])

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from pipeline.cameras import PosedPhotos
-from pipeline.field.grid_field import Field
+from pipeline.field.grid_field import GridField
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.parallel import Progress, silent
@@ -142,7 +142,7 @@ def ball(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points, axis=1) - RIM
 
 
-def field_distance(field: Field) -> Distance:
+def field_distance(field: GridField) -> Distance:
     """The field's signed distance as a function of points [P, 3] float in normalised space."""
 
     @torch.no_grad()
@@ -166,7 +166,7 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
 
 
 def surface_of(
-    volume: Volume, field: Field, poses: PosedPhotos, photos_folder: Path, limit: Distance, *,
+    volume: Volume, field: GridField, poses: PosedPhotos, photos_folder: Path, limit: Distance, *,
     known: Callable[[np.ndarray], np.ndarray] | None = None, on_progress: Progress = silent,
 ) -> FieldSurface:  # fmt: skip
     """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; the
@@ -191,7 +191,7 @@ def surface_of(
 
 
 @torch.no_grad()
-def field_colors(field: Field, mesh: Mesh) -> np.ndarray:
+def field_colors(field: GridField, mesh: Mesh) -> np.ndarray:
     """The field's colour [V, 3] in 0..1 of each vertex, seen straight on."""
     device = field.device
     points = torch.tensor(mesh.vertices, dtype=torch.float32, device=device)

@@ -33,7 +33,7 @@ from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
 
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
-RESOLUTION = {"quick": 256, "standard": 320, "fine": 512, "volsdf": 448}  # samples per side, by preset
+RESOLUTION = {"quick": 256, "standard": 320}  # samples per side, by preset
 # The picture of names: largest number of photos, their width while they are chosen and in the picture, px, and the
 # tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45

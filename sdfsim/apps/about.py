@@ -51,7 +51,7 @@ def about() -> dict[str, Any]:
             devices += [f"cuda:{k} {found.cuda.get_device_name(k)}" for k in range(found.cuda.device_count())]
             threads = found.get_num_threads()
     if len(devices) == 1:
-        missing.append("a CUDA device, for fast training and volsdf: everything else runs without it")
+        missing.append("a CUDA device, for fast training: everything else runs without it")
     for name, (extra, use) in EXTRAS.items():
         if versions[name] == "missing":
             missing.append(f"{name}, for {use}: pip install 'sdfsim[{extra}]'")

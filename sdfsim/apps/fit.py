@@ -49,7 +49,7 @@ def fit(
     """Fit a mesh file and write the shape folder `out`; or fit several files, or those of a folder, into `out`/NAME.
 
     Args:
-        recipe: how networks are fitted: "quick", "default", or "paper" (as Rubanova et al.).
+        recipe: how networks are fitted: "quick" or "default".
         budget: s, time limit of one fit.
         cap: close openings of any size.
         thicken: m, the thickness that an open sheet gets.

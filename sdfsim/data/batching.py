@@ -34,7 +34,6 @@ def merged(
     shapes: dict[str, Shape],
     units: Units,
     floor: tuple[float, float] = FLOOR,
-    plane: Shape = PLANE,
 ) -> tuple[Bodies, State]:
     """Bodies of all trajectories, each at its frame in `frames` [W], then one floor that they share; worlds do not
     touch each other.
@@ -44,7 +43,7 @@ def merged(
     """
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
     relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]
-    scene, world = scene_of(relative, frames, shapes, floor, plane)
+    scene, world = scene_of(relative, frames, shapes, floor)
     return side_by_side(scene, world, units)
 
 
@@ -53,7 +52,6 @@ def scene_of(
     frames: list[int],
     shapes: dict[str, Shape],
     floor: tuple[float, float] = FLOOR,
-    plane: Shape = PLANE,
 ) -> tuple[Scene, list[int]]:
     """One scene with all trajectories, each at its frame, and the world of each of its bodies (-1: the floor, which is
     in all)."""
@@ -80,7 +78,7 @@ def scene_of(
             world.append(w)
     zero, unturned = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
     bodies.append(Body("floor", len(names), "static", 1.0, zero, unturned, zero, zero, 0.0, *floor))
-    scene = Scene(shapes=(*about, plane), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
+    scene = Scene(shapes=(*about, PLANE), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
     return scene, [*world, -1]
 
 
@@ -124,22 +122,22 @@ def roll_out(
     units = model_units(stepper, group[0])
     gravity = np.asarray(group[0].gravity, dtype=np.float64) / units.acceleration
     options = Options(gravity, group[0].dt / units.time, substeps)
-    known, plane = {name: stepper.surface(shape) for name, shape in shapes.items()}, stepper.surface(PLANE)
+    known = {name: stepper.surface(shape) for name, shape in shapes.items()}
     # The solve is fastest with one trajectory at a time, on all cores; a network with all of them in one graph.
     alone = model.kind == SOLVER
     groups = [[t] for t in group] if alone else [group]
     shared = SharedShapes()
-    jobs = [(some, known, plane, units, stepper, options, steps, floor, shared) for some in groups]
+    jobs = [(some, known, units, stepper, options, steps, floor, shared) for some in groups]
     found = dict(threads(_rolled, jobs)) if alone else {0: _rolled(*jobs[0])}
     return [t for k in range(len(jobs)) for t in found[k]]
 
 
 def _rolled(
-    group: list[Trajectory], shapes: dict[str, Shape], plane: Shape, units: Units, stepper: Stepper, options: Options,
+    group: list[Trajectory], shapes: dict[str, Shape], units: Units, stepper: Stepper, options: Options,
     steps: int, floor: tuple[float, float], shared: SharedShapes,
 ) -> list[Trajectory]:  # fmt: skip
     """The predicted motions of trajectories that are simulated side by side."""
-    bodies, start = merged(group, [0] * len(group), shapes, units, floor, plane)
+    bodies, start = merged(group, [0] * len(group), shapes, units, floor)
     start = stepper.began(start, bodies, options)
     made = stepper.advance(start, stepper.init(bodies, start, options, shared), steps, keep=True)
     frames = cast("Frames", made.frames)

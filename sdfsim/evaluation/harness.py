@@ -6,7 +6,7 @@ file for each, so that an interrupted study continues where it stopped.
 
 import multiprocessing
 import platform
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -142,12 +142,6 @@ class Line:
     x: Sequence[float]  # [K]
     y: Sequence[float]  # [K]
     noise: Sequence[float] | None = None  # [K], half-widths of error bars
-
-
-def line(name: str, results: Iterable[dict[str, Any]], x: str, y: str) -> Line:
-    """Two figures of the results that did not fail."""
-    known = [found for found in results if "failed" not in found]
-    return Line(name, [found[x] for found in known], [found[y] for found in known])
 
 
 @dataclass(frozen=True)

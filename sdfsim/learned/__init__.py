@@ -1,2 +1,1 @@
-"""The networks: `impulse`, which acts on top of the contact solve; SDF-Sim as published (`sdf-sim`), and its
-baselines."""
+"""The networks: `impulse`, on bodies, and SDF-Sim as published (`sdf-sim`), on surface nodes."""

@@ -3,6 +3,8 @@ both ways (up: to the body node). A surface node within the contact radius of an
 both ways. Surface nodes are never joined to each other.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -10,6 +12,7 @@ from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, Layout, 
 from sdfsim.learned.near import Contacts
 from sdfsim.learned.surfaces import NODES, STAR, motion_features, star
 from sdfsim.learned.tensors import BodyTensors, StateTensors
+from sdfsim.shape.shape import Shape
 
 CONTACT = Features(15, (0, 3, 6, 9))
 SDF_SIM = Layout(
@@ -18,9 +21,14 @@ SDF_SIM = Layout(
 )
 
 
+def points(shape: Shape, count: int | None) -> Shape:
+    """The shape with the first `count` of its nodes (None: all): the outermost ones, then the most evenly spread."""
+    return replace(shape, nodes=shape.nodes[:count])
+
+
 def sdf_sim_graph(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> MultiGraph:
     features = _contact_features(bodies, state, contacts).float()
-    node, body = contacts.node[:, None], contacts.body[:, None]
+    node, body = contacts.node, contacts.body
     edges = {"contact_up": EdgeSet(features, node, body), "contact_down": EdgeSet(features, body, node)}
     return MultiGraph(motion_features(bodies, state), star(bodies, state) | edges)
 

@@ -1,8 +1,5 @@
-"""Encode, process, decode on typed graphs: the network that SDF-Sim and its baselines share.
-
-They differ only in their graphs: the sets of nodes, and the kinds of edges that join them (`Layout`). An edge joins
-single nodes, or the three corners of one face to those of another; then it carries a message for each corner.
-"""
+"""Encode, process, decode on typed graphs: a network knows a graph by its sets of nodes, and the kinds of edges that
+join them (`Layout`)."""
 
 from __future__ import annotations
 
@@ -24,12 +21,11 @@ class Features:
 
 @dataclass(frozen=True)
 class EdgeKind:
-    """Edges from nodes of the set `sender` to nodes of the set `receiver`, with `corners` nodes at each end."""
+    """Edges from nodes of the set `sender` to nodes of the set `receiver`."""
 
     sender: str
     receiver: str
     features: Features
-    corners: int = 1
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,7 @@ class Layout:
 @dataclass(frozen=True)
 class EdgeSet:
     features: Tensor  # [E, F] float32
-    # sender, receiver: [E, corners] int64, in the sets that the kind names
+    # sender, receiver: [E] int64, in the sets that the kind names
     sender: Tensor
     receiver: Tensor
 
@@ -76,15 +72,9 @@ def flipped(values: Tensor, kind: Features) -> Tensor:
     return values * sign
 
 
-def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> EdgeSet:
-    """Edges in both directions: features `forth` [E, F] from `first` to `second` [E, corners], `back` the other way."""
-    features = torch.cat([forth, back]).float()
-    return EdgeSet(features, torch.cat([first, second]), torch.cat([second, first]))
-
-
 @dataclass(frozen=True)
 class GraphConfig:
-    """Sizes of a network (published, all of them: width 128; SDF-Sim, FIGNet, MeshGraphNets: 10 to 15 steps)."""
+    """Sizes of a network (published: width 128, 10 steps)."""
 
     width: int = 128  # width of every latent and hidden layer
     steps: int = 10  # steps of message passing, each with its own weights
@@ -100,29 +90,24 @@ class EdgeUpdate(nn.Module):
     """MLP over [edge, its senders, its receivers], with its first layer split so that each part is computed as cheaply
     as possible."""
 
-    def __init__(self, width: int, corners: int) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.edge = nn.Linear(corners * width, width)
-        self.sender = nn.Linear(corners * width, width, bias=False)
-        self.receiver = nn.Linear(corners * width, width, bias=False)
-        outputs = corners * width
+        self.edge = nn.Linear(width, width)
+        self.sender = nn.Linear(width, width, bias=False)
+        self.receiver = nn.Linear(width, width, bias=False)
         self.rest = nn.Sequential(
-            nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs), nn.LayerNorm(outputs)
+            nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.LayerNorm(width)
         )
 
     def forward(self, sent: Tensor, received: Tensor, edge: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
-        """[E, corners * width] updates of edges from nodes `sender` [E, corners] to `receiver` [E, corners]."""
+        """[E, width] updates of edges from nodes `sender` [E] to `receiver` [E]."""
         ends = _gathered(self.sender, sent, sender) + _gathered(self.receiver, received, receiver)
         return self.rest(self.edge(edge) + ends)
 
 
 def _gathered(layer: nn.Linear, latent: Tensor, index: Tensor) -> Tensor:
-    """[E, width] a layer applied to the latents of nodes `index` [E, corners]: per edge, or first once per node."""
-    if len(index) < len(latent):
-        return layer(latent[index].flatten(1))
-    parts = layer.weight.split(latent.shape[1], dim=1)
-    projected = [(latent @ part.T)[index[:, k]] for k, part in enumerate(parts)]
-    return torch.stack(projected).sum(0) if len(projected) > 1 else projected[0]
+    """[E, width] a layer applied to the latents of nodes `index` [E]: per edge, or first once per node."""
+    return layer(latent[index]) if len(index) < len(latent) else layer(latent)[index]
 
 
 class Step(nn.Module):
@@ -133,7 +118,7 @@ class Step(nn.Module):
 
     def __init__(self, layout: Layout, width: int) -> None:
         super().__init__()
-        self.edges = nn.ModuleDict({name: EdgeUpdate(width, kind.corners) for name, kind in layout.edges.items()})
+        self.edges = nn.ModuleDict({name: EdgeUpdate(width) for name in layout.edges})
         received = {name: 1 + sum(kind.receiver == name for kind in layout.edges.values()) for name in layout.nodes}
         self.nodes = nn.ModuleDict({name: mlp(count * width, width, width) for name, count in received.items()})
 
@@ -144,13 +129,12 @@ class GraphNetwork(nn.Module):
     def __init__(self, layout: Layout, config: GraphConfig) -> None:
         super().__init__()
         self.layout, self.config = layout, config
-        width, kinds = config.width, layout.edges
+        width = config.width
         sizes = {name: features.size for name, features in layout.nodes.items()}
-        sizes |= {name: kind.features.size for name, kind in kinds.items()}
-        outputs = {name: width * (kinds[name].corners if name in kinds else 1) for name in sizes}
+        sizes |= {name: kind.features.size for name, kind in layout.edges.items()}
         self.scale = nn.ModuleDict({name: Normaliser(size) for name, size in sizes.items()})
         self.target = Normaliser(3)
-        self.encode = nn.ModuleDict({name: mlp(size, width, outputs[name]) for name, size in sizes.items()})
+        self.encode = nn.ModuleDict({name: mlp(size, width, width) for name, size in sizes.items()})
         self.steps = nn.ModuleList([Step(layout, width) for _ in range(config.steps)])
         self.decode = mlp(width, width, 3, normalised=False)
 
@@ -175,8 +159,7 @@ class GraphNetwork(nn.Module):
                 ends, sent, received_by = graph.edges[name], node[kind.sender], node[kind.receiver]
                 edge[name] = edge[name] + step.edges[name](sent, received_by, edge[name], ends.sender, ends.receiver)
                 total = torch.zeros_like(node[kind.receiver])
-                messages = edge[name].reshape(-1, self.config.width)
-                received[kind.receiver].append(total.index_add_(0, ends.receiver.flatten(), messages))
+                received[kind.receiver].append(total.index_add_(0, ends.receiver, edge[name]))
             node = {name: node[name] + step.nodes[name](torch.cat(parts, -1)) for name, parts in received.items()}
         return self.decode(node["node"])
 

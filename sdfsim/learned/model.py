@@ -20,7 +20,8 @@ BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # largest value of any size of a network
 MODEL_VERSION = 4  # of what networks read; files of earlier versions have to be trained again
 SOLVER = "solver"
-IMPULSE = "impulse"  # the network on bodies; messages of all others run between surface nodes
+SURFACES = "sdf-sim"  # the network on surface nodes
+IMPULSE = "impulse"  # the network on bodies
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Model:
     """Weights with everything needed to use them."""
 
     name: str  # bundled name or file stem
-    kind: str  # "solver", "impulse" or a name in `learned.families`
+    kind: str  # "solver", "impulse" or "sdf-sim"
     network: Any  # an `nn.Module` in evaluation mode; None for the solver, or if loaded without weights
     dt: float  # s, the step of the training data, or of the solver for bodies of `length` at `gravity`
     gravity: float  # m/s^2, its magnitude in the training data
@@ -69,15 +70,17 @@ class Model:
 
 
 def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
-    """An untrained network of `kind` ("impulse" or a name in `learned.families`). Raises KeyError for another kind."""
+    """An untrained network of `kind` ("impulse" or "sdf-sim"). Raises KeyError for another kind."""
     if kind == IMPULSE:
         from sdfsim.learned.impulse import ImpulseConfig, ImpulseNetwork
 
         return ImpulseNetwork(ImpulseConfig(**config))
-    from sdfsim.learned.families import FAMILIES
+    if kind != SURFACES:
+        raise KeyError(kind)
+    from sdfsim.learned.graphs import SDF_SIM
     from sdfsim.learned.message_passing import GraphConfig, GraphNetwork
 
-    return GraphNetwork(FAMILIES[kind].layout, GraphConfig(**config))
+    return GraphNetwork(SDF_SIM, GraphConfig(**config))
 
 
 def bundled_models() -> list[str]:

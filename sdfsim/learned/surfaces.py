@@ -1,29 +1,27 @@
-"""The parts that all networks on surface nodes share: features of nodes and of edges within bodies, targets, and the
-step to new poses.
+"""The network on surface nodes: features of nodes and of edges within bodies, targets, and the step to new poses.
 
-A network predicts an acceleration for every surface node; shape matching turns those of a body into its next pose.
+The network predicts an acceleration for every surface node; shape matching turns those of a body into its next pose.
 """
 
 from dataclasses import fields, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from sdfsim.learned import pose
 from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, GraphNetwork, MultiGraph
+from sdfsim.learned.near import Contacts
 from sdfsim.learned.tensors import BodyTensors, StateTensors
 
 NODE = Features(13, (0, 3, 6))  # features of surface nodes and of body nodes
 INTRA = Features(8, (0, 4))  # features of edges within a body
 NODES = {"body": NODE, "node": NODE}
 STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
-MESH = EdgeKind("node", "node", INTRA)
 TARGET = Features(3, (0,))  # accelerations
 # Weight of staying at `start`, relative to the nodes' spread. It is far below the weight of any extent beyond rounding,
 # so it decides only about rotations that the nodes do not define.
 STAY = 1e-12
-_NOT_PER_BODY = ("node", "node_start", "face", "allowed")
+_NOT_PER_BODY = ("node", "node_start")
 
 
 def node_owner(bodies: BodyTensors) -> Tensor:
@@ -33,10 +31,9 @@ def node_owner(bodies: BodyTensors) -> Tensor:
 
 
 def compact(
-    bodies: BodyTensors, state: StateTensors, contacts: Any, rows: Tensor
-) -> tuple[BodyTensors, StateTensors, Any]:
-    """Only the bodies `rows` [A], in ascending order, with their states and all contacts (`Contacts` or `Pairs`), which
-    must be among them."""
+    bodies: BodyTensors, state: StateTensors, contacts: Contacts, rows: Tensor
+) -> tuple[BodyTensors, StateTensors, Contacts]:
+    """Only the bodies `rows` [A], in ascending order, with their states and all contacts, which must be among them."""
     if len(rows) == len(bodies):
         return bodies, state, contacts
     owner, node = expanded(bodies.node_start[rows], bodies.node_start[rows + 1])
@@ -45,11 +42,8 @@ def compact(
     ends = torch.bincount(owner, minlength=len(rows)).cumsum(0)
     start = torch.cat([ends.new_zeros(1), ends])
     per_body = [f.name for f in fields(bodies) if f.name not in _NOT_PER_BODY]
-    face = place[bodies.face]
-    some = replace(
-        bodies, **{k: getattr(bodies, k)[rows] for k in per_body}, node=bodies.node[node], node_start=start,
-        face=face[(face >= 0).all(-1)],
-    )  # fmt: skip
+    per_row = {k: getattr(bodies, k)[rows] for k in per_body}
+    some = replace(bodies, **per_row, node=bodies.node[node], node_start=start)
     earlier_position, earlier_orientation = _history(state)
     moved = StateTensors(
         *(v[rows] for v in (state.position, state.orientation, state.velocity, state.angular_velocity)),
@@ -75,7 +69,7 @@ def expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def motion_features(bodies: BodyTensors, state: StateTensors) -> dict[str, Tensor]:
-    """Features of body nodes [N, 13] and surface nodes [M, 13], the same for every network.
+    """Features of body nodes [N, 13] and surface nodes [M, 13].
 
     Displacement over each of the last two steps, displacement of the body's centre over the last step, inverse mass,
     friction, restitution, and whether the body is static. Displacements are differences of float64 poses, never of
@@ -99,36 +93,13 @@ def motion_features(bodies: BodyTensors, state: StateTensors) -> dict[str, Tenso
 
 
 def star(bodies: BodyTensors, state: StateTensors) -> dict[str, EdgeSet]:
-    """Edges between the surface nodes and their body's node, up and down: the node relative to the centre, now and at
-    rest."""
-    owner = node_owner(bodies)
-    features = _now_and_at_rest(_arms(bodies, state), bodies.node)
-    node, body = torch.arange(len(owner), device=owner.device)[:, None], owner[:, None]
-    return {"intra_up": EdgeSet(features, node, body), "intra_down": EdgeSet(features, body, node)}
-
-
-def mesh_edges(bodies: BodyTensors, state: StateTensors) -> EdgeSet:
-    """Edges along the sides of the mesh's faces, once in each direction: sender relative to receiver, now and at
-    rest."""
-    sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
-    sides = sides[sides[:, 0] != sides[:, 1]]  # drops those of the plane's one node
-    count = len(bodies.node)
-    # `unique` is 50 times slower for rows than for numbers.
-    key = torch.unique(torch.cat([sides, sides.flip(1)]) @ sides.new_tensor([count, 1]))
-    sender, receiver = key // count, key % count
-    arm = _arms(bodies, state)
-    features = _now_and_at_rest(arm[sender] - arm[receiver], bodies.node[sender] - bodies.node[receiver])
-    return EdgeSet(features, sender[:, None], receiver[:, None])
-
-
-def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
-    """[E, 8] float32: a vector [E, 3] in world axes and the one at rest in body axes, each with its length."""
-    return torch.cat([now, now.norm(dim=-1, keepdim=True), rest, rest.norm(dim=-1, keepdim=True)], -1).float()
-
-
-def _arms(bodies: BodyTensors, state: StateTensors) -> Tensor:
-    """[M, 3] nodes relative to their body's centre of mass, world axes."""
-    return pose.apply(pose.to_matrix(state.orientation)[node_owner(bodies)], bodies.node)
+    """Edges between the surface nodes and their body's node, up and down: the node relative to the centre, now (world
+    axes) and at rest (body axes), each with its length."""
+    owner, rest = node_owner(bodies), bodies.node
+    now = pose.apply(pose.to_matrix(state.orientation)[owner], rest)
+    features = torch.cat([now, now.norm(dim=-1, keepdim=True), rest, rest.norm(dim=-1, keepdim=True)], -1).float()
+    node = torch.arange(len(owner), device=owner.device)
+    return {"intra_up": EdgeSet(features, node, owner), "intra_down": EdgeSet(features, owner, node)}
 
 
 def advance(bodies: BodyTensors, state: StateTensors, acceleration: Tensor, dt: float) -> StateTensors:

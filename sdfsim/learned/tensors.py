@@ -21,10 +21,6 @@ class BodyTensors:
     size: Tensor  # [N] float64
     node: Tensor  # [M, 3] float64
     node_start: Tensor  # [N + 1] int64
-    face: Tensor  # [F, 3] int64
-    group: Tensor  # [N] int64
-    allowed: Tensor  # [G, G] bool
-    world: Tensor  # [N] int64
 
     def __len__(self) -> int:
         return len(self.moves)
@@ -32,12 +28,6 @@ class BodyTensors:
     @property
     def device(self) -> torch.device:
         return self.moves.device
-
-    def may_meet(self, a: Tensor, b: Tensor) -> Tensor:
-        """[P] bool: whether bodies `a` [P] and `b` [P] may touch; at least one of a pair is dynamic."""
-        one, other = self.world[a], self.world[b]
-        together = (one == other) | (one < 0) | (other < 0)
-        return together & (self.moves[a] | self.moves[b]) & self.allowed[self.group[a], self.group[b]]
 
 
 @dataclass(frozen=True)

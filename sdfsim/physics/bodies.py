@@ -110,8 +110,6 @@ class Bodies:
     radius: np.ndarray  # [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane)
     node: np.ndarray  # [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled
     node_start: np.ndarray  # [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1]
-    # [F, 3] int64, corners of the surfaces' triangles, indices into `node`; empty if nodes are only points
-    face: np.ndarray
     group: np.ndarray  # [N] int64, the group of a body by its `collides_with`
     allowed: np.ndarray  # [G, G] bool, whether bodies of two groups may touch
     world: np.ndarray  # [N] int64: bodies of different worlds never meet; -1 is in all of them
@@ -225,7 +223,6 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
     force = units.mass * units.length / units.time**2
     nodes = [(s.nodes - s.com) * k for s, k in zip(shapes, scale, strict=True)]
     node_start = np.concatenate([[0], np.cumsum([len(n) for n in nodes])])
-    faces = [s.faces + first for s, first in zip(shapes, node_start[:-1], strict=True)]
 
     def array(values: Any, dtype: type = np.float64) -> np.ndarray:
         return np.ascontiguousarray(values, dtype=dtype)
@@ -251,7 +248,6 @@ def from_scene(scene: Scene, units: Units) -> tuple[Bodies, State]:
         radius=array(np.linalg.norm(np.abs(bounds).max(1), axis=-1)),
         node=array(np.concatenate(nodes).reshape(-1, 3)),
         node_start=array(node_start, np.int64),
-        face=array(np.concatenate(faces), np.int64),
         group=array(group, np.int64),
         allowed=array(allowed, bool),
         world=np.zeros(len(scene.bodies), dtype=np.int64),

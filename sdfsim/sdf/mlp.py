@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     import torch
 else:
     from sdfsim.base.lazy import torch
-
-Activation = Literal["wave", "relu"]
 
 # Points prepared and finished at once, a few hundred bytes each.
 PREPARED = 131_072
@@ -37,7 +35,6 @@ class MlpSdf:
 
     weights: tuple[torch.Tensor, ...]  # per layer [out, in] float32
     biases: tuple[torch.Tensor, ...]  # per layer [out] float32
-    activation: Activation  # of the hidden layers (the frequency of the periodic ones is part of the weights)
     frame: Frame  # metres <-> normalised
     bounds: np.ndarray  # [2, 3] float64 m, the box that holds the solid
     # for each of the frame's planes x = 0, y = 0, z = 0, whether the solid is its own mirror image; the network holds
@@ -67,13 +64,13 @@ class MlpSdf:
         # -1 if the point is on the side of a mirror plane that the network does not hold.
         mirrored = torch.tensor(self.mirrors, device=points.device)
         side = 1.0 - 2.0 * (mirrored & (points < 0)).to(points.dtype)
-        value, gradient = value_and_gradient(self.weights, self.biases, self.activation, points * side)
+        value, gradient = value_and_gradient(self.weights, self.biases, points * side)
         return value, gradient * side
 
 
 def wave(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None:
-    """The periodic activation: parabolic arcs r (1 - 2 |r|) with r = x - round(x), close to a sine at a quarter of its
-    cost. `before`, x, becomes the value, `slope` the derivative 1 - 4 |r|; `spare` is overwritten."""
+    """The activation of hidden layers: parabolic arcs r (1 - 2 |r|) with r = x - round(x), close to a sine at a quarter
+    of its cost. `before`, x, becomes the value, `slope` the derivative 1 - 4 |r|; `spare` is overwritten."""
     torch.round(before, out=spare)
     before.sub_(spare)
     torch.abs(before, out=spare)
@@ -81,21 +78,11 @@ def wave(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None
     before.addcmul_(before, spare, value=-2.0)
 
 
-def relu(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None:
-    """The same for max(x, 0)."""
-    torch.gt(before, 0.0, out=slope)
-    before.mul_(slope)
-
-
-ACTIVATIONS = {"wave": wave, "relu": relu}
-
-
 class Tape:
-    """Working memory of the sweeps. A layer is `act(W x + b)`; the last one, which `layers` counts too, is linear with
+    """Working memory of the sweeps. A layer is `wave(W x + b)`; the last one, which `layers` counts too, is linear with
     one output. Each layer has weights [out, in] and biases [out], with the device and dtype of `like`."""
 
-    def __init__(self, activation: Activation, width: int, layers: int, like: torch.Tensor) -> None:
-        self._act = ACTIVATIONS[activation]
+    def __init__(self, width: int, layers: int, like: torch.Tensor) -> None:
         self._width, self._layers = width, layers
         self._like = like.new_empty(0)
         self._room = 0
@@ -113,7 +100,7 @@ class Tape:
         below = points
         for weight, bias, hidden, slope in zip(weights[:-1], biases[:-1], self.hidden, self.slope, strict=True):
             torch.addmm(bias, below, weight.T, out=hidden)
-            self._act(hidden, slope, self._spare)
+            wave(hidden, slope, self._spare)
             below = hidden
         return torch.addmm(biases[-1], below, weights[-1].T)[:, 0]
 
@@ -156,15 +143,15 @@ _kept = threading.local()
 
 
 def value_and_gradient(
-    weights: Sequence[torch.Tensor], biases: Sequence[torch.Tensor], activation: Activation, points: torch.Tensor
+    weights: Sequence[torch.Tensor], biases: Sequence[torch.Tensor], points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Value [T] and gradient [T, 3] of a network (see `Tape`) at normalised points [T, 3]; no autograd graph is built.
     The forward sweep keeps each activation's derivative; one reverse sweep multiplies them back to the input."""
     tapes = _kept.__dict__.setdefault("tapes", {})
     like, width = weights[0], len(weights[0])
-    key = (activation, width, len(weights), like.device, like.dtype)
+    key = (width, len(weights), like.device, like.dtype)
     if key not in tapes:
-        tapes[key] = Tape(activation, width, len(weights), like)
+        tapes[key] = Tape(width, len(weights), like)
     tape, room = tapes[key], SWEPT[like.device.type]
     value, gradient = points.new_empty(len(points), dtype=like.dtype), torch.empty_like(points, dtype=like.dtype)
     with torch.no_grad():

@@ -20,7 +20,7 @@ from sdfsim.sdf.closed_forms import CLOSED_FORMS, ClosedForm, PlaneSdf
 from sdfsim.sdf.fit.certificate import certify_grid
 from sdfsim.sdf.grid import GridSdf, sample_grid
 from sdfsim.sdf.mesh_sdf import MeshSdf
-from sdfsim.sdf.mlp import ACTIVATIONS, MlpSdf
+from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import MeshDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.contact_geometry import ContactGeometry
@@ -58,7 +58,6 @@ class Shape:
         source: where it came from, and a hash of its content.
         pieces: the vertices [V, 3] float64 m of each of its convex pieces, if it was made of pieces.
         skin: a mesh with a texture that is shown in place of `mesh`, or None.
-        faces: [F, 3] int64 triangles between the nodes, if these are the vertices of a mesh; never stored.
     """
 
     name: str
@@ -72,7 +71,6 @@ class Shape:
     source: dict = field(default_factory=dict)
     pieces: tuple[np.ndarray, ...] = ()
     skin: Mesh | None = None
-    faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
 
     @property
     def shown(self) -> Mesh:
@@ -179,7 +177,7 @@ def _sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[st
         for layer, (weight, bias) in enumerate(zip(sdf.weights, sdf.biases, strict=True)):
             tensors[f"layer{layer}.weight"] = weight.cpu().contiguous()
             tensors[f"layer{layer}.bias"] = bias.cpu().contiguous()
-        described = {"kind": "mlp", "activation": sdf.activation, "mirrors": list(sdf.mirrors)}
+        described = {"kind": "mlp", "activation": "wave", "mirrors": list(sdf.mirrors)}
         return tensors, {**described, "layers": len(sdf.weights), **frame}
     if isinstance(sdf, MeshSdf):
         if not all(np.array_equal(getattr(sdf.mesh, key), getattr(mesh, key)) for key in ("vertices", "faces")):
@@ -204,7 +202,7 @@ def _sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor]
     bounds = _finite(tensors["bounds"].numpy(), "bounds", 2, 3)
     if kind == "grid":
         return GridSdf(tensors["grid"].float(), frame, bounds)
-    if kind != "mlp" or description["activation"] not in ACTIVATIONS:
+    if kind != "mlp" or description["activation"] != "wave":
         raise ValueError(f"unknown SDF kind {kind!r} or activation {description.get('activation')!r}")
     weights, biases = (
         tuple(tensors[f"layer{layer}.{part}"].float() for layer in range(int(description["layers"])))
@@ -216,7 +214,7 @@ def _sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor]
     if rows[-1] != 1 or [tuple(weight.shape) for weight in weights] != list(zip(rows, [3, *rows[:-1]], strict=True)):
         raise ValueError("the layers do not fit together")
     x, y, z = (bool(mirror) for mirror in description.get("mirrors", (False, False, False)))
-    return MlpSdf(weights, biases, description["activation"], frame, bounds, (x, y, z))
+    return MlpSdf(weights, biases, frame, bounds, (x, y, z))
 
 
 def _finite(value: Any, what: str, *shape: int) -> np.ndarray:

@@ -34,7 +34,6 @@ from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
 
 if TYPE_CHECKING:  # numba and torch are slow to load
-    from sdfsim.learned.families import Family
     from sdfsim.learned.impulse import ImpulseNetwork
     from sdfsim.learned.near import Contacts
     from sdfsim.learned.tensors import BodyTensors
@@ -98,7 +97,7 @@ class Stepper:
         return scene_units(scene, dt, **known, mean=self.mean)
 
     def surface(self, shape: Shape) -> Shape:
-        """The shape with the surface nodes, and the faces between them, that the stepper uses."""
+        """The shape with the surface nodes that the stepper uses."""
         return shape
 
     def unknown(self, scenes: Sequence[Scene], units: Units) -> list[str]:
@@ -232,10 +231,9 @@ class OnBodies(Stepper):
 
 @dataclass(frozen=True)
 class OnSurfaces(Stepper):
-    """The networks on surface nodes: the step of the papers for bodies that are near another, free flight for the
-    others, which the networks may predict too (`learned`)."""
+    """The network on surface nodes: the step of the paper for bodies that are near another, free flight for the
+    others, which the network may predict too (`learned`)."""
 
-    family: Family = field(kw_only=True)
     contact: bool = True
     learned: bool = False
 
@@ -244,14 +242,16 @@ class OnSurfaces(Stepper):
 
     @property
     def distances(self) -> bool:
-        return self.contact and self.family.distances
+        return self.contact
 
     @property
     def device(self) -> Any:
         return next(iter(self.model.network.state_dict().values())).device
 
     def surface(self, shape: Shape) -> Shape:
-        return self.family.surface(shape, self.model.nodes)
+        from sdfsim.learned.graphs import points
+
+        return points(shape, self.model.nodes)
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
         return with_history(state, bodies, options)
@@ -288,19 +288,21 @@ class OnSurfaces(Stepper):
     def _step(self, state: State, carry: Carry) -> State:
         import torch
 
+        from sdfsim.learned.graphs import sdf_sim_graph
+        from sdfsim.learned.near import find_contacts, no_contacts
         from sdfsim.learned.surfaces import compact, predict
         from sdfsim.learned.tensors import state_tensors
 
-        options, family, tensors = carry.options, self.family, self._tensors(carry)
+        options, tensors = carry.options, self._tensors(carry)
         if state.earlier_position is None:  # from a stepper that needs no earlier positions
             state = self.began(state, carry.bodies, options)
         free = super()._step(state, carry)
         with torch.no_grad():
             now = state_tensors(state, self.device)
             with carry.timed("contact_ms"):
-                near = family.none(self.device)
+                near = no_contacts(self.device)
                 if self.contact:
-                    near = family.near(tensors, now, options.gravity, self.model.reach, options.dt, carry.scene)
+                    near = find_contacts(tensors, now, options.gravity, self.model.reach, options.dt, carry.scene)
             ends = [near.owner, near.body]
             if self.learned:
                 ends.append(torch.from_numpy(awake(carry.bodies, state)).to(self.device))
@@ -312,7 +314,7 @@ class OnSurfaces(Stepper):
                 return free
             with carry.timed("network_ms"):
                 some, start, among = compact(tensors, now, near, active)
-                graph = family.graph(some, start, among)
+                graph = sdf_sim_graph(some, start, among)
                 predicted = predict(cast("Any", self.model.network), graph, some, start, options.dt)
                 moved = {name: getattr(predicted, name)[chosen].cpu().numpy() for name in MOTION}
         carry.counts |= {"nodes": len(graph), "edges": graph.edge_count}
@@ -390,7 +392,5 @@ def stepper_of(
     if device is not None:
         model = model.to(str(pick_device(device)) if on_surfaces else "cpu")
     if on_surfaces:
-        from sdfsim.learned.families import FAMILIES
-
-        return OnSurfaces(model, True, family=FAMILIES[model.kind], contact=contact, learned=learned)
+        return OnSurfaces(model, True, contact=contact, learned=learned)
     return Solver(model) if model.kind == SOLVER else OnBodies(model)

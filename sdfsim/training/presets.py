@@ -5,14 +5,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Preset:
-    kind: str  # "impulse", or a network on surface nodes: "sdf-sim", "fignet", "fignet-star", "mgn", "dpi"
+    kind: str  # "impulse" or "sdf-sim"
     config: dict[str, int]  # sizes of the network
     steps: int  # steps of the optimiser
     batch: int  # contact frames (impulse) or recorded steps (others) a step
     rate: float  # peak learning rate of Adam; it falls to a hundredth along a cosine
     reach: float = 0.1  # m, contact radius D
-    # surface nodes of a body (for meshes, about this number of vertices); None for all
-    nodes: int | None = None
+    nodes: int | None = None  # surface nodes of a body; None for all
     noise: float | None = None  # m, standard deviation of pose noise, for networks on surface nodes (None: no noise)
     # peak learning rate of Muon, which then trains the hidden matrices; None: Adam trains everything, as published
     matrix_rate: float | None = None

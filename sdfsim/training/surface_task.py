@@ -2,19 +2,19 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sdfsim.base.files import digest
-from sdfsim.data.batching import PLANE, centred, merged, state_at
+from sdfsim.data.batching import centred, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
-from sdfsim.learned.families import FAMILIES
+from sdfsim.learned.graphs import points, sdf_sim_graph
 from sdfsim.learned.message_passing import GraphNetwork, MultiGraph, flipped
+from sdfsim.learned.near import find_contacts
 from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
-from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
+from sdfsim.learned.tensors import body_tensors, state_tensors
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.physics.solver.prepare import Compiled, SharedShapes
@@ -43,10 +43,8 @@ class SurfaceTask:
         self.trajectories, self.floor = [Trajectory.load(f) for f in files], conditions_of(files[0].parent).floor
         check_alike(f"{data / split}", self.trajectories)
         names = {str(n) for t in self.trajectories for n in t.shape}
-        self.family, self.nodes = FAMILIES[plan.kind], plan.nodes
-        shapes = load_shapes(data, names)
-        self.shapes = {k: self.family.surface(centred(s), plan.nodes) for k, s in shapes.items()}
-        self.plane = self.family.surface(PLANE, plan.nodes)
+        self.nodes = plan.nodes
+        self.shapes = {k: points(centred(s), plan.nodes) for k, s in load_shapes(data, names).items()}
         self.reach, self.noise = plan.reach, plan.noise if noisy else None
         self.counts = [len(self.trajectories)]
         self.dt = self.trajectories[0].dt
@@ -66,17 +64,13 @@ class SurfaceTask:
     def draw(self, rng: np.random.Generator, count: int) -> Batch:
         """`count` recorded steps as one graph, or this process's part of them."""
         bodies, state, after = self.scenes(rng, count)
-        scene = Compiled(bodies, state, self.shared) if self.family.distances else None
+        scene = Compiled(bodies, state, self.shared)
         bodies, state = body_tensors(bodies, CPU), state_tensors(state, CPU)
         # The target leads from the disturbed poses to the recorded one, so that the network learns to undo errors.
         target = target_acceleration(bodies, state, *map(torch.from_numpy, after))
-        graph = self.family.graph(bodies, state, self.near(bodies, state, scene))
-        return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
-
-    def near(self, bodies: BodyTensors, state: StateTensors, scene: Compiled | None) -> Any:
-        """The near parts of bodies; see `Family.near`."""
         gravity = np.asarray(self.trajectories[0].gravity, dtype=np.float64)
-        return self.family.near(bodies, state, gravity, self.reach, self.dt, scene)
+        graph = sdf_sim_graph(bodies, state, find_contacts(bodies, state, gravity, self.reach, self.dt, scene))
+        return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 
     def scenes(self, rng: np.random.Generator, count: int) -> tuple[Bodies, State, tuple[np.ndarray, np.ndarray]]:
         """Bodies of `count` recorded steps side by side, their motion before, and their poses [N, *] after."""
@@ -85,7 +79,7 @@ class SurfaceTask:
         yaw = pose.from_rotvec(np.array([0.0, 0.0, rng.uniform(0, 2 * np.pi)]))
         noise = self._noise(picked, rng)
         units = Units(1.0, 1.0, 1.0)
-        bodies, state = merged(picked, frames, self.shapes, units, self.floor, self.plane)
+        bodies, state = merged(picked, frames, self.shapes, units, self.floor)
         recorded = [state_at(picked, [k + offset for k in frames], state) for offset in (-2, -1, 0, 1)]
         yaw = np.broadcast_to(yaw, state.orientation.shape)
         poses = [(pose.rotate(yaw, one.position), pose.multiply(yaw, one.orientation)) for one in recorded]

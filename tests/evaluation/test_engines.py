@@ -63,7 +63,7 @@ def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
 
 
 def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_has_it(tmp_path):
-    start = start_of_scene(hard_cases.tower(2), tmp_path)
+    start = start_of_scene(hard_cases.wall(2), tmp_path)
     bullet(replace(start, own_inertia=False), 2)
     doubled = replace(start.motion, inertia=2 * start.motion.inertia)
     bullet(replace(start, motion=doubled), 2)

@@ -102,9 +102,9 @@ def contact_edges(
     return *tensors, find_contacts(*tensors, gravity, reach, dt, Compiled(bodies, state))
 
 
-def surface_model(kind: str = "sdf-sim", push: float = 1e-3):
+def surface_model(push: float = 1e-3):
     """Untrained, its accelerations of the size of `push`."""
-    model = random_model(kind, width=16, steps=2)
+    model = random_model("sdf-sim", width=16, steps=2)
     model.network.target.total.fill_(1.0)
     model.network.target.squares.fill_(push**2)
     return model

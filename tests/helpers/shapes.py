@@ -17,7 +17,6 @@ def fitted() -> Shape:
     sdf = MlpSdf(
         weights,
         (torch.randn(8), torch.randn(8), torch.randn(1)),
-        "wave",
         Frame(np.array([1.0, 2.0, 3.0]), 0.3),
         np.array([[0.9, 1.9, 2.85], [1.1, 2.1, 3.15]]),
     )

@@ -1,13 +1,18 @@
-"""Contact edges against a slow readable twin that asks every node about every other body."""
+"""SDF-Sim's graph: contact edges against a slow readable twin that asks every node about every other body, and the
+graph's mirror image."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
+from sdfsim.learned.graphs import SDF_SIM, sdf_sim_graph
 from sdfsim.physics.bodies import Units, from_scene
+from sdfsim.physics.free_flight import with_history
+from sdfsim.physics.options import Options
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from tests.helpers.scenes import contact_edges, make_body
@@ -98,6 +103,37 @@ def test_collides_with_is_kept_by_both_sides():
         return all(b.collides_with is None or a.name in b.collides_with for a, b in ((one, other), (other, one)))
 
     assert set(as_edges(bodies, contacts)) == set(slow_twin(scene, allowed))
+
+
+def test_the_mirrored_graph_is_the_graph_of_the_mirrored_scene():
+    """Boxes and balls are their own mirror images; their nodes are mirrored with the scene."""
+    bodies, state = from_scene(heap(0), Units(1.0, 1.0, 1.0))
+    state = with_history(state, bodies, Options(gravity=GRAVITY, dt=DT))
+    # axial: a mirrored turn goes the other way
+    flip, turned = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0, 1.0])
+    image = replace(
+        state,
+        position=state.position * flip,
+        orientation=state.orientation * turned,
+        velocity=state.velocity * flip,
+        angular_velocity=-state.angular_velocity * flip,
+        earlier_position=state.earlier_position * flip,
+        earlier_orientation=state.earlier_orientation * turned,
+    )
+    both = ((bodies, state), (replace(bodies, node=bodies.node * flip), image))
+    made, theirs = (sdf_sim_graph(*contact_edges(*one, GRAVITY, REACH, DT)) for one in both)
+    made = made.mirrored(SDF_SIM)
+    for name, features in made.nodes.items():
+        torch.testing.assert_close(features, theirs.nodes[name], rtol=0, atol=1e-5)
+    assert len(made.edges["contact_up"].sender) > 50
+    for name, edges in made.edges.items():
+        torch.testing.assert_close(*map(_sorted, (edges, theirs.edges[name])), rtol=0, atol=1e-4)
+
+
+def _sorted(edges) -> torch.Tensor:
+    """[E, *] ends and features, in an order that only the ends decide."""
+    order = np.lexsort((edges.receiver, edges.sender))
+    return torch.cat([edges.sender[:, None], edges.receiver[:, None], edges.features], 1)[order]
 
 
 def test_fast_bodies_have_an_edge_before_they_arrive():

@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.baselines import FAMILIES
 from sdfsim.learned.surfaces import advance, node_owner
 from sdfsim.learned.tensors import state_arrays
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import angle_between, in_torch, make_body, random_model, surface_model
-
-
-@pytest.fixture(params=FAMILIES)
-def kind(request) -> str:
-    return request.param
 
 
 def test_without_acceleration_every_body_goes_on_as_it_came(dropped):
@@ -46,9 +40,9 @@ def test_a_common_acceleration_moves_the_centre_by_it(free_pair):
     assert angle_between(with_push.orientation, without.orientation).max() < 1e-6
 
 
-def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(dropped, kind):
-    exact = Simulator(dropped, surface_model(kind)).run(steps=5)
-    learned = Simulator(dropped, surface_model(kind), free_flight="learned").run(steps=5)
+def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(dropped):
+    exact = Simulator(dropped, surface_model()).run(steps=5)
+    learned = Simulator(dropped, surface_model(), free_flight="learned").run(steps=5)
     high = dropped.bodies[3]
     t = exact.time[:, None]
     fall = high.position + 0.5 * dropped.gravity * t**2
@@ -56,15 +50,15 @@ def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(
     assert np.abs(learned.position[:, 3] - fall).max() > 1e-4
 
 
-def test_learned_free_flight_reaches_the_network_without_any_contact(dropped, kind):
+def test_learned_free_flight_reaches_the_network_without_any_contact(dropped):
     alone = replace(dropped, bodies=(dropped.bodies[3],))
-    learned = Simulator(alone, surface_model(kind), free_flight="learned").run(steps=3)
+    learned = Simulator(alone, surface_model(), free_flight="learned").run(steps=3)
     fall = alone.bodies[0].position + 0.5 * alone.gravity * learned.time[:, None] ** 2
     assert np.abs(learned.position[:, 0] - fall).max() > 1e-4
 
 
 def test_rotation_off_keeps_every_orientation(dropped):
-    for model in (*map(surface_model, FAMILIES), random_model("impulse", push=0.05)):
+    for model in (surface_model(), random_model("impulse", push=0.05)):
         scene = replace(dropped, effects=Effects(rotation="off"))
         rollout = Simulator(scene, model).run(steps=8)
         assert rollout.contact_count.sum() > 0
@@ -72,8 +66,8 @@ def test_rotation_off_keeps_every_orientation(dropped):
         assert (rollout.angular_velocity[1:] == 0).all()
 
 
-def test_friction_and_restitution_off_equal_bodies_without_them(dropped, kind):
-    model = surface_model(kind)
+def test_friction_and_restitution_off_equal_bodies_without_them(dropped):
+    model = surface_model()
     off = Simulator(replace(dropped, effects=Effects(friction="off", restitution="off")), model).run(steps=6)
     bare = tuple(replace(b, friction=0.0, restitution=0.0) for b in dropped.bodies)
     none = Simulator(replace(dropped, bodies=bare), model).run(steps=6)
@@ -108,21 +102,21 @@ def test_a_state_of_another_run_keeps_its_own_history_and_one_without_gets_one(d
     np.testing.assert_allclose(went.position, near.position, rtol=0, atol=0.02)
 
 
-def test_far_from_the_origin_a_step_is_the_same(dropped, kind):
+def test_far_from_the_origin_a_step_is_the_same(dropped):
     """Only differences of poses enter; the floor is infinite, so scenes may be anywhere above it."""
     far = np.array([1e4, -2e4, 0.0])
     moved = replace(dropped, bodies=tuple(replace(b, position=b.position + far) for b in dropped.bodies))
-    here, there = (Simulator(scene, surface_model(kind), free_flight="learned") for scene in (dropped, moved))
+    here, there = (Simulator(scene, surface_model(), free_flight="learned") for scene in (dropped, moved))
     (one,), (other,) = (list(sim.steps(1)) for sim in (here, there))
     np.testing.assert_allclose(other.position - far, one.position, rtol=0, atol=1e-6)
 
 
-def test_the_order_of_bodies_does_not_matter(dropped, kind):
+def test_the_order_of_bodies_does_not_matter(dropped):
     """Where surfaces do not cross: of crossing faces any common point is the closest."""
     apart = replace(dropped.bodies[2], position=np.array([0.85, 0.95, 0.8]))
     bodies, order = (*dropped.bodies[:2], apart, dropped.bodies[3]), [2, 0, 3, 1]
     scenes = (replace(dropped, bodies=b) for b in (bodies, tuple(bodies[k] for k in order)))
-    one, other = (next(Simulator(s, surface_model(kind), free_flight="learned").steps(1)) for s in scenes)
+    one, other = (next(Simulator(s, surface_model(), free_flight="learned").steps(1)) for s in scenes)
     np.testing.assert_allclose(other.position, one.position[order], rtol=0, atol=1e-6)
 
 

@@ -11,7 +11,7 @@ from tests.helpers.command import run as command
 @pytest.mark.parametrize(
     ("values", "name", "got"),
     [
-        ({"preset": "slow"}, "preset", "'slow'"),
+        ({"preset": "volsdf"}, "preset", "'volsdf'"),
         ({"size": -1.0}, "size", "-1"),
         ({"size": float("nan")}, "size", "nan"),
         ({"distance": ["a", "b", 0]}, "distance", "0"),
@@ -61,8 +61,8 @@ def test_an_option_that_does_not_exist_is_named_with_those_that_do():
 
 def test_config_gives_back_every_option(tmp_path):
     given = options_of(
-        photos="/a", preset="fine", budget=90, seed=3, distance=["a.jpg:1,2", "b.jpg", 2], crop=["0,0,0", "1,2,3.5"],
-        drop="ball", material={"cup": "ceramic:4mm"}, recipe="paper", device="cpu",
+        photos="/a", preset="quick", budget=90, seed=3, distance=["a.jpg:1,2", "b.jpg", 2], crop=["0,0,0", "1,2,3.5"],
+        drop="ball", material={"cup": "ceramic:4mm"}, recipe="quick", device="cpu",
     )  # fmt: skip
     write_config(given, tmp_path)
     assert read_config(tmp_path) == given

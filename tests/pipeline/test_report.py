@@ -60,9 +60,7 @@ def test_a_run_that_stopped_says_where_and_why(photos, tmp_path, act):
     ("options", "said"),
     [
         (Options(preset="quick"), "--preset standard"),
-        (Options(preset="standard"), "--preset fine"),
-        (Options(preset="fine"), "more and sharper photos"),
-        (Options(preset="volsdf"), "more and sharper photos"),
+        (Options(preset="standard"), "more and sharper photos"),
         (Options(preset="standard", budget=60.0), "a larger --budget"),
     ],
 )

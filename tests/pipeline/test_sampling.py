@@ -1,4 +1,4 @@
-"""Where the field is asked: samples of bounded error, free space that photos prove, and the cached SDF."""
+"""Where the field is asked: drawn samples, free space that photos prove, and the cached SDF."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from pipeline.cameras import PosedPhotos, Sparse
-from pipeline.field.grid_field import FieldSize, GridField, laplace_density
-from pipeline.field.rendering import EPSILON, bounded_samples, draw, opacity_bound, sdf_cache
+from pipeline.field.grid_field import FieldSize, GridField
+from pipeline.field.rendering import draw, sdf_cache
 from pipeline.field.supervision import (
     CLEARANCE,
     FILLED,
@@ -27,66 +27,7 @@ from pipeline.stereo.depth import DepthMap
 from tests.helpers.sparse import NOTHING
 from tests.helpers.surfaces import ring
 
-DOUBLE = torch.float64
 CELL = 2 / 127  # of the preset quick
-
-
-def rays(count: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rays through the unit sphere past a small ball in its middle, near and far."""
-    offset = torch.linspace(0.0, 0.9, count, dtype=DOUBLE)
-    origins = torch.stack([offset, torch.zeros(count, dtype=DOUBLE), torch.full((count,), -3.0, dtype=DOUBLE)], 1)
-    return origins, torch.tensor([0.0, 0, 1], dtype=DOUBLE)
-
-
-def ball(origins: torch.Tensor, direction: torch.Tensor, distance: torch.Tensor, radius: float = 0.2) -> torch.Tensor:
-    return (origins[:, None] + distance[..., None] * direction).norm(dim=-1) - radius
-
-
-def chord(origins: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    half = (1 - origins[:, 0] ** 2).sqrt()
-    return 3 - half, 3 + half
-
-
-def test_the_bound_holds_for_every_ray_and_number_of_samples():
-    origins, direction = rays()
-    enter, leave = chord(origins)
-    beta = torch.tensor([[0.02]], dtype=DOUBLE)
-    for count in (16, 64, 400):
-        distance = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, count, dtype=DOUBLE)
-        sdf = ball(origins, direction, distance)
-        bound, before = opacity_bound(distance, sdf, beta)
-        fine = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, 20001, dtype=DOUBLE)
-        density = laplace_density(ball(origins, direction, fine), beta)
-        depth = torch.cumulative_trapezoid(density, fine, dim=1)
-        at_samples = np.stack([np.interp(distance[r, 1:], fine[r, 1:], depth[r]) for r in range(len(origins))])
-        delta = distance[:, 1:] - distance[:, :-1]
-        ours = 1 - torch.exp(-(before + laplace_density(sdf[:, :-1], beta) * delta))
-        error = (ours - (1 - torch.exp(-torch.tensor(at_samples)))).abs()
-        assert (error <= bound + 1e-6).all()
-
-
-@pytest.mark.parametrize("beta", [0.1, 0.01, 0.003])
-def test_opacity_from_the_samples_is_right(beta):
-    """What the samples are for: the opacity of rays, from 64 of them, is that of 20,000. A wide density needs no second
-    look; a narrow one only along some of the rays."""
-    origins, direction = rays()
-    enter, leave = chord(origins)
-    calls: list[int] = []
-
-    def sdf_at(chosen: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
-        calls.append(distance.numel())
-        return ball(origins[chosen], direction, distance)
-
-    uniforms = torch.full((len(origins), 64), 0.5, dtype=DOUBLE)
-    distance, converged = bounded_samples(sdf_at, enter, leave, torch.tensor(beta), uniforms)
-    assert converged.double().mean() > 0.9 and (distance.diff(dim=1) >= 0).all()
-    assert (len(calls) == 1) == (beta == 0.1)
-    assert sum(calls[1:]) < 0.8 * len(origins) * 128 * max(1, len(calls) - 1)
-    edge = torch.cat([enter[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, leave[:, None]], 1)
-    ours = 1 - torch.exp(-(laplace_density(ball(origins, direction, distance), beta) * edge.diff(dim=1)).sum(1))
-    fine = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, 20001, dtype=DOUBLE)
-    true = 1 - torch.exp(-torch.trapezoid(laplace_density(ball(origins, direction, fine), beta), fine, dim=1))
-    assert (ours - true)[converged].abs().max() < EPSILON
 
 
 def test_draws_follow_their_density():

@@ -263,8 +263,8 @@ def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, call
     calls.clear()
     assert command("poses", photos, "-o", out).exit_code == 0
     assert read_config(out) == before and calls == []
-    assert command("poses", photos, "-o", out, "--preset", "fine").exit_code == 0
-    assert read_config(out) == before.changed({"preset": "fine"})
+    assert command("poses", photos, "-o", out, "--preset", "standard").exit_code == 0
+    assert read_config(out) == before.changed({"preset": "standard"})
 
 
 def test_a_place_that_is_not_in_the_photos_is_refused_before_the_poses(photos, tmp_path, calls, monkeypatch):

@@ -93,18 +93,6 @@ def test_a_goal_that_is_met_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) 
     assert fit_mesh(primitives.box(), name="box").certificate["steps"] == 200
 
 
-def test_paper_recipe_learns(monkeypatch: pytest.MonkeyPatch) -> None:
-    paper = fit_module.RECIPES["paper"]
-    assert (paper.activation, paper.width, paper.layers, paper.lr, paper.steps) == ("relu", 128, 8, 1e-5, 400_000)
-    plan = replace(paper, steps=150, batch=512, pool=4096, lr=1e-3)
-    monkeypatch.setitem(fit_module.RECIPES, "paper", plan)
-    shape = fit_mesh(primitives.sphere(), name="ball", recipe="paper")
-    assert isinstance(shape.sdf, MlpSdf)
-    assert [tuple(w.shape) for w in shape.sdf.weights] == [(128, 3), *[(128, 128)] * 6, (1, 128)]
-    assert shape.certificate["error_in_box"] < 0.05
-    assert not shape.certificate["passed"] or shape.certificate["error_within_0.01"] < 1.5e-3
-
-
 def test_pieces_keep_their_own_vertices_as_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(fit_module.RECIPES["default"], width=32, layers=5, steps=500, batch=512, pool=30_000, goal=None)
     monkeypatch.setitem(fit_module.RECIPES, "default", plan)

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.baselines import FAMILIES
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.batching import merged
 from sdfsim.data.dataset import Trajectory, load_shapes
-from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.learned.contact_graph import OF_BODIES, OF_EDGES, REST_SPEED
 from sdfsim.learned.impulse import Velocities
 from sdfsim.learned.inference import step_graph
@@ -22,7 +20,7 @@ from sdfsim.physics.solver.prepare import Compiled, points_near
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_frames import Disturbed, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
-from sdfsim.training.presets import PRESETS, Preset
+from sdfsim.training.presets import PRESETS
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
@@ -81,19 +79,6 @@ def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets,
     assert model.kind == plan.kind and model.dt == pytest.approx(0.02) and model.gravity == pytest.approx(10.0)
     assert model.ranges["restitution"][0] == pytest.approx(0.3 * 0.3)
     assert not list(place.glob("*.part")) and (place / "log.jsonl").exists()
-
-
-@pytest.mark.parametrize("kind", [kind for kind in FAMILIES if kind != "sdf-sim"])
-def test_the_baselines_learn_and_move_bodies(ball_data, kind, tmp_path):
-    plan = Preset(kind, {"width": 16, "steps": 2}, steps=60, batch=2, rate=3e-3, nodes=30, noise=0.003)
-    task, held_out = train_module._tasks(plan, [ball_data], lambda f, m: None)
-    before = held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
-    report = train(ball_data, tmp_path, preset=plan)
-    assert report["held_out_loss"] < 0.7 * before
-    model = load_model(tmp_path / "model.safetensors")
-    assert model.kind == kind and model.nodes == 30
-    judged = evaluate(ball_data, model=model, split="validation", steps=5, free_flight="learned", errors_only=True)
-    assert 0 < judged["model"]["5"]["translation_rmse"] < 1.0
 
 
 def test_a_budget_ends_a_run_early_and_resuming_ends_it_as_without(ball_data, presets, tmp_path):

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-Recipe = Literal["quick", "default", "paper"]
+Recipe = Literal["quick", "default"]
 
 # Increase it whenever the same mesh would be fitted differently; it is part of every cache key.
 FIT_VERSION = 8

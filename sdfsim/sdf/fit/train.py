@@ -17,7 +17,7 @@ from sdfsim.sdf.far_field import BOX
 from sdfsim.sdf.fit import Recipe
 from sdfsim.sdf.fit.certificate import SIGN_FROM, certify
 from sdfsim.sdf.fit.soap import Soap
-from sdfsim.sdf.mlp import Activation, MlpSdf, Tape, value_and_gradient
+from sdfsim.sdf.mlp import MlpSdf, Tape, value_and_gradient
 from sdfsim.sdf.reference import DistanceOracle
 from sdfsim.sdf.sdf import Sdf
 
@@ -48,21 +48,17 @@ class FitOptions:
     some hundredths of the size; without both, the far field would be wrong by as much.
     """
 
-    # activation of the hidden layers. "relu" is trained as in the paper: by Adam, on both sides of every mirror plane,
-    # with signs only where the paper's rule trusts them
-    activation: Activation = "wave"
     width: int = 64  # width of the hidden layers
     layers: int = 6  # linear layers, the last one included
     lr: float = 1e-2  # step size
-    decay: float = 0.5  # part of the steps, at the end, over which the step size falls to zero (0: constant)
+    decay: float = 0.5  # part of the steps, at the end, over which the step size falls to zero
     steps: int = 5000  # updates
     batch: int = 4096  # points per update
     # distance of points from the surface (standard deviation, log-uniform between the two)
     sigmas: tuple[float, float] = (0.002, 0.15)
     near: float = 0.8  # fraction of points near the surface; the others are uniform in the box
-    resample: int = 0  # updates between fresh pools of points (0: one pool)
     pool: int = 400_000  # points in a pool
-    soften: float | None = 0.04  # errors have the weight soften / (|distance| + soften); None: all have the same
+    soften: float = 0.04  # errors have the weight soften / (|distance| + soften)
     # errors of the averaged weights at which the decay begins early (the decay halves them): of the distance (means
     # within 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction wrong
     # farther than 0.002). None: never stop early
@@ -74,21 +70,6 @@ RECIPES = {
     "default": FitOptions(),
     # A surface from a few minutes of reconstruction is not exact enough to be worth a full fit.
     "quick": FitOptions(steps=1500, settle=600, pool=200_000),
-    # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
-    "paper": FitOptions(
-        activation="relu",
-        width=128,
-        layers=8,
-        lr=1e-5,
-        decay=0.0,
-        steps=400_000,
-        sigmas=(0.1, 0.1),
-        near=1.0,
-        resample=100,
-        pool=65_536,
-        soften=None,
-        goal=None,
-    ),
 }
 
 
@@ -146,10 +127,10 @@ class _Fit:
     `stop`; an early stop or a short budget moves both forward."""
 
     def __init__(self, oracle: DistanceOracle, options: FitOptions, seed: int, device: torch.device) -> None:
-        self.oracle, self.options, self.device, self._seed = oracle, options, device, seed
+        self.oracle, self.options, self.device = oracle, options, device
         self.frame = normal_frame(oracle.bounds)
-        self.mirrors = self._mirrors() if options.activation == "wave" else (False, False, False)
-        self.pool = self._pool(0)
+        self.mirrors = self._mirrors()
+        self.pool = self._pool(np.random.default_rng([seed, 0]))
         # Points for checks during training: `CHECKED` of each of three kinds.
         sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
         self.check = self._sample(sigma, CHECKED, np.random.default_rng([seed, 1]))
@@ -159,15 +140,14 @@ class _Fit:
         for parameter in self.parameters:
             parameter.grad = torch.zeros_like(parameter)
         self.average = [parameter.clone() for parameter in self.parameters]
-        self.optimiser = (Soap if options.activation == "wave" else torch.optim.Adam)(self.parameters, options.lr)
+        self.optimiser = Soap(self.parameters, options.lr)
         self.step = 0
         self.turn, self.stop = int(options.steps * (1.0 - options.decay)), options.steps
-        self._tape = Tape(options.activation, options.width, options.layers, self.parameters[0])
+        self._tape = Tape(options.width, options.layers, self.parameters[0])
 
-    def _pool(self, step: int) -> Pool:
-        """Training points as drawn before update `step`."""
+    def _pool(self, rng: np.random.Generator) -> Pool:
+        """Training points."""
         options = self.options
-        rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
         near = int(options.pool * options.near)
         low, high = np.log(options.sigmas)
         sigma = np.exp(rng.uniform(low, high, (near, 1)))
@@ -181,7 +161,7 @@ class _Fit:
         local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
         truth = self.oracle(self.frame.outward(local))
         distance = truth.distance / self.frame.scale
-        signed = truth.trusted | (self.oracle.closed and self.options.activation == "wave")
+        signed = truth.trusted | self.oracle.closed
         # This close to the surface the direction from it is only rounding error.
         clear = np.abs(distance) > 1e-4
         offset = local - self.frame.inward(truth.closest)
@@ -207,18 +187,9 @@ class _Fit:
     def update(self) -> None:
         """One step of the optimiser."""
         options = self.options
-        if options.resample and self.step and self.step % options.resample == 0:
-            self.pool = self._pool(self.step)
         self.differentiate(torch.randint(options.pool, (options.batch,), generator=self.generator))
-        factor = min(1.0, (self.step + 1) / WARMUP)
-        if options.decay:
-            late = min(max((self.step - self.turn) / max(self.stop - self.turn, 1), 0.0), 1.0)
-            factor *= 0.5 * (1.0 + math.cos(math.pi * late))
-        if isinstance(self.optimiser, Soap):
-            self.optimiser.step(factor)
-        else:
-            self.optimiser.param_groups[0]["lr"] = options.lr * factor
-            self.optimiser.step()
+        late = min(max((self.step - self.turn) / max(self.stop - self.turn, 1), 0.0), 1.0)
+        self.optimiser.step(min(1.0, (self.step + 1) / WARMUP) * 0.5 * (1.0 + math.cos(math.pi * late)))
         self.step += 1
         for mean, parameter in zip(self.average, self.parameters, strict=True):
             mean.lerp_(parameter, 0.02)
@@ -227,21 +198,21 @@ class _Fit:
         """Fill the gradients of the weighted L1 loss at the `chosen` [T] points of the pool: of the signed distance, or
         of the unsigned one if the sign is not known."""
         points, distance, signed, _ = (part[chosen.to(self.device)] for part in self.pool)
-        weights, biases = _layers(self.parameters, self.options.activation)
+        weights, biases = _layers(self.parameters)
         value = self._tape.forward(weights, biases, points)
         error = torch.where(signed, value - distance, value.abs() - distance.abs())
+        soften = self.options.soften
         slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
-        if self.options.soften is not None:
-            slope = slope * (self.options.soften / (distance.abs() + self.options.soften))
+        slope = slope * (soften / (distance.abs() + soften))
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
-        for gradient, scale in zip(gradients, _SCALES[self.options.activation], strict=True):
+        for gradient, scale in zip(gradients, _SCALES, strict=True):
             gradient.mul_(scale)
 
     def judge(self) -> tuple[float, float]:
         """Begin the decay if the goal is met. Returns mean errors near the surface and in the box."""
-        layers = _layers(self.average, self.options.activation)
-        value, gradient = value_and_gradient(*layers, self.options.activation, self.check.points)
+        layers = _layers(self.average)
+        value, gradient = value_and_gradient(*layers, self.check.points)
         distance, signed = self.check.distance, self.check.signed
         error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
         near, far = float(error[:CHECKED].mean()), float(error[2 * CHECKED :].mean())
@@ -265,38 +236,37 @@ class _Fit:
 
     def result(self) -> MlpSdf:
         """The network."""
-        parts = _layers(self.parameters, self.options.activation)
+        parts = _layers(self.parameters)
         weights, biases = (tuple(part.cpu().clone() for part in layers) for layers in parts)
-        return MlpSdf(weights, biases, self.options.activation, self.frame, self.oracle.bounds.copy(), self.mirrors)
+        return MlpSdf(weights, biases, self.frame, self.oracle.bounds.copy(), self.mirrors)
 
 
 def _initial(options: FitOptions, generator: torch.Generator) -> list[torch.Tensor]:
     """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights; biases [L - 1, W, 1] and [1, 1, 1]: equal
     layers are stacked for the optimiser. Periodic layers start with phases all around and the spread of inputs that
-    sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance."""
+    sine layers have (Sitzmann et al. 2020)."""
     width, hidden = options.width, options.layers - 2
 
     def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
         return (2.0 * torch.rand((layers, *shape), generator=generator) - 1.0) * bound
 
-    periodic = options.activation == "wave"
     return [
-        uniform(FIRST if periodic else math.sqrt(2.0), 1, width, 3),
+        uniform(FIRST, 1, width, 3),
         uniform(math.sqrt(6.0 / width), hidden, width, width),
-        uniform(math.sqrt(6.0 / width) / (10.0 if periodic else 1.0), 1, 1, width),
-        uniform(math.pi if periodic else 0.05, options.layers - 1, width, 1),
+        uniform(math.sqrt(6.0 / width) / 10.0, 1, 1, width),
+        uniform(math.pi, options.layers - 1, width, 1),
         uniform(0.05, 1, 1, 1),
     ]
 
 
 # A wave of period 1 with the parameters of a sine of period 2 pi: they are trained at the sine's scale, on which
 # equal steps of the optimiser suit all layers, and multiplied by these before every use. Its height is 1/8.
-_SCALES = {"wave": (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0), "relu": (1.0,) * 5}
+_SCALES = (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0)
 
 
-def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
+def _layers(parameters: list[torch.Tensor]) -> Layers:
     """The layers as networks use them."""
-    return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)])
+    return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES, strict=True)])
 
 
 def _split(parts: list[torch.Tensor]) -> Layers:
